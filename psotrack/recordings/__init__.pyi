@@ -14,6 +14,7 @@ from .image_files import (
 from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
 from .marker_groups import NoDronesError
+from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video
 from .recording import OnboardVideo, Recording
 from .recording_file import (
@@ -39,7 +40,6 @@ from .video import (
     probe,
     probe_images,
     read_frames,
-    silence_opencv,
 )
 
 __all__ = [

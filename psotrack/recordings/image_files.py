@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,9 +13,12 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from psotrack.errors import InputError
+from psotrack.recordings.opencv_messages import silence_opencv
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+#: First bytes of a PNG, and the least size of a part of it: length, name and checksum.
+_PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -109,10 +113,32 @@ def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
         coded = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(path, expected="an image", found=(error.strerror or str(error)).lower()) from error
-    image = cv2.imdecode(coded, flags) if len(coded) else None
+    if coded[: len(_PNG)].tobytes() == _PNG and not _is_whole_png(coded):
+        raise InputError(path, expected="an image", found="a PNG that is cut short or damaged")
+    with silence_opencv():
+        image = cv2.imdecode(coded, flags) if len(coded) else None
     if image is None:
         raise InputError(path, expected="an image", found="a file that OpenCV cannot decode")
     return np.asarray(image)
+
+
+def _is_whole_png(coded: UInt8[np.ndarray, " bytes"]) -> bool:
+    """Whether a PNG's parts up to its end are there, and those that an image needs fit their checksums.
+
+    libpng writes about parts that do not straight to the terminal, which no setting of OpenCV prevents.
+    """
+    data = memoryview(coded.tobytes())
+    at, name = len(_PNG), b""
+    while name != b"IEND":
+        end = at + _PNG_PART + int.from_bytes(data[at : at + 4])
+        if end > len(data):
+            return False
+        name = bytes(data[at + 4 : at + 8])
+        # The name of a part that an image needs begins with a capital letter.
+        if name[:1].isupper() and zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+            return False
+        at = end
+    return True
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:

@@ -11,7 +11,6 @@ import contextlib
 import math
 import os
 import shlex
-import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,17 +22,15 @@ from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
 from psotrack.recordings.image_files import depth_of, read_image
+from psotrack.recordings.opencv_messages import silence_opencv
 from psotrack.support import atomic_write, digest_file, digest_record
 
 #: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
 _CODEC = "XVID"
-_FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
-_FFMPEG_QUIET = "-8"
 #: Properties of a writer that takes encoded frames and the flags of key frames.
 _CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
 #: Largest number of images of which the depth is read.
 _READ_IMAGES = 5
-_opening = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -363,26 +360,6 @@ def _count_packets(path: Path) -> int:
         return count
     finally:
         capture.release()
-
-
-@contextlib.contextmanager
-def silence_opencv() -> Iterator[None]:
-    """Suppress the messages of OpenCV and FFmpeg about a file that is opened in this block; errors replace them.
-
-    FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user has set is
-    kept.
-    """
-    with _opening:
-        level = cv2.utils.logging.getLogLevel()
-        chosen = _FFMPEG_LOG_LEVEL in os.environ
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        os.environ.setdefault(_FFMPEG_LOG_LEVEL, _FFMPEG_QUIET)
-        try:
-            yield
-        finally:
-            cv2.utils.logging.setLogLevel(level)
-            if not chosen:
-                del os.environ[_FFMPEG_LOG_LEVEL]
 
 
 class TruncatedVideoError(InputError):

@@ -17,18 +17,27 @@ from psotrack.inside_out.mapping.sightings import MarkerSightings
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import PoseSettings, RollingShutter
 
+#: Standard deviation of a line time, as a share of it, by the errors of the map that was made from the same video: on
+#: drawn walks of 3 s, line times were up to 6 % off where the frames alone agreed to 1 %.
+_BY_MAP = 0.05
 #: Shutters and what the videos show of them, one for each video.
 Shutters = tuple[RollingShutter | None, ...]
 LineTimes = tuple[LineTime | None, ...]
 
 
 def line_times(sightings: MarkerSightings, marker_map: MarkerMap) -> LineTimes:
-    """The line time that each video shows, with a map of its markers; None where too few frames follow one another."""
+    """The line time that each video shows, with a map of its markers; None where too few frames follow one another.
+
+    The standard deviation includes errors of a map that was made from the same frames.
+    """
     found: list[LineTime | None] = []
     for index, lens in enumerate(sightings.lenses):
         frames = sightings.consecutive[index] if sightings.consecutive else ()
         seen = [_of_map(frame, marker_map) for frame in frames or _views(sightings, index)]
-        found.append(estimate_line_time(seen, marker_map, lens, PoseSettings(min_markers=2)))
+        shown = estimate_line_time(seen, marker_map, lens, PoseSettings(min_markers=2))
+        if shown is not None:
+            shown = replace(shown, std_s=float(np.hypot(shown.std_s, _BY_MAP * shown.line_time_s)))
+        found.append(shown)
     return tuple(found)
 
 
