@@ -20,9 +20,9 @@ class FrameMotion:
     Attributes:
         assumed: (6,), motion with which the pose was computed.
         by_motion: (6, 6), change of the pose, metres and radians, by the true motion.
-        covariance: (6, 6), covariance of the pose if the motion were known, as in `CameraPath`.
+        covariance: (6, 6), covariance of the pose if the motion were known, as in `CameraPath`; `common` is in it.
         measured: (6,), motion by the rows of this frame alone.
-        measured_covariance: (6, 6), its covariance; wide in directions that the markers do not show.
+        measured_covariance: (6, 6), its covariance; wide in directions that the markers do not show. `common` is in it.
         common: (12, errors), change of the pose for a known motion, and of the measured motion, by one standard
             deviation of each error that is the same in all frames.
     """

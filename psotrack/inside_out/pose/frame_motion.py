@@ -52,12 +52,17 @@ def frame_motion(
         common = np.concatenate([common, (by_line_time[whole] @ extra[2:])[:, None]], axis=1)
     common[:6] += by_motion @ common[6:]
     of_pose = covariance[:6, :6] + by_motion @ covariance[6:, :6]
+    of_motion = covariance[6:, 6:]
+    if seen.unsure is not None:
+        # Errors of the line time are no part of the solution's covariance; those of the map are.
+        late = common[:, -1:]
+        of_pose, of_motion = of_pose + late[:6] @ late[:6].T, of_motion + late[6:] @ late[6:].T
     return FrameMotion(
         assumed=extra[2:],
         by_motion=by_motion,
         covariance=(of_pose + of_pose.T) / 2,
         measured=extra[2:] + solution.step[POSE_SIZE + 2 :],
-        measured_covariance=covariance[6:, 6:],
+        measured_covariance=of_motion,
         common=common,
     )
 
