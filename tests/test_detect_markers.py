@@ -200,6 +200,13 @@ def test_flat_markers_with_more_cells_are_not_read():
         assert len(found) == 0, dictionary
 
 
+def test_what_the_border_of_the_image_leaves_of_a_marker_is_no_other_marker():
+    """Found: the right half of marker 52 was read as marker 660, which has no white border at the image's border."""
+    half = picture([Sheet(52, (0.5, 80.0), 80.0)], (200, 160), "4x4_1000")
+    for gray in (half, half[:, ::-1].copy(), half.T.copy(), half.T[::-1].copy()):
+        assert len(MarkerDetector("4x4_1000", thorough=True).detect(gray)) == 0
+
+
 def run(*words, expect=None):
     result = CliRunner().invoke(detect_markers, [str(word) for word in words])
     if expect is None:

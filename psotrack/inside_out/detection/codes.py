@@ -158,6 +158,9 @@ def share_outlined(
 ) -> Float[np.ndarray, " quads"]:
     """Share of the outline at which the outside is lighter than the border; darker, around an inverted print.
 
+    Where the outside is out of the image it counts as not lighter: what the image's border leaves of a marker may look
+    like another one.
+
     Args:
         gray: (rows, columns).
         quads_px: (quads, 4, 2), pixels.
@@ -166,13 +169,15 @@ def share_outlined(
         contrast: (quads,), difference of brightness between white and black cells, grey levels.
     """
     along, beside = (np.arange(_ALONG) + 0.5) / _ALONG, _BESIDE / cells
-    sides = []
+    sides, places = [], []
     for across in (-beside, beside):
         first, last = np.full(_ALONG, across), np.full(_ALONG, 1.0 - across)
         u, v = np.concatenate([along, along, first, last]), np.concatenate([first, last, along, along])
-        sides.append(_sample(gray, quads_px, np.stack([u, v], axis=-1)))
+        places.append(np.stack([u, v], axis=-1))
+        sides.append(_sample(gray, quads_px, places[-1]))
     step = (sides[0] - sides[1]) * np.where(inverted, -1.0, 1.0)[:, None]
-    return (step > _LEAST_STEP * np.maximum(contrast, 1.0)[:, None]).mean(axis=1)
+    is_edge = step > _LEAST_STEP * np.maximum(contrast, 1.0)[:, None]
+    return (is_edge & _in_image(gray, quads_px, places[0])).mean(axis=1)
 
 
 def pattern_agreement(
@@ -229,13 +234,32 @@ def _sample(
     """Brightness at places of the unit square that each quadrangle is."""
     found = np.zeros((len(quads_px), len(places)))
     for first in range(0, len(quads_px), _AT_ONCE):
-        to_image = homographies(quads_px[first : first + _AT_ONCE])
-        x, y, depth = np.moveaxis(to_image[..., :2] @ places.T + to_image[..., 2:], 1, 0)
-        at = ((x / depth).astype(np.float32), (y / depth).astype(np.float32))
+        x, y = _pixels(quads_px[first : first + _AT_ONCE], places)
+        at = (x.astype(np.float32), y.astype(np.float32))
         found[first : first + _AT_ONCE] = cv2.remap(
             gray, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
     return found
+
+
+def _in_image(
+    gray: UInt8[np.ndarray, "rows columns"],
+    quads_px: Float[np.ndarray, "quads 4 2"],
+    places: Float[np.ndarray, "places 2"],
+) -> Bool[np.ndarray, "quads places"]:
+    """Which places of the unit square that each quadrangle is are in the image."""
+    x, y = _pixels(quads_px, places)
+    rows, columns = gray.shape
+    return (x > -0.5) & (x < columns - 0.5) & (y > -0.5) & (y < rows - 0.5)
+
+
+def _pixels(
+    quads_px: Float[np.ndarray, "quads 4 2"], places: Float[np.ndarray, "places 2"]
+) -> tuple[Float[np.ndarray, "quads places"], Float[np.ndarray, "quads places"]]:
+    """Pixels, x and y, of places of the unit square that each quadrangle is."""
+    to_image = homographies(quads_px)
+    x, y, depth = np.moveaxis(to_image[..., :2] @ places.T + to_image[..., 2:], 1, 0)
+    return x / depth, y / depth
 
 
 def homographies(quads_px: Float[np.ndarray, "quads 4 2"]) -> Float[np.ndarray, "quads 3 3"]:
