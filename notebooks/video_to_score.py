@@ -37,7 +37,8 @@ from psotrack.initiation.initialisation import find_drones
 from psotrack.recordings import read_frames
 from psotrack.silhouettes import compute, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.silhouettes.foreground import classify, coverage, learn_background, learning_step
+from psotrack.silhouettes.foreground import coverage, learning_step
+from psotrack.silhouettes.living_background import Living
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import SoftIoU, on_device
@@ -70,26 +71,26 @@ names = recording.rig.names
 # %% [markdown]
 # ## Frame → foreground → silhouette
 #
-# The cameras stand still, so a pixel shows the background most of the time. A background model (MOG2) learns what each
-# pixel usually shows from frames of the whole video; pixels that differ from the model are foreground. The tracker
-# reads a coarser picture: each value of a *silhouette* is the share of a small square of pixels that is foreground, 0
-# to 255. `psotrack.silhouettes.compute` does the same for all cameras and frames, and keeps the result.
+# The cameras stand still, so a pixel shows the background most of the time. A background model learns what each pixel
+# usually shows from frames of the whole video, and goes on learning from frame to frame; what differs from the model and
+# ends in sharp edges is foreground. The tracker reads a coarser picture: each value of a *silhouette* is the share of a
+# small square of pixels that is foreground, 0 to 255. `psotrack.silhouettes.compute` does the same for all cameras and
+# frames, and keeps the result.
 
 # %%
+scaled = SILHOUETTES.scaled([video.image_size_wh for video in recording.videos.values()])
 images, masks = [], []
 for camera in CAMERAS:
     video = recording.videos[names[camera]]
-    model = learn_background(read_frames(video, learning_step(video.num_frames, SILHOUETTES)), SILHOUETTES)
-    for image in islice(read_frames(video), FRAME + 1):  # in order: what was seen leaves traces in the model
-        mask = classify(model, image, SILHOUETTES)
-    images.append(image)
-    masks.append(mask)
+    learning = read_frames(video, learning_step(video.num_frames, scaled))
+    foreground = Living(scaled).foreground(learning, read_frames(video))
+    images.append(next(islice(read_frames(video), FRAME, None)))
+    masks.append(next(islice(foreground, FRAME, None)))
 
 silhouettes = compute(recording, SILHOUETTES, cache=DATA / "silhouettes")
 seen = silhouettes.read(FRAME, FRAME + 1)[0]  # cameras, height, width
 for camera, mask in zip(CAMERAS, masks, strict=True):  # just so they are made
-    made = coverage(mask, SILHOUETTES.reduction // SILHOUETTES.working_reduction)
-    assert np.array_equal(made, seen[camera])
+    assert np.array_equal(coverage(mask, scaled.reduction // scaled.working_reduction), seen[camera])
 
 # %% [markdown]
 # ## A point → a box in every camera
