@@ -141,7 +141,7 @@ def main() -> None:
         "--kinds", nargs="+", choices=KINDS, default=["calm", "restless"], help="kinds of surroundings"
     )
     options.add_argument(
-        "--background", nargs="+", default=["mog2"], metavar="NAME", help="names of background models"
+        "--background", nargs="+", default=["living"], metavar="NAME", help="names of background models"
     )
     chosen = options.parse_args()
     run = start("restless")
