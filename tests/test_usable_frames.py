@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.silhouettes import Silhouettes, SilhouetteSettings, blob_detections, compute
-from psotrack.silhouettes.usable_frames import foreground_is_everywhere, in_words, intervals_of
+from psotrack.silhouettes.usable_frames import LEAST_FRAMES, foreground_is_everywhere, in_words, intervals_of
 
 SIZE_WH = (160, 120)
 NUM_FRAMES = 80
@@ -50,6 +50,12 @@ def test_intervals_are_the_chosen_frames(chosen: list[bool]) -> None:
         assert not again[max(start - 1, 0) : stop].any()
         again[start:stop] = True
     assert again.tolist() == chosen
+
+
+def test_a_single_frame_with_speckle_everywhere_is_kept() -> None:
+    """Found: key frames of a codec were left out in all cameras at once, and tracks were lost there."""
+    unusable = np.array([0, 1, 0, 1, 1, 0, 1, 1, 1], bool)
+    assert intervals_of(unusable, LEAST_FRAMES) == [(6, 9)]
 
 
 def test_intervals_in_words_leave_out_short_gaps() -> None:

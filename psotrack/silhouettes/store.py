@@ -25,7 +25,12 @@ from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
 from psotrack.silhouettes.settings import ScaledSettings
-from psotrack.silhouettes.usable_frames import Interval, foreground_is_everywhere, intervals_of
+from psotrack.silhouettes.usable_frames import (
+    LEAST_FRAMES,
+    Interval,
+    foreground_is_everywhere,
+    intervals_of,
+)
 from psotrack.support import Advance, digest_file, digest_record, identify
 
 logger = logging.getLogger(__name__)
@@ -186,7 +191,8 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
             array[index + 1 - count : index + 1] = chunk[:count]
             everywhere.append(foreground_is_everywhere(chunk[:count]))
-    array.update_attributes({_LEFT_OUT: intervals_of(np.concatenate([np.zeros(0, bool), *everywhere]))})
+    unusable = np.concatenate([np.zeros(0, bool), *everywhere])
+    array.update_attributes({_LEFT_OUT: intervals_of(unusable, LEAST_FRAMES)})
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
     return seconds
 

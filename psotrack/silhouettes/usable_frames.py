@@ -19,6 +19,9 @@ _PARTS = 16
 #: Share of the parts with foreground from which on foreground is everywhere. Ten drones of a part's size touch 40 of
 #: 144 parts; a single drone that touches more than half of them is nearer than its distance can be told from its size.
 _MOST_PARTS = 0.5
+#: Shortest interval that is left out, frames. A single frame, such as the key frame of a codec with its speckle, does
+#: the tracker less harm than a camera that is missing.
+LEAST_FRAMES = 3
 
 #: First frame and the frame after the last of one interval.
 Interval = tuple[int, int]
@@ -41,10 +44,14 @@ def foreground_is_everywhere(
     return (most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS
 
 
-def intervals_of(chosen: Bool[np.ndarray, "frames"]) -> list[Interval]:
-    """The intervals of the chosen frames, in order."""
+def intervals_of(chosen: Bool[np.ndarray, "frames"], least_frames: int = 1) -> list[Interval]:
+    """The intervals of the chosen frames that have at least `least_frames` frames, in order."""
     changes = np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0))
-    return [(int(start), int(stop)) for start, stop in zip(changes[::2], changes[1::2], strict=True)]
+    return [
+        (int(start), int(stop))
+        for start, stop in zip(changes[::2], changes[1::2], strict=True)
+        if stop - start >= least_frames
+    ]
 
 
 def in_words(intervals: list[Interval], *, gap_frames: int) -> str:
