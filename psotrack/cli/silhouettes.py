@@ -81,7 +81,7 @@ def silhouettes(
     \b
     Examples:
       psotrack silhouettes data/Simulated_Data/S02_D4_A
-      psotrack silhouettes data/Simulated_Data/S02_D4_A --shadows drop --json -
+      psotrack silhouettes data/Simulated_Data/S02_D4_A --frames 100 --json -
       psotrack silhouettes data/Simulated_Data/S02_D4_A --masks masks
       psotrack silhouettes flight.mp4 --masks flight_mask.mp4
       psotrack silhouettes pictures/ --masks masks --background mog2 --min-blob 16

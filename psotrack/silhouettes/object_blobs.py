@@ -85,10 +85,11 @@ def find_objects(
         if not blobs.area.any():
             break
         contours = _contours(blobs, changed.shape)
+        levels, steepness = difference.ravel()[blobs.pixels], _gradient_at(difference, contours.pixels)
         # A blob that fills the image has no contour.
         is_object = (contours.length == 0) | (
-            _is_sharp(blobs, contours, difference)
-            & (_steep_part(blobs, contours, difference, share) >= steep_part)
+            _is_sharp(blobs, contours, levels, steepness)
+            & (_steep_part(blobs, contours, levels, steepness, share) >= steep_part)
         )
         mask.ravel()[blobs.chosen(is_object).pixels] = 255
         own.ravel()[blobs.chosen(is_object & _has_own_edges(contours, image, background)).pixels] = 255
@@ -96,19 +97,40 @@ def find_objects(
     return ObjectBlobs(mask, own)
 
 
-def _is_sharp(blobs: _PixelBlobs, contours: _Contours, difference: _Mask) -> Bool[np.ndarray, "blobs"]:
-    """Whether the difference to the background rises steeply at a blob's contour, in the mean."""
-    contrast = blobs.sums(difference.ravel()[blobs.pixels]) / np.maximum(blobs.area, 1)
+def _is_sharp(
+    blobs: _PixelBlobs,
+    contours: _Contours,
+    levels: Shaped[np.ndarray, "pixels"],
+    steepness: Float[np.ndarray, "points"],
+) -> Bool[np.ndarray, "blobs"]:
+    """Whether the difference to the background rises steeply at a blob's contour, in the mean.
+
+    Args:
+        blobs: the blobs.
+        contours: their contours.
+        levels: (pixels,), difference to the background at the blobs' pixels.
+        steepness: (points,), gradient of the difference at the contours.
+    """
+    contrast = blobs.sums(levels) / np.maximum(blobs.area, 1)
     least = _SHARP * np.minimum(contrast, _SHARP_DIFFERENCE) + _NOISE_GRADIENT
-    return contours.means(_gradient_at(difference, contours.pixels)) > least
+    return contours.means(steepness) > least
 
 
 def _steep_part(
-    blobs: _PixelBlobs, contours: _Contours, difference: _Mask, share: float
+    blobs: _PixelBlobs,
+    contours: _Contours,
+    levels: Shaped[np.ndarray, "pixels"],
+    steepness: Float[np.ndarray, "points"],
+    share: float,
 ) -> Float[np.ndarray, "blobs"]:
-    """(blobs,), part of a blob's contour where the difference is a step, and not the slope of a cloud."""
-    least = _STEEP * _ending_level(blobs, difference.ravel()[blobs.pixels], share) + _NOISE_GRADIENT
-    return contours.means(_gradient_at(difference, contours.pixels) > least[contours.blob])
+    """(blobs,), part of a blob's contour where the difference is a step, and not the slope of a cloud.
+
+    Args:
+        blobs, contours, levels, steepness: as for `_is_sharp`.
+        share: share of its contrast at which a blob ends.
+    """
+    least = _STEEP * _ending_level(blobs, levels, share) + _NOISE_GRADIENT
+    return contours.means(steepness > least[contours.blob])
 
 
 def _has_own_edges(
