@@ -12,5 +12,6 @@ to white across an edge, `edge_lines` fits lines to the edges, `distortion` conv
 
 from psotrack.inside_out.detection.corners import refine_corners
 from psotrack.inside_out.detection.detector import DetectedMarkers, MarkerDetector
+from psotrack.inside_out.detection.search import FirstPass
 
-__all__ = ["DetectedMarkers", "MarkerDetector", "refine_corners"]
+__all__ = ["DetectedMarkers", "FirstPass", "MarkerDetector", "refine_corners"]

@@ -17,7 +17,14 @@ from jaxtyping import Bool, Float, UInt8
 
 from psotrack.geometry import Camera
 from psotrack.inside_out.detection.distortion import distort_pixels, undistort_pixels
-from psotrack.inside_out.detection.edge_lines import BEFORE, NEXT, fit_curves, fit_lines, intersections
+from psotrack.inside_out.detection.edge_lines import (
+    BEFORE,
+    NEXT,
+    fit_curves,
+    fit_lines,
+    intersections,
+    median_of_rows,
+)
 from psotrack.inside_out.detection.edge_transitions import Levels, find_transitions
 from psotrack.inside_out.detection.gamma import estimate_gamma, linearise
 
@@ -165,5 +172,5 @@ def _measure_edges(
     return _Edges(
         np.where(is_shown[..., None], points, 0.0),
         np.where(is_shown, height, 0.0),
-        np.median(spread, axis=-1) * reach_px,
+        median_of_rows(spread) * reach_px,
     )

@@ -15,7 +15,7 @@ from psotrack.geometry import Camera
 from psotrack.inside_out.detection.codes import MarkerCodes, pattern_agreement
 from psotrack.inside_out.detection.corners import refine_corners
 from psotrack.inside_out.detection.distortion import undistort_pixels
-from psotrack.inside_out.detection.search import MarkerSearch
+from psotrack.inside_out.detection.search import FirstPass, MarkerSearch
 
 #: Shortest side of a marker, in pixels of the full image: one pixel for each of 6 cells, border cells included.
 _SHORTEST_PX = 6.0
@@ -106,9 +106,20 @@ class MarkerDetector:
         is_bent = lens is not None and (np.any(lens.dist) or bool(lens.fisheye))
         self._lens = lens if is_bent else None
 
-    def detect(self, gray: UInt8[np.ndarray, "height width"]) -> DetectedMarkers:
-        """Detect the markers in an image, (height, width); empty if there are none."""
-        found = self._search.find(gray)
+    def first_pass(self, gray: UInt8[np.ndarray, "height width"]) -> FirstPass:
+        """OpenCV's part of `detect`, which several threads can run at once; the other part holds Python's lock."""
+        return self._search.first_pass(gray)
+
+    def detect(
+        self, gray: UInt8[np.ndarray, "height width"], first: FirstPass | None = None
+    ) -> DetectedMarkers:
+        """Detect the markers in an image; empty if there are none.
+
+        Args:
+            gray: (height, width).
+            first: what `first_pass` returned for this image; None to run this pass here.
+        """
+        found = self._search.find(gray, first)
         # A marker that reaches beyond what the lens model shows has no place without distortion.
         is_shown = np.isfinite(undistort_pixels(found.corners_px, self._lens)).all(axis=(1, 2))
         found = found.select(valid_quads(found.corners_px) & is_shown)

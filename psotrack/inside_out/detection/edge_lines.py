@@ -62,15 +62,13 @@ def fit_lines(
     weighted = weight
     for _ in range(1 + _REWEIGHTINGS):
         total = np.maximum(weighted.sum(axis=-1), 1e-9)[..., None]
-        middle = (weighted[..., None] * points).sum(axis=2) / total
+        middle = (weighted[..., None, :] @ points)[..., 0, :] / total
         apart = points - middle[:, :, None]
-        xx, yy, xy = (
-            (weighted * apart[..., i] * apart[..., j]).sum(axis=-1) for i, j in ((0, 0), (1, 1), (0, 1))
-        )
-        angle = np.arctan2(2 * xy, xx - yy) / 2
+        square = np.swapaxes(weighted[..., None] * apart, -1, -2) @ apart
+        angle = np.arctan2(2 * square[..., 0, 1], square[..., 0, 0] - square[..., 1, 1]) / 2
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         distance = np.abs(apart[..., 0] * direction[..., None, 1] - apart[..., 1] * direction[..., None, 0])
-        typical = np.median(distance, axis=-1, keepdims=True)
+        typical = median_of_rows(distance)[..., None]
         weighted = weight / (1 + (distance / np.maximum(1.5 * typical, _INLIER_PX)) ** 2)
     return middle, direction, typical[..., 0]
 
@@ -193,7 +191,7 @@ def _fit_powers(
         inverse = np.linalg.inv(columns @ basis + unused + 1e-6 * np.eye(3))
         powers = (inverse @ (columns @ off[..., None]))[..., 0]
         left2 = (off - (basis @ powers[..., None])[..., 0]) ** 2
-        typical2 = np.maximum(1.5**2 * np.median(left2, axis=-1, keepdims=True), _INLIER_PX**2)
+        typical2 = np.maximum(1.5**2 * median_of_rows(left2)[..., None], _INLIER_PX**2)
         weighted = weight / (1 + left2 / typical2)
     count = np.array([2.0, 3.0])[:, None, None]
     freedom = np.maximum((weight > 0).sum(axis=-1) / shared - count, 1.0)
@@ -205,6 +203,14 @@ def _fit_powers(
     )
     bend_std = np.sqrt(scatter_of_all[1] * covariance[1][..., 2, 2])
     return powers, scatter[..., None, None] * covariance, bend_std
+
+
+def median_of_rows(values: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, "*rows"]:
+    """Median of each row of finite values. `numpy.median`, which looks for NaN first, takes three times as long."""
+    above = values.shape[-1] // 2
+    below = above - 1 + values.shape[-1] % 2
+    ordered = np.partition(values, (below, above), axis=-1)
+    return (ordered[..., below] + ordered[..., above]) / 2
 
 
 def intersections(

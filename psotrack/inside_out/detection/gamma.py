@@ -115,9 +115,8 @@ def _cell_edges(
     grid = np.stack([upright, upright[..., ::-1]])
     half = np.array([[0.5, 0.0], [0.0, 0.5]])[:, None, None] / cells
     to_image = homographies(undistort_pixels(corners_px, lens))
-    places_px, before_px, after_px = (
-        distort_pixels(_project(to_image, at), lens) for at in (grid, grid - half, grid + half)
-    )
+    at = np.stack([grid, grid - half, grid + half])
+    places_px, before_px, after_px = np.moveaxis(distort_pixels(_project(to_image, at), lens), 1, 0)
     cell_px = np.linalg.norm(after_px - before_px, axis=-1, keepdims=True)
     ahead = (after_px - before_px) / np.maximum(cell_px, 1e-9)
     # Steps to the right cross the left and the right edge of a marker, which are the odd ones of the four.
@@ -153,10 +152,8 @@ def _white_gain_px(
 
 
 def _project(
-    to_image: Float[np.ndarray, "markers 3 3"], points: Float[np.ndarray, "2 lines cells 2"]
-) -> _Grid:
+    to_image: Float[np.ndarray, "markers 3 3"], points: Float[np.ndarray, "3 2 lines cells 2"]
+) -> Float[np.ndarray, "markers 3 2 lines cells 2"]:
     """Points of the unit square in the image, by each marker's homography."""
-    homogeneous = (
-        np.einsum("mij,alpj->malpi", to_image[..., :2], points) + to_image[:, None, None, None, :, 2]
-    )
-    return homogeneous[..., :2] / homogeneous[..., 2:]
+    homogeneous = points.reshape(-1, 2) @ to_image[..., :2].swapaxes(1, 2) + to_image[:, None, :, 2]
+    return (homogeneous[..., :2] / homogeneous[..., 2:]).reshape(-1, *points.shape)

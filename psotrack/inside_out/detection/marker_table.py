@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.inside_out.detection.detector import DetectedMarkers, MarkerDetector
+from psotrack.inside_out.detection.search import FirstPass
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.recordings import read_grey
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 
-#: Number of threads that detect markers, each in an image of its own.
+#: Number of threads that detect markers, or make a first pass, each in an image of its own.
 _WORKERS = min(4, os.cpu_count() or 1)
 #: Columns of the table, after the one that says which image or frame.
 _COLUMNS = ("id", *(f"{axis}{corner}_px" for corner in range(4) for axis in "xy"), "std_px")
@@ -53,16 +54,14 @@ def markers_of_video(
     """
     detector = MarkerDetector(dictionary)
 
-    def found(frame: Frame) -> DetectedMarkers:
-        grey: UInt8[np.ndarray, "height width"] = np.asarray(
-            cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8
-        )
-        return detector.detect(grey)
+    def search(frame: Frame) -> tuple[UInt8[np.ndarray, "height width"], FirstPass]:
+        grey = np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        return grey, detector.first_pass(grey)
 
     with report("markers", source.num_frames or 0) as advance:
-        for markers in map_ahead(found, read_ahead(source.frames()), _WORKERS):
+        for grey, first in map_ahead(search, read_ahead(source.frames()), _WORKERS):
             advance(1)
-            yield markers
+            yield detector.detect(grey, first)
 
 
 def write_marker_table(

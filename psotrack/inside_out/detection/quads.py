@@ -28,26 +28,24 @@ def find_quads(
         (quads, 4, 2), corners on the edges of the pixels, clockwise with y down, pixels.
     """
     contours, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    found = [
-        quad for each in contours if len(each) >= 4 * least_side_px and (quad := _quad(each)) is not None
-    ]
+    long_enough = [each for each in contours if len(each) >= 4 * least_side_px]
+    found = [(quad[:, 0], len(each)) for each in long_enough if (quad := _quad(each)) is not None]
     if not found:
         return np.zeros((0, 4, 2))
-    return _to_pixel_edges(np.array(found, np.float64))
+    quads = np.array([quad for quad, _ in found], np.float64)
+    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
+    least = _SHORTEST_SIDE * np.array([length for _, length in found])
+    return _to_pixel_edges(quads[sides.min(axis=1) >= least])
 
 
 def _quad(contour: np.ndarray) -> np.ndarray | None:
-    """Corners of a contour that is a convex quadrangle, (4, 2); None of other contours."""
-    length = len(contour)
+    """Corners of a contour that is a convex quadrangle, (4, 1, 2); None of other contours."""
     for accuracy in _ACCURACIES:
-        polygon = np.asarray(cv2.approxPolyDP(contour, accuracy * length, True))
+        polygon = np.asarray(cv2.approxPolyDP(contour, accuracy * len(contour), True))
         if len(polygon) < 4:
             return None
         if len(polygon) == 4:
-            quad = polygon[:, 0]
-            sides = np.hypot(*(np.roll(quad, -1, axis=0) - quad).T)
-            long_enough = sides.min() >= _SHORTEST_SIDE * length
-            return quad if long_enough and cv2.isContourConvex(polygon) else None
+            return polygon if cv2.isContourConvex(polygon) else None
     return None
 
 

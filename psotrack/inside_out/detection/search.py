@@ -75,6 +75,19 @@ class Candidates:
         return Candidates(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
+@dataclass(frozen=True)
+class FirstPass:
+    """What OpenCV's detector finds in an image with its defaults.
+
+    Attributes:
+        index: (markers,), number of the marker among the codes.
+        corners_px: (markers, 4, 2), from the marker's own top left, pixels.
+    """
+
+    index: Int[np.ndarray, " markers"]
+    corners_px: Float[np.ndarray, "markers 4 2"]
+
+
 class MarkerSearch:
     """Finds the markers of a dictionary, with corners that are good to a few pixels.
 
@@ -92,9 +105,21 @@ class MarkerSearch:
             low + min(share, 1.0) * (high - low) for low, high in (_LEAST_OPENCV, _LEAST_OTHER)
         )
 
-    def find(self, gray: UInt8[np.ndarray, "height width"]) -> Candidates:
-        """Find the markers in an image; no two are at one place."""
-        passes = [self._find_by_opencv(gray, inverted=False)]
+    def first_pass(self, gray: UInt8[np.ndarray, "height width"]) -> FirstPass:
+        """Run OpenCV's detector. It does not hold Python's lock, so that several threads can run it at once."""
+        quads, which, _ = self._opencv.detectMarkers(gray)
+        index = np.zeros(0, np.int64) if which is None else np.asarray(which).ravel().astype(np.int64)
+        corners_px = np.concatenate([np.zeros((0, 4, 2)), *(np.asarray(quad, np.float64) for quad in quads)])
+        return FirstPass(index, corners_px)
+
+    def find(self, gray: UInt8[np.ndarray, "height width"], first: FirstPass | None = None) -> Candidates:
+        """Find the markers in an image; no two are at one place.
+
+        Args:
+            gray: (height, width).
+            first: the first pass over this image; None to run it here.
+        """
+        passes = [self._choose_by_agreement(gray, first or self.first_pass(gray), inverted=False)]
         if self._thorough:
             times = 1.0
             while times == 1 or max(gray.shape) / times >= _SMALLEST_PX:
@@ -106,7 +131,8 @@ class MarkerSearch:
             passes.append(self._find_in(gray, times, ((window_px, _DARKER),)))
         # A video's markers are printed alike, so that where none is inverted, OpenCV would find none either.
         if self._thorough or any(one.inverted.any() for one in passes):
-            passes.append(self._find_by_opencv(gray, inverted=True))
+            negative = np.asarray(cv2.bitwise_not(gray), np.uint8)
+            passes.append(self._choose_by_agreement(gray, self.first_pass(negative), inverted=True))
         found = Candidates(
             *(
                 np.concatenate([getattr(one, name) for one in passes])
@@ -125,14 +151,13 @@ class MarkerSearch:
         levels = sample_cells(gray, corners_px, self._codes.cells)
         return self._codes.agreement(levels, found.index, np.zeros(len(found), np.int64), found.inverted)[0]
 
-    def _find_by_opencv(self, gray: _Image, *, inverted: bool) -> Candidates:
-        """Find markers by OpenCV's defaults, which read black on white, in the image or in its negative."""
-        quads, which, _ = self._opencv.detectMarkers(cv2.bitwise_not(gray) if inverted else gray)
-        index = np.zeros(0, np.int64) if which is None else np.asarray(which).ravel().astype(np.int64)
-        corners_px = np.concatenate([np.zeros((0, 4, 2)), *(np.asarray(quad, np.float64) for quad in quads)])
-        of_opencv = np.ones(len(index), bool)
-        found = Candidates(index, corners_px, of_opencv & inverted, np.zeros(len(index)), of_opencv)
-        found = replace(found, agreement=self.agreement(gray, found, corners_px))
+    def _choose_by_agreement(self, gray: _Image, first: FirstPass, *, inverted: bool) -> Candidates:
+        """The markers of OpenCV's detector whose cells agree with the image; it ran in the negative if `inverted`."""
+        of_opencv = np.ones(len(first.index), bool)
+        found = Candidates(
+            first.index, first.corners_px, of_opencv & inverted, np.zeros(len(of_opencv)), of_opencv
+        )
+        found = replace(found, agreement=self.agreement(gray, found, found.corners_px))
         return found.select(found.agreement >= self._least_opencv)
 
     def _find_in(self, gray: _Image, times: float, windows: tuple[tuple[int, float], ...]) -> Candidates:
@@ -165,11 +190,11 @@ def _best_of_each_place(found: Candidates) -> Int[np.ndarray, " kept"]:
     """Numbers of the candidates that agree best, without others at their places and without parts of them."""
     centre = found.corners_px.mean(axis=1)
     side = np.linalg.norm(np.roll(found.corners_px, -1, axis=1) - found.corners_px, axis=-1).mean(axis=1)
+    apart = np.linalg.norm(centre[:, None] - centre, axis=-1)
+    same = apart < 0.5 * np.minimum(side[:, None], side)
+    hides = same | ((apart < 0.5 * side[:, None]) & ~found.by_opencv)
     kept: list[int] = []
     for one in np.argsort(-found.agreement, kind="stable").tolist():
-        apart = np.linalg.norm(centre[kept] - centre[one], axis=1)
-        same = apart < 0.5 * np.minimum(side[kept], side[one])
-        inside = apart < 0.5 * side[kept]
-        if not (same.any() or (inside.any() and not found.by_opencv[one])):
+        if not hides[kept, one].any():
             kept.append(one)
     return np.array(sorted(kept), np.int64)

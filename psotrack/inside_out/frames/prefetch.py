@@ -88,9 +88,9 @@ def map_ahead(
     Args:
         function: called in several threads at once.
         items: its arguments.
-        workers: number of threads; 1 computes each result when it is asked for, so that no item waits.
+        workers: number of threads; 0 computes each result when it is asked for, so that no item waits.
     """
-    if workers < 2:
+    if workers < 1:
         yield from map(function, items)
         return
     pool = ThreadPoolExecutor(workers, thread_name_prefix="psotrack-map")

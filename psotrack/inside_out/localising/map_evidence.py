@@ -21,8 +21,9 @@ from psotrack.inside_out.pose import PoseSettings
 #: Root mean square distance in the image of two markers from their common pose above which the two disagree: as a
 #: multiple of the median distance, which a rolling shutter enlarges, between two multiples of the stated deviation.
 _DISAGREE, _DISAGREE_LEAST, _DISAGREE_MOST = 3.0, 15.0, 60.0
-#: Largest number of frames and of pairs in a frame that are looked at: about a second.
-_MOST_FRAMES, _MOST_PAIRS = 150, 36
+#: Largest number of frames and of pairs in a frame that are looked at: about 0.1 s. In a room of 40 markers each marker
+#: has 100 pairs.
+_MOST_FRAMES, _MOST_PAIRS = 60, 36
 #: A marker is wrong if it disagrees in more than the share `_WRONG_SHARE` of its pairs, of at least `_LEAST_PAIRS`.
 _WRONG_SHARE, _LEAST_PAIRS = 0.5, 3
 #: Number of right markers that a pose needs where wrong ones are left out.
