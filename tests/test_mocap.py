@@ -268,6 +268,16 @@ def test_a_single_marker_beside_rigid_bodies_is_left_out():
     assert body_trajectories(flash, fps=25.0, num_frames=9, where=WHERE).drones == ("cf1",)
 
 
+def test_unidentified_markers_are_named():
+    """A file without labels: the user learns what `--body` may name."""
+    markers, _ = make_markers(drones=("cf1",))
+    unnamed = Markers(("*1", "*2", "*3", "*4", "*5"), markers.position_m, 100.0)
+    with pytest.raises(
+        NoDronesError, match=r"found unidentified markers only \(\*1, \*2, .*\*5\); say which"
+    ):
+        body_trajectories(unnamed, fps=25.0, num_frames=9, where=WHERE)
+
+
 def test_a_single_frame_shows_no_rigid_body():
     markers = make_markers(1, drones=("cf1",))[0]
     with pytest.raises(NoDronesError, match="cf1, seen together in one frame at most"):
