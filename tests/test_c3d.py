@@ -217,6 +217,26 @@ def test_a_file_without_points(tmp_path):
         read_c3d(path)
 
 
+def test_a_file_without_parameters_is_read_by_its_header(tmp_path, caplog):
+    """Found in a published file: an empty section of parameters before frames of points."""
+    points = make_points()
+    path = make_c3d(tmp_path / "a.c3d", points)
+    content = bytearray(path.read_bytes())
+    end = 512 * (struct.unpack_from("<H", content, 16)[0] - 1)
+    content[514] = 0
+    content[516:end] = bytes(end - 516)
+    path.write_bytes(content)
+    markers = read_c3d(path)
+    assert markers.labels == ("*1", "*2", "*3")
+    assert markers.rate_hz == 50
+    np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
+    assert "it has no POINT:UNITS; its coordinates are read as millimetres" in caplog.text
+    content[530] = 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="parameters that are damaged: none can be read"):
+        read_c3d(path)
+
+
 def test_analogue_samples_counted_as_channels(tmp_path):
     """Some makers write the number of channels into the header, where the number of samples per frame belongs."""
     points = make_points()

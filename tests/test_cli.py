@@ -440,6 +440,13 @@ class TestBadInput:
         (sequence / "dl_data" / "cam1i_s.csv").write_text("0,1,2,3,4,2.5,4,0.9\n1,5,6\n")
         assert_one_line(run("info", sequence), "cam1i_s.csv", "line 2")
 
+    def test_a_marker_twice(self, run: Run, sequence: Path) -> None:
+        corners = [5, 0, 0, 5, 0.2, 0, 5, 0.2, -0.2, 5, 0, -0.2]
+        header = "id;" + ";".join(f"{axis}{corner}[m]" for corner in range(1, 5) for axis in "xyz")
+        row = ";".join(map(str, [7, *corners]))
+        (sequence / "aruco_corners.csv").write_text(f"{header}\n{row}\n{row}\n")
+        assert_one_line(run("info", sequence), "aruco_corners.csv, line 3", "each marker once, found 7 again")
+
     def test_a_table_without_positions_is_no_file_of_tracks(
         self, run: Run, sequence: Path, tmp_path: Path
     ) -> None:

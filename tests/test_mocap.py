@@ -268,6 +268,16 @@ def test_a_single_marker_beside_rigid_bodies_is_left_out():
     assert body_trajectories(flash, fps=25.0, num_frames=9, where=WHERE).drones == ("cf1",)
 
 
+def test_unidentified_markers_are_named():
+    """A file without labels: the user learns what `--body` may name."""
+    markers, _ = make_markers(drones=("cf1",))
+    unnamed = Markers(("*1", "*2", "*3", "*4", "*5"), markers.position_m, 100.0)
+    with pytest.raises(
+        NoDronesError, match=r"found unidentified markers only \(\*1, \*2, .*\*5\); say which"
+    ):
+        body_trajectories(unnamed, fps=25.0, num_frames=9, where=WHERE)
+
+
 def test_a_single_frame_shows_no_rigid_body():
     markers = make_markers(1, drones=("cf1",))[0]
     with pytest.raises(NoDronesError, match="cf1, seen together in one frame at most"):
@@ -308,6 +318,38 @@ def test_a_person_who_stands_still_is_no_drone():
         markers = Markers(labels[: position_m.shape[1]], position_m, 100.0)
         with pytest.raises(NoDronesError, match=r"dron1, (\d\.\d m large|40 markers)"):
             body_trajectories(markers, fps=25.0, num_frames=9, where=WHERE)
+
+
+def test_evaluate_says_a_warning_of_the_reference_once(tmp_path):
+    """With `--offset`, the reference is read twice."""
+    markers, _ = make_markers(200, drones=("cf1", "cf2"))
+    write_c3d(tmp_path / "flight.c3d", markers)
+    (tmp_path / "recording.toml").write_text(
+        "version = 1\n[cameras.left]\nfps = 25.0\nsize = [64, 48]\n"
+        "K = [[50, 0, 32], [0, 50, 24], [0, 0, 1]]\nrvec = [1.5, 0, 0]\ntvec = [0, 0, 5]\n"
+        'detections = "left.csv"\n[reference]\nfiles = ["flight.c3d"]\n'
+    )
+    (tmp_path / "left.csv").write_text("".join(f"{frame},10,10,14,14,12,12,0.9\n" for frame in range(50)))
+    truth = body_trajectories(markers, fps=25.0, num_frames=50, where=WHERE)
+    rows = [
+        f"{frame},{frame / 25},{drone},{x},{y},{z}\n"
+        for frame, places in enumerate(truth.position_m)
+        for drone, (x, y, z) in enumerate(places)
+    ]
+    (tmp_path / "tracks.csv").write_text("frame,time_s,drone,x_m,y_m,z_m\n" + "".join(rows))
+    command = [
+        sys.executable,
+        "-m",
+        "psotrack",
+        "evaluate",
+        tmp_path / "tracks.csv",
+        tmp_path,
+        "--offset",
+        "0",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("taken for drones, because their markers are rigid") == 1
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 25.0, 119.88, 120.0, 240.0, 59.94])

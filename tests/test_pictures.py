@@ -126,6 +126,33 @@ def test_missing_numbers_are_said(pictures, caplog):
     )
 
 
+def test_missing_numbers_are_said_of_a_pattern(pictures, caplog):
+    """What `init` writes for a folder is a pattern. Times that the user states make up for missing pictures."""
+    folder = pictures.parent
+    table = '[cameras.left]\nimages = "left/*.png"\nfps = 20\n' + CAMERA.format(turn=0)
+    (pictures / "frame4.png").unlink()
+    (folder / "recording.toml").write_text("version = 1\n" + table)
+    open_recording(folder)
+    assert [message.split("left: ")[1] for message in caplog.messages] == [
+        "no pictures with the numbers 4: the pictures count as frames without a gap"
+    ]
+    caplog.clear()
+    rows = "".join(f"{index},{0.1 * index}\n" for index in range(FRAMES - 1))
+    (folder / "times.csv").write_text("frame,time_s\n" + rows)
+    (folder / "recording.toml").write_text(
+        "version = 1\n" + table.replace("fps = 20", 'timestamps = "times.csv"')
+    )
+    open_recording(folder)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("arguments", [["silhouettes", "--masks"], ["detect", "--blobs", "--out"]])
+@pytest.mark.parametrize("name", ["flight.mp4", "pictures/"])
+def test_a_missing_video_is_no_missing_recording(tmp_path, arguments, name):
+    message = refusal(*arguments, tmp_path / "out", tmp_path / name)
+    assert "expected a video, a folder of pictures, or a recording, found no such file or folder" in message
+
+
 def test_an_empty_folder(tmp_path):
     with pytest.raises(InputError, match=r"expected images, which end in \.png, .*, found none"):
         open_video(tmp_path, 25.0)

@@ -122,11 +122,28 @@ def cli(verbose: bool) -> None:
       ~/.config/fish/config.fish  _PSOTRACK_COMPLETE=fish_source psotrack | source
     """
     logging.addLevelName(logging.WARNING, "warning")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.addFilter(_FirstOnly())
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
         format="%(levelname)s %(name)s: %(message)s" if verbose else "psotrack: %(levelname)s: %(message)s",
-        stream=sys.stderr,
+        handlers=[handler],
     )
+
+
+class _FirstOnly(logging.Filter):
+    """Lets a warning pass once: `evaluate --offset`, for one, reads the reference twice."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is the first one with its text, or no warning."""
+        message = record.getMessage()
+        new = record.levelno < logging.WARNING or message not in self._said
+        self._said.add(message)
+        return new
 
 
 def main() -> None:

@@ -33,6 +33,10 @@ def info(sequence: Path, bodies: dict[str, tuple[str, ...]], force: bool, json_p
     for video in recording.videos.values():
         check_end(video)
     recording.check_detections(recording.detections or {})
+    if recording.marker_corners is not None:
+        from psotrack.inside_out import read_marker_table
+
+        read_marker_table(recording.marker_corners)
     content = describe_recording(recording)
     output_json(json_path, content, force)
     if json_path != Path("-"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 import platformdirs
 
-from psotrack.errors import SettingsError
+from psotrack.errors import InputError, SettingsError
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
 
@@ -250,7 +250,11 @@ def filmed_recording(source: Path, cameras: str | None, num_frames: int | None) 
     from psotrack.datasets import is_recording, open_recording
     from psotrack.recordings import is_picture_folder, open_video, recording_of_video, with_all_videos
 
-    if source.exists() and not is_recording(source):
+    if not source.exists():
+        raise InputError(
+            source, expected="a video, a folder of pictures, or a recording", found="no such file or folder"
+        )
+    if not is_recording(source):
         # Nothing that is made from the pictures depends on their rate.
         recording = recording_of_video(open_video(source, 1.0 if is_picture_folder(source) else None))
     else:

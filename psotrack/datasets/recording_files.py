@@ -31,6 +31,7 @@ from psotrack.recordings import (
     read_mask,
     read_recording_file,
     read_timestamps,
+    warn_of_missing_numbers,
 )
 from psotrack.rig_files import UNITS_M, Entry, camera_of_table, read_entries
 
@@ -208,6 +209,8 @@ def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:
         images = find_images(folder, table.images, f"{path}, {place}.images")
         if table.timestamps is not None:
             fps = read_timestamps(folder / table.timestamps, len(images)).fps
+        else:
+            warn_of_missing_numbers(images[0].parent, images)
         assert fps is not None, "the schema asks for fps or timestamps of images"
         return probe_images(images, fps)
     if table.video is None:

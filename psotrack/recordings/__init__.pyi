@@ -15,7 +15,7 @@ from .inventory import describe_recording, inventory_table
 from .marker_bodies import body_trajectories
 from .marker_groups import NoDronesError
 from .opencv_messages import silence_opencv
-from .pictures import is_picture_folder, open_pictures, open_video
+from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
 from .recording import OnboardVideo, Recording
 from .recording_file import (
     RECORDING_FILE,
@@ -89,6 +89,7 @@ __all__ = [
     "recording_file_text",
     "recording_of_video",
     "silence_opencv",
+    "warn_of_missing_numbers",
     "with_all_videos",
     "write_c3d",
     "write_detections",

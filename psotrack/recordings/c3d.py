@@ -63,7 +63,8 @@ def read_c3d(path: Path | str) -> Markers:
     """Read the markers of a C3D file of any maker, in metres.
 
     The parameters of the file count, not its header: some makers leave the header at what it was before the recording
-    was cut. A length unit that is not stated is the millimetre, with a warning.
+    was cut. Where there are no parameters, the header counts, and markers have no labels. A length unit that is not
+    stated is the millimetre, with a warning.
 
     Raises:
         InputError: the file cannot be read, is cut short, has no markers, or its length unit is unknown.
@@ -171,7 +172,7 @@ def _find_points(
 ) -> _Points:
     """The layout of the points, by what the parameters say, what the header says, and what the file holds."""
     used = parameters.count("POINT:USED")
-    if not any(name.startswith("POINT:") for name in parameters.values):
+    if parameters.values and not any(name.startswith("POINT:") for name in parameters.values):
         raise InputError(
             path, expected="a C3D file with parameters of its points, POINT:LABELS and the like", found="none"
         )

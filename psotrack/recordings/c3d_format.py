@@ -160,6 +160,8 @@ def _read_parameters(section: bytes, processor: Processor) -> dict[str, Any]:
         if offset == 0:
             break
         position = after_name + offset
+    if not found and any(section[4:]):
+        raise ValueError("parameters that are damaged: none can be read")
     values: dict[str, Any] = {}
     for group, name, value in found:
         values.setdefault(f"{groups.get(group, group)}:{name}", value)

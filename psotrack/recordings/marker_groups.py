@@ -75,7 +75,9 @@ def drone_markers(
             found="; ".join(
                 f"{name}, {faults[name] or 'rigid'} ({_shown(markers, columns)})"
                 for name, columns in bodies.items()
-            ),
+            )
+            if any(bodies.values())
+            else f"unidentified markers only ({_shown(markers, range(len(markers.labels)))})",
             remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies], or leave the "
             "file out of the recording",
         )

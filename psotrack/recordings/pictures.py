@@ -63,7 +63,7 @@ def open_pictures(folder: Path, fps: float | None) -> VideoInfo:
             found="none",
             remedy="state it as fps, in frames per second",
         )
-    _check_numbers(folder, paths)
+    warn_of_missing_numbers(folder, paths)
     return probe_images(paths, fps)
 
 
@@ -72,7 +72,7 @@ def is_picture_folder(path: Path) -> bool:
     return path.is_dir() and bool(image_files(path))
 
 
-def _check_numbers(folder: Path, paths: Sequence[Path]) -> None:
+def warn_of_missing_numbers(folder: Path, paths: Sequence[Path]) -> None:
     """Warn of numbers that are missing: each picture counts as the frame after the one before."""
     found = [re.findall(r"\d+", path.stem) for path in paths]
     if len(paths) < 3 or not all(found):
