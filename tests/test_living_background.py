@@ -173,6 +173,20 @@ def test_clouds_that_drift_are_background_and_a_shrinking_drone_is_found() -> No
     assert false_blobs <= 0.5 * len(frames)
 
 
+def test_a_place_that_drones_cross_stays_calm() -> None:
+    """A pale drone is found in full where dark drones crossed before: each of them is no change that goes on."""
+    rng = np.random.default_rng(3)
+    wall = np.full((HEIGHT, WIDTH, 3), 100.0)
+    background = LivingBackground(SETTINGS, _exposed(wall, rng), 100)
+    for index in range(160):
+        image, _ = _with_drone(wall, 4 * (index % 60) - 80, 60)
+        background.step(_exposed(image, rng))
+    pale, drone = wall.copy(), _with_drone(wall, 80, 60)[1]
+    pale[drone] -= 16
+    # Before such changes were limited, the drone was not found at all.
+    assert _f1(background.step(_exposed(pale, rng)), drone) > 0.9
+
+
 def test_what_a_tracker_knows_is_not_learned() -> None:
     """Where a tracker says that a drone is, even a difference without edges of its own stays."""
     rng = np.random.default_rng(6)

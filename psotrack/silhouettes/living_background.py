@@ -52,6 +52,9 @@ _LEAST_DIFFERENCE = 8.0
 _DEVIATIONS = 4.0
 #: A strong pixel also differs by more than this many times the place's mean change within `_CHANGE_EVERY` frames.
 _CHANGES, _CHANGE_EVERY = 3.0, 5
+#: A single change counts at most as this many times the place's mean change, and as the least difference beside: the
+#: changes of leaves and screens, which go on, soon count in full, and a place that a few drones cross stays calm.
+_COUNTED_CHANGES = 4.0
 #: A strong pixel also differs by more than a shift of the image by this many pixels would explain.
 _SHIFT_PX = 1.0
 #: Pixels that differ by less than this share of what makes a pixel strong are no part of a blob.
@@ -84,7 +87,7 @@ class Living:
     def key(self) -> Mapping[str, Any]:
         """See `BackgroundModel`."""
         used = ("working_reduction", "num_learning_frames", "min_blob_px")
-        return {"living": 1, **{name: getattr(self.settings, name) for name in used}}
+        return {"living": 2, **{name: getattr(self.settings, name) for name in used}}
 
     def foreground(
         self,
@@ -183,7 +186,8 @@ class LivingBackground:
         cv2.accumulateWeighted(square, self._square, usual_rate, free)
         if self._num_frames % _CHANGE_EVERY == 0:
             # A hovering drone hardly changes, a screen does: so this is learned at objects too.
-            change = largest(cv2.absdiff(image, self._last))
+            change = largest(cv2.absdiff(image, self._last)).astype(np.float32)
+            change = np.minimum(change, _COUNTED_CHANGES * self._change + _LEAST_DIFFERENCE)
             cv2.accumulateWeighted(change, self._change, _CHANGE_EVERY * usual_rate)
             self._last = image
 
