@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, SettingsError
@@ -581,6 +582,29 @@ def test_the_covariance_agrees_with_the_errors():
     # The mean is less than 3, because the covariance allows for errors common to all frames, which these corners do not
     # have. The 15 markers of a room share errors, so 12 rooms have about 60 degrees of freedom: 3 +- 0.5.
     assert 1.2 < np.mean(normalised) < 4.0
+
+
+def with_insets(seen, seed):
+    """Corners of a camera that encodes light by another power than assumed: all sides are found too far inside."""
+    rng = np.random.default_rng(seed)
+    inset_px = 0.05 * rng.normal() + 0.02 * rng.normal(size=max(ROOM) + 1)
+    return replace(seen, corners_px=seen.corners_px - inset_px[seen.marker, None, None] * outward(seen))
+
+
+def test_the_covariance_agrees_with_the_errors_of_a_camera_of_another_power():
+    """Found: an average of 1.6, because the covariance had whole insets, and the adjustment finds a part of them."""
+    normalised = []
+    for seed in range(12):
+        seen = with_insets(sightings(noise_px=0.1, num_views=50, seed=seed), seed)
+        built = build_map(seen, {7: ROOM[7]})
+        truth_m = np.array([ROOM[marker].mean(axis=0) for marker in built.ids.tolist()])
+        off = (built.marker_map.centres_m - truth_m)[~built.known]
+        covariance = built.covariance[~built.known, :3, :3]
+        normalised.append((off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(axis=1))
+    # Measured 2.1, less than 3: insets that differ among markers also count as errors that last. The markers of a room
+    # share one inset, so 12 rooms have few degrees of freedom.
+    assert 1.8 < np.mean(normalised) < 4.0
+    assert np.mean(np.concatenate(normalised) < chi2.ppf(0.9, 3)) > 0.85
 
 
 # Wrong maps

@@ -10,8 +10,10 @@ The residuals say which of the two is stronger, and how large the errors are. A 
 frames of a video are counted together. Their noise takes the place of the stated one (`PoseSettings.usual_px`), and
 each frame's own residuals correct it. `PoseSettings.centre_scale` is chosen so that the markers' mean residuals are as
 large as their covariances let expect (estimation of variance components: W. Förstner, Ein Verfahren zur Schätzung von
-Varianz- und Kovarianzkomponenten, Allgemeine Vermessungs-Nachrichten 86, 1979). The scale has a smallest value, because
-residuals do not show all errors: a shift of all corners in the image looks like a turn of the camera.
+Varianz- und Kovarianzkomponenten, Allgemeine Vermessungs-Nachrichten 86, 1979). The scale has a smallest value, by how
+edges are measured. Where the mean residuals are smaller still, the stated errors of the markers' places
+(`PoseSettings.place_m`) are too large, and `PoseSettings.usual_place_m` takes their place. Residuals do not show all
+errors: a shift of all corners in the image looks like a turn of the camera, and is stated (`PoseSettings.shift_px`).
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ LEAST_SCALE = 0.48
 MOST_SCALE = 4.0
 #: Largest number of frames that are looked at, and number of markers that suffice: the standard error of a deviation
 #: from 2 x 600 residuals is 2 %. And number of estimates, each with the covariances by the one before.
-_MOST_FRAMES, _ENOUGH_MARKERS, _TURNS = 60, 600, 4
+_MOST_FRAMES, _ENOUGH_MARKERS, _TURNS = 60, 600, 6
+#: Smallest deviation of a marker's place, as a share of the stated one.
+_LEAST_PLACE = 1 / 3
 #: Change of a deviation, as a share, below which it is not estimated once more.
 _SAME = 0.02
 #: Smallest number of markers whose mean residuals say anything: three give no more equations than unknowns.
@@ -52,10 +56,13 @@ class CornerNoise:
         usual_px: standard deviation of a corner's own error along x and along y, pixels.
         centre_scale: deviation of the mean error of a marker's corners, as a multiple of the deviation that it would
             have if the errors of the corners were independent.
+        usual_place_m: standard deviation of the error that all corners of a marker share in one frame, along each
+            axis, metres.
     """
 
     usual_px: float
     centre_scale: float
+    usual_place_m: float
 
     def settings(self, given: PoseSettings) -> PoseSettings:
         """Settings with these errors, where none are given."""
@@ -63,6 +70,7 @@ class CornerNoise:
             given,
             usual_px=given.usual_px or self.usual_px,
             centre_scale=given.centre_scale or self.centre_scale,
+            usual_place_m=given.usual_place_m or self.usual_place_m,
         )
 
 
@@ -79,7 +87,7 @@ def estimate_corner_noise(
         detected: number and time of each frame, and its markers.
         marker_map: map of the room.
         lens: intrinsics of the camera.
-        settings: settings of pose estimation; their `usual_px` and `centre_scale` are not used.
+        settings: settings of pose estimation; what is estimated here is not used.
         shutter: the rolling shutter; None is a global shutter.
     """
     usable = [markers for _, _, markers in detected if len(markers) >= _FEWEST_MARKERS]
@@ -87,10 +95,15 @@ def estimate_corner_noise(
     count = min(_MOST_FRAMES, len(usable), int(np.ceil(_ENOUGH_MARKERS / in_each)))
     chosen = np.unique(np.linspace(0, len(usable) - 1, count).astype(int))
     frames = [usable[index] for index in chosen]
-    stated = found = CornerNoise(settings.noise_px, 1.0)
+    stated = found = CornerNoise(settings.noise_px, 1.0, settings.place_m)
     for _ in range(_TURNS):
         before = found
-        using = replace(settings, usual_px=before.usual_px, centre_scale=before.centre_scale)
+        using = replace(
+            settings,
+            usual_px=before.usual_px,
+            centre_scale=before.centre_scale,
+            usual_place_m=before.usual_place_m,
+        )
         residuals = [
             pose.residuals
             for markers in frames
@@ -113,11 +126,34 @@ def estimate_corner_noise(
         observed, expected = sum(one.observed for one in residuals), sum(one.expected for one in residuals)
         variance = before.centre_scale**2
         ratio = (_PRIOR_RESIDUALS + observed) / (_PRIOR_RESIDUALS * variance + expected)
+        by_places = float(np.mean([one.by_places for one in residuals]))
         found = CornerNoise(
             float(np.sqrt(own / (_PRIOR_RESIDUALS + sum(one.freedom for one in residuals)))),
-            float(np.sqrt(np.clip(variance * ratio, LEAST_SCALE**2, MOST_SCALE**2))),
+            *_shared_errors(before, ratio, by_places, settings.place_m),
         )
-        changes = found.usual_px / before.usual_px, found.centre_scale / before.centre_scale
-        if max(abs(np.log(changes))) < _SAME:
+        changes = [getattr(found, name) / getattr(before, name) for name in vars(found)]
+        if np.abs(np.log(changes)).max() < _SAME:
             break
     return found
+
+
+def _shared_errors(
+    before: CornerNoise, ratio: float, by_places: float, stated_m: float
+) -> tuple[float, float]:
+    """The scale, and the deviation of places in metres, by which mean residuals have the variance that is observed.
+
+    The places have their stated deviation as long as the scale alone can explain the residuals.
+
+    Args:
+        before: errors with which the residuals were computed.
+        ratio: ratio of the observed variance of the means to the variance that these errors let expect.
+        by_places: share of the places' errors in the latter variance.
+        stated_m: stated deviation of a place, metres.
+    """
+    if before.usual_place_m < stated_m or (before.centre_scale <= LEAST_SCALE and ratio < 1):
+        # Only the part of the places changes.
+        factor = max(1 + (ratio - 1) / max(by_places, _LEAST_PLACE**2), _LEAST_PLACE**2)
+        place_m = before.usual_place_m * np.sqrt(factor)
+        return before.centre_scale, float(np.clip(place_m, _LEAST_PLACE * stated_m, stated_m))
+    scale = before.centre_scale * np.sqrt(ratio)
+    return float(np.clip(scale, LEAST_SCALE, MOST_SCALE)), before.usual_place_m

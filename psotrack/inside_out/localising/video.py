@@ -165,7 +165,7 @@ def _learned(
     line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
     if line_time is not None:
         settings = replace(settings, shutter=line_time.shutter(settings.shutter))
-    if settings.pose.centre_scale is None or settings.pose.usual_px is None:
+    if None in (settings.pose.centre_scale, settings.pose.usual_px, settings.pose.usual_place_m):
         noise = estimate_corner_noise(detected, marker_map, lens, settings.pose, settings.shutter)
         settings = replace(settings, pose=noise.settings(settings.pose))
     seconds["locate"] += time.perf_counter() - began_s

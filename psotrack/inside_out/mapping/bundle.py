@@ -279,28 +279,30 @@ def _problem(
 
 
 def _covariance(bundle: _Bundle) -> Float[np.ndarray, "markers 7 7"]:
-    """(markers, 7, 7), covariance from noise of each frame, from lasting errors of the corners, and from the insets."""
+    """(markers, 7, 7), covariance from noise of each frame, from lasting errors of the corners, and from the insets.
+
+    Each part is the effect of these errors on the estimate as it is made, which has insets with a strong prior as
+    unknowns: they follow a part of each error, and a camera's own inset counts as far as the prior holds them back.
+    """
     problem, scene = bundle.problem, bundle.scene
-    equations = bundle.equations()
-    reduced = equations.reduced()
+    reduced = bundle.equations().reduced()
     count, size = len(scene.ids), len(reduced.information) - len(scene.inset_px)
-    of_markers, by_inset = reduced.information[:size, :size], reduced.information[:size, size:]
     try:
-        inverse = covariance_from_information(of_markers)
+        inverse = covariance_from_information(reduced.information)[:size]
     except np.linalg.LinAlgError:
         # A marker whose sightings are all outliers is undetermined, so no covariance is known.
-        inverse = np.full(of_markers.shape, np.nan)
-    by_corner = inverse @ _corner_pulls(bundle, reduced)[:size]
+        inverse = np.full((size, len(reduced.information)), np.nan)
+    by_corner = inverse @ _corner_pulls(bundle, reduced)
     # All four corners of a marker move outwards by sqrt(2) px where its sides move by 1 px.
     by_marker = np.sqrt(2) * by_corner.reshape(size, count, 4, 2)[..., 0].sum(axis=-1)
     parts = [
         _lasting_px(bundle) * by_corner,
         _INSET_APART_PX * by_marker,
-        _INSET_PX * (inverse @ by_inset),
+        _INSET_PX * inverse[:, size:] * problem.inset_weight,
     ]
     whole = np.zeros((7 * count, 7 * count))
     rows = problem.free[: 7 * count]
-    whole[np.ix_(rows, rows)] = inverse + sum(part @ part.T for part in parts)
+    whole[np.ix_(rows, rows)] = inverse[:, :size] + sum(part @ part.T for part in parts)
     return np.einsum("aiaj->aij", whole.reshape(count, 7, count, 7)).copy()
 
 

@@ -53,10 +53,12 @@ class SeenCorners:
         noise_px: stated standard deviation of a corner along x and along y, pixels.
         usual_px: the same in other frames, which counts together with the residuals of this frame.
         place_m: stated standard deviation of a marker's place along each axis, metres.
+        usual_place_m: the same in other frames, which counts together with the residuals of this frame.
         map_share: share of the variance of a marker's place that comes from the map and is the same in every frame.
         focal_error: stated standard deviation of the focal length, as a share of the focal length.
         centre_scale: deviation of the mean error of a marker's corners, as a multiple of the deviation that it would
             have if the errors of the corners were independent.
+        shift_px: stated standard deviation of an error that all corners share, along x and along y, pixels.
         rows: when the corners were exposed, and the motion that is expected; None of a global shutter.
         unsure: by how much these times may be wrong; None if the line time is exact.
     """
@@ -68,9 +70,11 @@ class SeenCorners:
     noise_px: float
     usual_px: float
     place_m: float
+    usual_place_m: float
     map_share: float
     focal_error: float
     centre_scale: float = 1.0
+    shift_px: float = 0.0
     rows: RowMotion | None = None
     unsure: UnsureRows | None = None
 
@@ -196,7 +200,7 @@ class Sums:
         square += np.sum((self.by_place[..., :3] @ off_m[..., None])[..., 0] * off_m)
         return Noise(
             (PRIOR_RESIDUALS * seen.usual_px**2 + max(square, 0.0)) / own_freedom,
-            (PRIOR_RESIDUALS * seen.place_m**2 + np.sum(off_m**2)) / place_freedom,
+            (PRIOR_RESIDUALS * seen.usual_place_m**2 + np.sum(off_m**2)) / place_freedom,
             own_freedom,
             place_freedom,
         )
@@ -256,6 +260,7 @@ def seen_markers(
         lens,
         noise_px,
         noise_px,
+        off_m,
         off_m,
         (map_error_m / off_m) ** 2,
         focal_error,
@@ -357,6 +362,7 @@ def corner_residuals(
         noise.own_freedom - PRIOR_RESIDUALS,
         float((mean_px**2).sum()) / noise.own_px2,
         max(own_px2 + places_px2 + others_px2 - fitted_px2, 0.0) / noise.own_px2,
+        places_px2 / (own_px2 + places_px2 + others_px2),
     )
 
 

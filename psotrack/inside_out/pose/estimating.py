@@ -98,11 +98,15 @@ def estimate_pose(
         settings.map_error_m,
         settings.focal_error,
     )
+    usual_place_m = float(np.hypot(settings.usual_place_m or settings.place_m, settings.map_error_m))
     corners = replace(
         corners,
         rows=rows,
         unsure=unsure,
         centre_scale=settings.centre_scale or 1.0,
+        shift_px=settings.shift_px,
+        usual_place_m=usual_place_m,
+        map_share=(settings.map_error_m / usual_place_m) ** 2,
         usual_px=settings.usual_px or settings.noise_px,
     )
     poses = _likely_poses(corners, rays)

@@ -32,10 +32,10 @@ from psotrack.inside_out.pose.equations import (
     with_prior,
 )
 from psotrack.inside_out.pose.frame_motion import (
-    acceleration_effects,
-    acceleration_residuals,
     frame_motion,
     line_time_effects,
+    unmodelled_effects,
+    unmodelled_residuals,
 )
 from psotrack.inside_out.pose.records import CornerResiduals
 
@@ -282,10 +282,10 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
     too_large = noise.own_px2 > (_LARGEST_NOISE_SCALE * seen.noise_px) ** 2
     if solution is None or too_large or noise.place_m2 > _LARGEST_PLACE_M**2:
         return None
-    by_acceleration = acceleration_effects(seen, last.rows, fits, widened, seen.prior_information)
-    if by_acceleration is None:
+    by_others = unmodelled_effects(seen, last.rows, fits, widened, seen.prior_information)
+    if by_others is None:
         return None
-    covariance = (solution.covariance + by_acceleration @ by_acceleration.T)[:6, :6]
+    covariance = (solution.covariance + by_others @ by_others.T)[:6, :6]
     motion, by_line_time, whole = None, None, covariance
     if seen.rows is not None:
         motion = frame_motion(seen, sums, last.rows, fits, widened, pose.extra)
@@ -318,7 +318,7 @@ def _fitted(seen: SeenCorners, pose: _Pose, last: _LastStep, noise: Noise) -> Fi
             solution,
             widened,
             seen,
-            acceleration_residuals(seen, last.rows, by_acceleration),
+            unmodelled_residuals(seen, last.rows, by_others),
         ),
         motion,
         by_line_time,

@@ -39,7 +39,7 @@ def frame_motion(
     if solution is None:
         return None
     whole = np.r_[:POSE_SIZE, POSE_SIZE + 2 : POSE_SIZE + 8]
-    effects = acceleration_effects(seen, rows, fits, noise, prior)
+    effects = unmodelled_effects(seen, rows, fits, noise, prior)
     if effects is None:
         return None
     covariance = (solution.covariance + effects @ effects.T)[np.ix_(whole, whole)]
@@ -85,42 +85,42 @@ def line_time_effects(
     return _effects(seen, rows, fits, noise, prior_information, off_px)
 
 
-def acceleration_effects(
+def unmodelled_effects(
     seen: SeenCorners,
     rows: Float[np.ndarray, "markers 4 2 columns"],
     fits: Bool[np.ndarray, "markers 4"],
     noise: Noise,
     prior_information: Float[np.ndarray, "extra extra"],
-) -> Float[np.ndarray, "unknowns 6"] | None:
-    """Change of the unknowns by an acceleration of one standard deviation, along and about each axis.
+) -> Float[np.ndarray, "unknowns causes"] | None:
+    """Change of the unknowns by one standard deviation of each cause of errors that the equations do not have.
 
-    In the time s before and after the reference row, an acceleration a takes the camera a s² / 2 away from where a
-    constant motion takes it. None if the equations are singular; 0 for a global shutter.
+    The causes are a shift of all corners along x and along y of the image, and of a rolling shutter the acceleration
+    along and about each axis: in the time s before and after the reference row, an acceleration a takes the camera
+    a s² / 2 away from where a constant motion takes it. None if the equations are singular.
     """
-    off_px = _by_acceleration(seen, rows)
-    if not off_px.any():
-        return np.zeros((rows.shape[-1] - 1, 6))
-    return _effects(seen, rows, fits, noise, prior_information, off_px)
+    return _effects(seen, rows, fits, noise, prior_information, _unmodelled_px(seen, rows))
 
 
-def acceleration_residuals(
+def unmodelled_residuals(
     seen: SeenCorners,
     rows: Float[np.ndarray, "markers 4 2 columns"],
-    effects: Float[np.ndarray, "unknowns 6"],
-) -> Float[np.ndarray, "markers 4 2 6"]:
-    """Residuals that an acceleration of one standard deviation leaves, with the effects that it has on the unknowns."""
-    return _by_acceleration(seen, rows) - rows[..., :-1] @ effects
+    effects: Float[np.ndarray, "unknowns causes"],
+) -> Float[np.ndarray, "markers 4 2 causes"]:
+    """Residuals that one standard deviation of each such cause leaves, with its effects on the unknowns."""
+    return _unmodelled_px(seen, rows) - rows[..., :-1] @ effects
 
 
-def _by_acceleration(
+def _unmodelled_px(
     seen: SeenCorners, rows: Float[np.ndarray, "markers 4 2 columns"]
-) -> Float[np.ndarray, "markers 4 2 6"]:
-    """Changes of the pixels by an acceleration of one standard deviation, along and about each axis."""
+) -> Float[np.ndarray, "markers 4 2 causes"]:
+    """Changes of the pixels by one standard deviation of each such cause."""
+    shifts = np.broadcast_to(seen.shift_px * np.eye(2), (*rows.shape[:3], 2))
     if seen.rows is None:
-        return np.zeros((*rows.shape[:3], 6))
+        return shifts
     # The derivatives by the motion are s times those by the pose.
     by_motion = rows[..., POSE_SIZE + 2 : POSE_SIZE + 8]
-    return seen.rows.time_s[..., None, None] / 2 * by_motion * seen.rows.acceleration_std
+    by_acceleration = seen.rows.time_s[..., None, None] / 2 * by_motion * seen.rows.acceleration_std
+    return np.concatenate([shifts, by_acceleration], axis=-1)
 
 
 def _effects(
@@ -133,13 +133,13 @@ def _effects(
 ) -> Float[np.ndarray, "unknowns errors"] | None:
     """Change of the unknowns by changes of the pixels; None if the equations are singular."""
     none, moved = np.zeros(len(prior_information)), rows.copy()
-    effects = []
-    for error in range(off_px.shape[-1]):
+    effects = np.zeros((rows.shape[-1] - 1, off_px.shape[-1]))
+    for error in np.flatnonzero(off_px.any(axis=(0, 1, 2))):
         moved[..., -1] = off_px[..., error]
         solution: Solution | None = summed(moved, fits, seen.centre_scale).solved(
             noise, prior_information, none
         )
         if solution is None:
             return None
-        effects.append(solution.step)
-    return np.stack(effects, axis=1)
+        effects[:, error] = solution.step
+    return effects
