@@ -10,6 +10,7 @@ an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (
 
 from psotrack.inside_out.pose.estimating import estimate_pose
 from psotrack.inside_out.pose.records import (
+    CornerResiduals,
     ExpectedMotion,
     ExpectedPose,
     MarkerPose,
@@ -19,6 +20,7 @@ from psotrack.inside_out.pose.records import (
 from psotrack.inside_out.pose.row_motion import row_times_s
 
 __all__ = [
+    "CornerResiduals",
     "ExpectedMotion",
     "ExpectedPose",
     "MarkerPose",
