@@ -131,9 +131,6 @@ def map_markers(
     Most cameras expose the rows of a frame one after the other (rolling shutter). The time from row to row is estimated
     from each video, unless --line-time or --readout gives it for all.
 
-    In images whose longer side is 2880 pixels or more, such as 3840 x 2160, markers are searched for in an image of
-    half the size, and markers whose sides are shorter than 48 pixels are overlooked.
-
     \b
     Examples:
       psotrack map-markers room.c3d --out corners.csv
@@ -181,23 +178,14 @@ def map_markers(
     shutter = None
     for video, _ in videos.values():
         shutter = given_shutter(line_time_s, readout_s, video.image_size_wh[1], video.fps)
-    if marker_map is not None and shutter is not None and shutter.line_time_s:
-        raise SettingsError(
-            "--line-time and --readout",
-            expected="--out; --check takes the shutter for global",
-            found="--check",
-            remedy="make a map of the video by --out, and compare it with the other one",
-        )
-    sightings = find_sightings(
-        list(videos.values()), dictionary, consecutive=checked is None, report=report_to(quiet)
-    )
+    sightings = find_sightings(list(videos.values()), dictionary, consecutive=True, report=report_to(quiet))
+    rows = {name: video.image_size_wh[1] for name, (video, _) in videos.items()}
     if marker_map is not None:
-        checkup = check_map(sightings, marker_map)
-        show_check(checkup, Path(str(checked)), quiet, json_path, force)
+        checkup = check_map(sightings, marker_map, shutter)
+        show_check(checkup, rows, shutter, Path(str(checked)), quiet, json_path, force)
         if checkup.findings:
             sys.exit(FOUND)
     elif out is not None:
         built = build_map(sightings, world, side_m=side_m, estimate_sides=estimate_sides, shutter=shutter)
         write_marker_corners(out, built.marker_map.corners_m)
-        rows = {name: video.image_size_wh[1] for name, (video, _) in videos.items()}
         show_built(built, rows, shutter, out, quiet, json_path, force)

@@ -84,12 +84,7 @@ def show_built(
         "frames": built.num_views,
         "noise_px": built.noise_px,
         "inset_px": dict(zip(rows_px, built.inset_px.tolist(), strict=True)),
-        "shutter": {
-            name: shutter_content(given, used, shown, rows)
-            for (name, rows), used, shown in zip(
-                rows_px.items(), built.shutters, built.line_times, strict=True
-            )
-        },
+        "shutter": _shutters(built, rows_px, given),
         "unplaced": list(built.unplaced),
         "markers": rows,
     }
@@ -114,14 +109,28 @@ def show_built(
     if built.unplaced:
         names = ", ".join(map(str, built.unplaced))
         print_line(quiet, json_path, f"not placed, because too rarely seen beside other markers: {names}")
-    for name, shown in zip(rows_px, built.line_times, strict=True):
-        if of_shutter := shutter_sentence(given, shown):
-            print_line(quiet, json_path, f"{name}: {of_shutter}")
+    _print_shutters(built, rows_px, given, quiet, json_path)
     print_line(quiet, json_path, f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 
-def show_check(checkup: MapCheck, path: Path, quiet: bool, json_path: Path | None, force: bool) -> None:
-    """Show the markers of a map that videos see elsewhere."""
+def show_check(
+    checkup: MapCheck,
+    rows_px: dict[str, int],
+    given: RollingShutter | None,
+    path: Path,
+    quiet: bool,
+    json_path: Path | None,
+    force: bool,
+) -> None:
+    """Show the markers of a map that videos see elsewhere.
+
+    Args:
+        checkup: result of the check.
+        rows_px: height of the images by video.
+        given: the shutter that the options give.
+        path: table of the map.
+        quiet, json_path, force: as in `cli.output`.
+    """
     rows = {
         marker: {
             "frames": one.sightings,
@@ -140,6 +149,7 @@ def show_check(checkup: MapCheck, path: Path, quiet: bool, json_path: Path | Non
         "frames": checkup.num_views,
         "noise_px": checkup.noise_px,
         "not_in_map": list(checkup.not_in_map),
+        "shutter": _shutters(checkup, rows_px, given),
         "markers": rows,
     }
     output_json(json_path, content, force)
@@ -156,10 +166,33 @@ def show_check(checkup: MapCheck, path: Path, quiet: bool, json_path: Path | Non
             for marker, row in rows.items()
         ],
     )
+    _print_shutters(checkup, rows_px, given, quiet, json_path)
     for finding in checkup.findings:
         print_line(False, json_path, str(finding))
     if not checkup.findings:
         print_line(quiet, json_path, f"{path}: nothing disagrees")
+
+
+def _shutters(
+    found: BuiltMap | MapCheck, rows_px: dict[str, int], given: RollingShutter | None
+) -> dict[str, Any]:
+    """The shutter of each video: given, used, and shown by the video."""
+    return {
+        name: shutter_content(given, used, shown, rows)
+        for (name, rows), used, shown in zip(rows_px.items(), found.shutters, found.line_times, strict=True)
+    }
+
+
+def _print_shutters(
+    found: BuiltMap | MapCheck,
+    rows_px: dict[str, int],
+    given: RollingShutter | None,
+    quiet: bool,
+    json_path: Path | None,
+) -> None:
+    for name, shown in zip(rows_px, found.line_times, strict=True):
+        if of_shutter := shutter_sentence(given, shown):
+            print_line(quiet, json_path, f"{name}: {of_shutter}")
 
 
 def _place(marker_map: MarkerMap, marker: int) -> dict[str, Any]:

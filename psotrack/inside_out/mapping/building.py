@@ -22,7 +22,13 @@ from psotrack.inside_out.mapping.initial_map import (
     place_markers,
     placed_markers,
 )
-from psotrack.inside_out.mapping.rolling import LineTimes, Shutters, line_times, with_shutters
+from psotrack.inside_out.mapping.rolling import (
+    LineTimes,
+    Shutters,
+    line_times,
+    rolling_shutters,
+    with_shutters,
+)
 from psotrack.inside_out.mapping.scene import MappedScene
 from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
 from psotrack.inside_out.mapping.square_fitting import fit_square
@@ -122,21 +128,16 @@ def build_map(
     if shutter is None:
         if not any(one is not None and one.rolls for one in shown):
             return replace(first, shutters=given, line_times=shown)
-        found = _build(with_shutters(sightings, _rolling(shown)), known, side_m, estimate_sides)
+        found = _build(with_shutters(sightings, rolling_shutters(shown)), known, side_m, estimate_sides)
         # A map bent by the shutter may have biased the line times. The map itself depends little on the line times,
         # because the motion in each view is free.
         shown = line_times(sightings, found.marker_map)
-        return replace(found, shutters=_rolling(shown), line_times=shown)
+        return replace(found, shutters=rolling_shutters(shown), line_times=shown)
     first = replace(first, shutters=given, line_times=shown)
     if not any(one is not None and one.contradicts(shutter.line_time_s) for one in shown):
         return first
-    other = _build(with_shutters(sightings, _rolling(shown)), known, side_m, estimate_sides)
+    other = _build(with_shutters(sightings, rolling_shutters(shown)), known, side_m, estimate_sides)
     return _with_difference(first, other)
-
-
-def _rolling(shown: LineTimes) -> Shutters:
-    """The shutters that certainly roll, as the videos show them."""
-    return tuple(one.shutter() if one is not None and one.rolls else None for one in shown)
 
 
 def _with_difference(built: BuiltMap, other: BuiltMap) -> BuiltMap:

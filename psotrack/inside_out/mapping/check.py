@@ -24,10 +24,18 @@ from psotrack.inside_out.mapping.initial_map import (
     make_scene,
     placed_markers,
 )
+from psotrack.inside_out.mapping.rolling import (
+    LineTimes,
+    Shutters,
+    line_times,
+    rolling_shutters,
+    with_shutters,
+)
 from psotrack.inside_out.mapping.scene import MappedScene, residuals_px
 from psotrack.inside_out.mapping.sightings import MarkerSightings
 from psotrack.inside_out.mapping.square_fitting import fit_square
 from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.pose import RollingShutter
 
 #: Median residual of a suspect marker, as a multiple of the usual median residual.
 _SUSPECT = 4.0
@@ -47,6 +55,8 @@ class MapCheck:
         noise_px: standard deviation of a corner along x and along y, pixels.
         num_views: number of frames that show at least two markers of the map.
         not_in_map: ids that are seen but not in the map.
+        shutters: (videos,), rolling shutters with which the cameras were located; None is a global shutter.
+        line_times: (videos,), what the videos show of their shutters; None where too few frames follow one another.
     """
 
     findings: tuple[MapFinding, ...]
@@ -54,10 +64,19 @@ class MapCheck:
     noise_px: float
     num_views: int
     not_in_map: tuple[int, ...]
+    shutters: Shutters
+    line_times: LineTimes
 
 
-def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
+def check_map(
+    sightings: MarkerSightings, marker_map: MarkerMap, shutter: RollingShutter | None = None
+) -> MapCheck:
     """Check a map against sightings.
+
+    Args:
+        sightings: markers in the videos.
+        marker_map: the map.
+        shutter: rolling shutter of all cameras; None is estimated for each video, with the map as it is.
 
     Raises:
         InputError: no frame shows two markers of the map.
@@ -77,6 +96,10 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
             remedy="check that the map and the video are of the same room",
         )
     sightings = sightings.select(kept)
+    shown = line_times(sightings, marker_map)
+    shutters = rolling_shutters(shown) if shutter is None else (shutter,) * len(sightings.lenses)
+    sightings = with_shutters(sightings, shutters)
+    about = (sightings.num_views, not_in_map, shutters, shown)
     side_m = float(np.median(marker_map.sides_m))
     located = _locate_by_map(sightings, given, side_m)
     residual_px = _by_marker(sightings, residuals_px(sightings, located))
@@ -93,10 +116,10 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
             f"the map as a whole does not fit the video: {len(sound)} of {len(typical)} markers agree with one another",
             "check that lens, dictionary and map are those of this room, and that no axis is mirrored",
         )
-        return MapCheck((finding,), checked, noise_px, sightings.num_views, not_in_map)
+        return MapCheck((finding,), checked, noise_px, *about)
     suspects = [marker for marker in typical if marker not in sound]
     if not suspects:
-        return MapCheck((), checked, noise_px, sightings.num_views, not_in_map)
+        return MapCheck((), checked, noise_px, *about)
     measured, noise_px = _measure_suspects(sightings, sound, suspects, located, side_m)
     checked |= {
         marker: _compare_marker(given[marker], *one, residual_px[marker]) for marker, one in measured.items()
@@ -104,7 +127,7 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
     findings = find_faults(
         given, {marker: found for marker, (found, _) in measured.items()}, checked, suspects
     )
-    return MapCheck(tuple(findings), checked, noise_px, sightings.num_views, not_in_map)
+    return MapCheck(tuple(findings), checked, noise_px, *about)
 
 
 def _locate_by_map(
@@ -147,7 +170,12 @@ def _measure_suspects(
     kept = of_sound[sightings.view] >= 2
     connected, rows = sightings.select(kept), np.unique(sightings.view[kept])
     placer = MarkerPlacer(connected, side_m)
-    before = replace(located, R_cam_world=located.R_cam_world[rows], t_m=located.t_m[rows])
+    before = replace(
+        located,
+        R_cam_world=located.R_cam_world[rows],
+        t_m=located.t_m[rows],
+        motion=None if located.motion is None else located.motion[rows],
+    )
     views = placer.locate_views(sound, before)
     placed = dict(sound)
     for marker in suspects:

@@ -41,6 +41,11 @@ def line_times(sightings: MarkerSightings, marker_map: MarkerMap) -> LineTimes:
     return tuple(found)
 
 
+def rolling_shutters(shown: LineTimes) -> Shutters:
+    """The shutters that certainly roll, as the videos show them."""
+    return tuple(one.shutter() if one is not None and one.rolls else None for one in shown)
+
+
 def with_shutters(sightings: MarkerSightings, shutters: Sequence[RollingShutter | None]) -> MarkerSightings:
     """The sightings by cameras with these shutters."""
     return replace(sightings, shutters=tuple(shutters))
