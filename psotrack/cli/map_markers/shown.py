@@ -109,7 +109,9 @@ def show_built(
     if built.unplaced:
         names = ", ".join(map(str, built.unplaced))
         print_line(quiet, json_path, f"not placed, because too rarely seen beside other markers: {names}")
-    _print_shutters(built, rows_px, given, quiet, json_path)
+    for name, shown in zip(rows_px, built.line_times, strict=True):
+        if of_shutter := shutter_sentence(given, shown):
+            print_line(quiet, json_path, f"{name}: {of_shutter}")
     print_line(quiet, json_path, f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 
@@ -166,7 +168,9 @@ def show_check(
             for marker, row in rows.items()
         ],
     )
-    _print_shutters(checkup, rows_px, given, quiet, json_path)
+    for name, shown in zip(rows_px, checkup.line_times, strict=True):
+        if of_shutter := shutter_sentence(given, shown, "the check uses the given one"):
+            print_line(quiet, json_path, f"{name}: {of_shutter}")
     for finding in checkup.findings:
         print_line(False, json_path, str(finding))
     if not checkup.findings:
@@ -181,18 +185,6 @@ def _shutters(
         name: shutter_content(given, used, shown, rows)
         for (name, rows), used, shown in zip(rows_px.items(), found.shutters, found.line_times, strict=True)
     }
-
-
-def _print_shutters(
-    found: BuiltMap | MapCheck,
-    rows_px: dict[str, int],
-    given: RollingShutter | None,
-    quiet: bool,
-    json_path: Path | None,
-) -> None:
-    for name, shown in zip(rows_px, found.line_times, strict=True):
-        if of_shutter := shutter_sentence(given, shown):
-            print_line(quiet, json_path, f"{name}: {of_shutter}")
 
 
 def _place(marker_map: MarkerMap, marker: int) -> dict[str, Any]:
