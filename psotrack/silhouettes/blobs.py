@@ -12,11 +12,10 @@ from psotrack._typing import Array
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.settings import MIN_COVERAGE
 
-#: Smallest number of cells of a blob, because a single cell is often noise. The silhouettes have a limit of their own,
-#: `min_blob_px`.
-MIN_BLOB_CELLS = 2
 #: Smallest uncertainty of a blob's middle, cells.
 LEAST_RADIUS_CELLS = 1.5
+#: Neighbours of a cell that close a gap.
+_CLOSING = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -83,20 +82,35 @@ def find_blobs(
     reduction: int,
     border: Int[np.ndarray, "2"] | None = None,
 ) -> Blobs:
-    """Find the blobs of one silhouette, sorted from large to small boxes.
+    """Find the blobs of one silhouette, sorted from large to small boxes; of equal boxes the upper one is first.
+
+    A single cell is no blob, because it is often noise. The silhouettes have a limit of their own, `min_blob_px`.
 
     Args:
         coverage: (height, width), the silhouette, 0 to 255.
         reduction: image pixels per cell, along each side.
         border: width and height of the image in cells, from `border_cells`; None where the array ends at its border.
     """
-    foreground = (coverage >= MIN_COVERAGE).astype(np.uint8)
+    foreground = (coverage >= MIN_COVERAGE).view(np.uint8)
     # In thin silhouettes, gaps of one cell separate rotors and arms from the body.
-    closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    _, _, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    stats = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= MIN_BLOB_CELLS]
-    stats = stats[np.argsort(-stats[:, 2] * stats[:, 3], kind="stable")]
-    corner, size = stats[:, :2].astype(float), stats[:, 2:4].astype(float)
+    closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, _CLOSING)
+    # Outlines instead of labels, because most of a silhouette is empty: labels would be written to every cell of it.
+    outlines, levels = cv2.findContours(closed, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    outer = (
+        []
+        if levels is None
+        else [outlines[number] for number in np.flatnonzero(levels[0, :, 3] < 0).tolist()]
+    )
+    if not outer:
+        return Blobs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool))
+    # OpenCV lists the outlines from below.
+    cells = np.concatenate(outer[::-1])[:, 0]
+    starts = np.cumsum([0, *map(len, outer[:0:-1])])
+    corner = np.minimum.reduceat(cells, starts)
+    size = np.maximum.reduceat(cells, starts) + 1 - corner
+    area = size.prod(axis=-1)
+    order = np.argsort(-area, kind="stable")[: np.count_nonzero(area > 1)]
+    corner, size = corner[order].astype(float), size[order].astype(float)
     end = coverage.shape[::-1] if border is None else border
     whole = ((corner > 0) & (corner + size < end)).all(axis=-1)
     return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)
