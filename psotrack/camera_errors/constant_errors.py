@@ -93,7 +93,9 @@ def fit_constant_errors(
     design = np.concatenate([turn_px, -flow_px_s[..., None]], axis=-1) * (weight > 0)[..., None]
     own = np.einsum("rci,rcip,rciq->cpq", weight, design, design)
     crossed = np.einsum("rcik,rcip->rcpk", weighted, design).reshape(len(weight), 4 * num_cameras, 3)
-    information = -np.einsum("rak,rkl,rbl->ab", crossed, inverse, crossed, optimize=True)
+    # All rows together as one product of matrices; not by BLAS, whose threads wait long where processors are shared.
+    solved, crossed = (of.swapaxes(0, 1).reshape(4 * num_cameras, -1) for of in (crossed @ inverse, crossed))
+    information = -np.einsum("am,bm->ab", solved, crossed)
     for camera in range(num_cameras):
         part = slice(4 * camera, 4 * camera + 4)
         information[part, part] += own[camera]

@@ -67,7 +67,7 @@ def weighted_residuals(
     residual_px = np.where(places.shown[..., None], places.residual_px, 0.0)
     weighted = weight[..., None] * places.jacobian
     inverse = np.linalg.inv(np.einsum("rcik,rcil->rkl", weighted, places.jacobian))
-    moved_m = np.einsum("rkl,rcil,rci->rk", inverse, weighted, residual_px)
+    moved_m = np.einsum("rkl,rl->rk", inverse, np.einsum("rcil,rci->rl", weighted, residual_px))
     return weight * residual_px - np.einsum("rcik,rk->rci", weighted, moved_m), weighted, inverse
 
 
@@ -88,25 +88,85 @@ def camera_variances(
     seen = np.repeat(np.any(places.shown, axis=0, keepdims=True).T, 2, axis=-1)
     if not len(places.shown):
         return np.full(seen.shape, np.nan)
-    shown = places.shown[..., None]
-    squared = np.where(shown, places.residual_px, 0.0) ** 2
-    mean_px2 = squared.sum() / max(1, 2 * places.shown.sum())
+    parts = _Parts.of(places)
+    known_px2 = known_px2.reshape(len(known_px2), -1).T
+    mean_px2 = np.square(parts.residual_px).sum() / max(1, 2 * places.shown.sum())
     least_px2 = _LEAST * mean_px2 + np.finfo(float).tiny
     variance_px2 = np.full(seen.shape, mean_px2 + least_px2)
     for _ in range(_NUM_STEPS):
-        weight = np.where(shown, 1 / (known_px2 + variance_px2), 0.0)
-        left, weighted, inverse = weighted_residuals(places, weight)
-        # Diagonal of P: w - w² J (Jᵀ W J)⁻¹ Jᵀ.
-        leverage = np.einsum("rcik,rkl,rcil->rci", weighted, inverse, weighted, optimize=True)
-        expected = (weight - leverage).sum(axis=0)
-        found = np.square(left).sum(axis=0)
+        weight = parts.shown / (known_px2 + variance_px2.reshape(-1, 1))
+        found, expected = (of.reshape(seen.shape) for of in parts.squares(weight))
         # The common variance counts as some more residuals of each camera.
         told = np.where(seen, expected, 0.0)
         common_px2 = (told * variance_px2).sum() / told.sum() if told.sum() > 0 else mean_px2
-        found += _COMMON * common_px2 / np.square(variance_px2)
-        expected += _COMMON / variance_px2
+        found = found + _COMMON * common_px2 / np.square(variance_px2)
+        expected = expected + _COMMON / variance_px2
         before_px2 = variance_px2
         variance_px2 = np.maximum(before_px2 * np.sqrt(found / expected), least_px2)
         if np.abs(variance_px2 - before_px2).max() < _SETTLED * mean_px2:
             break
     return np.where(seen, variance_px2, np.nan)
+
+
+#: Elements of a symmetric 3 x 3 matrix, and how often each is in the matrix.
+_PAIRS, _TIMES = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)), np.array([1, 2, 1, 2, 2, 1])
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Places with the axis of rows last, along which NumPy computes fast; 0 where a camera does not show the place.
+
+    Attributes:
+        residual_px: (views, rows), residuals, one view for each camera and axis of its image.
+        jacobian: (3, views, rows), derivatives of the residuals' places.
+        products: (6, views, rows), products of two derivatives, for the lower triangle of a matrix.
+        shown: (views, rows), 1 where shown.
+    """
+
+    residual_px: Float[np.ndarray, "views rows"]
+    jacobian: Float[np.ndarray, "3 views rows"]
+    products: Float[np.ndarray, "6 views rows"]
+    shown: Float[np.ndarray, "views rows"]
+
+    @classmethod
+    def of(cls, places: FittedPlaces) -> _Parts:
+        """The parts of some places."""
+        num_rows = len(places.shown)
+        shown = np.repeat(places.shown, 2, axis=-1).T.astype(float)
+        residual_px = np.where(shown > 0, places.residual_px.reshape(num_rows, -1).T, 0.0)
+        jacobian = np.where(shown > 0, places.jacobian.reshape(num_rows, -1, 3).transpose(2, 1, 0), 0.0)
+        products = np.stack([jacobian[first] * jacobian[second] for first, second in _PAIRS])
+        return cls(residual_px, jacobian, products, shown)
+
+    def squares(
+        self, weight: Float[np.ndarray, "views rows"]
+    ) -> tuple[Float[np.ndarray, "views"], Float[np.ndarray, "views"]]:
+        """Sums over the rows of (P r)², and of the diagonal of P (see `weighted_residuals`)."""
+        inverse = _inverse(np.einsum("pvr,vr->pr", self.products, weight))
+        to_place = np.einsum("kvr,vr->kr", self.jacobian, weight * self.residual_px)
+        element = {pair: inverse[number] for number, pair in enumerate(_PAIRS)}
+        rows = ((max(k, other), min(k, other)) for k in range(3) for other in range(3))
+        matrix = np.stack([element[pair] for pair in rows]).reshape(3, 3, -1)
+        moved_m = np.einsum("kmr,mr->kr", matrix, to_place)
+        left = weight * (self.residual_px - np.einsum("kvr,kr->vr", self.jacobian, moved_m))
+        # Diagonal of P: w - w² J (Jᵀ W J)⁻¹ Jᵀ.
+        leverage = np.einsum("pvr,pr->vr", self.products, _TIMES[:, None] * inverse)
+        diagonal = weight - np.square(weight) * leverage
+        return np.square(left).sum(axis=-1), diagonal.sum(axis=-1)
+
+
+def _inverse(matrix: Float[np.ndarray, "6 rows"]) -> Float[np.ndarray, "6 rows"]:
+    """Inverses of positive definite 3 x 3 matrices, given as their lower triangles, by Cholesky factors."""
+    a, b, c, d, e, f = matrix
+    # Factor L, with the inverses of its diagonal; then L⁻¹; then L⁻ᵀ L⁻¹.
+    p = 1 / np.sqrt(a)
+    l10, l20 = b * p, d * p
+    q = 1 / np.sqrt(c - l10 * l10)
+    l21 = (e - l20 * l10) * q
+    s = 1 / np.sqrt(f - l20 * l20 - l21 * l21)
+    m10 = -l10 * p * q
+    m21 = -l21 * q * s
+    m20 = -(l20 * p + l21 * m10) * s
+    return np.stack(
+        [p * p + m10 * m10 + m20 * m20, m10 * q + m20 * m21, q * q + m21 * m21, m20 * s, m21 * s, s * s]
+    )
