@@ -35,9 +35,10 @@ from psotrack.geometry import make_extents, project_boxes
 from psotrack.initiation import room_bounds
 from psotrack.initiation.initialisation import find_drones
 from psotrack.recordings import read_frames
-from psotrack.silhouettes import compute, summed_area_table
+from psotrack.silhouettes import compute, scaled_settings, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.silhouettes.foreground import coverage, learning_step
+from psotrack.silhouettes.first_look import look_first
+from psotrack.silhouettes.foreground import coverage
 from psotrack.silhouettes.living_background import Living
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
@@ -72,18 +73,18 @@ names = recording.rig.names
 # ## Frame → foreground → silhouette
 #
 # The cameras stand still, so a pixel shows the background most of the time. A background model learns what each pixel
-# usually shows from frames of the whole video, and goes on learning from frame to frame; what differs from the model and
+# usually shows from a first look at the whole video, and goes on learning from frame to frame; what differs from the model and
 # ends in sharp edges is foreground. The tracker reads a coarser picture: each value of a *silhouette* is the share of a
 # small square of pixels that is foreground, 0 to 255. `psotrack.silhouettes.compute` does the same for all cameras and
 # frames, and keeps the result.
 
 # %%
-scaled = SILHOUETTES.scaled([video.image_size_wh for video in recording.videos.values()])
+scaled = scaled_settings(SILHOUETTES, recording)
 images, masks = [], []
 for camera in CAMERAS:
     video = recording.videos[names[camera]]
-    learning = read_frames(video, learning_step(video.num_frames, scaled))
-    foreground = Living(scaled).foreground(learning, read_frames(video))
+    first_look, frames = look_first(video, read_frames(video), scaled)
+    foreground = Living(scaled).masks(first_look, frames)
     images.append(next(islice(read_frames(video), FRAME, None)))
     masks.append(next(islice(foreground, FRAME, None)))
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import time
 
 
 def main() -> None:
     """Run the command line; Ctrl-C ends it with one line and exit code 2."""
+    started = time.perf_counter()
     try:
         # Imported here, so that Ctrl-C is answered during the import too.
         from psotrack.cli import main as run
 
-        run()
+        run(started)
     except KeyboardInterrupt:
         sys.stderr.write(
             "psotrack: interrupted; earlier results are unchanged; run the command again to finish\n"

@@ -127,6 +127,10 @@ def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: 
     assert record["seed"] == 3
     assert record["settings"]["swarm"]["particles"] == 20
     assert set(record["seconds"]) == {"decode", "foreground", "track", "compile", "finish", "total"}
+    # All of the program's time counts, and less of it without the start and the compilation.
+    total_s = NUM_FRAMES / 25 / record["real_time_factor"]
+    assert total_s == pytest.approx(record["seconds"]["total"], rel=0.02)
+    assert record["real_time_factor_running"] > record["real_time_factor"] > 0
     assert set(record["input_keys"]) == {f"cam{i}" for i in range(1, 9)}
     assert {"python", "jax", "numpy", "psotrack"} <= set(record["versions"])
     assert record["device"]["platform"]

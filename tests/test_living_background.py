@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.silhouettes import ForegroundSettings, ScaledSettings, find_background
-from psotrack.silhouettes.lighting import remove_light
+from psotrack.silhouettes.lighting import light_of, remove_light
 from psotrack.silhouettes.living_background import Living, LivingBackground
 from psotrack.silhouettes.object_blobs import find_objects, largest
 
@@ -209,7 +209,7 @@ def test_a_gain_of_the_whole_image_is_removed(gain: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     room = np.clip(_room(rng), 40, 170)
     lit = np.clip(room * gain, 0, 255).round().astype(np.uint8)
-    without = remove_light(lit, room.astype(np.float32), np.zeros((HEIGHT, WIDTH), np.uint8))
+    without = remove_light(lit, light_of(room.astype(np.float32)), np.zeros((HEIGHT, WIDTH), np.uint8))
     # The offset for the dark and the rounding to whole grey levels cost up to 2 levels each.
     assert np.abs(without - room).max() < 4
 
@@ -219,7 +219,7 @@ def test_an_object_is_no_change_of_the_light() -> None:
     room = _room(rng)
     image, drone = _with_drone(room, 80, 60, width_px=40)
     without = remove_light(
-        image.round().astype(np.uint8), room.astype(np.float32), np.zeros((HEIGHT, WIDTH), np.uint8)
+        image.round().astype(np.uint8), light_of(room.astype(np.float32)), np.zeros((HEIGHT, WIDTH), np.uint8)
     )
     assert np.abs(without[~drone] - room[~drone]).max() < 2
     assert without[drone].max() < 35
@@ -258,6 +258,23 @@ def test_all_foreground_belongs_to_blobs_that_changed(seed: int, strength: float
     image[y : y + 15, x : x + 20] = np.clip(image[y : y + 15, x : x + 20] + strength, 0, 255).astype(np.uint8)
     difference = largest(cv2.absdiff(image, background))
     changed, strong = (np.where(difference > level, np.uint8(255), np.uint8(0)) for level in (3, 8))
-    found = find_objects(changed, strong, image, background, difference, np.zeros((HEIGHT, WIDTH), bool), 9)
+    found = find_objects(changed, strong, difference, np.zeros((HEIGHT, WIDTH), bool), 9)
     assert not (found.mask & ~changed).any()
-    assert not (found.own & ~found.mask).any()
+    assert not (found.with_own_edges(image, background) & ~found.mask).any()
+
+
+def test_a_pixel_at_a_contour_has_the_share_that_the_object_covers() -> None:
+    rng = np.random.default_rng(5)
+    wall = np.full((HEIGHT, WIDTH, 3), 150.0)
+    background = LivingBackground(ScaledSettings(working_reduction=2, reduction=2), _exposed(wall, rng), 100)
+    for _ in range(10):
+        background.step(_exposed(wall, rng))
+    scene = wall.copy()
+    scene[40:60, 50:80] = 50
+    scene[40:60, 80] = 50 + 100 * 0.25  # three quarters of these pixels show the object
+    mask = background.step(_exposed(scene, rng))
+    assert (mask[42:58, 52:78] == 255).all()
+    # The largest of three channels' noise of two grey levels is a fiftieth of the contrast.
+    assert mask[42:58, 80].mean() / 255 == pytest.approx(0.75, abs=0.05)
+    assert mask[42:58, 81].mean() / 255 < 0.04
+    assert not mask[:, 90:].any()

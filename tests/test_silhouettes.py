@@ -25,7 +25,14 @@ import pytest
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
-from psotrack.silhouettes import ScaledSettings, Silhouettes, SilhouetteSettings, compute, silhouette_keys
+from psotrack.silhouettes import (
+    ScaledSettings,
+    Silhouettes,
+    SilhouetteSettings,
+    compute,
+    silhouette_keys,
+    usual_drone_px,
+)
 from psotrack.silhouettes import store as silhouette_store
 from psotrack.silhouettes.foreground import coverage, foreground
 from psotrack.support import Advance, map_in_processes
@@ -183,6 +190,7 @@ def test_name_and_folder_of_a_video_are_not_in_the_key(
         {"shadows": "drop"},
         {"shadow_weight": 0.4},
         {"min_blob_px": 33},
+        {"first_look": False},
     ],
 )
 def test_every_setting_is_in_the_key(video_folder: Path, change: dict[str, object]) -> None:
@@ -231,6 +239,38 @@ def test_reduction_and_smallest_blob_follow_from_the_drones_size(
 ) -> None:
     scaled = SilhouetteSettings(**settings).scaled(sizes_wh)
     assert (scaled.working_reduction, scaled.reduction, scaled.min_blob_px) == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "usual_px", "expected"),
+    [
+        # A drone of 24 px is six stored values of 4 px wide: the background model needs no finer image.
+        ({}, 24.0, (4, 4)),
+        ({}, 23.0, (2, 4)),
+        ({}, 500.0, (4, 4)),
+        ({"reduction": 8}, 500.0, (8, 8)),
+        ({"drone_px": 40.0}, 500.0, (2, 4)),
+        ({"working_reduction": 1}, 500.0, (1, 2)),
+    ],
+)
+def test_the_background_model_sees_no_finer_image_than_the_rig_demands(
+    settings: dict[str, Any], usual_px: float, expected: tuple[int, int]
+) -> None:
+    scaled = SilhouetteSettings(**settings).scaled([(1920, 1080)], usual_px)
+    assert (scaled.working_reduction, scaled.reduction) == expected
+
+
+def test_the_usual_width_of_a_drone_follows_from_the_rig() -> None:
+    K = np.array([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]])
+    poses = {
+        name: look_at(eye, (0.0, 0.0, 1.0)) for name, eye in (("a", (6.0, 0.0, 1.0)), ("b", (0.0, 3.0, 1.0)))
+    }
+    cameras = {
+        name: make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080)) for name, (R, t_m) in poses.items()
+    }
+    # 0.3 m at 6 m, in the farther camera.
+    assert usual_drone_px(make_rig(cameras)) == pytest.approx(50.0)
+    assert usual_drone_px(make_rig({"a": cameras["a"]})) is None
 
 
 @pytest.mark.parametrize(

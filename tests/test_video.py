@@ -14,7 +14,15 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.recordings import VideoInfo, VideoWriter, check_end, join_videos, probe, read_frames
+from psotrack.recordings import (
+    VideoInfo,
+    VideoWriter,
+    check_end,
+    join_videos,
+    probe,
+    read_frames,
+    read_near,
+)
 
 WIDTH, HEIGHT = 96, 64
 
@@ -308,6 +316,24 @@ def moving_picture(num_frames: int, start: int = 0) -> list[np.ndarray]:
     """Make frames of a moving picture; no two of its frames are equal."""
     large = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 400, 3), np.uint8), (0, 0), 2)
     return [large[:, k : k + WIDTH].copy() for k in range(start, start + num_frames)]
+
+
+def test_frames_near_some_places_are_the_frames_of_these_numbers(tmp_path):
+    path = write(tmp_path / "v.avi", moving_picture(200))
+    frames = list(read_frames(probe(path)))
+    places = [3, 60, 61, 140, 199]
+    found = dict(read_near(probe(path), places))
+    for number, frame in found.items():
+        np.testing.assert_array_equal(frame, frames[number])
+    # The writer makes a key frame every 12 frames; a frame near a place is that long after a key frame.
+    for place in places[1:]:
+        assert min(abs(np.array(list(found)) - place)) <= 12
+    assert len(found) == 4  # 60 and 61 have the same key frame
+
+
+def test_frames_near_no_place_are_none(tmp_path):
+    path = write(tmp_path / "v.avi", moving_picture(20))
+    assert list(read_near(probe(path), [])) == []
 
 
 @pytest.mark.parametrize("lengths", [(5,), (24, 24, 7), (1, 13, 30, 2)])

@@ -146,8 +146,11 @@ class _FirstOnly(logging.Filter):
         return new
 
 
-def main() -> None:
+def main(started: float | None = None) -> None:
     """Run the command line; an error that psotrack raises on purpose becomes one line and exit code 2.
+
+    Args:
+        started: value of `time.perf_counter` when the program started; None is now.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed.
@@ -155,7 +158,7 @@ def main() -> None:
     try:
         _complete()
         # `cli.main` would answer Ctrl-C itself.
-        with orderly_interrupts(), cli.make_context("psotrack", sys.argv[1:]) as context:
+        with orderly_interrupts(), cli.make_context("psotrack", sys.argv[1:], obj=started) as context:
             cli.invoke(context)
     except click.exceptions.Exit as done:
         sys.exit(done.exit_code)

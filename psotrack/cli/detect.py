@@ -160,7 +160,9 @@ def _by_blobs(
 
     sizes_wh = [video.image_size_wh for video in recording.videos.values()]
     if settings.reduction is None:
-        settings = replace(settings, reduction=settings.scaled(sizes_wh).working_reduction)
+        # The boxes are as fine as the images allow, not as coarse as the tracker can do with.
+        working = settings.scaled(sizes_wh).working_reduction
+        settings = replace(settings, reduction=working, working_reduction=working)
     made = compute(recording, settings, cache=cache_folder(cache), jobs=jobs, report=report_to(quiet))
     sizes = np.array([recording.videos[name].image_size_wh for name in made.cameras], float)
     return list(blob_detections(made, sizes, report_to(quiet)).items())

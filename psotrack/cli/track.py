@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any, get_args
 
@@ -229,10 +230,11 @@ def track(
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
+    started = click.get_current_context().obj or time.perf_counter()
     from psotrack.datasets import open_recording
     from psotrack.detection import DetectorSettings, find_detector
     from psotrack.methods import check_detections, usable_for
-    from psotrack.pipeline import Parts, track_recording
+    from psotrack.pipeline import Parts, track_recording, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 
@@ -246,6 +248,7 @@ def track(
         detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
     )
     keep_compiled(compiled_folder(cache))
+    start_s = time.perf_counter() - started
     opened = open_recording(sequence)
     if detector is None:
         check_detections(opened, chosen)
@@ -267,15 +270,15 @@ def track(
     write_trajectories(out, tracked.trajectories, force=force)
     identities, time_s = tracked.identities, tracked.trajectories.time_s
     write_ambiguity(ambiguity_path, time_s, identities.pairs, identities.ambiguity, force=force)
-    write_json(record_path, tracked.record)
-    output_json(json_path, tracked.record, force)
+    record = with_real_time(tracked.record, time.perf_counter() - started, start_s=start_s)
+    write_json(record_path, record)
+    output_json(json_path, record, force)
     seen = tracked.trajectories.seen.mean()
-    seconds = tracked.record["seconds"]
     print_line(
         quiet,
         json_path,
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
-        f"{seen:.1%} seen, {seconds['total']:.1f} s",
+        f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {record['real_time_factor']:.2g} of real time",
     )
 
 

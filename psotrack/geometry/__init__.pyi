@@ -19,7 +19,7 @@ from .image_scale import sizes_m, sizes_px, undistortion_stretch
 from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
 from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
 from .rotations import cross_matrices, rotation_matrices
-from .shared_views import in_images, views_meet
+from .shared_views import in_images, looking_depths_m, views_meet
 from .triangulation import (
     MAX_CONDITION,
     match_views,
@@ -49,6 +49,7 @@ __all__ = [
     "has_image",
     "in_images",
     "look_at",
+    "looking_depths_m",
     "make_camera",
     "make_extents",
     "make_rig",

@@ -25,6 +25,22 @@ def in_images(
     return np.asarray(inside.all(axis=-1) & (depth > NEAR_M))
 
 
+def looking_depths_m(cameras: Camera) -> Float[np.ndarray, "cameras"]:
+    """Distance from each camera, along its optical axis, of the point at which all cameras look, metres.
+
+    The point is the one nearest to all optical axes. Parallel axes have none: the distances are a quarter to twice the
+    largest spread of the cameras' centres; 0 for a single camera.
+
+    Args:
+        cameras: cameras with one leading axis.
+    """
+    axis, centre = cameras.T_cam_world[:, 2, :3], cameras.centre_world
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    focus = np.linalg.lstsq(across.sum(axis=0), (across @ centre[..., None]).sum(axis=0)[:, 0])[0]
+    spread = np.linalg.norm(np.ptp(centre, axis=0))
+    return np.clip(((focus - centre) * axis).sum(axis=-1), spread / 4, 2 * spread)
+
+
 def views_meet(cameras: Camera) -> bool:
     """Whether there is a place, at any distance, that two cameras have in view.
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.geometry import Rig
+from psotrack.geometry import Rig, looking_depths_m
 from psotrack.initiation.initialisation import InitialState, all_blobs, find_drones_in_blobs
 from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
@@ -79,12 +79,7 @@ def room_bounds(
     if bounds_m is not None:
         return np.array(bounds_m, np.float64).reshape(3, 2).T
     axis, centre = rig.cameras.T_cam_world[:, 2, :3], rig.cameras.centre_world
-    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
-    # The point nearest to all optical axes. Parallel axes have none: the spread of the cameras then limits the depth.
-    focus = np.linalg.lstsq(across.sum(axis=0), (across @ centre[..., None]).sum(axis=0)[:, 0])[0]
-    spread = np.linalg.norm(np.ptp(centre, axis=0))
-    depth = np.clip(((focus - centre) * axis).sum(axis=-1), spread / 4, 2 * spread)
-    corners = np.concatenate([centre, centre + 2 * depth[:, None] * axis])
+    corners = np.concatenate([centre, centre + 2 * looking_depths_m(rig.cameras)[:, None] * axis])
     low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
     low[2] = 0.0 if centre[:, 2].min() > 0 else centre[:, 2].min() - 1.0
     high[2] = centre[:, 2].max() + 1.0

@@ -1,5 +1,5 @@
 from .parts import Parts
-from .results import TrackedRecording, environment
+from .results import TrackedRecording, environment, with_real_time
 from .running import track_recording, track_runs
 
 __all__ = [
@@ -8,4 +8,5 @@ __all__ = [
     "environment",
     "track_recording",
     "track_runs",
+    "with_real_time",
 ]

@@ -10,7 +10,13 @@ from psotrack.errors import SettingsError
 from psotrack.methods import Method
 from psotrack.recordings import Recording
 from psotrack.settings import YOLO, TrackSettings
-from psotrack.silhouettes import BackgroundModel, Living, SilhouetteSettings, find_background
+from psotrack.silhouettes import (
+    BackgroundModel,
+    Living,
+    SilhouetteSettings,
+    find_background,
+    scaled_settings,
+)
 from psotrack.support import check_interface, identify, make_plugin
 from psotrack.tracking import Score, Search
 
@@ -69,8 +75,7 @@ def with_background(parts: Parts, recording: Recording, settings: SilhouetteSett
     """
     if parts.background is not None or not recording.videos:
         return parts
-    scaled = settings.scaled([video.image_size_wh for video in recording.videos.values()])
-    model = find_background(settings.background, scaled)
+    model = find_background(settings.background, scaled_settings(settings, recording))
     return parts if model is None or isinstance(model, Living) else replace(parts, background=model)
 
 

@@ -146,6 +146,24 @@ def environment() -> dict[str, Any]:
     }
 
 
+def with_real_time(record: Mapping[str, Any], wall_s: float, *, start_s: float = 0.0) -> dict[str, Any]:
+    """The record with its real-time factors: seconds of video over seconds of wall clock.
+
+    Args:
+        record: record of a run.
+        wall_s: time from the first byte that was read to the last row, seconds.
+        start_s: part of it that the program took to start.
+    """
+    video_s = record["frames"] / record["rate_hz"]
+    running_s = max(wall_s - start_s - record["seconds"]["compile"], 1e-3)
+    return {
+        **record,
+        "seconds": {**record["seconds"], "total": round(wall_s, 4)},
+        "real_time_factor": round(video_s / wall_s, 3),
+        "real_time_factor_running": round(video_s / running_s, 3),
+    }
+
+
 def _times_record(recording: Recording) -> dict[str, dict[str, Any]]:
     """When each camera's frames were exposed, as the tracker used it, fit for JSON."""
     return {

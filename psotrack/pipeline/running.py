@@ -25,7 +25,7 @@ from psotrack.methods import MethodResult, usable_for
 from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
 from psotrack.pipeline.parts import Parts, check_detector_is_used, tracks_silhouettes, with_background
 from psotrack.pipeline.preparation import PreparedRun, prepare
-from psotrack.pipeline.results import TrackedRecording, finish
+from psotrack.pipeline.results import TrackedRecording, finish, with_real_time
 from psotrack.pipeline.stages import (
     initial_states,
     track_detections,
@@ -105,8 +105,7 @@ def track_recording(
         raise tracked
     if settings.clocks == "given" and len(recording.rig) > 2:
         advise_on_clocks(recording, silhouettes, settings, tracked.trajectories)
-    seconds = tracked.record["seconds"] | {"total": round(time.perf_counter() - began, 4)}
-    return replace(tracked, record={**tracked.record, "seconds": seconds})
+    return replace(tracked, record=with_real_time(tracked.record, time.perf_counter() - began))
 
 
 def track_runs(

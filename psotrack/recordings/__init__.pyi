@@ -40,6 +40,7 @@ from .video import (
     probe,
     probe_images,
     read_frames,
+    read_near,
 )
 
 __all__ = [
@@ -84,6 +85,7 @@ __all__ = [
     "read_grey",
     "read_image",
     "read_mask",
+    "read_near",
     "read_recording_file",
     "read_timestamps",
     "recording_file_text",

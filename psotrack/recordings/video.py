@@ -31,6 +31,8 @@ _CODEC = "XVID"
 _CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
 #: Largest number of images of which the depth is read.
 _READ_IMAGES = 5
+#: OpenCV seeks so many frames before a frame, and decodes from the key frame there.
+_SEEK_BEFORE = 17
 
 
 @dataclass(frozen=True)
@@ -158,6 +160,57 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
             yield frame
     finally:
         capture.release()
+
+
+def read_near(
+    video: VideoInfo, places: Sequence[int]
+) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+    """Yield frames near some places, and their numbers, without decoding the video up to there.
+
+    A frame of a video file is one shortly after the key frame that is nearest to the place. Places with the same key
+    frame yield one frame, so a video with few key frames yields few. A frame that cannot be decoded is left out.
+
+    Args:
+        video: the video.
+        places: numbers of frames, ascending.
+    """
+    if video.images:
+        for place in places:
+            yield place, read_image(video.images[place], video.depth_bits)
+        return
+    if not places:
+        return
+    key_frames = np.array(_key_frames(video))
+    if not len(key_frames):
+        return
+    nearest = np.abs(key_frames + _SEEK_BEFORE - np.array(places)[:, None]).argmin(axis=1)
+    capture = _open(video.path)
+    try:
+        for key_frame in np.unique(key_frames[nearest]).tolist():
+            number = min(key_frame + _SEEK_BEFORE, video.num_frames - 1)
+            with silence_opencv():
+                capture.set(cv2.CAP_PROP_POS_FRAMES, number)
+                decoded, frame = capture.read()
+            if decoded and frame.shape[1::-1] == video.image_size_wh:
+                yield number, frame
+    finally:
+        capture.release()
+
+
+def _key_frames(video: VideoInfo) -> list[int]:
+    """Numbers of the frames that can be decoded without others, found without decoding."""
+    capture = _open(video.path)
+    found = []
+    try:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        for index in range(video.num_frames):
+            if not capture.grab():
+                break
+            if capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
+                found.append(index)
+    finally:
+        capture.release()
+    return found
 
 
 def _check_size(
@@ -339,8 +392,10 @@ def _open(path: Path) -> cv2.VideoCapture:
     if empty:
         raise InputError(path, expected="a video", found="an empty file")
     with silence_opencv():
+        # As many threads as OpenCV may use: one in a worker process, so that processes do not compete for processors.
+        threads = (cv2.CAP_PROP_N_THREADS, max(1, cv2.getNumThreads()))
         # An absolute path, because FFmpeg reads the text before a colon as a protocol.
-        capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
+        capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG, threads)
     if not capture.isOpened():
         raise InputError(path, expected="a video", found="a file that FFmpeg cannot open")
     return capture

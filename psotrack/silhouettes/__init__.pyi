@@ -1,7 +1,15 @@
 from .background_models import find_background
 from .blob_boxes import blob_detections
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stack_blobs
-from .computation import Silhouettes, compute, exposures_of, silhouette_keys, tasks_of
+from .computation import (
+    Silhouettes,
+    compute,
+    exposures_of,
+    scaled_settings,
+    silhouette_keys,
+    tasks_of,
+    usual_drone_px,
+)
 from .exposures import Exposures, moved_by
 from .foreground import BackgroundModel, Mog2
 from .living_background import Living, LivingBackground
@@ -9,6 +17,7 @@ from .masks import MaskTask, masks_out, write_masks
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, frames_to_decode, key_of, open_stored, reduced_shape
 from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
+from .usable_frames import foreground_is_everywhere
 
 __all__ = [
     "LEAST_RADIUS_CELLS",
@@ -33,6 +42,7 @@ __all__ = [
     "exposures_of",
     "find_background",
     "find_blobs",
+    "foreground_is_everywhere",
     "frames_to_decode",
     "key_of",
     "masks_out",
@@ -41,9 +51,11 @@ __all__ = [
     "open_stored",
     "pack",
     "reduced_shape",
+    "scaled_settings",
     "silhouette_keys",
     "stack_blobs",
     "summed_area_table",
     "tasks_of",
+    "usual_drone_px",
     "write_masks",
 ]

@@ -14,11 +14,12 @@ import zarr
 from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.geometry import Rig, looking_depths_m
 from psotrack.recordings import Recording, Timeline, TruncatedVideoError
 from psotrack.silhouettes.background_models import find_background
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.foreground import BackgroundModel
-from psotrack.silhouettes.settings import SilhouetteSettings, check_whole
+from psotrack.silhouettes.settings import ScaledSettings, SilhouetteSettings, check_whole
 from psotrack.silhouettes.store import (
     Task,
     frames_to_decode,
@@ -35,6 +36,9 @@ from psotrack.support import Report, map_in_processes, no_progress, short_repr
 __all__ = ["SilhouetteSettings", "Silhouettes", "compute"]
 
 logger = logging.getLogger(__name__)
+
+#: Width of a usual drone, metres: most are wider; smaller ones have fewer pixels in the reduced images.
+_USUAL_DRONE_M = 0.3
 
 
 @dataclass(frozen=True, repr=False)
@@ -303,7 +307,7 @@ def tasks_of(
     videos = {name: recording.videos[name] for name in recording.rig.names if name in recording.videos}
     if not videos:
         return {}
-    scaled = settings.scaled([video.image_size_wh for video in videos.values()])
+    scaled = scaled_settings(settings, recording)
     model = find_background(settings.background, scaled) if background is None else background
     ignored = {name: recording.ignore.get(name) for name in videos}
     with ThreadPoolExecutor() as threads:
@@ -312,6 +316,23 @@ def tasks_of(
         name: Task(video, scaled, cache, key, model, ignored[name])
         for (name, video), key in zip(videos.items(), keys, strict=True)
     }
+
+
+def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> ScaledSettings:
+    """The settings of silhouettes for the images and the rig of a recording with videos."""
+    sizes_wh = [video.image_size_wh for video in recording.videos.values()]
+    return settings.scaled(sizes_wh, usual_drone_px(recording.rig))
+
+
+def usual_drone_px(rig: Rig) -> float | None:
+    """Width of a drone of 0.3 m at the place at which all cameras look, pixels, in the camera that shows it smallest.
+
+    None where the cameras are at one place, so that the rig does not say how far drones are.
+    """
+    depth_m = looking_depths_m(rig.cameras)
+    if not (depth_m > 0).all():
+        return None
+    return float((_USUAL_DRONE_M * rig.cameras.K[:, 0, 0] / depth_m).min())
 
 
 def silhouette_keys(recording: Recording, settings: SilhouetteSettings) -> dict[str, str]:

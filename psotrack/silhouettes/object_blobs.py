@@ -48,18 +48,25 @@ class ObjectBlobs:
 
     Attributes:
         mask: (height, width), 255 at the pixels of blobs that are foreground, else 0.
-        own: (height, width), 255 at those of them that have edges of their own: objects, also if they stand still.
+        found: the same blobs, with their contours.
     """
 
     mask: _Mask
-    own: _Mask
+    found: list[tuple[_PixelBlobs, _Contours]]
+
+    def with_own_edges(
+        self, image: UInt8[np.ndarray, "height width 3"], background: UInt8[np.ndarray, "height width 3"]
+    ) -> _Mask:
+        """(height, width), 255 at the blobs that have edges of their own: objects, also if they stand still."""
+        own = np.zeros_like(self.mask)
+        for blobs, contours in self.found:
+            own.ravel()[blobs.chosen(_has_own_edges(contours, image, background)).pixels] = 255
+        return own
 
 
 def find_objects(
     changed: _Mask,
     strong: _Mask,
-    image: UInt8[np.ndarray, "height width 3"],
-    background: UInt8[np.ndarray, "height width 3"],
     difference: _Mask,
     restless: Bool[np.ndarray, "height width"],
     least_px: int,
@@ -69,13 +76,11 @@ def find_objects(
     Args:
         changed: (height, width), above 0 at the pixels that differ from the background.
         strong: (height, width), above 0 at the pixels that differ by more than the place usually does.
-        image: (height, width, 3), the frame.
-        background: (height, width, 3), the background.
         difference: (height, width), the largest difference of the channels, grey levels.
         restless: (height, width), whether leaves, screens, waves or noise change the place again and again.
         least_px: smallest number of pixels of a blob.
     """
-    mask, own = np.zeros_like(changed), np.zeros_like(changed)
+    mask, found = np.zeros_like(changed), []
     for share, steep_part in _EXTENTS:
         blobs = _find_blobs(changed, strong, difference, least_px, share)
         num_restless = blobs.sums(restless.ravel()[blobs.pixels])
@@ -91,10 +96,13 @@ def find_objects(
             _is_sharp(blobs, contours, levels, steepness)
             & (_steep_part(blobs, contours, levels, steepness, share) >= steep_part)
         )
-        mask.ravel()[blobs.chosen(is_object).pixels] = 255
-        own.ravel()[blobs.chosen(is_object & _has_own_edges(contours, image, background)).pixels] = 255
+        objects = blobs.chosen(is_object)
+        mask.ravel()[objects.pixels] = 255
+        found.append((objects, contours))
+        if len(objects.pixels) == len(blobs.pixels):
+            break
         changed = _mask_of(blobs.chosen(~is_object).pixels, changed.shape)
-    return ObjectBlobs(mask, own)
+    return ObjectBlobs(mask, found)
 
 
 def _is_sharp(
@@ -260,13 +268,19 @@ def _gradient_at(
     image: UInt8[np.ndarray, "height width *channels"], points: Int[np.ndarray, "points"]
 ) -> Float[np.ndarray, "points"]:
     """What `gradient` is at some pixels, given as flat indices."""
-    levels = image.reshape(image.shape[0] * image.shape[1], -1)
-    north_west, north, north_east, west, east, south_west, south, south_east = (
-        levels[near].astype(np.float32) for near in _neighbours(points, image.shape)
-    )
-    along_x = north_east + 2 * east + south_east - north_west - 2 * west - south_west
-    along_y = south_west + 2 * south + south_east - north_west - 2 * north - north_east
-    return np.hypot(along_x, along_y).max(axis=-1, initial=0) / 4
+    width = image.shape[1] + 2
+    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    rows, columns = np.divmod(points, image.shape[1])
+    corners = rows * width + columns  # north-west of each pixel, in the padded image
+    steps = np.array([0, 1, 2, width, width + 2, 2 * width, 2 * width + 1, 2 * width + 2])
+    levels = padded.reshape(-1, *image.shape[2:])
+    north_west, north, north_east, west, east, south_west, south, south_east = levels[
+        corners + steps[:, None]
+    ].astype(np.float32)
+    along_x = north_east - north_west + 2 * (east - west) + south_east - south_west
+    along_y = south_west - north_west + 2 * (south - north) + south_east - north_east
+    length = np.hypot(along_x, along_y)
+    return (length if length.ndim == 1 else length.max(axis=-1, initial=0)) / 4
 
 
 def gradient(image: UInt8[np.ndarray, "height width *channels"]) -> Float[np.ndarray, "height width"]:

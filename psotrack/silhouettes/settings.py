@@ -23,6 +23,9 @@ _DRONES_ACROSS = 48
 _LEAST_DRONE_PX = 20
 #: Narrower drones are not reduced for storing either, pixels.
 _LEAST_STORED_PX = 8
+#: Where the rig is known: a drone whose usual width is this many stored values or more keeps its shape, even if the
+#: background model sees no finer image than what is stored.
+_LEAST_DRONE_CELLS = 6
 #: Speckle: blobs narrower than this share of a drone's width; a blob has 4 pixels at least.
 _SPECKLE, _LEAST_BLOB_PX = 0.2, 4
 #: Smallest blob of the background model "living" where the drones' size is not given, pixels: a distant drone of 5 x 2
@@ -47,6 +50,7 @@ class _CommonSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     var_threshold: float = 8.0
     shadows: Shadows = "keep"
     shadow_weight: float = 0.5
+    first_look: bool = True
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -65,7 +69,8 @@ class ForegroundSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
     """Settings that separate foreground from background, for images of a known size.
 
     Attributes:
-        num_learning_frames, learning_rate, var_threshold, shadows, shadow_weight: as in `SilhouetteSettings`.
+        num_learning_frames, learning_rate, var_threshold, shadows, shadow_weight, first_look: as in
+            `SilhouetteSettings`.
         working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
             image; 1 is the full image.
         min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
@@ -81,6 +86,11 @@ class ForegroundSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         super().__post_init__()
         check_whole("working_reduction", self.working_reduction, lowest=1)
         check_whole("min_blob_px", self.min_blob_px, lowest=0)
+
+    @property
+    def soft_edges(self) -> bool:
+        """Whether a mask tells the share of each pixel at a contour, instead of foreground or background."""
+        return False
 
 
 class ScaledSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -100,6 +110,11 @@ class ScaledSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unkno
         check_whole("reduction", self.reduction, lowest=1)
         _check_multiple(self.reduction, self.working_reduction)
 
+    @property
+    def soft_edges(self) -> bool:
+        """See `ForegroundSettings`: where masks are stored as they are, no mean of finer pixels tells the shares."""
+        return self.reduction == self.working_reduction > 1
+
 
 class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of silhouettes.
@@ -110,13 +125,16 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
             longer side of the images / 48, which is 40 pixels in an image of 1920; smaller drones are found as well.
         reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
         working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
-            image; 1 is the full image.
+            image; 1 is the full image. None: from `drone_px`; where the rig says that drones of 0.3 m are wide in the
+            images (see `usual_drone_px`), the reduction.
         min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
         num_learning_frames: largest number of frames, spread over the video, from which the background is learned.
         learning_rate: learning rate per frame in the second pass of "mog2", in [0, 1]; 0 keeps the learned background.
         var_threshold: squared Mahalanobis distance from the background beyond which a pixel is foreground, for "mog2".
         shadows: meaning of MOG2's shadow label, for "mog2".
         shadow_weight: weight of a shadow pixel in [0, 1], for `shadows="weight"` of "mog2".
+        first_look: whether the background is first learned from frames of the whole video; False: the first frame is
+            the background, and the rest is learned as the frames come, as from a live camera (only "living").
 
     Raises:
         SettingsError: a value is out of range, or belongs to another background model.
@@ -139,6 +157,12 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
             _check_multiple(self.reduction, self.working_reduction)
         if self.background == LIVING:
             self._check_unused()
+        elif not self.first_look:
+            raise SettingsError(
+                "first_look",
+                expected=f"the background model {LIVING}, which learns as frames come",
+                found=self.background,
+            )
 
     def _check_unused(self) -> None:
         for name in ("learning_rate", "var_threshold", "shadows", "shadow_weight"):
@@ -151,11 +175,14 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
                     remedy=f"or choose the background model {MOG2}",
                 )
 
-    def scaled(self, image_sizes_wh: Sequence[tuple[int, int]]) -> ScaledSettings:
+    def scaled(
+        self, image_sizes_wh: Sequence[tuple[int, int]], usual_px: float | None = None
+    ) -> ScaledSettings:
         """These settings for images of given sizes.
 
         Args:
             image_sizes_wh: widths and heights of the images, pixels, at least one.
+            usual_px: usual width of a drone in the images, pixels (see `usual_drone_px`); None where it is not known.
         """
         across_px = self.drone_px or max(map(max, image_sizes_wh)) / _DRONES_ACROSS
         working, reduction = self.working_reduction, self.reduction
@@ -166,6 +193,9 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
             )
         if reduction is None:
             reduction = working * (2 if across_px >= _LEAST_STORED_PX else 1)
+        given = self.drone_px is not None or self.working_reduction is not None
+        if not given and usual_px is not None and usual_px >= _LEAST_DRONE_CELLS * reduction:
+            working = reduction
         least_px = self.min_blob_px
         if least_px is None and self.drone_px is None and self.background == LIVING:
             least_px = _LEAST_OBJECT_PX

@@ -23,7 +23,15 @@ from zarr.codecs import ZstdCodec
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import VideoInfo, digest_video, read_frames, read_mask
-from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step
+from psotrack.silhouettes.first_look import look_first
+from psotrack.silhouettes.foreground import (
+    BackgroundModel,
+    Mog2,
+    coverage,
+    learning_step,
+    reduce_frame,
+)
+from psotrack.silhouettes.living_background import Living
 from psotrack.silhouettes.settings import ScaledSettings
 from psotrack.silhouettes.usable_frames import (
     LEAST_FRAMES,
@@ -122,8 +130,10 @@ def reduced_shape(video: VideoInfo, reduction: int) -> tuple[int, int]:
 
 
 def frames_to_decode(task: Task) -> int:
-    """Number of frames that `store` decodes in both passes."""
+    """Number of frames of which `store` tells its progress."""
     num_frames = task.video.num_frames
+    if isinstance(task.background, Living):
+        return num_frames
     return num_frames + len(range(0, num_frames, learning_step(num_frames, task.settings)))
 
 
@@ -213,10 +223,14 @@ def foreground_of(
     """
     video, settings = task.video, task.settings
     background = Mog2(settings) if task.background is None else task.background
-    masks = background.foreground(
-        _decoded(video, learning_step(video.num_frames, settings), seconds, advance),
-        _decoded(video, 1, seconds, advance),
-    )
+    frames = _decoded(read_frames(video), seconds, advance)
+    if isinstance(background, Living) and settings.first_look:
+        masks = background.masks(*look_first(video, frames, settings))
+    elif isinstance(background, Living):
+        masks = background.masks_as_they_come(reduce_frame(frame, settings) for frame in frames)
+    else:
+        learning = read_frames(video, learning_step(video.num_frames, settings))
+        masks = background.foreground(_decoded(learning, seconds, advance), frames)
     ignored = None if task.ignore is None else _ignored_pixels(task)
     index = -1
     for index, mask in enumerate(masks):
@@ -259,10 +273,9 @@ def _model_name(task: Task) -> str:
 
 
 def _decoded(
-    video: VideoInfo, step: int, seconds: dict[str, float], advance: Advance
+    frames: Iterator[UInt8[np.ndarray, "height width 3"]], seconds: dict[str, float], advance: Advance
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-    """Yield every `step`-th frame; adds the decoding time to `seconds`, and advances the progress bar by each frame."""
-    frames = read_frames(video, step)
+    """Yield frames; adds the time that they take to `seconds`, and advances the progress bar by each frame."""
     while True:
         started = time.perf_counter()
         frame = next(frames, None)

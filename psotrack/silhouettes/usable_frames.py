@@ -39,9 +39,13 @@ def foreground_is_everywhere(
     side = max(1, -(-max(height, width) // _PARTS))
     if not num_frames:
         return np.zeros(0, bool)
+    # Without foreground in most rows there is none in most parts, which is told much faster.
     rows, columns = np.arange(0, height, side), np.arange(0, width, side)
-    most = np.maximum.reduceat(np.maximum.reduceat(silhouettes, rows, axis=1), columns, axis=2)
-    return (most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS
+    of_rows = np.maximum.reduceat(silhouettes, rows, axis=1)
+    everywhere = (of_rows.max(axis=2) >= MIN_COVERAGE).mean(axis=1) > _MOST_PARTS
+    most = np.maximum.reduceat(of_rows[everywhere], columns, axis=2)
+    everywhere[everywhere] = (most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS
+    return everywhere
 
 
 def intervals_of(chosen: Bool[np.ndarray, "frames"], least_frames: int = 1) -> list[Interval]:

@@ -24,6 +24,8 @@ _Result = TypeVar("_Result")
 
 #: Time that the workers have to notice that the pipe is broken, seconds. `SystemExit` is raised in them after it.
 GRACE_S = 1.0
+#: Time between two messages of progress, seconds.
+_PROGRESS_S = 0.1
 #: Time that they have after that to remove their temporary files before they are killed, seconds.
 _CLEAN_UP_S = 5.0
 
@@ -129,6 +131,25 @@ def _receive(connection: Connection) -> Any:
         ) from error
 
 
+class _Progress:
+    """Tells the parent process of progress, some times per second: a message for each step would take its time."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection, self._steps, self._sent_s = connection, 0, 0.0
+
+    def advance(self, steps: int) -> None:
+        """See `Advance`; raises `BrokenPipeError` where the parent process has ended."""
+        self._steps += steps
+        if time.monotonic() - self._sent_s > _PROGRESS_S:
+            self.send()
+
+    def send(self) -> None:
+        """Send the steps that were not sent."""
+        if self._steps:
+            self._connection.send(self._steps)
+        self._steps, self._sent_s = 0, time.monotonic()
+
+
 def _serve(function: Callable[..., Any], connection: Connection) -> None:
     """Run a worker: receive tasks; send progress (int), results (index, result) and exceptions."""
     cv2.setNumThreads(1)
@@ -138,7 +159,9 @@ def _serve(function: Callable[..., Any], connection: Connection) -> None:
         while True:
             index, task = connection.recv()
             try:
-                result = function(task, connection.send)
+                progress = _Progress(connection)
+                result = function(task, progress.advance)
+                progress.send()
             except Exception as error:
                 if not isinstance(error, PsotrackError):  # a bug: its traceback would get lost in the pipe
                     error.add_note(f"in a worker process:\n{traceback.format_exc()}")

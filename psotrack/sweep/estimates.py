@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.silhouettes import open_stored, reduced_shape
+from psotrack.silhouettes import open_stored, reduced_shape, scaled_settings
 from psotrack.sweep.cells import Cell, cell_key
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance
@@ -167,7 +167,7 @@ def _rule_s(rows: pd.DataFrame) -> pd.Series:
 def _silhouettes_s(cell: Cell, inputs: Inputs) -> float:
     """Time of making a cell's missing silhouettes, with all processes."""
     recording, keys = inputs.recording_of(cell), inputs.keys_of(cell)
-    scaled = cell.settings.silhouettes.scaled([video.image_size_wh for video in recording.videos.values()])
+    scaled = scaled_settings(cell.settings.silhouettes, recording)
     megapixels = [
         video.num_frames * video.image_size_wh[0] * video.image_size_wh[1] / 1e6
         for name, video in recording.videos.items()
