@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -30,6 +30,9 @@ from psotrack.errors import SettingsError
 from psotrack.settings import RENAMED, USUAL_SPEED_M_S, Clocks, ErrorSettings, SwarmKind, TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.support import refuse_to_overwrite
+
+if TYPE_CHECKING:
+    from psotrack.recordings import Recording
 
 
 @click.command()
@@ -193,6 +196,18 @@ from psotrack.support import refuse_to_overwrite
 @click.option(
     "--smooth", is_flag=True, default=TRACK.smooth, help="Correct each frame's positions by later frames."
 )
+@click.option(
+    "--causal",
+    is_flag=True,
+    help="Track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.",
+)
+@click.option(
+    "--most-drones",
+    type=click.IntRange(min=1),
+    default=16,
+    show_default=True,
+    help="Largest number of drones at one time, for --causal.",
+)
 @silhouette_options
 @CAMERAS
 @frames_option
@@ -213,6 +228,8 @@ def track(
     json_path: Path | None,
     detector: str | None,
     detector_size: int,
+    causal: bool,
+    most_drones: int,
     **settings: Any,
 ) -> None:
     """Track the drones of SEQ from its videos, or from detections in them.
@@ -226,6 +243,7 @@ def track(
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
       psotrack track flight/recording.toml --out tracks.csv
       psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
+      psotrack track data/Simulated_Data/S02_D4_A --out as_live.csv --causal
       psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
@@ -241,7 +259,7 @@ def track(
     if out.suffix not in {".csv", ".parquet"}:
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
-    for path in (out, record_path, ambiguity_path):
+    for path in (out, record_path) if causal else (out, record_path, ambiguity_path):
         refuse_to_overwrite(path, force)
     chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
     parts = Parts(
@@ -259,6 +277,11 @@ def track(
         num_frames=num_frames,
         videos=detector is not None,
     )
+    if causal:
+        if detector is not None:
+            raise SettingsError("--detector", expected="none with --causal", found=detector)
+        _track_causally(recording, chosen, out, cache, jobs, most_drones, force, quiet, json_path, started)
+        return
     tracked = track_recording(
         recording,
         chosen,
@@ -279,6 +302,45 @@ def track(
         json_path,
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
         f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {record['real_time_factor']:.2g} of real time",
+    )
+
+
+def _track_causally(
+    recording: Recording,
+    settings: TrackSettings,
+    out: Path,
+    cache: Path | None,
+    jobs: int | None,
+    most_drones: int,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+    started: float,
+) -> None:
+    """Track a recording without the future, and write the rows of each frame as it is done."""
+    from psotrack.pipeline import CausalRecording, with_real_time
+    from psotrack.trajectories import RowStream
+
+    start_s = time.perf_counter() - started
+    run = CausalRecording(
+        recording,
+        settings,
+        cache=cache_folder(cache),
+        jobs=jobs,
+        most_drones=most_drones,
+        report=report_to(quiet),
+    )
+    with RowStream(out, force=force) as rows:
+        for frame in run:
+            rows.write(frame)
+    record = with_real_time(run.record, time.perf_counter() - started, start_s=start_s)
+    write_json(out.with_suffix(".json"), record)
+    output_json(json_path, record, force)
+    print_line(
+        quiet,
+        json_path,
+        f"{out}: {record['drones']} drones, {record['frames']} frames, {record['seconds']['total']:.1f} s, "
+        f"{record['real_time_factor']:.2g} of real time",
     )
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.geometry import Camera, match_views, sizes_m, to_camera, viewpoints
 from psotrack.initiation.initialisation import FLOOR_CLEARANCE_M, InitialState, find_drones
@@ -71,6 +71,20 @@ class KnownDrones:
 
 
 @dataclass(frozen=True)
+class Sighted:
+    """A drone in one frame.
+
+    Attributes:
+        frame: the frame, counted from the chunk's first frame.
+        position_m, velocity_m_s: (3,), position and velocity in this frame.
+    """
+
+    frame: int
+    position_m: Float[np.ndarray, "3"]
+    velocity_m_s: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
 class TrackCandidate:
     """A drone without a track.
 
@@ -81,6 +95,7 @@ class TrackCandidate:
         num_cameras: number of cameras that see the drone in this frame.
         moves: whether the drone moves. A candidate that does not move may be a ghost: foreground at a place where a
             drone stood while the background was learned.
+        last: the drone in the last frame in which it is found; None where it is not known.
     """
 
     frame: int
@@ -89,6 +104,7 @@ class TrackCandidate:
     size_m: Float[np.ndarray, "3"]
     num_cameras: int
     moves: bool
+    last: Sighted | None = None
 
 
 def find_candidates(
@@ -264,17 +280,33 @@ def _make_candidate(
         places = _places(path)[rows]
         if np.linalg.norm(places[-1] - places[0]) * fps > max_speed_m_s * (rows[-1] - rows[0]):
             continue
-        # A drone turns within half a second, and the ends of a straight line would be wrong by centimetres.
-        _, velocity, position = np.polyfit((rows - frame) / fps, places, 2)
+        position, velocity = _state_at(frame, rows, places, fps, max_speed_m_s)
+        last = np.flatnonzero(found)[-WINDOW_FRAMES:]
         return TrackCandidate(
             frame=frame,
             position_m=position,
-            velocity_m_s=velocity * min(1.0, max_speed_m_s / max(float(np.linalg.norm(velocity)), 1e-9)),
+            velocity_m_s=velocity,
             size_m=size_m,
             num_cameras=path[frame].num_cameras,
             moves=_is_moving(_places(path)[found], float(size_m.max())),
+            last=Sighted(
+                int(last[-1]), *_state_at(int(last[-1]), last, _places(path)[last], fps, max_speed_m_s)
+            ),
         )
     return None
+
+
+def _state_at(
+    frame: int,
+    rows: Int[np.ndarray, "rows"],
+    places_m: Float[np.ndarray, "rows 3"],
+    fps: float,
+    max_speed_m_s: float,
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Position and velocity in a frame, from the places in some frames."""
+    # A drone turns within half a second, and the ends of a straight line would be wrong by centimetres.
+    _, velocity, position = np.polyfit((rows - frame) / fps, places_m, 2)
+    return position, velocity * min(1.0, max_speed_m_s / max(float(np.linalg.norm(velocity)), 1e-9))
 
 
 def _is_moving(places_m: Float[np.ndarray, "places 3"], span_m: float) -> bool:

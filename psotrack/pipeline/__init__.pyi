@@ -1,10 +1,14 @@
+from .causal_run import CausalRecording, CausalRun, causal_settings
 from .parts import Parts
 from .results import TrackedRecording, environment, with_real_time
 from .running import track_recording, track_runs
 
 __all__ = [
+    "CausalRecording",
+    "CausalRun",
     "Parts",
     "TrackedRecording",
+    "causal_settings",
     "environment",
     "track_recording",
     "track_runs",

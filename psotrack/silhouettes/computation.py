@@ -248,7 +248,12 @@ def compute(
     )
     shape = (max(heights), max(widths))
     stored = {name: _open(task) for name, task in tasks.items()}
-    unusable = {name: intervals for name, array in stored.items() if (intervals := left_out(array))}
+    # Without the future, whoever reads a frame decides about this frame.
+    unusable = {
+        name: intervals
+        for name, array in stored.items()
+        if (intervals := left_out(array)) and scaled.first_look
+    }
     arrays = {name: _without(array, unusable.get(name, [])) for name, array in stored.items()}
     for name, intervals in unusable.items():
         _say_left_out(name, tasks[name], intervals)

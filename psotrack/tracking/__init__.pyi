@@ -1,4 +1,5 @@
 from .camera_middles import CameraMiddles, middles_in_cameras
+from .causal import CausalRow, CausalTracker
 from .chunks import RunInputs, on_device, track_silhouettes
 from .fitness import (
     PAPER_SCORE,
@@ -17,6 +18,8 @@ __all__ = [
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
     "CameraMiddles",
+    "CausalRow",
+    "CausalTracker",
     "ParticleSwarm",
     "RunInputs",
     "Score",

@@ -1,6 +1,7 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import read_trajectories, write_ambiguity, write_trajectories
 from .resampling import resample
+from .row_streams import RowStream
 from .tracks import Arrival, DroneSizes, Tracks, unknown_value
 from .trajectories import Status, Trajectories
 
@@ -9,6 +10,7 @@ __all__ = [
     "UNASSIGNED",
     "Arrival",
     "DroneSizes",
+    "RowStream",
     "Status",
     "Tracks",
     "Trajectories",

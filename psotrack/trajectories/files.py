@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -75,7 +75,7 @@ def write_trajectories(path: Path | str, trajectories: Trajectories, *, force: b
     path = Path(path)
     write = _by_suffix(path, {".csv": _write_csv, ".parquet": _write_parquet})
     refuse_to_overwrite(path, force)
-    columns = _to_columns(trajectories)
+    columns = columns_of(trajectories)
     with atomic_write(path) as temporary:
         write(temporary, columns)
 
@@ -165,7 +165,7 @@ def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
 # Writing
 
 
-def _to_columns(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
+def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
     """One array per column; unknown values are NaN, and -1 in `num_cameras`."""
     shape = (trajectories.num_frames, trajectories.num_drones)
     unknown = np.full(shape, np.nan, np.float32)
@@ -202,14 +202,25 @@ def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) ->
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        # NumPy writes the shortest digits that read back as the same number in the array's own precision.
-        words = [np.where(_known(column), column.astype(str), "") for column in columns.values()]
-        writer.writerows(zip(*words, strict=True))
+        writer.writerows(words_of(columns))
+
+
+def words_of(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> Iterator[tuple[str, ...]]:
+    """The words of each row of a CSV file."""
+    # NumPy writes the shortest digits that read back as the same number in the array's own precision.
+    words = [np.where(_known(column), column.astype(str), "") for column in columns.values()]
+    return zip(*words, strict=True)
 
 
 def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
-    import pyarrow as pa
     import pyarrow.parquet as pq
+
+    pq.write_table(parquet_table(columns), path)
+
+
+def parquet_table(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> pa.Table:
+    """The columns as a table with units and schema version."""
+    import pyarrow as pa
 
     types = {"frame": pa.int64(), "drone": pa.string(), "num_cameras": pa.int32(), "status": pa.string()}
     arrays = {
@@ -218,7 +229,7 @@ def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]
     }
     units = {name: _READ[name] for name in columns}
     metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
-    pq.write_table(pa.table(arrays).replace_schema_metadata(metadata), path)
+    return pa.table(arrays).replace_schema_metadata(metadata)
 
 
 def _known(column: Shaped[np.ndarray, "rows"]) -> Shaped[np.ndarray, "rows"]:
