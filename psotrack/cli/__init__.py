@@ -63,6 +63,10 @@ COMMANDS = {
     "labels": LazyCommand(
         "psotrack.cli.labels", "Write a YOLO training set from sequences with a reference."
     ),
+    "live": LazyCommand(
+        "psotrack.cli.live",
+        "Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.",
+    ),
     "localise": LazyCommand(
         "psotrack.cli.localise",
         "Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.",

@@ -29,7 +29,7 @@ from .recording_file import (
     write_recording_file,
 )
 from .timestamps import read_timestamps
-from .timing import FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
+from .timing import REACH, FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
 from .video import (
     TruncatedVideoError,
     VideoInfo,
@@ -45,6 +45,7 @@ from .video import (
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "REACH",
     "RECORDING_FILE",
     "CameraTable",
     "Detections",

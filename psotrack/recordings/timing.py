@@ -18,7 +18,7 @@ from psotrack.support import short_repr
 
 #: Largest distance of a frame from an instant at which the frame is shown, in intervals of the frame's camera: half an
 #: interval, and a tenth for times that jitter.
-_REACH = 0.6
+REACH = 0.6
 #: Times nearer than this share of an interval are one time: rates such as 30000/1001 are rounded in files.
 _SAME = 1e-6
 #: Lowest and highest rate of a camera with which drones are tracked, frames per second. With one frame in a quarter of
@@ -265,7 +265,7 @@ def _of_equal_frames(names: tuple[str, ...], times: list[FrameTimes], longest: F
 
 
 def _of_nearest_frames(names: tuple[str, ...], times: list[FrameTimes], rate_hz: float) -> Timeline:
-    last_s = max((each.time_s[-1] + _REACH / each.fps for each in times if each.num_frames), default=-1.0)
+    last_s = max((each.time_s[-1] + REACH / each.fps for each in times if each.num_frames), default=-1.0)
     time_s = np.arange(max(0, int(np.floor(last_s * rate_hz)) + 1)) / rate_hz
     frame = np.full((len(time_s), len(times)), -1)
     offset_s = np.zeros(frame.shape)
@@ -295,7 +295,7 @@ def nearest_frames(
     own_s = times.time_s
     nearest = _nearest(own_s, at_s)
     off_s = own_s[nearest] - at_s
-    there = np.abs(off_s) * times.fps <= _REACH
+    there = np.abs(off_s) * times.fps <= REACH
     return np.where(there, nearest, -1), np.where(there, off_s, 0.0)
 
 

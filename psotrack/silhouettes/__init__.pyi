@@ -11,11 +11,11 @@ from .computation import (
     usual_drone_px,
 )
 from .exposures import Exposures, moved_by
-from .foreground import BackgroundModel, Mog2
+from .foreground import BackgroundModel, Mog2, coverage, reduce_frame
 from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
-from .store import Task, frames_to_decode, key_of, open_stored, reduced_shape
+from .store import Task, frames_to_decode, ignored_pixels, key_of, open_stored, reduced_shape
 from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
@@ -39,17 +39,20 @@ __all__ = [
     "box_sum",
     "check_whole",
     "compute",
+    "coverage",
     "exposures_of",
     "find_background",
     "find_blobs",
     "foreground_is_everywhere",
     "frames_to_decode",
+    "ignored_pixels",
     "key_of",
     "masks_out",
     "moved_by",
     "of_packed_box_sums",
     "open_stored",
     "pack",
+    "reduce_frame",
     "reduced_shape",
     "scaled_settings",
     "silhouette_keys",

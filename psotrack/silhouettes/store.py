@@ -231,7 +231,11 @@ def foreground_of(
     else:
         learning = read_frames(video, learning_step(video.num_frames, settings))
         masks = background.foreground(_decoded(learning, seconds, advance), frames)
-    ignored = None if task.ignore is None else _ignored_pixels(task)
+    ignored = (
+        None
+        if task.ignore is None
+        else ignored_pixels(task.ignore, video.path.name, video.image_size_wh, settings.working_reduction)
+    )
     index = -1
     for index, mask in enumerate(masks):
         _check_mask(mask, index, task)
@@ -242,15 +246,25 @@ def foreground_of(
         )
 
 
-def _ignored_pixels(task: Task) -> Bool[np.ndarray, "working_height working_width"]:
-    """Pixels of the masks of which a part is ignored."""
-    assert task.ignore is not None
-    reduction = task.settings.working_reduction
-    white = (read_mask(task.ignore) > _GREY).astype(np.uint8)
-    width, height = task.video.image_size_wh
+def ignored_pixels(
+    ignore: Path, video: object, image_size_wh: tuple[int, int], reduction: int
+) -> Bool[np.ndarray, "working_height working_width"]:
+    """Pixels of the masks of which a part is ignored.
+
+    Args:
+        ignore: image that is white where nothing counts as foreground.
+        video: name of the video, for messages.
+        image_size_wh: width and height of the video's images, pixels.
+        reduction: image pixels per pixel of the masks, along each side.
+
+    Raises:
+        InputError: the image cannot be read, or has another size.
+    """
+    white = (read_mask(ignore) > _GREY).astype(np.uint8)
+    width, height = image_size_wh
     if white.shape != (height, width):
-        expected = f"{width} x {height} pixels as in {task.video.path.name}"
-        raise InputError(task.ignore, expected=expected, found=f"{white.shape[1]} x {white.shape[0]}")
+        expected = f"{width} x {height} pixels as in {video}"
+        raise InputError(ignore, expected=expected, found=f"{white.shape[1]} x {white.shape[0]}")
     return coverage(255 * white, reduction) > 0
 
 

@@ -288,7 +288,7 @@ class CausalTracker:
         # What was remembered of this place is of another drone.
         for index, frame in enumerate(self._memory):
             status = np.array(frame.info.status)
-            status[place] = Status.LOST
+            status[place : place + 1] = Status.LOST  # none in frames before the places were extended
             self._memory[index] = replace(frame, info=replace(frame.info, status=status))
         return place
 

@@ -1,0 +1,262 @@
+"""`psotrack live`: drones while the cameras film."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from psotrack.cli.options import (
+    CACHE,
+    CAMERAS,
+    FORCE,
+    JSON,
+    QUIET,
+    SEQUENCE,
+    TRACK,
+    cache_folder,
+    camera_names,
+    compiled_folder,
+    silhouette_options,
+)
+from psotrack.cli.output import output_json, print_line, write_json
+from psotrack.errors import SettingsError
+from psotrack.settings import RENAMED, TrackSettings
+from psotrack.silhouettes import SilhouetteSettings
+from psotrack.support import refuse_to_overwrite
+
+if TYPE_CHECKING:
+    from psotrack.live import LiveResult, LiveSession
+
+#: Time between two changes of the table on the terminal, seconds.
+_SHOWN_S = 0.5
+
+
+@click.command()
+@SEQUENCE
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="File of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end.",
+)
+@click.option("--replay", is_flag=True, help="Play the videos of SEQ at their own rate, instead of cameras.")
+@click.option(
+    "--speed",
+    type=click.FloatRange(min=0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Seconds of video per second, for --replay.",
+)
+@click.option(
+    "--loops",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="How often the videos are played, for --replay.",
+)
+@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after this time.")
+@click.option("--lines", is_flag=True, help="Write each row as a line of JSON to stdout.")
+@click.option("--udp", metavar="HOST:PORT", help="Send each row as a line of JSON by UDP.")
+@click.option(
+    "--particles",
+    type=int,
+    default=TRACK.swarm.particles,
+    show_default=True,
+    help="Particles of every swarm.",
+)
+@click.option(
+    "--iterations", type=int, default=TRACK.swarm.iterations, show_default=True, help="Iterations per frame."
+)
+@click.option("--drones", type=int, metavar="N", help="Number of drones, if it is known.")
+@click.option(
+    "--most-drones",
+    type=click.IntRange(min=1),
+    default=16,
+    show_default=True,
+    help="Largest number of drones at one time.",
+)
+@silhouette_options
+@CAMERAS
+@CACHE
+@FORCE
+@QUIET
+@JSON
+def live(
+    sequence: Path,
+    out: Path | None,
+    replay: bool,
+    speed: float,
+    loops: int,
+    seconds: float | None,
+    lines: bool,
+    udp: str | None,
+    most_drones: int,
+    cameras: str | None,
+    cache: Path | None,
+    force: bool,
+    quiet: bool,
+    json_path: Path | None,
+    **settings: Any,
+) -> None:
+    """Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.
+
+    SEQ is a recording.toml whose cameras have the number of a device or the address of a stream as `video`. A table on
+    the terminal shows the drones, the delay, and what was lost of each camera. Ctrl-C ends the session; all rows so far
+    are written. The tracks are those of `psotrack track --causal`, where nothing is lost.
+
+    \b
+    Examples:
+      psotrack live lab/recording.toml --out tracks.csv
+      psotrack live lab/recording.toml --udp 127.0.0.1:9000
+      psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
+      psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
+    """
+    from psotrack.datasets import open_recording
+    from psotrack.live import JsonLines, LiveSession, UdpLines, live_cameras
+    from psotrack.pipeline import environment
+    from psotrack.support import keep_compiled
+    from psotrack.trajectories import RowStream
+
+    if out is None and not lines and udp is None:
+        raise SettingsError("--out", expected="--out FILE, --lines or --udp", found="none of them")
+    if out is not None and out.suffix not in {".csv", ".parquet"}:
+        raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
+    for path in () if out is None else (out, out.with_suffix(".json")):
+        refuse_to_overwrite(path, force)
+    chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
+    keep_compiled(compiled_folder(cache))
+    cache_folder(cache)
+    recording = open_recording(sequence)
+    if replay:
+        recording = recording.usable(camera_names(cameras))
+    used = live_cameras(recording, replay=replay, speed=speed, loops=loops)
+    names = camera_names(cameras)
+    used = [camera for camera in used if names is None or camera.name in names]
+    first_s = float(recording.timeline().time_s[0]) if replay else 0.0
+    session = LiveSession(recording, used, chosen, most_drones=most_drones, first_s=first_s)
+    outputs: list[Any] = [JsonLines(sys.stdout)] if lines else []
+    outputs += [] if udp is None else [UdpLines(udp)]
+    session.compile()
+    with _Table(quiet or lines) as table, _ended_by_ctrl_c(session):
+        show = table.show if seconds is None else _until(seconds, session, table.show)
+        if out is None:
+            result = session.run(outputs, show)
+        else:
+            with RowStream(out, force=force) as rows:
+                result = session.run([rows, *outputs], show)
+    record = _record(result) | environment()
+    if out is not None:
+        write_json(out.with_suffix(".json"), record)
+    output_json(json_path, record, force)
+    print_line(
+        quiet or lines,
+        json_path,
+        f"{out or 'live'}: {len(result.drones)} drones, {result.instants} frames, "
+        f"delay {1e3 * record['delay_s']['median']:.0f} ms, {result.left_out} frames left out",
+    )
+
+
+def _setting_name(option: str) -> str:
+    """Dotted name of the setting that an option sets."""
+    if option in SilhouetteSettings.__struct_fields__:
+        return f"silhouettes.{option}"
+    return RENAMED.get(option, option)
+
+
+def _record(result: LiveResult) -> dict[str, Any]:
+    """What a session has done, fit for JSON."""
+    import numpy as np
+
+    delay_s = np.array(result.delay_s or [np.nan])
+    return {
+        "live": True,
+        "frames": result.instants,
+        "left_out": result.left_out,
+        "drones": sorted(result.drones, key=int),
+        "seconds": round(result.seconds, 3),
+        "delay_s": {
+            "median": float(np.median(delay_s)),
+            "p99": float(np.quantile(delay_s, 0.99)),
+            "max": float(delay_s.max()),
+        },
+        "cameras": {name: dict(vars(counts)) for name, counts in result.counts.items()},
+    }
+
+
+class _Table:
+    """A table on the terminal; shows nothing where stderr is no terminal."""
+
+    def __init__(self, hidden: bool) -> None:
+        self._hidden, self._shown_s = hidden, 0.0
+
+    def __enter__(self) -> _Table:
+        from rich.console import Console
+        from rich.live import Live
+
+        console = Console(stderr=True)
+        self._hidden = self._hidden or not console.is_terminal
+        self._live = None if self._hidden else Live(console=console, auto_refresh=False, transient=True)
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, result: LiveResult, films: list[bool]) -> None:
+        """Show what the session has done so far."""
+        if self._live is None or time.monotonic() - self._shown_s < _SHOWN_S:
+            return
+        import numpy as np
+        from rich.table import Table
+
+        self._shown_s = time.monotonic()
+        recent_ms = 1e3 * np.array(result.delay_s[-250:])
+        rate_hz = result.instants / max(result.seconds, 1e-3)
+        table = Table(
+            title=f"{len(result.drones)} drones, {rate_hz:.1f} frames/s, delay {np.median(recent_ms):.0f} ms "
+            f"(99 %: {np.quantile(recent_ms, 0.99):.0f}), {result.left_out} left out"
+        )
+        for column in ("camera", "", "frames", "missing", "late", "twice", "left out", "stops"):
+            table.add_column(column, justify="left" if column in ("camera", "") else "right")
+        for (name, counts), there in zip(result.counts.items(), films, strict=True):
+            table.add_row(
+                name, "films" if there else "silent", *(f"{value}" for value in vars(counts).values())
+            )
+        self._live.update(table, refresh=True)
+
+
+def _until(
+    seconds: float, session: LiveSession, show: Callable[[LiveResult, list[bool]], None]
+) -> Callable[[LiveResult, list[bool]], None]:
+    """Show the result, and end the session after a time."""
+
+    def shown(result: LiveResult, films: list[bool]) -> None:
+        show(result, films)
+        if result.seconds >= seconds:
+            session.stop()
+
+    return shown
+
+
+@contextlib.contextmanager
+def _ended_by_ctrl_c(session: LiveSession) -> Iterator[None]:
+    """Ctrl-C ends the session, instead of the program."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        session.stop()
+
+    before = {each: signal.signal(each, end) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)

@@ -1,0 +1,250 @@
+"""Frames of several cameras meet at instants, by their times, while they come.
+
+Instants follow one another by 1 / rate. At an instant each camera shows its nearest frame. An instant is complete when
+no camera that films can still bring a nearer frame, or when it has waited long enough: a camera without a frame by then
+is missing in the instant. A camera that has been silent for long is not waited for, until it films again.
+
+No clock and no thread is used here: the caller says what time it is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from psotrack.recordings import REACH
+
+#: A frame is the nearest one if the next frame, which comes this share of an interval later at least, is farther away.
+_LEAST_INTERVAL = 0.8
+#: A frame that comes sooner after the one before, in intervals, is the same frame again.
+_DOUBLED = 0.3
+#: A camera that was silent for so long has stopped, seconds.
+STOPPED_S = 1.0
+
+
+@dataclass
+class CameraCounts:
+    """What happened to the frames of one camera.
+
+    Attributes:
+        frames: frames that came in time.
+        missing: instants without a frame of the camera while it filmed.
+        late: frames that came after their instant was over.
+        doubled: frames that came twice.
+        left_out: frames that were not processed, because the computer was too slow.
+        stops: how often the camera stopped.
+    """
+
+    frames: int = 0
+    missing: int = 0
+    late: int = 0
+    doubled: int = 0
+    left_out: int = 0
+    stops: int = 0
+
+
+@dataclass(frozen=True)
+class Instant:
+    """The frames of all cameras that meet at an instant.
+
+    Attributes:
+        number: number of the instant.
+        time_s: its time, seconds.
+        coverage: silhouette of each camera, by the camera's index; None where a camera has no frame.
+        offset_s: (cameras,), time of each camera's frame minus the instant's, seconds; 0 where there is none.
+        arrived_s: when the last of the frames came, on the caller's clock.
+    """
+
+    number: int
+    time_s: float
+    coverage: list[UInt8[np.ndarray, "height width"] | None]
+    offset_s: Float[np.ndarray, "cameras"]
+    arrived_s: float
+
+
+@dataclass
+class _Camera:
+    """A camera's last frames, and its state."""
+
+    interval_s: float
+    frames: deque[tuple[float, UInt8[np.ndarray, "height width"], float]] = field(default_factory=deque)
+    last_time_s: float = -np.inf
+    last_came_s: float = -np.inf
+    in_work_s: float | None = None
+    films: bool = False
+    has_ended: bool = False
+    counts: CameraCounts = field(default_factory=CameraCounts)
+
+
+class Meeting:
+    """Brings frames together.
+
+    Args:
+        fps: frames per second of each camera.
+        rate_hz: instants per second.
+        wait_s: how long an instant waits for cameras, from its first frame on, seconds.
+        began_s: when the cameras began, on the caller's clock: none has stopped before.
+        first_s: time of the first instant, seconds.
+
+    Attributes:
+        counts: counts of each camera.
+    """
+
+    def __init__(
+        self, fps: list[float], rate_hz: float, *, wait_s: float, began_s: float, first_s: float = 0.0
+    ) -> None:
+        self._cameras = [_Camera(1 / each) for each in fps]
+        for camera in self._cameras:
+            camera.last_came_s = began_s
+            camera.films = True
+        self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
+        self._wait_s, self._first_s = wait_s, first_s
+        self._next = 0
+
+    @property
+    def counts(self) -> list[CameraCounts]:
+        """Counts of each camera."""
+        return [camera.counts for camera in self._cameras]
+
+    @property
+    def films(self) -> list[bool]:
+        """Whether each camera films."""
+        return [camera.films for camera in self._cameras]
+
+    def announce(self, index: int, time_s: float, now_s: float) -> bool:
+        """A frame of a camera has come, and is in work: its instant waits for `put` or `leave_out`.
+
+        Returns:
+            Whether the camera has come back with it.
+        """
+        camera = self._cameras[index]
+        is_back = not camera.films and not camera.has_ended
+        camera.films, camera.last_came_s, camera.in_work_s = True, now_s, time_s
+        return is_back
+
+    def leave_out(self, index: int) -> None:
+        """The announced frame is not processed."""
+        camera = self._cameras[index]
+        if camera.in_work_s is not None:
+            camera.last_time_s = max(camera.last_time_s, camera.in_work_s)
+        camera.in_work_s = None
+        camera.counts.left_out += 1
+
+    def put(
+        self, index: int, time_s: float, coverage: UInt8[np.ndarray, "height width"], arrived_s: float
+    ) -> None:
+        """The silhouette of a frame.
+
+        Args:
+            index: the camera.
+            time_s: when the frame was filmed, on the recording's clock.
+            coverage: the silhouette.
+            arrived_s: when the frame came, on the caller's clock.
+        """
+        camera = self._cameras[index]
+        camera.in_work_s = None
+        if time_s - camera.last_time_s < _DOUBLED * camera.interval_s:
+            camera.counts.doubled += 1
+            return
+        camera.last_time_s = time_s
+        if time_s + REACH * camera.interval_s < self._next_s:
+            camera.counts.late += 1
+            return
+        camera.counts.frames += 1
+        camera.frames.append((time_s, coverage, arrived_s))
+
+    def end(self, index: int) -> None:
+        """A camera has ended for good: it is not waited for."""
+        camera = self._cameras[index]
+        camera.films, camera.has_ended = False, True
+
+    def stopped(self, now_s: float) -> list[int]:
+        """Cameras that have just stopped; they are not waited for until they film again."""
+        found = []
+        for index, camera in enumerate(self._cameras):
+            if camera.films and now_s - camera.last_came_s > STOPPED_S:
+                camera.films = False
+                camera.counts.stops += 1
+                found.append(index)
+        return found
+
+    @property
+    def _next_s(self) -> float:
+        """Time of the next instant."""
+        return self._first_s + self._next / self._rate_hz
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether all cameras have ended, and no frame waits."""
+        return all(camera.has_ended and not camera.frames for camera in self._cameras)
+
+    def take(self, now_s: float) -> Instant | None:
+        """The next instant, if it is complete or has waited long enough; instants that no camera films are passed."""
+        while True:
+            at_s = self._next_s
+            came_s = [
+                frame[2]
+                for camera in self._cameras
+                for frame in camera.frames
+                if abs(frame[0] - at_s) <= REACH * camera.interval_s
+            ]
+            if not came_s:
+                if not self._is_over(at_s):
+                    return None
+                self._next += 1
+                continue
+            if any(_is_in_work(camera, at_s) for camera in self._cameras):
+                return None
+            undecided = [camera for camera in self._cameras if camera.films and not _is_decided(camera, at_s)]
+            if undecided and now_s - min(came_s) < self._wait_s:
+                return None
+            return self._taken(at_s)
+
+    def deadline_s(self) -> float | None:
+        """When the next instant has waited long enough; None while no frame waits."""
+        came_s = [camera.frames[0][2] for camera in self._cameras if camera.frames]
+        return min(came_s) + self._wait_s if came_s else None
+
+    def _is_over(self, at_s: float) -> bool:
+        """Whether a later frame shows that an instant that no frame shows will stay without frames."""
+        later = any(camera.frames and camera.frames[0][0] > at_s for camera in self._cameras)
+        return later and all(
+            not camera.films or camera.last_time_s > at_s + REACH * camera.interval_s
+            for camera in self._cameras
+        )
+
+    def _taken(self, at_s: float) -> Instant:
+        coverage: list[UInt8[np.ndarray, "height width"] | None] = []
+        offset_s = np.zeros(len(self._cameras))
+        arrived_s = -np.inf
+        for index, camera in enumerate(self._cameras):
+            reach_s = REACH * camera.interval_s
+            near = [frame for frame in camera.frames if abs(frame[0] - at_s) <= reach_s]
+            if not near:
+                coverage.append(None)
+                camera.counts.missing += camera.films
+            else:
+                time_s, image, came_s = min(near, key=lambda frame: abs(frame[0] - at_s))
+                coverage.append(image)
+                off_s = time_s - at_s
+                offset_s[index] = off_s if abs(off_s) >= 1e-6 * self._period_s else 0.0
+                arrived_s = max(arrived_s, came_s)
+            # The next instant needs no frame that is too far before it.
+            while camera.frames and camera.frames[0][0] + reach_s < at_s + self._period_s:
+                camera.frames.popleft()
+        instant = Instant(self._next, at_s, coverage, offset_s, float(arrived_s))
+        self._next += 1
+        return instant
+
+
+def _is_decided(camera: _Camera, at_s: float) -> bool:
+    """Whether no frame that is still to come can be nearer to an instant than those that came."""
+    return camera.last_time_s >= at_s - _LEAST_INTERVAL / 2 * camera.interval_s
+
+
+def _is_in_work(camera: _Camera, at_s: float) -> bool:
+    """Whether a frame that an instant may show is in work."""
+    return camera.in_work_s is not None and abs(camera.in_work_s - at_s) <= REACH * camera.interval_s

@@ -1,0 +1,82 @@
+"""Rows as messages: one line of JSON per drone and instant, on a stream of text or by UDP."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Any, TextIO
+
+from psotrack.errors import OutputError, SettingsError
+from psotrack.trajectories import Status, Trajectories
+
+
+def lines_of(rows: Trajectories) -> list[str]:
+    """One line of JSON for each drone: frame, time_s, drone, position_m, velocity_m_s, covariance_m2, status."""
+    assert rows.velocity_m_s is not None
+    assert rows.covariance_m2 is not None
+    assert rows.status is not None
+    lines = []
+    for index, drone in enumerate(rows.drones):
+        content: dict[str, Any] = {
+            "frame": int(rows.frame[0]),
+            "time_s": float(rows.time_s[0]),
+            "drone": drone,
+            "position_m": rows.position_m[0, index].tolist(),
+            "velocity_m_s": rows.velocity_m_s[0, index].tolist(),
+            "covariance_m2": rows.covariance_m2[0, index].tolist(),
+            "status": Status(int(rows.status[0, index])).label,
+        }
+        lines.append(json.dumps(content))
+    return lines
+
+
+class JsonLines:
+    """Writes rows to a stream of text, such as stdout."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, rows: Trajectories) -> None:
+        """Write the rows of an instant."""
+        for line in lines_of(rows):
+            self._stream.write(line + "\n")
+        self._stream.flush()
+
+
+class UdpLines:
+    """Sends rows by UDP, a datagram per drone and instant.
+
+    Args:
+        address: HOST:PORT.
+
+    Raises:
+        SettingsError: the address is none.
+    """
+
+    def __init__(self, address: str) -> None:
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise SettingsError("--udp", expected="HOST:PORT, such as 127.0.0.1:9000", found=address)
+        try:
+            family, _, _, _, target = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
+        except OSError as error:
+            raise SettingsError("--udp", expected="a host that is known", found=host) from error
+        self._address = address
+        self._target = target
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+
+    def write(self, rows: Trajectories) -> None:
+        """Send the rows of an instant.
+
+        Raises:
+            OutputError: the network refuses.
+        """
+        try:
+            for line in lines_of(rows):
+                self._socket.sendto(line.encode(), self._target)
+        except ConnectionRefusedError:
+            return  # nobody listens on this machine yet
+        except OSError as error:
+            raise OutputError(
+                self._address, expected="to send rows", found=error.strerror or f"{error}"
+            ) from error

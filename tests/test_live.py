@@ -1,0 +1,285 @@
+"""`psotrack live`: replayed files give the tracks of `track --causal`; cameras on the network stop and come back."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import make_once
+
+from psotrack.datasets import open_recording
+from psotrack.rig_files import write_rig
+from psotrack.simulation import SimulationSettings, simulate
+from psotrack.trajectories import read_trajectories
+
+pytestmark = pytest.mark.slow
+
+#: Few, small cameras: a machine that is busy with other tests must keep up with the replay.
+CAMERAS, NUM_FRAMES, SCALE = ("cam1", "cam3", "cam5", "cam7"), 50, 0.35
+EFFORT = ["--particles", "20", "--iterations", "15"]
+
+#: A camera on the network: sends the frames of a video again and again as JPEG images over HTTP, 10 per second, because
+#: a busy machine must keep up.
+CAMERA = """
+import http.server, itertools, sys, time
+import cv2
+
+path, port = sys.argv[1], int(sys.argv[2])
+capture, images = cv2.VideoCapture(path), []
+while True:
+    there, frame = capture.read()
+    if not there:
+        break
+    images.append(cv2.imencode(".jpg", frame)[1].tobytes())
+
+class Camera(http.server.BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.end_headers()
+        while True:
+            # All cameras show the same moment, as cameras of one room do.
+            image = images[int(time.time() * 10) % len(images)]
+            head = f"--frame\\r\\nContent-Type: image/jpeg\\r\\nContent-Length: {len(image)}\\r\\n\\r\\n"
+            self.wfile.write(head.encode() + image + b"\\r\\n")
+            time.sleep(0.1 - time.time() % 0.1)
+
+    def log_message(self, *arguments):
+        pass
+
+http.server.ThreadingHTTPServer(("127.0.0.1", port), Camera).serve_forever()
+"""
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    def make(folder: Path) -> None:
+        settings = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+        simulate("S02_D4_A", folder, settings, jobs=2)
+
+    return make_once(tmp_path_factory, "live_sequence", make) / "Simulated_Data" / "S02_D4_A"
+
+
+@pytest.fixture
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.getbasetemp() / "live_cache"
+
+
+def _psotrack(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "psotrack", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        **more,  # type: ignore[call-overload]
+    )
+
+
+def _free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+@pytest.fixture
+def cameras() -> Iterator[dict[int, subprocess.Popen[bytes]]]:
+    """Processes of cameras, by port; ended after the test."""
+    processes: dict[int, subprocess.Popen[bytes]] = {}
+    yield processes
+    for process in processes.values():
+        process.kill()
+        process.wait()
+
+
+def _film(processes: dict[int, subprocess.Popen[bytes]], video: Path, port: int) -> None:
+    """Start a camera, and wait until it answers."""
+    processes[port] = subprocess.Popen([sys.executable, "-c", CAMERA, str(video), str(port)])
+    for _ in range(300):
+        with socket.socket() as one:
+            if one.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
+    raise AssertionError(f"no camera answers at port {port}")
+
+
+def _laboratory(folder: Path, sequence: Path, addresses: dict[str, str]) -> Path:
+    """A recording.toml of cameras on the network, with the rig of a sequence."""
+    rig = open_recording(sequence).rig.select(list(addresses))
+    write_rig(folder / "rig.toml", rig)
+    lines = ["version = 1", 'calibration = "rig.toml"']
+    for name, address in addresses.items():
+        lines += [f"[cameras.{name}]", f'video = "{address}"', "fps = 10"]
+    path = folder / "recording.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_replay_without_losses_gives_the_tracks_of_the_offline_twin(
+    sequence: Path, cache: Path, tmp_path: Path
+) -> None:
+    common = ["--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
+    offline = _psotrack("track", sequence, "--causal", "--out", tmp_path / "offline.csv", *common)
+    assert offline.returncode == 0, offline.stderr
+    # Slow enough for a machine that is busy with other tests.
+    live = _psotrack("live", sequence, "--replay", "--speed", "0.1", "--out", tmp_path / "live.csv", *common)
+    assert live.returncode == 0, live.stderr
+    record = json.loads((tmp_path / "live.json").read_text())
+    assert record["frames"] == NUM_FRAMES
+    assert record["left_out"] == 0
+    assert (tmp_path / "live.csv").read_bytes() == (tmp_path / "offline.csv").read_bytes()
+    tracks = read_trajectories(tmp_path / "live.csv")
+    assert tracks.num_drones >= 3
+    # No row depends on a later frame: a shorter recording gives the beginning of the same table.
+    short = _psotrack("track", sequence, "--causal", "--frames", 35, "--out", tmp_path / "short.csv", *common)
+    assert short.returncode == 0, short.stderr
+    assert (tmp_path / "live.csv").read_text().startswith((tmp_path / "short.csv").read_text())
+
+
+def test_rows_come_as_lines_and_by_udp(sequence: Path, cache: Path, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(1.0)
+        port = receiver.getsockname()[1]
+        done = _psotrack(
+            "live", sequence, "--replay", "--speed", "0.1", "--lines", "--udp", f"127.0.0.1:{port}",
+            "--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        sent = []
+        receiver.setblocking(False)
+        while True:
+            try:
+                sent.append(receiver.recv(65536).decode())
+            except BlockingIOError:
+                break
+    lines = done.stdout.splitlines()
+    assert lines
+    assert sent == lines
+    rows = [json.loads(line) for line in lines]
+    assert set(rows[0]) == {
+        *("frame", "time_s", "drone", "position_m", "velocity_m_s", "covariance_m2", "status")
+    }
+    assert np.shape(rows[0]["covariance_m2"]) == (3, 3)
+    assert [row["frame"] for row in rows] == sorted(row["frame"] for row in rows)
+
+
+def test_cameras_on_the_network_stop_and_come_back(
+    sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
+) -> None:
+    ports = {name: _free_port() for name in CAMERAS}
+    for name, port in ports.items():
+        _film(cameras, sequence / f"{name}i_s.avi", port)
+    laboratory = _laboratory(
+        tmp_path, sequence, {name: f"http://127.0.0.1:{port}/" for name, port in ports.items()}
+    )
+    options = ["--out", f"{tmp_path / 'live.csv'}", "--cache", f"{cache}", "--most-drones", "4", *EFFORT]
+    live = subprocess.Popen(
+        [sys.executable, "-m", "psotrack", "live", f"{laboratory}", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    table = tmp_path / "live.csv"
+
+    def wait_for_rows(count: int) -> None:
+        before = table.read_text().count("\n") if table.exists() else 0
+        for _ in range(1200):
+            if table.exists() and table.read_text().count("\n") >= before + count:
+                return
+            assert live.poll() is None, live.communicate()
+            time.sleep(0.1)
+        raise AssertionError("no rows come")
+
+    wait_for_rows(60)
+    gone = ports["cam3"]
+    cameras[gone].kill()
+    cameras[gone].wait()
+    wait_for_rows(60)
+    _film(cameras, sequence / "cam3i_s.avi", gone)
+    wait_for_rows(60)
+    live.send_signal(signal.SIGINT)
+    out, err = live.communicate(timeout=60)
+    assert live.returncode == 0, err
+    assert "4 drones" in out or "3 drones" in out
+    record = json.loads((tmp_path / "live.json").read_text())
+    assert record["cameras"]["cam3"]["stops"] >= 1
+    assert record["cameras"]["cam3"]["frames"] > 0
+    assert "camera cam3: " in err
+    assert "has broken off" in err
+    # Said once, not once per frame.
+    assert len(err.splitlines()) < 20
+    assert read_trajectories(table).num_frames > 50
+
+
+def test_a_stream_that_does_not_answer_is_one_line(
+    sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
+) -> None:
+    names = CAMERAS[:3]
+    ports = [_free_port() for _ in names]
+    for name, port in zip(names[1:], ports[1:], strict=True):
+        _film(cameras, sequence / f"{name}i_s.avi", port)
+    addresses = {name: f"http://127.0.0.1:{port}/" for name, port in zip(names, ports, strict=True)}
+    laboratory = _laboratory(tmp_path, sequence, addresses)
+    done = _psotrack(
+        "live", laboratory, "--out", tmp_path / "live.csv", "--cache", cache, "--seconds", "8", *EFFORT
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("does not answer") == 1
+    record = json.loads((tmp_path / "live.json").read_text())
+    assert record["cameras"][names[0]]["frames"] == 0
+    assert record["cameras"][names[1]]["frames"] > 10
+
+
+def test_a_camera_of_another_size_is_left_out_and_none_ends_the_command(
+    sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
+) -> None:
+    port = _free_port()
+    small = tmp_path / "small.avi"
+    simulate_small = textwrap.dedent("""
+        import cv2, sys
+        writer = cv2.VideoWriter(sys.argv[1], cv2.VideoWriter.fourcc(*"XVID"), 10, (64, 48))
+        import numpy as np
+        for level in range(30):
+            writer.write(np.full((48, 64, 3), level, np.uint8))
+        writer.release()
+    """)
+    subprocess.run([sys.executable, "-c", simulate_small, str(small)], check=True)
+    _film(cameras, small, port)
+    laboratory = _laboratory(
+        tmp_path, sequence, {name: f"http://127.0.0.1:{port}/{name}" for name in CAMERAS[:2]}
+    )
+    done = _psotrack("live", laboratory, "--lines", "--cache", cache, "--seconds", "20", *EFFORT)
+    assert done.returncode == 2
+    assert "expected images of 672 x 378 pixels, as the rig says, found 64 x 48" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--replay"], "--out: expected --out FILE, --lines or --udp"),
+        (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
+        (["--replay", "--out", "tracks.txt"], "ends in .csv or .parquet"),
+        (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    sequence: Path, cache: Path, tmp_path: Path, options: list[str], words: str
+) -> None:
+    copy = shutil.copytree(sequence, tmp_path / "copy")
+    done = _psotrack("live", copy, "--cache", cache, *options, cwd=tmp_path, env=dict(os.environ))
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
