@@ -15,15 +15,16 @@ be drawn upwards.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped, UInt8, UInt32
 
 from psotrack._typing import Array, Coverage, Positions, Tables
 from psotrack.geometry import Boxes, Camera, Extents, project_boxes
-from psotrack.silhouettes import pack, summed_area_table
+from psotrack.silhouettes import pack
 from psotrack.tracking.occlusion import (
     CORE_SCALE,
     Occluders,
@@ -42,6 +43,10 @@ Middles = tuple[Float[Array, "drones cameras 1 side"], Float[Array, "drones came
 
 #: Value of a fully covered pixel of the silhouettes.
 FULL = 255
+#: Bits that hold the sum of a line of a window: 64 pixels of 0..255.
+_LINE_BITS = 14
+#: (side, side + 1): a line of pixels times this matrix gives the sums of the pixels before each edge.
+_BEFORE = np.triu(np.ones((SIDE, SIDE + 1), np.float32), 1)
 #: Usual share of foreground at a place of a drone's box: this number minus the distance from the box's middle (in half
 #: lengths of the box, along the farther axis). Silhouettes of four quadrotors fill 0.8 to 0.9, 0.6 to 0.7 and 0.4 to
 #: 0.5 of boxes of scale 0.4, 0.7 and 1; this model 0.83, 0.63 and 0.43.
@@ -81,6 +86,23 @@ class Patches:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Windows:
+    """The pixels of the windows of all drones in all cameras, whatever other drones may cover.
+
+    Attributes:
+        value: foreground of each pixel, 0 to `FULL`; 0 outside of the image.
+        x_px, y_px, pixel_px, size_wh_px: as in `Patches`.
+    """
+
+    value: Int[Array, "drones cameras side side"]
+    x_px: Float[Array, "drones cameras"]
+    y_px: Float[Array, "drones cameras"]
+    pixel_px: Float[Array, "drones cameras"]
+    size_wh_px: tuple[Float[Array, "cameras"], Float[Array, "cameras"]]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class ExpectedDrones:
     """Where windows are cut.
 
@@ -116,6 +138,35 @@ class _Grid:
     row: Int[Array, "drones cameras side"]
     column: Int[Array, "drones cameras side"]
 
+    def is_at(self, level: int) -> Bool[Array, "drones cameras 1 1"]:
+        """Which windows are at a level."""
+        return (self.level == level)[..., None, None]
+
+    def pixels(
+        self, images: Shaped[Array, "cameras rows words"], level: int, per_word: int = 1
+    ) -> Int[Array, "drones cameras side side"]:
+        """The pixels of the windows at a level; any values elsewhere.
+
+        Args:
+            images: the images at this level.
+            level: number of the level.
+            per_word: number of pixels in each number of `images`, from the lowest bits on.
+        """
+        cameras, rows, words = images.shape
+        here = (self.level == level)[..., None]
+        row = jnp.where(here, jnp.clip(self.row, 0, rows - 1), 0)
+        column = jnp.where(here, jnp.clip(self.column, 0, words * per_word - 1), 0)
+        line = (jnp.arange(cameras)[:, None] * rows + row) * words
+        # The barrier keeps XLA from computing these again for every pixel.
+        line, word, shift = jax.lax.optimization_barrier(
+            (line, column // per_word, column % per_word * (32 // per_word))
+        )
+        index = line[..., None] + word[..., None, :]
+        value = jnp.asarray(images).reshape(-1).at[index].get(mode="promise_in_bounds").astype(jnp.uint32)
+        if per_word > 1:
+            value = (value >> shift[..., None, :].astype(jnp.uint32)) & ((1 << 32 // per_word) - 1)
+        return value.astype(jnp.int32)
+
     def middles_px(self, pixel_px: Float[Array, "drones cameras"]) -> Middles:
         """x and y of the pixels' middles in the image, in shapes that broadcast against each other."""
         x_px, y_px = ((of.astype(jnp.float32) + 0.5) * pixel_px[..., None] for of in (self.column, self.row))
@@ -135,34 +186,86 @@ def cut(
         ring: scale of the largest box that is scored.
     """
     boxes = project_boxes(extents, expected.position_m)
-    grid = _grid(boxes, extents, expected.reach_m, reduction, ring)
-    pixel_px = _pixel_px(grid.level, reduction)
-    value = _read(_pyramid(coverage), coverage.shape, grid)
+    grid, windows = _windows(boxes, coverage, extents, expected.reach_m, reduction, ring)
+    value, pixel_px = windows.value, windows.pixel_px
     clear: Array = jnp.ones(pixel_px.shape)
     # Without other drones nothing is counted apart: the swarm then reads plain tables.
     packed = expected.occluding is not None and len(expected.position_m) > 1
+    shown, apart = value, None
     if expected.occluding is not None:
         occluders = find_occluders(boxes, occluding=expected.occluding, pixel_px=pixel_px)
         at_px = grid.middles_px(pixel_px)
-        shown = value
         if expected.floor_z_m is not None:
             shown = _without_shadows(value, coverage, extents, occluders, expected, at_px, reduction)
         if packed:
             clear = unoccluded_share(occluders, boxes)
             occluded = _occluded(occluders, boxes, at_px)
             # Occluded foreground is only counted: a pixel that is half covered or more counts as foreground.
-            shown = pack(jnp.where(occluded, 0, shown), occluded & (2 * value > FULL))
-        value = shown
+            shown, apart = jnp.where(occluded, 0, shown), occluded & (2 * value > FULL)
     return Patches(
-        tables=summed_area_table(value.reshape(-1, SIDE, SIDE)),
-        x_px=grid.column[..., 0].astype(jnp.float32) * pixel_px,
-        y_px=grid.row[..., 0].astype(jnp.float32) * pixel_px,
+        tables=_tables(shown, apart),
+        x_px=windows.x_px,
+        y_px=windows.y_px,
         pixel_px=pixel_px,
         clear=clear,
-        size_wh_px=_covered_px(extents.cameras, coverage.shape, reduction),
+        size_wh_px=windows.size_wh_px,
         reduction=reduction,
         packed=packed,
     )
+
+
+def cut_windows(
+    coverage: Coverage, extents: Extents, expected: ExpectedDrones, *, reduction: int, ring: float
+) -> Windows:
+    """The pixels of the windows of one frame; arguments as in `cut`."""
+    boxes = project_boxes(extents, expected.position_m)
+    return _windows(boxes, coverage, extents, expected.reach_m, reduction, ring)[1]
+
+
+def _windows(
+    boxes: Boxes,
+    coverage: Coverage,
+    extents: Extents,
+    reach_m: Float[Array, "drones"],
+    reduction: int,
+    ring: float,
+) -> tuple[_Grid, Windows]:
+    grid = _grid(boxes, extents, reach_m, reduction, ring)
+    pixel_px = _pixel_px(grid.level, reduction)
+    windows = Windows(
+        value=_read(coverage, grid),
+        x_px=grid.column[..., 0].astype(jnp.float32) * pixel_px,
+        y_px=grid.row[..., 0].astype(jnp.float32) * pixel_px,
+        pixel_px=pixel_px,
+        size_wh_px=_covered_px(extents.cameras, coverage.shape, reduction),
+    )
+    return grid, windows
+
+
+def _tables(
+    value: Int[Array, "drones cameras side side"], apart: Bool[Array, "drones cameras side side"] | None
+) -> Int[Array, "height1 windows width1"]:
+    """Summed-area tables of the windows; of values packed with the number of pixels that are counted apart.
+
+    The same numbers as from `psotrack.silhouettes.summed_area_table`. The lines are short, so that a product with a
+    matrix gives their sums exactly in float32, in half the time.
+    """
+    marked = value if apart is None else value + (apart.astype(jnp.int32) << _LINE_BITS)
+    lines: Array = jnp.dot(
+        marked.reshape(-1, SIDE).astype(jnp.float32),
+        jnp.asarray(_BEFORE),
+        precision=jax.lax.Precision.HIGHEST,
+    ).astype(jnp.int32)
+    if apart is not None:
+        one_apart = pack(jnp.zeros((), jnp.int32), jnp.ones((), bool))
+        lines = (lines & ((1 << _LINE_BITS) - 1)) + one_apart * (lines >> _LINE_BITS)
+
+    def add(total: jax.Array, line: Any) -> tuple[jax.Array, jax.Array]:
+        return total + line, total
+
+    # The last line is below the window: each line of the table is the sum of the lines before.
+    lines = jnp.pad(lines.reshape(-1, SIDE, SIDE + 1), [(0, 0), (0, 1), (0, 0)]).swapaxes(0, 1)
+    return jax.lax.scan(add, jnp.zeros(lines.shape[1:], jnp.int32), lines)[1]
 
 
 def _covered_px(
@@ -202,40 +305,57 @@ def _pixel_px(level: Int[Array, "drones cameras"], reduction: int) -> Float[Arra
     return (reduction << level).astype(jnp.float32)
 
 
-def _pyramid(coverage: Coverage) -> Int[Array, "pixels"]:
-    """All levels of all cameras in one array, level after level: means, rounded once from exact sums."""
+def _read(coverage: Coverage, grid: _Grid) -> Int[Array, "drones cameras side side"]:
+    """The windows' pixels: means, rounded once from exact sums; 0 outside of the image and its padding."""
     step = 2 ** (NUM_LEVELS - 1)
-    _, height, width = coverage.shape
-    # Boxes end at the image's border, which may lie inside a coarse pixel: beyond the border the image is repeated.
-    beyond = [(0, 0), (0, -height % step), (0, -width % step)]
-    image = jnp.pad(coverage, beyond, mode="edge").astype(jnp.int32)
-    levels = [image]
-    for _ in range(NUM_LEVELS - 1):
-        rows = levels[-1][:, 0::2] + levels[-1][:, 1::2]
-        levels.append(rows[..., 0::2] + rows[..., 1::2])
-    rounded = [(image + ((1 << 2 * n) >> 1)) >> 2 * n for n, image in enumerate(levels)]
-    return jnp.concatenate([image.reshape(-1) for image in rounded])
+    num_cameras, height, width = coverage.shape
+    none = jnp.zeros(grid.row.shape + grid.column.shape[-1:], jnp.int32)
 
+    # A branch makes each level once: XLA on a CPU would else compute it again for every pixel that is read.
+    def halved() -> Array:
+        # Boxes end at the image's border, which may lie inside a coarse pixel: beyond it the image is repeated.
+        beyond = [(0, 0), (0, -height % step), (0, -width % step)]
+        return _halved(jnp.pad(coverage, beyond, mode="edge"))
 
-def _read(
-    pyramid: Int[Array, "pixels"], shape: tuple[int, ...], grid: _Grid
-) -> Int[Array, "drones cameras side side"]:
-    """The windows' pixels; 0 outside of the image and its padding."""
-    num_cameras, height, width = shape
-    step = 2 ** (NUM_LEVELS - 1)
-    heights, widths = (
-        np.array([-(-side // step) * step >> n for n in range(NUM_LEVELS)]) for side in (height, width)
+    shape = (num_cameras, (height + -height % step) // 2, (width + -width % step) // 4)
+    two = jax.lax.cond((grid.level > 0).any(), halved, lambda: jnp.zeros(shape, jnp.uint32))
+
+    def coarse() -> Array:
+        rows = two[:, 0::2] + two[:, 1::2]
+        levels = [(rows & 0xFFFF) + (rows >> 16)]
+        for _ in range(3, NUM_LEVELS):
+            rows = levels[-1][:, 0::2] + levels[-1][:, 1::2]
+            levels.append(rows[..., 0::2] + rows[..., 1::2])
+        value = none
+        for number, level in enumerate(levels, 2):
+            value = jnp.where(grid.is_at(number), _mean(grid.pixels(level, number), number), value)
+        return value
+
+    # Only drones that are very near have coarser windows.
+    value = jax.lax.cond((grid.level > 1).any(), coarse, lambda: none)
+    value = jnp.where(grid.is_at(1), _mean(grid.pixels(two, 1, per_word=2), 1), value)
+    value = jnp.where(grid.is_at(0), grid.pixels(coverage, 0), value)
+    rows, columns = (((side + -side % step) >> grid.level)[..., None] for side in (height, width))
+    row_inside, column_inside = (
+        (grid.row >= 0) & (grid.row < rows),
+        (grid.column >= 0) & (grid.column < columns),
     )
-    starts = np.cumsum([0, *(num_cameras * heights * widths)[:-1]])
-    rows, columns, start = (jnp.asarray(of, jnp.int32)[grid.level] for of in (heights, widths, starts))
-    image = start + jnp.arange(num_cameras) * rows * columns
-    rows, columns = rows[..., None], columns[..., None]
-    line = image[..., None] + jnp.clip(grid.row, 0, rows - 1) * columns
-    index = line[..., None] + jnp.clip(grid.column, 0, columns - 1)[..., None, :]
-    row_inside = (grid.row >= 0) & (grid.row < rows)
-    column_inside = (grid.column >= 0) & (grid.column < columns)
-    value = jnp.asarray(pyramid).at[index].get(mode="promise_in_bounds")
     return jnp.where(row_inside[..., None] & column_inside[..., None, :], value, 0)
+
+
+def _halved(image: UInt8[Array, "cameras height width"]) -> UInt32[Array, "cameras rows words"]:
+    """Sums of 2 x 2 pixels: two sums in each word, of which the lower half is the left one.
+
+    Neighbours are added as parts of one word, because XLA on a CPU reads every other number of an array slowly.
+    """
+    four = jax.lax.bitcast_convert_type(image.reshape(*image.shape[:2], -1, 4), jnp.uint32)
+    two = (four & 0x00FF00FF) + ((four >> 8) & 0x00FF00FF)
+    return two[:, 0::2] + two[:, 1::2]
+
+
+def _mean(total: Array, level: int) -> Array:
+    """Means of the pixels that a pixel of a level holds, rounded, from their sums."""
+    return (total + (1 << 2 * level >> 1)) >> 2 * level
 
 
 def _occluded(occluders: Occluders, boxes: Boxes, at_px: Middles) -> Bool[Array, "drones cameras side side"]:

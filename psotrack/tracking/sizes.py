@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from psotrack._typing import Array, Coverage, Positions
 from psotrack.geometry import Boxes, Camera, Extents, make_extents, project_boxes
 from psotrack.silhouettes import Exposures
-from psotrack.tracking.patches import FULL, ExpectedDrones, Patches, cut
+from psotrack.tracking.patches import FULL, ExpectedDrones, Windows, cut_windows
 from psotrack.tracking.shadows import is_low
 
 #: Half length over the standard deviation of the foreground: 2 for an ellipse, the square root of 6 for a rhombus.
@@ -237,7 +237,7 @@ def _measure(
     same = jnp.ones(2)
     boxes, slope = boxes_of(same), jax.jacfwd(squares)(same)
     design = slope / slope.sum(axis=-1, keepdims=True)
-    patches = cut(
+    windows = cut_windows(
         coverage,
         in_cameras(size_m),
         # Views in which another drone could occlude the drone do not count.
@@ -245,8 +245,8 @@ def _measure(
         reduction=program.reduction,
         ring=program.ring,
     )
-    spread, fill, filled = _moments(patches, boxes, program)
-    counts = usable_views(boxes, patches, program.ring, well_seen) & (filled >= MIN_FILLED)
+    spread, fill, filled = _moments(windows, boxes, program)
+    counts = usable_views(boxes, windows, program.ring, well_seen) & (filled >= MIN_FILLED)
     if floor_z_m is not None:
         counts &= ~is_low(position_m, size_m, floor_z_m)[:, None]
     factors, share = _fit_lengths(design, HALF_PER_STD**2 * spread, counts)
@@ -260,7 +260,7 @@ def _measure(
 
 
 def _moments(
-    patches: Patches, boxes: Boxes, program: SizeProgram
+    windows: Windows, boxes: Boxes, program: SizeProgram
 ) -> tuple[
     Float[Array, "drones cameras 2"], Float[Array, "drones cameras windows"], Float[Array, "drones cameras"]
 ]:
@@ -270,19 +270,18 @@ def _moments(
         Variances along columns and rows in squared half lengths of the box, the filled share of each window, and the
         filled share of the box.
     """
-    image = jnp.diff(jnp.diff(patches.tables, axis=0), axis=2).transpose(1, 0, 2)
-    image = image.reshape(*patches.x_px.shape, *image.shape[1:]).astype(jnp.float32) / FULL
+    image = windows.value.astype(jnp.float32) / FULL
     scales = jnp.asarray((*program.windows, 1.0, program.ring))
 
     def line(first_px: Array, middle_px: Array, half_px: Array) -> tuple[Array, Array, Array]:
-        pixel = (patches.pixel_px / half_px)[..., None]
+        pixel = (windows.pixel_px / half_px)[..., None]
         cells = jnp.arange(image.shape[-1], dtype=jnp.float32) + 0.5
         at = ((first_px - middle_px) / half_px)[..., None] + cells * pixel
         inside = jnp.clip((scales[:, None] - jnp.abs(at[..., None, :])) / pixel[..., None] + 0.5, 0, 1)
         return at, inside, pixel
 
-    x, x_inside, x_pixel = line(patches.x_px, boxes.x_middle, boxes.x_half)
-    y, y_inside, y_pixel = line(patches.y_px, boxes.y_middle, boxes.y_half)
+    x, x_inside, x_pixel = line(windows.x_px, boxes.x_middle, boxes.x_half)
+    y, y_inside, y_pixel = line(windows.y_px, boxes.y_middle, boxes.y_half)
     sums = jnp.einsum("dcsi,dcij,dcsj->dcs", y_inside, image, x_inside)
     full = sums * x_pixel * y_pixel / jnp.square(2 * scales)
 
@@ -299,10 +298,10 @@ def _moments(
 
 
 def usable_views(
-    boxes: Boxes, patches: Patches, ring: float, well_seen: Bool[Array, "drones"]
+    boxes: Boxes, windows: Windows, ring: float, well_seen: Bool[Array, "drones"]
 ) -> Bool[Array, "drones cameras"]:
     """Which views show the drone alone and whole: the ring is inside the image, and no other drone is in the ring."""
-    width_px, height_px = patches.size_wh_px
+    width_px, height_px = windows.size_wh_px
 
     def within(middle: Array, half: Array, length_px: Array) -> Array:
         return (middle - ring * half >= 0) & (middle + ring * half <= length_px)
