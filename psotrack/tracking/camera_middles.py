@@ -20,7 +20,7 @@ from psotrack._typing import Array, Positions
 from psotrack.geometry import Boxes, Camera, make_extents, project_boxes
 from psotrack.silhouettes import Exposures, Silhouettes
 from psotrack.tracking.chunks import on_device
-from psotrack.tracking.patches import FULL, ExpectedDrones, Patches, cut
+from psotrack.tracking.patches import FULL, ExpectedDrones, Windows, cut_windows
 from psotrack.tracking.sizes import MIN_FILLED, SizeProgram, usable_views
 
 #: Number of times that the window is moved to the middle of the foreground that it contains.
@@ -77,10 +77,10 @@ def camera_middles(
             extents = exposures.moved(make_extents(exposures.seeing(cameras), size_m), position, velocity)
         boxes = project_boxes(extents, position)
         expected = ExpectedDrones(position, reach_m=size_m.max(axis=-1) / 2)
-        patches = cut(image, extents, expected, reduction=program.reduction, ring=program.ring)
-        middle_px, filled = _middles(patches, boxes, program.ring)
-        counts = usable_views(boxes, patches, program.ring, seen) & (filled >= MIN_FILLED)
-        width_px, height_px = patches.size_wh_px
+        windows = cut_windows(image, extents, expected, reduction=program.reduction, ring=program.ring)
+        middle_px, filled = _middles(windows, boxes, program.ring)
+        counts = usable_views(boxes, windows, program.ring, seen) & (filled >= MIN_FILLED)
+        width_px, height_px = windows.size_wh_px
         inside = (boxes.x_middle >= 0) & (boxes.x_middle <= width_px) & boxes.in_front & seen[:, None]
         inside &= (boxes.y_middle >= 0) & (boxes.y_middle <= height_px)
         return CameraMiddles(
@@ -93,18 +93,17 @@ def camera_middles(
 
 
 def _middles(
-    patches: Patches, boxes: Boxes, ring: float
+    windows: Windows, boxes: Boxes, ring: float
 ) -> tuple[Float[Array, "drones cameras 2"], Float[Array, "drones cameras"]]:
     """Middles of the foreground in a window as large as the ring that follows them, and its share of the box."""
-    image = jnp.diff(jnp.diff(patches.tables, axis=0), axis=2).transpose(1, 0, 2)
-    image = image.reshape(*patches.x_px.shape, *image.shape[1:]).astype(jnp.float32) / FULL
+    image = windows.value.astype(jnp.float32) / FULL
     cells = jnp.arange(image.shape[-1], dtype=jnp.float32) + 0.5
     x_px, y_px = (
-        first[..., None] + cells * patches.pixel_px[..., None] for first in (patches.x_px, patches.y_px)
+        first[..., None] + cells * windows.pixel_px[..., None] for first in (windows.x_px, windows.y_px)
     )
 
     def inside(at_px: Array, middle_px: Array, half_px: Array) -> Array:
-        to_edge = (ring * half_px - jnp.abs(at_px - middle_px)) / patches.pixel_px[..., None]
+        to_edge = (ring * half_px - jnp.abs(at_px - middle_px)) / windows.pixel_px[..., None]
         return jnp.clip(to_edge + 0.5, 0, 1)
 
     x_middle, y_middle = boxes.x_middle, boxes.y_middle
@@ -117,7 +116,7 @@ def _middles(
         new_x = jnp.einsum("dci,dcij,dcj->dc", down, image, across * x_px) / least
         new_y = jnp.einsum("dci,dcij,dcj->dc", down * y_px, image, across) / least
         x_middle, y_middle = jnp.where(total > 0, new_x, x_middle), jnp.where(total > 0, new_y, y_middle)
-    area = 4 * boxes.x_half * boxes.y_half / jnp.square(patches.pixel_px)
+    area = 4 * boxes.x_half * boxes.y_half / jnp.square(windows.pixel_px)
     return jnp.stack([x_middle, y_middle], axis=-1), total / jnp.maximum(area, 1e-6)
 
 
@@ -137,6 +136,7 @@ def middles_in_cameras(
         position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where a drone is not found.
     """
     program = SizeProgram(reduction=silhouettes.reduction)
+    size, cameras = jnp.asarray(size_m, jnp.float32), on_device(cameras)
     chunks = []
     for first in range(0, silhouettes.num_frames, _CHUNK_FRAMES):
         part = slice(first, min(first + _CHUNK_FRAMES, silhouettes.num_frames))
@@ -152,7 +152,8 @@ def middles_in_cameras(
         )
         exposures = silhouettes.exposures
         exposed = None if exposures is None else (velocity, exposures[part].padded(_CHUNK_FRAMES))
-        size = jnp.asarray(size_m, jnp.float32)
-        found = camera_middles(coverage, position, size, on_device(cameras), program, exposed)
-        chunks.append(jax.device_get(found))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(position_m)], *chunks)
+        # The device works on a chunk while the next one is read.
+        chunks.append(camera_middles(coverage, position, size, cameras, program, exposed))
+        if len(chunks) > 1:
+            jax.block_until_ready(chunks[-2])
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(position_m)], *jax.device_get(chunks))

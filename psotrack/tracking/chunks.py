@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Hashable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import TypeVar
@@ -17,9 +18,9 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
-from psotrack._typing import Array
+from psotrack._typing import Array, Key, Positions
 from psotrack.geometry import Camera, Rig
 from psotrack.initiation import (
     InitialState,
@@ -65,6 +66,39 @@ class RunInputs:
     settings: TrackerSettings
 
 
+@dataclass(frozen=True)
+class _History:
+    """States of a run's drones in all frames so far, in NumPy.
+
+    Attributes:
+        position_m, velocity_m_s: (frames, drones, 3), metres and m/s; NaN where the drone has no track.
+        tracked: (frames, drones), whether the drone was found, and not only predicted.
+    """
+
+    position_m: Float[np.ndarray, "frames drones 3"]
+    velocity_m_s: Float[np.ndarray, "frames drones 3"]
+    tracked: Bool[np.ndarray, "frames drones"]
+
+    @classmethod
+    def empty(cls, num_drones: int) -> _History:
+        """The history before the first frame."""
+        none_m = np.empty((0, num_drones, 3))
+        return cls(none_m, none_m, np.empty((0, num_drones), bool))
+
+    def joined(self, info: tracker.TrackerInfo) -> _History:
+        """The history with the frames of one more chunk, which may have more drones."""
+        more = [(0, 0), (0, info.status.shape[1] - self.tracked.shape[1])]
+        position_m, velocity_m_s = (
+            np.concatenate([np.pad(before, [*more, (0, 0)], constant_values=np.nan), after])
+            for before, after in (
+                (self.position_m, info.position_m),
+                (self.velocity_m_s, info.velocity_m_s),
+            )
+        )
+        tracked = np.concatenate([np.pad(self.tracked, more), np.asarray(info.status) == Status.TRACKED])
+        return _History(position_m, velocity_m_s, tracked)
+
+
 @dataclass
 class _Run:
     """A run in progress: its inputs, and its results so far."""
@@ -72,6 +106,7 @@ class _Run:
     inputs: RunInputs
     program: tracker.Program
     drones: TrackedDrones
+    history: _History
     infos: list[tracker.TrackerInfo] = field(default_factory=list)
     measured: list[SizeMeasurements] = field(default_factory=list)
     arrivals: list[Arrival] = field(default_factory=list)
@@ -152,7 +187,7 @@ def _track_through_chunks(
             num_frames = int(chunk.num_frames)
             tracked = batches.track(runs, [None] * len(runs), chunk)
             planned = [
-                _plan_new_tracks(chunk, [*run.infos, info], run, setting)
+                _plan_new_tracks(chunk, info, run, setting)
                 for run, (_, info, _) in zip(runs, tracked, strict=True)
             ]
             again = {number: starts for number, starts in enumerate(planned) if starts is not None}
@@ -164,7 +199,8 @@ def _track_through_chunks(
             for run, (drones, info, measured) in zip(runs, tracked, strict=True):
                 run.infos.append(info)
                 run.measured.append(measured)
-                run.drones = _without_false_tracks(drones, run.infos)
+                run.history = run.history.joined(info)
+                run.drones = _without_false_tracks(drones, run.history)
             advance(num_frames)
     return [(_tracks(run), batches.compile_s / len(runs)) for run in runs]
 
@@ -178,10 +214,15 @@ def _tracks(run: _Run) -> Tracks:
         **vars(info),
         measured_size_m=np.asarray(measured.size_m),
         sizes=DroneSizes(
-            learned.size_m, np.asarray(run.drones.sizes.std_m), learned.num_frames, learned.fill
+            learned.size_m, np.asarray(_size_std_m(run.drones.sizes)), learned.num_frames, learned.fill
         ),
         arrivals=tuple(run.arrivals),
     )
+
+
+@jax.jit
+def _size_std_m(state: SizeState) -> Float[Array, "drones 3"]:
+    return state.std_m
 
 
 class _Batches:
@@ -244,9 +285,11 @@ def _without_iterations(drones: TrackedDrones) -> TrackedDrones:
 
 
 def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, Chunk]]:
-    """First frame of each chunk, and the chunk; empty frames fill up the last chunk."""
-    for first in range(0, silhouettes.num_frames, CHUNK_FRAMES):
-        coverage = silhouettes.read(first, min(first + CHUNK_FRAMES, silhouettes.num_frames))
+    """First frame of each chunk, and the chunk; empty frames fill up the last chunk.
+
+    While a chunk is used, a thread reads the next one.
+    """
+    for first, coverage in _read_ahead(silhouettes):
         num_frames = len(coverage)
         exposures = silhouettes.exposures
         if exposures is not None:
@@ -255,6 +298,19 @@ def _chunks(silhouettes: Silhouettes) -> Iterator[tuple[int, Chunk]]:
             empty = np.zeros((CHUNK_FRAMES - num_frames, *coverage.shape[1:]), np.uint8)
             coverage = np.concatenate([coverage, empty])
         yield first, Chunk(coverage, np.array(num_frames, np.int32), exposures)
+
+
+def _read_ahead(
+    silhouettes: Silhouettes,
+) -> Iterator[tuple[int, UInt8[np.ndarray, "frames cameras height width"]]]:
+    ends = [*range(0, silhouettes.num_frames, CHUNK_FRAMES), silhouettes.num_frames]
+    with ThreadPoolExecutor(1) as thread:
+        reading = [thread.submit(silhouettes.read, *ends[:2])]
+        for number, first in enumerate(ends[:-1]):
+            coverage = reading.pop().result()
+            if number + 2 < len(ends):
+                reading.append(thread.submit(silhouettes.read, *ends[number + 1 : number + 3]))
+            yield first, coverage
 
 
 def _blank_chunk(silhouettes: Silhouettes) -> Chunk:
@@ -271,17 +327,39 @@ def _begin(inputs: RunInputs, setting: _Setting) -> _Run:
     initial, settings = inputs.initial, inputs.settings
     program = tracker_program(settings, setting.reduction)
     params = tracker_params(settings, initial.size_m, fps=setting.fps, bounds_m=inputs.bounds_m)
-    position, velocity = (
-        jnp.asarray(value, jnp.float32) for value in (initial.position_m, initial.velocity_m_s)
+    drones = _first_drones(
+        jax.random.key(settings.seed),
+        np.asarray(initial.position_m, np.float32),
+        np.asarray(initial.velocity_m_s, np.float32),
+        params,
+        is_pinned=_is_pinned(settings),
+        num_windows=len(program.windows),
     )
-    state = tracker.init(jax.random.key(settings.seed), position, velocity, params)
-    drones = TrackedDrones(state, params, _initial_sizes(params.size_m, settings, program))
-    return _Run(inputs, program, drones)
+    return _Run(inputs, program, drones, _History.empty(len(drones)))
 
 
-def _initial_sizes(size_m: Array, settings: TrackerSettings, program: tracker.Program) -> SizeState:
-    pinned = not settings.drones.learn_sizes or settings.drones.size_m is not None
-    return sizes.init(size_m, jnp.full(size_m.shape, pinned), len(program.windows))
+@partial(jax.jit, static_argnames=("is_pinned", "num_windows"))
+def _first_drones(
+    key: Key,
+    position_m: Positions,
+    velocity_m_s: Positions,
+    params: tracker.TrackerParams,
+    *,
+    is_pinned: bool,
+    num_windows: int,
+) -> TrackedDrones:
+    """The drones before the first frame; one program, because each operation alone would be a program of its own."""
+    state = tracker.init(key, position_m, velocity_m_s, params)
+    return TrackedDrones(state, params, _initial_sizes(params.size_m, is_pinned, num_windows))
+
+
+def _initial_sizes(size_m: Array, is_pinned: bool, num_windows: int) -> SizeState:
+    return sizes.init(size_m, jnp.full(size_m.shape, is_pinned), num_windows)
+
+
+def _is_pinned(settings: TrackerSettings) -> bool:
+    """Whether the sizes stay as they are."""
+    return not settings.drones.learn_sizes or settings.drones.size_m is not None
 
 
 def _track_starts(planned: PlannedStarts | None, num_drones: int) -> tracker.TrackStarts:
@@ -296,17 +374,17 @@ def _track_starts(planned: PlannedStarts | None, num_drones: int) -> tracker.Tra
 
 
 def _plan_new_tracks(
-    chunk: Chunk, infos: list[tracker.TrackerInfo], run: _Run, setting: _Setting
+    chunk: Chunk, info: tracker.TrackerInfo, run: _Run, setting: _Setting
 ) -> PlannedStarts | None:
     """Plan the tracks that start, or start again, in the chunk that was just tracked; None if no track starts."""
     settings, drones, fps = run.inputs.settings, run.drones, setting.fps
     coverage = np.asarray(chunk.coverage)[: chunk.num_frames]
     size_m = np.asarray(drones.params.size_m, np.float64)
-    whole = _joined(infos, len(drones))
+    whole = run.history.joined(info)
     lost = find_lost_tracks(
-        np.asarray(whole.position_m, np.float64),
-        np.asarray(whole.velocity_m_s, np.float64),
-        np.asarray(whole.status) == Status.TRACKED,
+        whole.position_m,
+        whole.velocity_m_s,
+        whole.tracked,
         size_m,
         chunk_frames=len(coverage),
         fps=fps,
@@ -319,7 +397,9 @@ def _plan_new_tracks(
     candidates = find_candidates(
         setting.rig.cameras,
         coverage,
-        replace(_known_drones(chunk, infos, size_m), min_viewpoints=settings.status.min_cameras_to_begin),
+        replace(
+            _known_drones(chunk, info, whole, size_m), min_viewpoints=settings.status.min_cameras_to_begin
+        ),
         reduction=setting.reduction,
         fps=fps,
         bounds_m=run.inputs.bounds_m,
@@ -338,40 +418,40 @@ def _plan_new_tracks(
 
 
 def _known_drones(
-    chunk: Chunk, infos: list[tracker.TrackerInfo], size_m: Float[np.ndarray, "drones 3"]
+    chunk: Chunk, info: tracker.TrackerInfo, whole: _History, size_m: Float[np.ndarray, "drones 3"]
 ) -> KnownDrones:
     """The drones that were tracked in the chunk, where the cameras' frames show them."""
-    position_m = np.asarray(infos[-1].position_m, np.float64)
-    known = KnownDrones(position_m, _known_well(infos), size_m)
+    position_m = np.asarray(info.position_m, np.float64)
+    known = KnownDrones(position_m, _known_well(whole.tracked, len(position_m)), size_m)
     if chunk.exposures is None:
         return known
     exposures = chunk.exposures[: len(position_m)]
-    moved_m = moved_by(exposures, np.asarray(infos[-1].velocity_m_s, np.float64))
+    moved_m = moved_by(exposures, np.asarray(info.velocity_m_s, np.float64))
     return replace(known, moved_m=moved_m, is_there=np.asarray(exposures.is_there))
 
 
-def _without_false_tracks(drones: TrackedDrones, infos: list[tracker.TrackerInfo]) -> TrackedDrones:
+def _without_false_tracks(drones: TrackedDrones, history: _History) -> TrackedDrones:
     """Mark the tracks that turned out to follow no drone as absent from the next chunk on."""
-    whole = _joined(infos, len(drones))
-    is_false = find_false_tracks(
-        np.asarray(whole.position_m, np.float64),
-        np.asarray(whole.status) == Status.TRACKED,
-        np.asarray(drones.params.size_m, np.float64),
-    )
+    size_m = np.asarray(drones.params.size_m, np.float64)
+    is_false = find_false_tracks(history.position_m, history.tracked, size_m)
+    if not is_false.any():
+        return drones
     present = drones.state.present & ~jnp.asarray(is_false)
     return replace(drones, state=replace(drones.state, present=present))
 
 
-def _known_well(infos: list[tracker.TrackerInfo]) -> Bool[np.ndarray, "frames drones"]:
-    """Whether a drone's position is known well enough to explain foreground, for each frame of the last chunk.
+def _known_well(
+    tracked: Bool[np.ndarray, "all drones"], num_frames: int
+) -> Bool[np.ndarray, "frames drones"]:
+    """Whether a drone's position is known well enough to explain foreground, for each of the last frames.
 
     The limit is the tracker's limit for occlusion: at most `MAX_OCCLUDING_FRAMES` since the drone was found.
     """
-    tracked = _joined(infos[-2:], infos[-1].status.shape[1]).status == Status.TRACKED
-    num_frames, recent = len(tracked), np.array(tracked)
+    tracked = tracked[max(len(tracked) - num_frames - tracker.MAX_OCCLUDING_FRAMES, 0) :]
+    recent = tracked.copy()
     for shift in range(1, tracker.MAX_OCCLUDING_FRAMES + 1):
-        recent[shift:] |= tracked[: num_frames - shift]
-    return recent[num_frames - len(infos[-1].status) :]
+        recent[shift:] |= tracked[:-shift]
+    return recent[len(tracked) - num_frames :]
 
 
 def _add_tracks(run: _Run, planned: PlannedStarts, first_frame: int) -> None:
@@ -383,7 +463,7 @@ def _add_tracks(run: _Run, planned: PlannedStarts, first_frame: int) -> None:
         drones = run.drones
         size_m = jnp.concatenate([drones.params.size_m, jnp.asarray(born_m, jnp.float32)])
         params = replace(drones.params, size_m=size_m, motion=motion_params(settings.motion, len(size_m)))
-        added = _initial_sizes(size_m[num_known:], settings, run.program)
+        added = _initial_sizes(size_m[num_known:], _is_pinned(settings), len(run.program.windows))
         run.drones = TrackedDrones(
             tracker.with_added_tracks(drones.state, params),
             params,
