@@ -1,8 +1,10 @@
 """Time of the track stage: psotrack, evosax's PSO on psotrack's fitness, pyswarms on the same fitness in NumPy.
 
-Runs in one process. Every method is warmed up. Then the methods are timed in turn, repeatedly, so that other load of
-the machine affects all methods equally. A timing ends when the result is on the host. `python
-experiments/benchmarks/track_stage.py --help`.
+Beside them stand the floor, which is the time of the look-ups in the tables that the score must do and of nothing else
+(see `_look_ups`), and with `--baseline COMMIT` the tracker of an earlier commit, in a process of its own.
+
+Every method is warmed up. Then the methods are timed in turn, repeatedly, so that other load of the machine affects all
+methods equally. A timing ends when the result is on the host. `python experiments/benchmarks/track_stage.py --help`.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from _baseline import Baseline, Times
+from _look_ups import LookUps
 from _numpy_fitness import NumpyFitness, PlainFitness, TunedFitness
 from _peers import Evosax, Problem, PySwarms
 
@@ -98,27 +103,18 @@ class Timing:
 @click.option("--iterations", default=70, type=click.IntRange(1), help="Iterations per frame.")
 @click.option("--drones", default=4, type=click.IntRange(1), help="Drones in the room.")
 @click.option("--cameras", default=8, type=click.IntRange(2), help="Cameras of 1920 x 1080 pixels.")
+@click.option("--baseline", metavar="COMMIT", help="Time the tracker of an earlier commit too.")
 @click.option(
     "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
 )
-def main(
-    frames: int,
-    repeats: int,
-    particles: int,
-    iterations: int,
-    drones: int,
-    cameras: int,
-    results: Path | None,
-) -> None:
+def main(repeats: int, baseline: str | None, results: Path | None, **shapes: int) -> None:
     """Time the track stage of psotrack, evosax and pyswarms on the same silhouettes; print a table."""
     _require_peers()
     run = _results.Run("track_stage")
-    scene = _scene.scene(frames, drones, cameras)
+    frames, particles, iterations = (shapes[name] for name in ("frames", "particles", "iterations"))
+    scene = _scene.scene(frames, shapes["drones"], shapes["cameras"])
     coverage = scene.coverage()
-    joint = _problem(
-        scene, TrackSettings(swarm=SwarmSettings(particles=particles, iterations=iterations, kind="joint"))
-    )
-    per_drone = replace(joint, settings=joint.settings.changed({"swarm.kind": "per-drone"}))
+    joint, per_drone = (make_problem(scene, particles, iterations, kind) for kind in ("joint", "per-drone"))
     size_m, score = joint.start.size_m, joint.score
     plain, tuned = (
         kind(scene.rig.cameras, size_m, score, joint.reduction) for kind in (PlainFitness, TunedFitness)
@@ -128,6 +124,7 @@ def main(
         for name, numpy_fitness in (("plain", plain), ("tuned", tuned))
     }
 
+    look_ups = LookUps(joint, coverage[0])
     methods: dict[str, Method] = {
         "psotrack, joint swarm": Psotrack(joint),
         "psotrack, swarm per drone": Psotrack(per_drone),
@@ -135,20 +132,28 @@ def main(
         "pyswarms, NumPy fitness": PySwarms(joint, plain),
         "pyswarms, NumPy fitness tuned by hand": PySwarms(joint, tuned),
     }
+    timed = {name: partial(_timed, method, coverage, scene.position_m) for name, method in methods.items()}
+    timed["floor: table look-ups alone"] = partial(_timed_look_ups, look_ups, frames)
+    earlier = None
+    if baseline is not None:
+        earlier = Baseline(baseline, shapes)
+        for kind, title in (("joint", "joint swarm"), ("per-drone", "swarm per drone")):
+            timed[f"commit {baseline[:10]}, {title}"] = partial(earlier.timed, kind)
     header = _header(
         {
-            "frames": frames,
+            **shapes,
             "repeats": repeats,
-            "particles": particles,
-            "iterations": iterations,
-            "drones": drones,
-            "cameras": cameras,
             "silhouettes": list(coverage.shape),
             "reduction": _scene.REDUCTION,
             "fitness_difference": difference,
+            "look_ups_per_frame": look_ups.per_frame,
         }
     )
-    timings = _time(methods, coverage, scene.position_m, repeats)
+    try:
+        timings = _time(timed, repeats)
+    finally:
+        if earlier is not None:
+            earlier.close()
     _print(header, timings)
     if results is not None:
         run.save(results, rows=pd.DataFrame([vars(timing) for timing in timings]), figures=header["shapes"])
@@ -166,7 +171,9 @@ def _require_peers() -> None:
         sys.exit(2)
 
 
-def _problem(scene: _scene.Scene, settings: TrackSettings) -> Problem:
+def make_problem(scene: _scene.Scene, particles: int, iterations: int, kind: str) -> Problem:
+    """The scene, tracked by a kind of swarm."""
+    settings = TrackSettings(swarm=SwarmSettings(particles=particles, iterations=iterations, kind=kind))
     start = InitialState(
         position_m=scene.position_m[0],
         velocity_m_s=scene.velocity_m_s[0],
@@ -203,27 +210,40 @@ def _check_same_fitness(
     return difference
 
 
-def _time(
-    methods: dict[str, Method], coverage: np.ndarray, truth_m: np.ndarray, repeats: int
-) -> list[Timing]:
-    errors_mm, warm_up_s = {}, {}
-    for name, method in methods.items():
-        began = time.perf_counter()
-        found_m = method(coverage)
-        warm_up_s[name] = time.perf_counter() - began
-        errors_mm[name] = 1e3 * float(np.linalg.norm(found_m - truth_m, axis=-1).mean())
+def _timed(method: Method, coverage: np.ndarray, truth_m: np.ndarray) -> Times:
+    """Track once."""
+    began, cpu_began = time.perf_counter(), time.process_time()
+    found_m = method(coverage)
+    wall_s, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
+    error_mm = 1e3 * float(np.linalg.norm(found_m - truth_m, axis=-1).mean())
+    return Times(1e3 * wall_s / len(coverage), 1e3 * cpu_s / len(coverage), error_mm)
 
-    names = list(methods)
+
+def _timed_look_ups(look_ups: LookUps, frames: int) -> Times:
+    """Do the look-ups once."""
+    began, cpu_began = time.perf_counter(), time.process_time()
+    look_ups(frames)
+    wall_s, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
+    return Times(1e3 * wall_s / frames, 1e3 * cpu_s / frames, float("nan"))
+
+
+def _time(timed: dict[str, Callable[[], Times]], repeats: int) -> list[Timing]:
+    errors_mm, warm_up_s = {}, {}
+    for name, run in timed.items():
+        began = time.perf_counter()
+        errors_mm[name] = run().error_mm
+        warm_up_s[name] = time.perf_counter() - began
+
+    names = list(timed)
     times_ms: dict[str, list[float]] = {name: [] for name in names}
     cpu_ms: dict[str, list[float]] = {name: [] for name in names}
     for repeat in range(repeats):
         # Each repeat begins with another method, so that the order of the methods has no effect.
         first = repeat % len(names)
         for name in names[first:] + names[:first]:
-            began, cpu_began = time.perf_counter(), time.process_time()
-            methods[name](coverage)
-            times_ms[name].append(1e3 * (time.perf_counter() - began) / len(coverage))
-            cpu_ms[name].append(1e3 * (time.process_time() - cpu_began) / len(coverage))
+            times = timed[name]()
+            times_ms[name].append(times.wall_ms)
+            cpu_ms[name].append(times.cpu_ms)
     return [
         Timing(
             method=name,
@@ -262,8 +282,9 @@ def _print(header: dict[str, Any], timings: list[Timing]) -> None:
     difference = shapes["fitness_difference"]
     print(
         f"largest difference from psotrack's fitness: NumPy {difference['plain']:.1e}, "
-        f"NumPy tuned by hand {difference['tuned']:.1e}\n"
+        f"NumPy tuned by hand {difference['tuned']:.1e}"
     )
+    print(f"the score reads {shapes['look_ups_per_frame'] / 1e6:.1f} million table entries per frame\n")
 
     columns = ("ms/frame", "min", "max", "CPU ms", "ratio", "error mm", "warm-up s")
     print(f"{'method':38}" + "".join(f"{column:>11}" for column in columns))
@@ -271,10 +292,14 @@ def _print(header: dict[str, Any], timings: list[Timing]) -> None:
         numbers = (
             *(f"{value:.2f}" for value in (timing.median_ms, timing.min_ms, timing.max_ms, timing.cpu_ms)),
             f"{timing.ratio:.2f}",
-            f"{timing.mean_error_mm:.1f}",
+            "-" if np.isnan(timing.mean_error_mm) else f"{timing.mean_error_mm:.1f}",
             f"{timing.warm_up_s:.1f}",
         )
         print(f"{timing.method:38}" + "".join(f"{number:>11}" for number in numbers))
+    (floor,) = (timing for timing in timings if timing.method.startswith("floor"))
+    print("\nprocessor time as a multiple of the floor:")
+    for timing in timings[:3]:
+        print(f"{timing.method:38}{timing.cpu_ms / floor.cpu_ms:>11.2f}")
 
 
 if __name__ == "__main__":
