@@ -10,7 +10,7 @@ from .initial_state import (
 )
 from .initialisation import FLOOR_CLEARANCE_M, InitialState
 from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
-from .new_tracks import KnownDrones, TrackCandidate, find_candidates
+from .new_tracks import KnownDrones, TrackCandidate, compile_search, find_candidates
 from .reidentification import (
     NEW,
     SPEED_SHARE,
@@ -35,6 +35,7 @@ __all__ = [
     "PlannedStarts",
     "StartSource",
     "TrackCandidate",
+    "compile_search",
     "complete_initial_state",
     "count_common",
     "find_candidates",

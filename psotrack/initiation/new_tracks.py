@@ -54,7 +54,7 @@ class KnownDrones:
         position_m: (frames, drones, 3), positions; any value, NaN included, where the drone does not explain
             foreground.
         explains: (frames, drones), whether the position is good enough to explain foreground.
-        size_m: (drones, 3), full lengths along the world's axes.
+        size_m: (drones, 3), full lengths along the world's axes; NaN for a place in the arrays without a drone.
         moved_m: (frames, drones, cameras, 3), motion of the drones from the instant to each camera's exposure; None
             where all cameras' frames were exposed at the instant.
         is_there: (frames, cameras), whether the camera has a frame at the instant; None where all cameras have one.
@@ -170,6 +170,22 @@ def find_candidates(
             found.append(candidate)
             drones = drones.join(project_drones(volume, _places(path)[:, None], size[None]))
     return tuple(found)
+
+
+def compile_search(cameras: Camera, num_frames: int, num_drones: int, reduction: int) -> None:
+    """Compile what `find_candidates` calls, so that no frame of a live camera has to wait for it.
+
+    Args:
+        cameras: cameras with one leading axis, for the full image.
+        num_frames: number of frames that will be searched.
+        num_drones: number of known drones, or of places for them, with motions to the cameras' exposures.
+        reduction: image pixels per silhouette pixel, along each side.
+    """
+    volume = SearchVolume(cameras, viewpoints(cameras), np.zeros((2, 3)), reduction)
+    known_m, size_m = np.zeros((num_frames, num_drones, 3)), np.ones((num_drones, 3))
+    project_drones(volume, known_m, size_m, np.zeros((num_frames, num_drones, len(cameras.K), 3)))
+    for frames in (1, num_frames):
+        project_drones(volume, np.zeros((frames, 1, 3)), np.ones((1, 3)))
 
 
 def _propose_places(
@@ -351,4 +367,5 @@ def _nearest_size(
 def _span_limits(known_m: Float[np.ndarray, "drones 3"]) -> tuple[float, float]:
     """Smallest and largest span of a candidate, given the sizes of the known drones."""
     spans = known_m.max(axis=-1)
+    spans = spans[np.isfinite(spans)]
     return (float(spans.min()) / SIZE_RATIO, float(spans.max()) * SIZE_RATIO) if len(spans) else SPANS_M

@@ -25,6 +25,7 @@ from psotrack.initiation import (
     KnownDrones,
     LostTracks,
     TrackCandidate,
+    compile_search,
     find_candidates,
     find_false_tracks,
     find_lost_tracks,
@@ -129,6 +130,7 @@ class CausalTracker:
             self._drones, self._number = self._no_drones(capacity), np.full(capacity, -1)
             _, measured = self._run(coverage, exposures, 1)
             self._learn_sizes([measured] * SIZES_EVERY)
+            compile_search(self._rig.cameras, SEARCHED_FRAMES, capacity, self._reduction)
             if capacity >= self._most:
                 break
             capacity = _capacity(capacity + 1)
@@ -224,7 +226,7 @@ class CausalTracker:
         candidates = find_candidates(
             self._rig.cameras,
             coverage,
-            self._known_drones(recent, position_m, velocity_m_s, tracked, size_m),
+            self._known_drones(recent),
             reduction=self._reduction,
             fps=self._fps,
             bounds_m=self._bounds_m,
@@ -331,23 +333,20 @@ class CausalTracker:
             tracked[row, :count] = frame.info.status == Status.TRACKED
         return position_m[:, places], velocity_m_s[:, places], tracked[:, places]
 
-    def _known_drones(
-        self,
-        recent: list[_Remembered],
-        position_m: Float[np.ndarray, "frames drones 3"],
-        velocity_m_s: Float[np.ndarray, "frames drones 3"],
-        tracked: np.ndarray,
-        size_m: Float[np.ndarray, "drones 3"],
-    ) -> KnownDrones:
+    def _known_drones(self, recent: list[_Remembered]) -> KnownDrones:
+        """The drones of all places in the last frames; places without a drone explain no foreground."""
+        position_m, velocity_m_s, tracked = self._flights(list(range(len(self._number))))
+        is_known = self._number >= 0
         explains = np.array(tracked)
         for shift in range(1, tracker.MAX_OCCLUDING_FRAMES + 1):
             explains[shift:] |= tracked[: len(tracked) - shift]
         count = len(recent)
         exposures = jax.tree.map(lambda *each: np.stack(each), *[frame.exposures for frame in recent])
+        size_m = np.asarray(self._drones.params.size_m, np.float64)
         return KnownDrones(
             position_m[-count:],
-            explains[-count:],
-            size_m,
+            explains[-count:] & is_known,
+            np.where(is_known[:, None], size_m, np.nan),
             moved_m=moved_by(exposures, np.nan_to_num(velocity_m_s[-count:])),
             is_there=exposures.is_there,
             min_viewpoints=self._settings.status.min_cameras_to_begin,
