@@ -2,7 +2,8 @@
 
 Runs with the same number of drones and the same program form a batch: one compiled function, one copy of the
 silhouettes. On a CPU the runs of a batch are computed one after the other, and each run gives the same bits as alone.
-On an accelerator the runs are computed side by side.
+On an accelerator the runs are computed side by side; each operation then works on all runs at once, and rounding may
+differ from the run alone in the last bits.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from psotrack._typing import Array
 from psotrack.geometry import Camera
 from psotrack.silhouettes import Exposures
 from psotrack.tracking import sizes, tracker
+from psotrack.tracking.devices import computes_side_by_side
 from psotrack.tracking.sizes import SizeMeasurements, SizeProgram, SizeState
 from psotrack.trajectories import Status
 
@@ -75,6 +77,7 @@ def track_batch(
     *,
     capacity: int,
     device: jax.Device,
+    side_by_side: bool | None = None,
 ) -> list[BatchResult]:
     """Track the drones of one or more runs through a chunk, and learn their sizes.
 
@@ -83,9 +86,11 @@ def track_batch(
         chunk: the silhouettes.
         cameras: cameras with one leading axis, float32.
         program: static values of the tracker, the same for all runs.
-        capacity: number of runs for which the function is compiled. Unused capacity costs next to nothing on a CPU; an
-            accelerator computes it too.
+        capacity: number of runs for which the function is compiled. Unused capacity costs next to nothing where runs
+            are computed one after the other; side by side it is computed too.
         device: device that computes.
+        side_by_side: whether the runs are computed side by side, not one after the other; None is the choice for the
+            device (`computes_side_by_side`). Each choice is another program.
 
     Returns:
         One result for each run. The info has all frames of the chunk.
@@ -94,16 +99,19 @@ def track_batch(
     filled = (*runs, *[runs[0]] * (capacity - len(runs)))
     # JAX compiles separately for arrays committed to a device and for uncommitted ones: all are committed.
     arguments = jax.device_put((filled, jnp.int32(len(runs)), chunk, cameras), device)
-    return _track_batch(*arguments, program)[: len(runs)]
+    if side_by_side is None:
+        side_by_side = computes_side_by_side(device.platform)
+    return _track_batch(*arguments, program, side_by_side)[: len(runs)]
 
 
-@partial(jax.jit, static_argnames="program")
+@partial(jax.jit, static_argnames=("program", "side_by_side"))
 def _track_batch(
     runs: tuple[tuple[TrackedDrones, tracker.TrackStarts], ...],
     count: Int[Array, ""],
     chunk: Chunk,
     cameras: Camera,
     program: tracker.Program,
+    side_by_side: bool,
 ) -> list[BatchResult]:
     structures: list[Any] = []
 
@@ -115,7 +123,6 @@ def _track_batch(
         return leaves
 
     batch = [jnp.stack(leaves) for leaves in zip(*map(jax.tree.leaves, runs), strict=True)]
-    side_by_side = jax.default_backend() != "cpu"
     tracked = (
         jax.vmap(track_leaves)(batch) if side_by_side else _one_after_another(track_leaves, batch, count)
     )

@@ -1,4 +1,4 @@
-"""Devices: runs shared among all devices, one thread for each device."""
+"""Devices: runs shared among all devices, one thread for each device; and how a device computes its runs."""
 
 from __future__ import annotations
 
@@ -77,3 +77,15 @@ def largest_share(kinds: Sequence[Hashable], kind: Hashable) -> int:
 def num_used_devices(num_jobs: int) -> int:
     """Number of devices that work on `num_jobs` jobs."""
     return len(jax.devices()[:num_jobs])
+
+
+def computes_side_by_side(platform: str) -> bool:
+    """Whether a device computes the runs of a batch side by side: an accelerator does, a CPU does not.
+
+    An accelerator is as fast for many runs as for one until its arithmetic units are busy. A CPU gains nothing, and one
+    run after the other has the same bits as alone.
+
+    Args:
+        platform: platform of the device: "cpu", "gpu" or another accelerator's.
+    """
+    return platform != "cpu"

@@ -1,0 +1,126 @@
+"""Runs side by side, as an accelerator computes them, against runs one after the other, both on the CPU.
+
+Silhouettes are drawn by casting rays.
+"""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from helpers import ROOM_M, draw_coverage, ring_rig, track_settings
+
+from psotrack.identity import postprocess
+from psotrack.initiation import InitialState
+from psotrack.silhouettes import Silhouettes
+from psotrack.tracking import RunInputs, chunks, track_silhouettes, tracker_settings
+from psotrack.tracking.batch import track_batch
+from psotrack.tracking.devices import computes_side_by_side
+from psotrack.trajectories import Status
+
+FPS = 25.0
+REDUCTION = 2
+NUM_FRAMES = 50
+RIG = ring_rig(5, image_size_wh=(480, 360))
+SIZE_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]])
+EFFORT = {"particles": 20, "iterations": 15}
+
+#: The second drone enters late, so that a chunk is tracked again with more drones.
+ENTERS = 8
+
+#: Rounding changes which particle is the best, and then the whole search. The vertex of the score, to which each search
+#: converges, stays the same: to a fortieth of a silhouette's cell, which is 2 cm.
+MEDIAN_M = 0.5e-3
+
+
+def paths():
+    """(frames, 2, 3) positions; NaN where there is no drone."""
+    time_s = np.arange(NUM_FRAMES)[:, None] / FPS
+    first = np.array([-0.9, -0.6, 1.2]) + time_s * [0.25, 0.1, 0.05]
+    second = np.array([0.9, 0.9, 0.9]) + time_s * [-0.1, 0.05, 0.05]
+    truth = np.stack([first, second], axis=1)
+    truth[:ENTERS, 1] = np.nan
+    return truth
+
+
+TRUTH_M = paths()
+
+
+@pytest.fixture(scope="module")
+def silhouettes():
+    there = np.isfinite(TRUTH_M).all(axis=-1)
+    images = [
+        draw_coverage(RIG, positions[visible], SIZE_M[visible], REDUCTION)
+        for positions, visible in zip(TRUTH_M, there, strict=True)
+    ]
+    arrays = tuple(np.moveaxis(np.array(images), 1, 0))
+    return Silhouettes(
+        RIG.names, dict.fromkeys(RIG.names, "drawn"), REDUCTION, NUM_FRAMES, arrays[0].shape[1:], {}, arrays
+    )
+
+
+def first_drone(size):
+    """Initial state of the first drone alone, whose lengths are `size` times the true ones."""
+    return InitialState(TRUTH_M[:1, 0], np.array([[0.25, 0.1, 0.05]]), size * SIZE_M[:1], np.array([5.0]))
+
+
+def run_inputs(start, **settings):
+    return RunInputs(start, ROOM_M, tracker_settings(track_settings(**(EFFORT | settings))))
+
+
+#: Runs of different seeds, sizes and numbers of drones. The first of the tests' two devices gets two runs, the second
+#: gets one run in a batch for two.
+RUNS = [
+    run_inputs(first_drone(1.0), seed=0),
+    run_inputs(first_drone(0.85), seed=5),
+    run_inputs(first_drone(1.15), seed=2, drones=1, iterations=9, inertia=0.5),
+]
+
+
+def tracked(silhouettes, runs, *, side_by_side):
+    """Tracks of each run, with the numbers of the drones after identities were settled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chunks, "track_batch", partial(track_batch, side_by_side=side_by_side))
+        results = track_silhouettes(RIG, silhouettes, runs, fps=FPS)
+    settings = track_settings()
+    return [
+        (tracks, postprocess(tracks, settings.motion, settings.identity, fps=FPS, smoothing=None)[0])
+        for tracks, _ in results
+    ]
+
+
+def assert_same_tracks(one, other):
+    """The same drones with the same numbers and statuses, at the same places."""
+    (tracks, trajectories), (other_tracks, other_trajectories) = one, other
+    assert tracks.arrivals == other_tracks.arrivals
+    np.testing.assert_array_equal(tracks.status, other_tracks.status)
+    np.testing.assert_array_equal(trajectories.status, other_trajectories.status)
+    position_m, other_m = trajectories.position_m, other_trajectories.position_m
+    distance_m = np.linalg.norm(position_m - other_m, axis=-1)
+    seen = trajectories.status == Status.TRACKED
+    assert seen.sum() > 0.8 * NUM_FRAMES
+    for drone in range(trajectories.num_drones):
+        assert np.median(distance_m[seen[:, drone], drone]) <= MEDIAN_M
+    # The drones are metres apart: a drone with another number would be no nearer than that in a single frame.
+    assert distance_m[seen].max() < SIZE_M.min()
+    np.testing.assert_allclose(tracks.sizes.size_m, other_tracks.sizes.size_m, atol=2 * MEDIAN_M)
+
+
+@pytest.mark.parametrize(("platform", "expected"), [("cpu", False), ("gpu", True), ("tpu", True)])
+def test_the_device_decides_how_runs_are_computed(platform, expected):
+    """Not the process's default backend: a process with a GPU may compute on its CPU too."""
+    assert computes_side_by_side(platform) is expected
+
+
+# One test, because each worker that ran a part of it would compile the programs again.
+@pytest.mark.slow
+def test_runs_side_by_side_are_the_runs_one_after_another(silhouettes):
+    side_by_side = tracked(silhouettes, RUNS, side_by_side=True)
+    one_after_another = tracked(silhouettes, RUNS, side_by_side=False)
+    for one, other in zip(side_by_side, one_after_another, strict=True):
+        assert_same_tracks(one, other)
+    # Two programs were compared: rounding differs in some frame.
+    assert (side_by_side[0][0].position_m != one_after_another[0][0].position_m).any()
+    # In the batch of two that held this run alone, a copy of the run filled the other place; alone, there is one place.
+    number = 1
+    (alone,) = tracked(silhouettes, [RUNS[number]], side_by_side=True)
+    assert_same_tracks(side_by_side[number], alone)
