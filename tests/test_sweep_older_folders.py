@@ -82,6 +82,7 @@ def test_rows_have_todays_names(tmp_path: Path) -> None:
             "settings.silhouettes.reduction": 4,
             "settings.silhouettes.background": "mog2",
             "settings.silhouettes.drone_px": None,
+            "settings.silhouettes.first_look": True,
         }
     )
     store = Store(tmp_path)

@@ -30,6 +30,7 @@ _NEW = {
     "errors.pixel_px": 0.0,
     "silhouettes.background": "mog2",
     "silhouettes.drone_px": None,
+    "silhouettes.first_look": True,
 }
 
 #: Values of version 0.1 for which the value is None today, where the data may say more.
