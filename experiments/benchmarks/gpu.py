@@ -11,8 +11,9 @@ Prints device, versions, shapes and medians, each beside what is to be reached:
   number and how many positions another status;
 - MOG2 in JAX, the upload of the frames included, against OpenCV's on two cores.
 
-Seconds of a call are divided into those of the device, from the upload of a chunk of silhouettes to the end of its
-tracks, and the others, those of the host: it looks for drones, plans new tracks, settles identities and smooths.
+Compilation is left out of all seconds. The device's part of them goes from the upload of a chunk of silhouettes to the
+end of its tracks. The track stage is this and the search for new tracks between the chunks. The rest is the host's, one
+run after the other: it looks for the volume and the drones, learns the cameras' errors, settles identities and smooths.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import os
 import statistics
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -108,27 +110,37 @@ class TimedBatches:
 
     Attributes:
         side_by_side: as in `track_batch`.
-        seconds: seconds of all calls.
+        seconds: seconds of all calls, summed over the threads of all devices.
     """
 
     side_by_side: bool | None
     seconds: float = 0.0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __call__(self, *arguments: Any, **named: Any) -> list[BatchResult]:
         """Track a chunk, and wait for the result."""
         began = time.perf_counter()
         result = track_batch(*arguments, **named, side_by_side=self.side_by_side)
         result = jax.block_until_ready(result)
-        self.seconds += time.perf_counter() - began
+        with self._lock:
+            self.seconds += time.perf_counter() - began
         return result
 
 
 @dataclass(frozen=True)
 class Timed:
-    """Trajectories of some runs, and the medians of the seconds of all runs and of the device's part of them."""
+    """Trajectories of some runs, and medians of the seconds of all runs together.
+
+    Attributes:
+        trajectories: the trajectories of each run.
+        total_s: seconds of the whole call.
+        track_s: seconds of the track stage.
+        device_s: seconds of the device; not meaningful for several devices.
+    """
 
     trajectories: list[Trajectories]
     total_s: float
+    track_s: float
     device_s: float
 
 
@@ -200,29 +212,29 @@ def compare_runs(
     # One after the other, so that neither has to share the cores.
     here = time_runs(folder, cache, size.runs, size, batches)
     there = cores.submit(_time_runs_on_cores, folder, cache, size).result()
-    frames_s, cpu_frames_s = (
-        recording.num_frames * runs / timed.total_s
-        for runs, timed in ((size.runs, here), (size.cpu_runs, there))
-    )
+    share = size.cpu_runs / size.runs
     figures = {
         "sequence": recording.name,
         "shape": shape,
         "runs": size.runs,
         "cpu_runs": size.cpu_runs,
         "total_s": here.total_s,
+        "track_s": here.track_s,
         "device_s": here.device_s,
         "cpu_total_s": there.total_s,
-        "cpu_device_s": there.device_s,
-        "frames_per_s": frames_s,
-        "cpu_frames_per_s": cpu_frames_s,
-        "ratio": frames_s / cpu_frames_s,
+        "cpu_track_s": there.track_s,
+        "frames_per_s": recording.num_frames * size.runs / here.total_s,
+        "ratio": there.total_s / (here.total_s * share),
+        "ratio_track": there.track_s / (here.track_s * share),
         **differences(here.trajectories[: size.cpu_runs], there.trajectories),
     }
     print(
         f"\n{recording.name}: silhouettes {shape} (frames, cameras, height, width), {TrackSettings().swarm}\n"
-        f"{size.runs} runs at once:       {here.total_s:8.2f} s, of which the device {here.device_s:.2f}\n"
-        f"{size.cpu_runs} runs on {CORES} cores:     {there.total_s:8.2f} s\n"
-        f"ratio of throughputs:  {figures['ratio']:8.2f} (to reach: {RATIO:g})\n"
+        f"{size.runs} runs at once:       {here.total_s:8.2f} s, track stage {here.track_s:.2f}, of which the device "
+        f"{here.device_s:.2f}\n"
+        f"{size.cpu_runs} runs on {CORES} cores:     {there.total_s:8.2f} s, track stage {there.track_s:.2f}\n"
+        f"ratio of throughputs:  {figures['ratio']:8.2f}, of the track stage {figures['ratio_track']:.2f} "
+        f"(to reach: {RATIO:g})\n"
         f"distance of tracks:    {figures['median_mm']:8.3f} mm in the median, {figures['p99_mm']:.3f} at 99 % "
         f"(to reach: {DISTANCE_MM:g} in the median)\n"
         f"another identity:      {figures['other_identities']:8d} drones, another status: "
@@ -237,18 +249,24 @@ def time_runs(folder: Path, cache: Path, runs: int, size: Size, batches: TimedBa
     recording = open_recording(folder).usable(num_frames=None)
     silhouettes = compute(recording, TrackSettings().silhouettes, cache=cache)
     settings = [TrackSettings(seed=seed).changed(size.settings) for seed in range(runs)]
-    results = track_runs(recording, silhouettes, settings)
-    total_s, device_s = [], []
-    for _ in range(size.repeats):
+    seconds: list[tuple[float, float, float]] = []
+    for _ in range(1 + size.repeats):
         batches.seconds, began = 0.0, time.perf_counter()
         results = track_runs(recording, silhouettes, settings)
-        total_s.append(time.perf_counter() - began)
-        device_s.append(batches.seconds)
-    for result in results:
-        if isinstance(result, InputError):
-            raise result
-    found = [result.trajectories for result in results if not isinstance(result, InputError)]
-    return Timed(found, statistics.median(total_s), statistics.median(device_s))
+        total_s = time.perf_counter() - began
+        found = []
+        for result in results:
+            if isinstance(result, InputError):
+                raise result
+            found.append(result)
+        # The seconds of a run are its share of those of all runs.
+        track_s, compile_s = (
+            sum(result.record["seconds"][stage] for result in found) for stage in ("track", "compile")
+        )
+        seconds.append((total_s - compile_s, track_s, batches.seconds - compile_s))
+    # The first call compiles. Later calls count a chunk without iterations as compilation, for each program.
+    medians = [statistics.median(column) for column in zip(*seconds[1:], strict=True)]
+    return Timed([result.trajectories for result in found], *medians)
 
 
 def _time_runs_on_cores(folder: Path, cache: Path, size: Size) -> Timed:
