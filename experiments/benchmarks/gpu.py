@@ -212,7 +212,7 @@ def compare_runs(
     # One after the other, so that neither has to share the cores.
     here = time_runs(folder, cache, size.runs, size, batches)
     there = cores.submit(_time_runs_on_cores, folder, cache, size).result()
-    share = size.cpu_runs / size.runs
+    swarm, share = TrackSettings().changed(size.settings).swarm, size.cpu_runs / size.runs
     figures = {
         "sequence": recording.name,
         "shape": shape,
@@ -229,7 +229,7 @@ def compare_runs(
         **differences(here.trajectories[: size.cpu_runs], there.trajectories),
     }
     print(
-        f"\n{recording.name}: silhouettes {shape} (frames, cameras, height, width), {TrackSettings().swarm}\n"
+        f"\n{recording.name}: silhouettes {shape} (frames, cameras, height, width), {swarm}\n"
         f"{size.runs} runs at once:       {here.total_s:8.2f} s, track stage {here.track_s:.2f}, of which the device "
         f"{here.device_s:.2f}\n"
         f"{size.cpu_runs} runs on {CORES} cores:     {there.total_s:8.2f} s, track stage {there.track_s:.2f}\n"
