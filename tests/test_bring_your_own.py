@@ -517,7 +517,7 @@ def test_search_and_background_by_entry_points(run_track):
     tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard", *SMALL)
     assert record["settings"]["swarm"]["search"] == "prediction"
     assert record["parts"] == {
-        "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 2}}
+        "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 1}}
     }
     # The measured position is always the predicted one, so the drones fly on with the velocity of frame 0.
     steps_m = np.diff(tracks.position_m, axis=0)

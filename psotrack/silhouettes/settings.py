@@ -26,6 +26,8 @@ _LEAST_STORED_PX = 8
 #: Where the rig is known: a drone whose usual width is this many stored values or more keeps its shape, even if the
 #: background model sees no finer image than what is stored.
 _LEAST_DRONE_CELLS = 6
+#: Of narrower drones no pixel is given away: in small images they have few, and the background model takes little time.
+_LEAST_USUAL_PX = 24
 #: Speckle: blobs narrower than this share of a drone's width; a blob has 4 pixels at least.
 _SPECKLE, _LEAST_BLOB_PX = 0.2, 4
 #: Smallest blob of the background model "living" where the drones' size is not given, pixels: a distant drone of 5 x 2
@@ -194,7 +196,8 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         if reduction is None:
             reduction = working * (2 if across_px >= _LEAST_STORED_PX else 1)
         given = self.drone_px is not None or self.working_reduction is not None
-        if not given and usual_px is not None and usual_px >= _LEAST_DRONE_CELLS * reduction:
+        wide_px = max(_LEAST_DRONE_CELLS * reduction, _LEAST_USUAL_PX)
+        if not given and usual_px is not None and usual_px >= wide_px:
             working = reduction
         least_px = self.min_blob_px
         if least_px is None and self.drone_px is None and self.background == LIVING:
