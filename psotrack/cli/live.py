@@ -21,7 +21,6 @@ from psotrack.cli.options import (
     QUIET,
     SEQUENCE,
     TRACK,
-    cache_folder,
     camera_names,
     compiled_folder,
     silhouette_options,
@@ -132,7 +131,6 @@ def live(
         refuse_to_overwrite(path, force)
     chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
     keep_compiled(compiled_folder(cache))
-    cache_folder(cache)
     recording = open_recording(sequence)
     if replay:
         recording = recording.usable(camera_names(cameras))

@@ -21,7 +21,7 @@ from psotrack.recordings import REACH
 _LEAST_INTERVAL = 0.8
 #: A frame that comes sooner after the one before, in intervals, is the same frame again.
 _DOUBLED = 0.3
-#: A camera that was silent for so long has stopped, seconds.
+#: A camera has stopped when no frame came for this time, seconds.
 STOPPED_S = 1.0
 
 

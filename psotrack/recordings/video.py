@@ -31,7 +31,7 @@ _CODEC = "XVID"
 _CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
 #: Largest number of images of which the depth is read.
 _READ_IMAGES = 5
-#: OpenCV seeks so many frames before a frame, and decodes from the key frame there.
+#: To reach a frame, OpenCV decodes from the last key frame that is at least this number of frames before it.
 _SEEK_BEFORE = 17
 
 

@@ -20,7 +20,7 @@ from psotrack.silhouettes.settings import ForegroundSettings
 
 #: Memory for the frames that are held, bytes: 10 s of a video of 1920 x 1080 pixels, reduced by 4.
 _HELD_BYTES = 128 * 2**20
-#: Frames that are looked at in the rest of the video: one of so many, and a number of them that is enough to tell what
+#: Frames that are looked at in the rest of the video: one of 200, and at least 4, which is enough to tell what
 #: stays at its place from what flies on.
 _LATER_SHARE, _LEAST_LATER = 200, 4
 #: Largest number of frames that are looked at: more do not tell better what most frames show.

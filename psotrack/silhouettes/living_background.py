@@ -67,9 +67,9 @@ _CALM_FRAMES = 10
 _LEAST_CHANGE = 4.0
 #: Number of frames between two updates of the difference that a strong pixel needs, because it changes slowly.
 _USUAL_EVERY = 8
-#: One of so many frames is learned, with the weight of all of them; each of the first frames of a live camera.
+#: One of three frames is learned, with the weight of three. Of a live camera, each of the first 25 frames is learned.
 _LEARN_EVERY, _ALL_LEARNED = 3, 25
-#: Pixels that show the background are learned by MOG2 only one of so many times.
+#: Pixels that show the known background are learned by MOG2 every second time only.
 _ALL_EVERY = 2
 #: Objects are protected from being learned with a margin, because their edges are blurred.
 _MARGIN = np.ones((5, 5), np.uint8)
@@ -213,8 +213,7 @@ class LivingBackground:
         num_frames, self._num_learned = self._num_frames - self._num_learned, self._num_frames
         # At first each frame has the same weight.
         learning_rate = max(_LEARNING_RATE, 1 / (self._num_before + self._num_frames))
-        # MOG2 takes long, and most pixels show the background as it is known: one of so many times is enough to learn
-        # those.
+        # MOG2 takes long, and most pixels show the background as it is known: they are learned less often.
         self._num_updates += 1
         known = protected if self._num_updates % _ALL_EVERY == 0 else cv2.bitwise_or(protected, same)
         self._mog2.apply(image, known, None, _of_frames(learning_rate, num_frames))
