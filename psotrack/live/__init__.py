@@ -1,9 +1,9 @@
 """Live cameras: frames that meet by their times while they come, and the rows of tracks as they are found.
 
 In: a rig and one source of frames per camera: a device, the address of a stream, or a video that is played at its own
-rate. Out: the rows of each instant, and counts of what was lost. `sources` read frames, `meeting` brings the frames of
-all cameras together, `session` runs the cameras' threads and the tracker. Other rooms may use every name in
-`__init__.pyi`.
+rate. Out: the rows of each instant, and counts of what was lost. `sources` read frames, `front_end` turns them into
+silhouettes in worker processes, `meeting` brings the frames of all cameras together, `session` runs the workers and the
+tracker. Other rooms may use every name in `__init__.pyi`.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""A session: a thread per camera makes silhouettes, the calling thread brings them together and tracks."""
+"""A session: worker processes make silhouettes, and the calling thread brings them together and tracks."""
 
 from __future__ import annotations
 
@@ -9,28 +9,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
 
 from psotrack.errors import InputError, PsotrackError
+from psotrack.live.front_end import Arrived, Ended, FilmTask, Message, Notice, Ready, Silhouette, film
 from psotrack.live.meeting import CameraCounts, Instant, Meeting
 from psotrack.live.sources import CameraStream, LiveSource, ReplayedVideo
 from psotrack.pipeline import CausalRun, causal_settings
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import (
-    Exposures,
-    LivingBackground,
-    ScaledSettings,
-    coverage,
-    ignored_pixels,
-    reduce_frame,
-    usual_drone_px,
-)
+from psotrack.silhouettes import Exposures, usual_drone_px
+from psotrack.support import worker_processes
 from psotrack.trajectories import Trajectories
 
 logger = logging.getLogger(__name__)
@@ -39,8 +32,8 @@ logger = logging.getLogger(__name__)
 WAIT_S = 0.1
 #: Largest number of complete instants that wait for the tracker: more are left out, so that the delay does not grow.
 _MOST_WAITING = 3
-#: A frame that waits for longer before it is processed is left out, seconds.
-_MOST_BEHIND_S = 0.1
+#: Time that a worker has to end, seconds.
+_END_S = 2.0
 #: Rate of a stream that does not tell its own, frames per second.
 _USUAL_HZ = 25.0
 
@@ -140,6 +133,7 @@ class LiveSession:
         most_drones: largest number of drones at one time.
         first_s: time of the first instant on the recording's clock, seconds.
         wait_s: how long an instant waits for cameras, seconds of the wall clock.
+        jobs: largest number of worker processes; None is one per processor.
     """
 
     def __init__(
@@ -151,6 +145,7 @@ class LiveSession:
         most_drones: int = 16,
         first_s: float = 0.0,
         wait_s: float = WAIT_S,
+        jobs: int | None = None,
     ) -> None:
         settings = causal_settings(settings)
         names = {each.name for each in cameras}
@@ -160,6 +155,7 @@ class LiveSession:
         self._scaled = settings.silhouettes.scaled(sizes_wh, usual_drone_px(recording.rig))
         self._rate_hz = settings.rate_hz or max(each.fps for each in cameras)
         self._wait_s, self._first_s = wait_s, first_s
+        self._num_workers = min(jobs or os.cpu_count() or 1, len(cameras))
         sizes = -(-np.asarray(self._rig.cameras.image_size_wh) // self._scaled.reduction)
         self._shape = int(sizes[:, 1].max()), int(sizes[:, 0].max())
         self._line_time_s = np.array([each.line_time_s for each in cameras], np.float32)
@@ -175,6 +171,7 @@ class LiveSession:
         self._stopped = threading.Event()
         self._changed = threading.Condition()
         self._failed: list[BaseException] = []
+        self._said = [""] * len(cameras)
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
     def compile(self) -> None:
@@ -200,43 +197,105 @@ class LiveSession:
             InputError: no source can bring frames.
             OutputError: an output fails.
         """
-        began_s = time.monotonic()
-        self._meeting = Meeting(
-            [each.fps for each in self._cameras],
-            self._rate_hz,
-            wait_s=self._wait_s,
-            began_s=began_s,
-            first_s=self._first_s,
-        )
-        self.result.counts = dict(
-            zip((each.name for each in self._cameras), self._meeting.counts, strict=True)
-        )
-        slots = threading.BoundedSemaphore(os.cpu_count() or 1)
-        threads = [
-            threading.Thread(target=self._film, args=(index, began_s, slots), daemon=True)
-            for index in range(len(self._cameras))
-        ]
-        before, cv2_threads = None, cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            for thread in threads:
-                thread.start()
-            for instant, num_left_out in self._instants():
-                elapsed = 1 if before is None else instant.number - before
-                before = instant.number
-                self._track(instant, elapsed, outputs)
-                self.result.left_out += num_left_out
-                self.result.seconds = time.monotonic() - began_s
-                if on_instant is not None:
-                    on_instant(self.result, self._meeting.films)
-        finally:
-            self.stop()
-            for thread in threads:
-                thread.join(timeout=2.0)
-            cv2.setNumThreads(cv2_threads)
-        if self._failed and not self.result.instants:
-            raise self._failed[0]
+        tasks = self._tasks()
+        with worker_processes(film, tasks) as connections:
+            for connection in connections:
+                assert isinstance(connection.recv(), Ready)
+            began_s = time.monotonic()
+            self._meeting = Meeting(
+                [each.fps for each in self._cameras],
+                self._rate_hz,
+                wait_s=self._wait_s,
+                began_s=began_s,
+                first_s=self._first_s,
+            )
+            names = (each.name for each in self._cameras)
+            self.result.counts = dict(zip(names, self._meeting.counts, strict=True))
+            listeners = [
+                threading.Thread(target=self._listen, args=(connection, of_worker), daemon=True)
+                for connection, of_worker in zip(connections, tasks, strict=True)
+            ]
+            try:
+                for connection, listener in zip(connections, listeners, strict=True):
+                    connection.send(began_s)
+                    listener.start()
+                self._track_all(began_s, outputs, on_instant)
+            finally:
+                self.stop()
+                for connection in connections:
+                    with contextlib.suppress(OSError):
+                        connection.send(None)
+                for listener in listeners:
+                    listener.join(_END_S)
+        bugs = [error for error in self._failed if not isinstance(error, PsotrackError)]
+        if bugs or (self._failed and not self.result.instants):
+            raise (bugs or self._failed)[0]
         return self.result
+
+    def _track_all(
+        self,
+        began_s: float,
+        outputs: list[RowsOutput],
+        on_instant: Callable[[LiveResult, list[bool]], None] | None,
+    ) -> None:
+        before = None
+        for instant, num_left_out in self._instants():
+            elapsed = 1 if before is None else instant.number - before
+            before = instant.number
+            self._track(instant, elapsed, outputs)
+            self.result.left_out += num_left_out
+            self.result.seconds = time.monotonic() - began_s
+            if on_instant is not None:
+                on_instant(self.result, self._meeting.films)
+
+    def _tasks(self) -> list[list[FilmTask]]:
+        """The cameras of each worker, dealt like cards."""
+        tasks = [
+            FilmTask(index, camera.source, self._scaled, camera.ignore)
+            for index, camera in enumerate(self._cameras)
+        ]
+        return [tasks[worker :: self._num_workers] for worker in range(self._num_workers)]
+
+    def _listen(self, connection: Connection, tasks: list[FilmTask]) -> None:
+        """Take the messages of a worker, until it ends; the other workers go on where one dies."""
+        while True:
+            try:
+                message: Message = connection.recv()
+            except (OSError, EOFError):
+                break
+            with self._changed:
+                self._take(message)
+                self._changed.notify_all()
+        if not self._stopped.is_set():
+            died = PsotrackError(
+                "a worker process", expected="frames", found="that it died", remedy="is memory short?"
+            )
+            with self._changed:
+                for task in tasks:
+                    self._take(Ended(task.index, died))
+                self._changed.notify_all()
+
+    def _take(self, message: Message) -> None:
+        meeting = self._meeting
+        match message:
+            case Arrived(index, time_s):
+                self._said[index] = ""
+                if meeting.announce(index, time_s, time.monotonic()):
+                    logger.warning("camera %s films again", self._cameras[index].name)
+            case Silhouette(index, time_s, arrived_s, coverage):
+                if coverage is None:
+                    meeting.leave_out(index)
+                else:
+                    meeting.put(index, time_s, coverage, arrived_s)
+            case Notice(index, line):
+                if line != self._said[index]:
+                    logger.warning("camera %s: %s", self._cameras[index].name, line)
+                self._said[index] = line
+            case Ended(index, error):
+                meeting.end(index)
+                if error is not None:
+                    logger.warning("camera %s: %s", self._cameras[index].name, error)
+                    self._failed.append(error)
 
     def _instants(self) -> Iterator[tuple[Instant, int]]:
         """Yield instants that are complete, and how many were left out before each."""
@@ -278,69 +337,3 @@ class LiveSession:
         del result.delay_s[: -round(3600 * self._rate_hz)]
         result.drones.update(rows.drones)
         self._run.look_ahead()
-
-    def _film(self, index: int, began_s: float, slots: threading.BoundedSemaphore) -> None:
-        """The thread of a camera: frames to silhouettes."""
-        camera = self._cameras[index]
-        said = ""
-        try:
-            silhouettes = _Silhouettes(self._scaled, camera.ignore)
-            frames = camera.source.frames(began_s, self._stopped.is_set)
-            with contextlib.closing(frames):
-                for frame in frames:
-                    if isinstance(frame, str):
-                        if frame != said:
-                            logger.warning("camera %s: %s", camera.name, frame)
-                        said = frame
-                        continue
-                    said = ""
-                    with self._changed:
-                        if self._meeting.announce(index, frame.time_s, time.monotonic()):
-                            logger.warning("camera %s films again", camera.name)
-                    with slots:
-                        # A frame that has waited for long is left out, so that the delay does not grow.
-                        is_late = time.monotonic() - frame.arrived_s > _MOST_BEHIND_S
-                        image = None if frame.image is None or is_late else silhouettes.step(frame.image)
-                    with self._changed:
-                        if image is None:
-                            silhouettes.num_left_out += 1
-                            self._meeting.leave_out(index)
-                        else:
-                            self._meeting.put(index, frame.time_s, image, frame.arrived_s)
-                        self._changed.notify_all()
-        except PsotrackError as error:
-            logger.warning("camera %s: %s", camera.name, error)
-            self._failed.append(error)
-        finally:
-            with self._changed:
-                self._meeting.end(index)
-                self._changed.notify_all()
-
-
-class _Silhouettes:
-    """Silhouettes of one camera's frames, whose background is learned as they come."""
-
-    def __init__(self, settings: ScaledSettings, ignore: Path | None) -> None:
-        self._settings = settings
-        self._ignore = ignore
-        self._ignored: Bool[np.ndarray, "rows columns"] | None = None
-        self._background: LivingBackground | None = None
-        self.num_left_out = 0
-
-    def step(self, frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns"]:
-        """The silhouette of the next frame."""
-        image = reduce_frame(frame, self._settings)
-        if self._background is None:
-            self._background = LivingBackground(self._settings, image)
-            if self._ignore is not None:
-                self._ignored = ignored_pixels(
-                    self._ignore,
-                    "the camera",
-                    (frame.shape[1], frame.shape[0]),
-                    self._settings.working_reduction,
-                )
-        mask = self._background.step(image, num_frames=1 + self.num_left_out)
-        self.num_left_out = 0
-        if self._ignored is not None:
-            mask = np.where(self._ignored, np.uint8(0), mask)
-        return coverage(mask, self._settings.reduction // self._settings.working_reduction)

@@ -3,7 +3,7 @@ from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .figures import COLOURS, drone_colour, save_figure
 from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
-from .processes import map_in_processes
+from .processes import map_in_processes, with_traceback, worker_processes
 from .progress import Advance, Report, no_progress, progress_bar
 from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_toml, toml_key, toml_value
@@ -47,5 +47,7 @@ __all__ = [
     "toml_key",
     "toml_value",
     "user_cache",
+    "with_traceback",
+    "worker_processes",
     "write_rows",
 ]

@@ -57,7 +57,7 @@ def map_in_processes(
         return [function(task, advance) for task in tasks]
     waiting = deque(enumerate(tasks))
     results: dict[int, _Result] = {}
-    with _workers(function, min(jobs, len(tasks))) as connections:
+    with worker_processes(_serve, [function] * min(jobs, len(tasks))) as connections:
         for connection in connections:
             connection.send(waiting.popleft())
         while len(results) < len(tasks):
@@ -76,17 +76,26 @@ def map_in_processes(
 
 
 @contextlib.contextmanager
-def _workers(function: Callable[..., Any], count: int) -> Iterator[list[Connection]]:
-    """Connections to `count` new processes that run `_serve` until the end of the block."""
+def worker_processes(
+    target: Callable[[_Task, Connection], None], tasks: Sequence[_Task]
+) -> Iterator[list[Connection]]:
+    """Connections to new processes, each of which runs `target(task, connection)`.
+
+    At the end of the block the pipes break: `target` shall return then. A process that does not is ended.
+
+    Args:
+        target: importable by name.
+        tasks: picklable; one for each process.
+    """
     # Spawned, not forked: a forked copy of a process with JAX or OpenCV threads may hang.
     context = multiprocessing.get_context("spawn")
     connections: list[Connection] = []
     processes = []
     try:
         with _sigint_ignored():
-            for _ in range(count):
+            for task in tasks:
                 here, there = context.Pipe()
-                process = context.Process(target=_serve, args=(function, there), daemon=True)
+                process = context.Process(target=_run, args=(target, task, there), daemon=True)
                 process.start()
                 there.close()
                 connections.append(here)
@@ -150,21 +159,31 @@ class _Progress:
         self._steps, self._sent_s = 0, time.monotonic()
 
 
-def _serve(function: Callable[..., Any], connection: Connection) -> None:
-    """Run a worker: receive tasks; send progress (int), results (index, result) and exceptions."""
+def _run(target: Callable[[_Task, Connection], None], task: _Task, connection: Connection) -> None:
+    """Run `target` in a worker process, until the pipe breaks."""
     cv2.setNumThreads(1)
-    # Where the parent process terminates the worker, the clean-up of `function` runs.
+    # Where the parent process terminates the worker, the clean-up of `target` runs.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            index, task = connection.recv()
-            try:
-                progress = _Progress(connection)
-                result = function(task, progress.advance)
-                progress.send()
-            except Exception as error:
-                if not isinstance(error, PsotrackError):  # a bug: its traceback would get lost in the pipe
-                    error.add_note(f"in a worker process:\n{traceback.format_exc()}")
-                connection.send(error)
-            else:
-                connection.send((index, result))
+        target(task, connection)
+
+
+def _serve(function: Callable[..., Any], connection: Connection) -> None:
+    """Receive tasks; send progress (int), results (index, result) and exceptions."""
+    while True:
+        index, task = connection.recv()
+        try:
+            progress = _Progress(connection)
+            result = function(task, progress.advance)
+            progress.send()
+        except Exception as error:
+            connection.send(with_traceback(error))
+        else:
+            connection.send((index, result))
+
+
+def with_traceback(error: BaseException) -> BaseException:
+    """An error of a worker process; with its traceback as a note, which a pipe would lose, where it is a bug."""
+    if not isinstance(error, PsotrackError):
+        error.add_note(f"in a worker process:\n{''.join(traceback.format_exception(error))}")
+    return error
