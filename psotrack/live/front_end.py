@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -24,6 +24,8 @@ from psotrack.support import with_traceback
 
 #: A frame that waits for longer before it is processed is left out, seconds.
 _MOST_BEHIND_S = 0.1
+#: Longest time that a camera waits for the silhouettes of others before it learns, seconds.
+_LONGEST_TURN_S = 0.02
 #: Time that the cameras' threads have to end, seconds.
 _END_S = 0.5
 
@@ -64,7 +66,7 @@ class Arrived:
 
 
 @dataclass(frozen=True)
-class Silhouette:
+class CameraSilhouette:
     """The silhouette of the frame that has come.
 
     Attributes:
@@ -106,7 +108,7 @@ class Ended:
     error: BaseException | None
 
 
-Message = Ready | Arrived | Silhouette | Notice | Ended
+Message = Ready | Arrived | CameraSilhouette | Notice | Ended
 
 
 def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
@@ -122,8 +124,10 @@ def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
 
     send(Ready())
     began_s = connection.recv()
+    turns = _Turns()
     threads = [
-        threading.Thread(target=_film_one, args=(task, began_s, stopped, send), daemon=True) for task in tasks
+        threading.Thread(target=_film_one, args=(task, began_s, stopped, send, turns), daemon=True)
+        for task in tasks
     ]
     for thread in threads:
         thread.start()
@@ -136,7 +140,7 @@ def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
 
 
 def _film_one(
-    task: FilmTask, began_s: float, stopped: threading.Event, send: Callable[[Message], None]
+    task: FilmTask, began_s: float, stopped: threading.Event, send: Callable[[Message], None], turns: _Turns
 ) -> None:
     """The thread of a camera: frames to silhouettes."""
     error: BaseException | None = None
@@ -149,14 +153,45 @@ def _film_one(
                     continue
                 send(Arrived(task.index, frame.time_s))
                 # A frame that has waited for long is left out, so that the delay does not grow.
-                is_late = time.monotonic() - frame.arrived_s > _MOST_BEHIND_S
-                image = None if frame.image is None or is_late else silhouettes.step(frame.image)
-                silhouettes.num_left_out += image is None
-                send(Silhouette(task.index, frame.time_s, frame.arrived_s, image))
+                if frame.image is None or time.monotonic() - frame.arrived_s > _MOST_BEHIND_S:
+                    silhouettes.leave_out()
+                    send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, None))
+                    continue
+                with turns.of_frame():
+                    silhouette = silhouettes.look(frame.image)
+                    send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, silhouette))
+                # What the tracker does not wait for.
+                turns.wait()
+                silhouettes.learn()
     except Exception as failed:
         error = with_traceback(failed)
     finally:
         send(Ended(task.index, error))
+
+
+class _Turns:
+    """The cameras of a worker: no camera learns while another one's silhouette is in work."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._num_in_work = 0
+
+    @contextlib.contextmanager
+    def of_frame(self) -> Iterator[None]:
+        """A silhouette is in work."""
+        with self._changed:
+            self._num_in_work += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._num_in_work -= 1
+                self._changed.notify_all()
+
+    def wait(self) -> None:
+        """Wait until no silhouette is in work, but not for long: the next frame comes."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._num_in_work, _LONGEST_TURN_S)
 
 
 class _Silhouettes:
@@ -167,10 +202,14 @@ class _Silhouettes:
         self._ignore = ignore
         self._ignored: Bool[np.ndarray, "rows columns"] | None = None
         self._background: LivingBackground | None = None
-        self.num_left_out = 0
+        self._num_left_out = 0
 
-    def step(self, frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns"]:
-        """The silhouette of the next frame."""
+    def leave_out(self) -> None:
+        """The next frame is not seen."""
+        self._num_left_out += 1
+
+    def look(self, frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns"]:
+        """The silhouette of the next frame; `learn` is to be called before the frame after it."""
         image = reduce_frame(frame, self._settings)
         if self._background is None:
             self._background = LivingBackground(self._settings, image)
@@ -181,8 +220,13 @@ class _Silhouettes:
                     (frame.shape[1], frame.shape[0]),
                     self._settings.working_reduction,
                 )
-        mask = self._background.step(image, num_frames=1 + self.num_left_out)
-        self.num_left_out = 0
+        mask = self._background.look(image, num_frames=1 + self._num_left_out)
+        self._num_left_out = 0
         if self._ignored is not None:
             mask = np.where(self._ignored, np.uint8(0), mask)
         return coverage(mask, self._settings.reduction // self._settings.working_reduction)
+
+    def learn(self) -> None:
+        """Learn from the last frame."""
+        assert self._background is not None
+        self._background.learn()

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.live.front_end import Arrived, Ended, FilmTask, Message, Notice, Ready, Silhouette, film
+from psotrack.live.front_end import Arrived, CameraSilhouette, Ended, FilmTask, Message, Notice, Ready, film
 from psotrack.live.meeting import CameraCounts, Instant, Meeting
 from psotrack.live.sources import CameraStream, LiveSource, ReplayedVideo
 from psotrack.pipeline import CausalRun, causal_settings
@@ -282,7 +282,7 @@ class LiveSession:
                 self._said[index] = ""
                 if meeting.announce(index, time_s, time.monotonic()):
                     logger.warning("camera %s films again", self._cameras[index].name)
-            case Silhouette(index, time_s, arrived_s, coverage):
+            case CameraSilhouette(index, time_s, arrived_s, coverage):
                 if coverage is None:
                     meeting.leave_out(index)
                 else:

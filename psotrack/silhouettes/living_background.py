@@ -20,7 +20,7 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from jaxtyping import Float, UInt8
 
 from psotrack.silhouettes.foreground import learn_weighted, reduce_frame
 from psotrack.silhouettes.lighting import light_of, remove_light
-from psotrack.silhouettes.object_blobs import find_objects, gradient, largest
+from psotrack.silhouettes.object_blobs import ObjectBlobs, find_objects, gradient, largest
 from psotrack.silhouettes.settings import ForegroundSettings
 
 #: MOG2's label of foreground that is no shadow.
@@ -140,6 +140,16 @@ class Living:
             yield background.step(frame)
 
 
+class _Look(NamedTuple):
+    """What was seen in a frame: the image without changes of light, and what differs from the background."""
+
+    image: _Image
+    difference: _Mask
+    differs: _Mask
+    labels: _Mask
+    found: ObjectBlobs
+
+
 class LivingBackground:
     """The background of one camera, which changes with each frame.
 
@@ -173,12 +183,16 @@ class LivingBackground:
         self._expect()
 
     def step(self, image: _Image, known: _Mask | None = None, *, num_frames: int = 1) -> _Mask:
-        """The foreground of the next frame; learns from the frame.
+        """The foreground of the next frame; learns from the frame: `look`, then `learn`."""
+        foreground = self.look(image, num_frames=num_frames)
+        self.learn(known)
+        return foreground
+
+    def look(self, image: _Image, *, num_frames: int = 1) -> _Mask:
+        """The foreground of the next frame; `learn` is to be called before the frame after it.
 
         Args:
             image: (height, width, 3), BGR frame.
-            known: (height, width), above 0 where a drone is known to be, for example by a tracker's prediction: these
-                pixels are not learned. None: nothing is known.
             num_frames: number of frames for which this one stands, where frames were left out before it.
 
         Returns:
@@ -187,8 +201,7 @@ class LivingBackground:
         """
         self._num_frames += num_frames
         image = remove_light(image, self._light, self.foreground)
-        background = self._light.background
-        difference = largest(cv2.absdiff(image, background))
+        difference = largest(cv2.absdiff(image, self._light.background))
         # MOG2 is asked only about pixels that differ, which takes a fraction of the time.
         differs = cv2.compare(difference, self._least, cv2.CMP_GT)
         labels = cv2.bitwise_and(self._mog2.apply(image, cv2.bitwise_not(differs), None, 0), differs)
@@ -196,14 +209,24 @@ class LivingBackground:
         changed = cv2.bitwise_and(touching, _white(labels > 0))
         strong = cv2.bitwise_and(changed, cv2.compare(difference, self._usual, cv2.CMP_GT))
         found = find_objects(changed, strong, difference, self._is_restless, self._least_px)
-        at_first = self._num_before + self._num_frames <= _ALL_LEARNED
-        if at_first or self._num_frames - self._num_learned >= _LEARN_EVERY:
-            objects = found.with_own_edges(image, background)
-            objects = objects if known is None else objects | known
-            self._learn(image, labels, difference, objects, cv2.bitwise_not(differs))
-            self._expect()
+        self._last_look = _Look(image, difference, differs, labels, found)
         self.foreground = found.mask
         return _with_soft_edges(found.mask, difference) if self._soft_edges else found.mask
+
+    def learn(self, known: _Mask | None = None) -> None:
+        """Learn from the last frame.
+
+        Args:
+            known: (height, width), above 0 where a drone is known to be, for example by a tracker's prediction: these
+                pixels are not learned. None: nothing is known.
+        """
+        at_first = self._num_before + self._num_frames <= _ALL_LEARNED
+        if at_first or self._num_frames - self._num_learned >= _LEARN_EVERY:
+            look = self._last_look
+            objects = look.found.with_own_edges(look.image, self._light.background)
+            objects = objects if known is None else objects | known
+            self._learn(look.image, look.labels, look.difference, objects, cv2.bitwise_not(look.differs))
+            self._expect()
 
     def _learn(self, image: _Image, labels: _Mask, difference: _Mask, objects: _Mask, same: _Mask) -> None:
         # A part of an object that one frame does not show is not learned at once.
