@@ -15,7 +15,7 @@ from psotrack.correspondence import NOISE_PX, CameraSightings, Sightings
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_extents, project, project_boxes, triangulate_paths, viewpoints
 from psotrack.initiation.initialisation import find_drones_in_blobs
-from psotrack.initiation.residual_foreground import SearchVolume, project_drones, subtract_drones
+from psotrack.initiation.residual_foreground import ResidualForeground, SearchVolume, project_drones
 from psotrack.projection_lines import LineSettings, track_detections
 from psotrack.projection_lines.exposures import moved_to_instant
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
@@ -261,7 +261,8 @@ def test_foreground_of_a_known_drone_is_hidden_where_the_camera_sees_the_drone()
     moved_m[0, 0, 2] = [0.5, 0.0, 0.1]
     there = np.array([[True, False, True, True, True]])
     drones = replace(project_drones(volume, position_m, size_m, moved_m), is_there=there)
-    visible = subtract_drones(np.zeros((5, 270, 480), np.uint8), drones, 0).visible
+    residual = ResidualForeground(np.zeros((5, 270, 480), np.uint8), drones, 0)
+    visible = np.array([residual.part(camera)[1] for camera in range(5)])
     assert not visible[1].any()
     for camera in (0, 2, 3, 4):
         pixel, _ = project(RIG.cameras, (position_m + moved_m[:, :, camera])[0, :, None])

@@ -22,7 +22,7 @@ from psotrack.initiation import (
     reidentify,
 )
 from psotrack.initiation.reidentification import NO_DRONE
-from psotrack.initiation.residual_foreground import SearchVolume, project_drones, subtract_drones
+from psotrack.initiation.residual_foreground import ResidualForeground, SearchVolume, project_drones
 from psotrack.silhouettes import ForegroundSettings
 from psotrack.silhouettes.foreground import foreground, learning_step
 
@@ -284,7 +284,7 @@ def test_known_drones_explain_their_enlarged_ellipse():
     full = np.full((6, 90, 120), 255, np.uint8)
     volume = SearchVolume(RIG.cameras, viewpoints(RIG.cameras), ROOM_M, REDUCTION)
     drones = project_drones(volume, ONE[:1, None], SIZE_M[None])
-    residual = subtract_drones(full, drones, 0)
+    residual = ResidualForeground(full, drones, 0)
     seen = project_boxes(make_extents(float32(RIG.cameras), np.float32(SIZE_M)), np.float32(ONE[0]))
     y, x = np.mgrid[:90, :120] + 0.5
     for camera in range(6):
@@ -292,9 +292,15 @@ def test_known_drones_explain_their_enlarged_ellipse():
         v = (y - seen.y_middle[camera] / REDUCTION) / (1.3 * seen.y_half[camera] / REDUCTION + 1.5)
         radius = np.hypot(u, v)
         # The half axes are at least eight cells, so a tenth is about a cell.
-        assert not residual.foreground[camera][radius < 0.9].any()
-        assert (residual.foreground[camera][radius > 1.1] == 255).all()
-    np.testing.assert_array_equal(residual.visible, residual.foreground == 255)
+        foreground, visible = residual.part(camera)
+        assert not foreground[radius < 0.9].any()
+        assert (foreground[radius > 1.1] == 255).all()
+        np.testing.assert_array_equal(visible, foreground == 255)
+        # A part of the image is what the whole image shows there, also where an ellipse is cut.
+        row, column = (int(value) // REDUCTION for value in (seen.y_middle[camera], seen.x_middle[camera]))
+        for rows, columns in ((slice(row, row + 30), slice(column - 12, column)), (slice(5), slice(7, 9))):
+            for part, whole in zip(residual.part(camera, rows, columns), (foreground, visible), strict=True):
+                np.testing.assert_array_equal(part, whole[rows, columns])
 
 
 def test_a_short_chunk_has_no_candidates(two_drones):

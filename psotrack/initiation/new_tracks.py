@@ -11,7 +11,7 @@ prefers to miss a candidate.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -26,7 +26,6 @@ from psotrack.initiation.residual_foreground import (
     SearchVolume,
     observe,
     project_drones,
-    subtract_drones,
 )
 from psotrack.silhouettes import LEAST_RADIUS_CELLS, border_cells, find_blobs
 
@@ -138,16 +137,26 @@ def find_candidates(
     drones = replace(
         project_drones(volume, explaining_m, known.size_m, known.moved_m), is_there=known.is_there
     )
-    find = partial(
-        find_drones, cameras, reduction=reduction, fps=fps, bounds_m=bounds_m, max_speed_m_s=max_speed_m_s
-    )
+
+    # Candidates that appear together are measured in the same frames.
+    @cache
+    def find(first: int) -> InitialState:
+        return find_drones(
+            cameras,
+            coverage[first : first + WINDOW_FRAMES],
+            reduction=reduction,
+            fps=fps,
+            bounds_m=bounds_m,
+            max_speed_m_s=max_speed_m_s,
+        )
+
     found: list[TrackCandidate] = []
     paths: list[list[Observation]] = []
     for frame in range(0, len(coverage) - WINDOW_FRAMES + SEARCH_STEP, SEARCH_STEP):
-        proposals = _propose_places(volume, subtract_drones(coverage[frame], drones, frame), spans_m)
+        proposals = _propose_places(volume, ResidualForeground(coverage[frame], drones, frame), spans_m)
         next_frame = frame + 1 if frame + 1 < len(coverage) else frame - 1
         next_places = (
-            _propose_places(volume, subtract_drones(coverage[next_frame], drones, next_frame), spans_m)
+            _propose_places(volume, ResidualForeground(coverage[next_frame], drones, next_frame), spans_m)
             if proposals
             else []
         )
@@ -159,7 +168,7 @@ def find_candidates(
                 # The size decides what foreground is the drone's own, and a single frame in which known drones are near
                 # gives a poor size. So measure the size again, in the frames with most cameras.
                 best = _best_window(path)
-                size = _nearest_size(find(coverage[best : best + WINDOW_FRAMES]), path[best], size)
+                size = _nearest_size(find(best), path[best], size)
                 path = _follow_place(volume, coverage, drones, frame, path[frame].position_m, size, shift)
                 candidate = _make_candidate(path, size, fps, max_speed_m_s)
             if candidate is None or not spans_m[0] <= size.max() <= spans_m[1]:
@@ -199,8 +208,8 @@ def _propose_places(
     least_px = spans_m[0] * focal_px.min(axis=-1) / farthest_m
     borders = border_cells(cameras.image_size_wh, volume.reduction)
     blobs = [
-        find_blobs(image, volume.reduction, border)
-        for image, border in zip(residual.foreground, borders, strict=True)
+        find_blobs(residual.part(camera)[0], volume.reduction, border)
+        for camera, border in enumerate(borders)
     ]
     large = [view.size_px.max(axis=-1) >= least for view, least in zip(blobs, least_px, strict=True)]
     centre_px = [view.centre_px[keep] for view, keep in zip(blobs, large, strict=True)]
@@ -243,8 +252,7 @@ def _follow_place(
     """
 
     def observe_at(at: int, place: Float[np.ndarray, "3"]) -> Observation:
-        residual = subtract_drones(coverage[at], drones, at)
-        return observe(volume, residual, drones.position_m[at], drones.size_m, place, size_m)
+        return observe(volume, ResidualForeground(coverage[at], drones, at), place, size_m)
 
     path = [NOT_FOUND] * len(coverage)
     path[frame] = observe_at(frame, position_m)

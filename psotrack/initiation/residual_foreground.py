@@ -99,10 +99,34 @@ class ProjectedDrones:
 
 @dataclass(frozen=True)
 class ResidualForeground:
-    """Foreground of one frame outside the known drones, 0 to 255, and the pixels that no known drone hides."""
+    """Foreground of one frame outside the known drones, which is computed for the parts that are looked at.
 
-    foreground: UInt8[np.ndarray, "cameras height width"]
-    visible: Bool[np.ndarray, "cameras height width"]
+    Attributes:
+        coverage: (cameras, height, width), silhouettes of the frame.
+        drones: the known drones.
+        frame: number of the frame in `drones`.
+    """
+
+    coverage: UInt8[np.ndarray, "cameras height width"]
+    drones: ProjectedDrones
+    frame: int
+
+    def part(
+        self, camera: int, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
+        """Part of a camera's image: the foreground, 0 to 255, and the pixels that no known drone hides."""
+        coverage = self.coverage[camera, rows, columns]
+        if self.drones.is_there is not None and not self.drones.is_there[self.frame, camera]:
+            return np.zeros_like(coverage), np.zeros(coverage.shape, bool)
+        visible = np.ones(coverage.shape, np.uint8)
+        middle = self.drones.middle[self.frame, :, camera] - (columns.start or 0, rows.start or 0)
+        half = self.drones.half[self.frame, :, camera] * ELLIPSE_FACTOR + ELLIPSE_MARGIN_CELLS
+        for drone in np.flatnonzero(_overlap_image(middle, half, coverage.shape)).tolist():
+            # OpenCV's coordinates begin at the middle of the first pixel; with shift=4 they are sixteenths of pixels.
+            x, y = np.rint(16 * (middle[drone] - 0.5)).astype(int).tolist()
+            axes = np.rint(16 * half[drone]).astype(int).tolist()
+            cv2.ellipse(visible, (x, y), axes, 0, 0, 360, 0, cv2.FILLED, shift=4)
+        return coverage * visible, visible.astype(bool)
 
 
 @dataclass(frozen=True)
@@ -144,27 +168,9 @@ def project_drones(
     return ProjectedDrones(position_m, size_m, *_ellipses(volume, position_m, size_m, moved_m))
 
 
-def subtract_drones(
-    coverage: UInt8[np.ndarray, "cameras height width"], drones: ProjectedDrones, frame: int
-) -> ResidualForeground:
-    """Remove the ellipses of known drones from a frame's silhouettes."""
-    visible = np.ones(coverage.shape, np.uint8)
-    half = drones.half[frame] * ELLIPSE_FACTOR + ELLIPSE_MARGIN_CELLS
-    for drone, camera in np.argwhere(_overlap_image(drones.middle[frame], half, coverage.shape)).tolist():
-        # OpenCV's coordinates begin at the middle of the first pixel; with shift=4 they are sixteenths of pixels.
-        x, y = np.rint(16 * (drones.middle[frame, drone, camera] - 0.5)).astype(int).tolist()
-        axes = np.rint(16 * half[drone, camera]).astype(int).tolist()
-        cv2.ellipse(visible[camera], (x, y), axes, 0, 0, 360, 0, cv2.FILLED, shift=4)
-    if drones.is_there is not None:
-        visible[~drones.is_there[frame]] = 0
-    return ResidualForeground(coverage * visible, visible.astype(bool))
-
-
 def observe(
     volume: SearchVolume,
     residual: ResidualForeground,
-    others_m: Float[np.ndarray, "drones 3"],
-    others_size_m: Float[np.ndarray, "drones 3"],
     position_m: Float[np.ndarray, "3"],
     size_m: Float[np.ndarray, "3"],
 ) -> Observation:
@@ -173,8 +179,6 @@ def observe(
     Args:
         volume: the cameras, and the region where drones may be.
         residual: foreground of the frame outside the known drones.
-        others_m: (drones, 3), positions of the known drones; NaN where not known.
-        others_size_m: (drones, 3), full lengths of the known drones.
         position_m: (3,), the place, which may be wrong by half of the drone's size.
         size_m: (3,), full lengths of the drone that is searched.
     """
@@ -183,6 +187,7 @@ def observe(
         if len(set(volume.viewpoint[views.sees].tolist())) < volume.required_viewpoints:
             return NOT_FOUND
         position_m = triangulate_linearly(volume.cameras, views.pixels, views.weight)
+    others_m, others_size_m = residual.drones.position_m[residual.frame], residual.drones.size_m
     distance = np.linalg.norm(2 * (others_m - position_m) / (others_size_m + size_m), axis=-1)
     num_cameras = int(views.sees.sum())
     found = (
@@ -228,19 +233,19 @@ def _observe_views(
     middle, half = (value[0, 0] for value in _ellipses(volume, position_m[None, None], size_m[None]))
     # A cell is a mean over a square, which adds the variance 1/12 along each side to the ellipse's variance half² / 4.
     half = np.sqrt(half**2 + 1 / 3)
-    shape = residual.visible.shape
+    shape = residual.coverage.shape
     pixels, weight, spread = np.full((len(middle), 2), np.nan), *np.zeros((2, len(middle)))
     sees, should_see = np.zeros((2, len(middle)), bool)
     _, depth = project(volume.cameras, position_m)
-    for camera in np.flatnonzero(_overlap_image(middle, half, shape)):
+    for camera in np.flatnonzero(_overlap_image(middle, half, shape)).tolist():
         reach = max(WINDOWS) * half[camera]
         low = np.floor(np.maximum(middle[camera] - reach, 0)).astype(int)
         high = np.ceil(np.minimum(middle[camera] + reach, (shape[2], shape[1]))).astype(int)
         x, y = (np.arange(low[axis], high[axis]) + 0.5 for axis in range(2))
         u, v = (x - middle[camera, 0]) / half[camera, 0], (y - middle[camera, 1]) / half[camera, 1]
         radius = np.hypot(u, v[:, None])
-        cut = (camera, slice(low[1], high[1]), slice(low[0], high[0]))
-        visible, foreground = residual.visible[cut], residual.foreground[cut] / 255
+        values, visible = residual.part(camera, slice(low[1], high[1]), slice(low[0], high[0]))
+        foreground = values / 255
         inside, ring = (radius <= 1) & visible, (radius > 1) & visible
         share = inside.sum() / (np.pi * half[camera].prod())
         filled, around = (foreground[where].sum() / max(where.sum(), 1) for where in (inside, ring))
@@ -248,7 +253,7 @@ def _observe_views(
         sees[camera] = should_see[camera] and filled - around >= MIN_CONTRAST
         if sees[camera]:
             mass = foreground * (radius <= window)
-            shift = np.array([_mean(mass, x) - _mean(inside, x), _mean(mass.T, y) - _mean(inside.T, y)])
+            shift = np.array(_middle(mass, x, y)) - _middle(inside, x, y)
             pixels[camera] = (middle[camera] + shift) * volume.reduction - 0.5
             spread[camera] = _spread(foreground, u, v)
             # The errors of the triangulation's equations are the pixels' errors times the depth.
@@ -256,12 +261,18 @@ def _observe_views(
     return _Views(pixels, weight, spread, sees, should_see)
 
 
-def _mean(mass: np.ndarray, along: Float[np.ndarray, "width"]) -> float:
-    return float(mass.sum(axis=0) @ along / mass.sum())
+def _middle(
+    mass: np.ndarray, x: Float[np.ndarray, "width"], y: Float[np.ndarray, "height"]
+) -> tuple[float, float]:
+    """Means of x and y over a mass of shape (height, width)."""
+    columns, rows = mass.sum(axis=0), mass.sum(axis=1)
+    total = columns.sum()
+    return float(columns @ x / total), float(rows @ y / total)
 
 
 def _spread(mass: np.ndarray, u: Float[np.ndarray, "width"], v: Float[np.ndarray, "height"]) -> float:
-    return _mean(mass, u**2) - _mean(mass, u) ** 2 + _mean(mass.T, v**2) - _mean(mass.T, v) ** 2
+    (mean_u, mean_v), squares = _middle(mass, u, v), _middle(mass, u**2, v**2)
+    return sum(squares) - mean_u**2 - mean_v**2
 
 
 def _ellipses(
@@ -312,4 +323,4 @@ def _overlap_image(
     middle: Float[np.ndarray, "*drones 2"], half: Float[np.ndarray, "*drones 2"], shape: tuple[int, ...]
 ) -> Bool[np.ndarray, "*drones"]:
     """Whether ellipses overlap images of a shape; False for NaN."""
-    return ((middle + half > 0) & (middle - half < (shape[2], shape[1]))).all(axis=-1)
+    return ((middle + half > 0) & (middle - half < (shape[-1], shape[-2]))).all(axis=-1)
