@@ -10,6 +10,7 @@ import pytest
 from helpers import ROOM_M, draw_coverage, ring_rig, track_settings
 
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.initiation import FoundCandidates, SeenFrame, candidate_search
 from psotrack.pipeline import causal_settings
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures
@@ -21,13 +22,15 @@ REDUCTION = 2
 RIG = ring_rig(5, image_size_wh=(480, 360))
 SIZE_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]])
 SHAPE = (180, 240)
-NUM_FRAMES = 130
+NUM_FRAMES = 215
 #: A cell of a silhouette is 2 px; at 4 m and a focal length of 390 px that is 2 cm.
 CELL_M = 0.02
 #: The first drone is away for a while and comes back elsewhere; the second enters late.
-AWAY, ENTERS = slice(45, 80), 31
-#: Frames after which a drone has a track: the frames that are searched, and the time to the next search.
-SOON = causal.SEARCHED_FRAMES + causal.SEARCH_EVERY
+AWAY, ENTERS = slice(75, 115), 45
+#: Time from the last frame that is searched to the track of a single drone, seconds.
+BEGIN_S = candidate_search.SEARCH_S + candidate_search.CANDIDATE_S + candidate_search.ARRIVAL_S
+#: Frames after which a drone has a track: those that are searched, those to the next search, and the time after it.
+SOON = candidate_search.SEARCHED_FRAMES + candidate_search.SEARCH_EVERY + round(BEGIN_S * FPS) + 2
 
 
 def _paths() -> np.ndarray:
@@ -109,9 +112,9 @@ def test_drones_that_come_leave_and_return_keep_their_numbers(tracked: list[list
 @pytest.mark.slow
 def test_rows_do_not_depend_on_later_frames(tracked: list[list[CausalRow]], coverage: np.ndarray) -> None:
     other = coverage.copy()
-    other[60:] = 0
+    other[130:] = 0
     again = _track(_tracker(), other)
-    for rows, same in zip(tracked[:60], again[:60], strict=True):
+    for rows, same in zip(tracked[:130], again[:130], strict=True):
         assert len(rows) == len(same)
         for one, two in zip(rows, same, strict=True):
             np.testing.assert_array_equal(one.position_m, two.position_m)
@@ -124,9 +127,9 @@ def test_a_camera_that_is_missing_or_sees_foreground_everywhere_loses_no_drone(
     tracked: list[list[CausalRow]], coverage: np.ndarray
 ) -> None:
     dazzled = coverage.copy()
-    dazzled[100:110, 2] = 255
-    rows = _track(_tracker(), dazzled, missing=dict.fromkeys(range(88, 120), (0,)))
-    for frame in range(110, NUM_FRAMES):
+    dazzled[180:190, 2] = 255
+    rows = _track(_tracker(), dazzled, missing=dict.fromkeys(range(170, 200), (0,)))
+    for frame in range(190, NUM_FRAMES):
         assert {row.drone for row in rows[frame]} == {row.drone for row in tracked[frame]}
         for drone in (0, 1):
             assert _error_m(rows[frame], drone, TRUTH_M[frame, drone]) < CELL_M
@@ -137,16 +140,16 @@ def test_one_program_for_all_frames(coverage: np.ndarray, optimised: None) -> No
     tracker = _tracker()
     tracker.compile()
     compiled = causal._step._cache_size(), causal._with_learned_sizes._cache_size()
-    _track(tracker, coverage[:60])
+    _track(tracker, coverage[:110])
     assert (causal._step._cache_size(), causal._with_learned_sizes._cache_size()) == compiled
 
 
 @pytest.mark.slow
 def test_frames_that_were_left_out_count_as_time(coverage: np.ndarray, optimised: None) -> None:
     tracker = _tracker()
-    _track(tracker, coverage[:40])
-    rows = tracker.step(coverage[43], _exposures(), num_frames=4)
-    assert _error_m(rows, 0, TRUTH_M[43, 0]) < CELL_M
+    _track(tracker, coverage[:60])
+    rows = tracker.step(coverage[63], _exposures(), num_frames=4)
+    assert _error_m(rows, 0, TRUTH_M[63, 0]) < CELL_M
 
 
 @pytest.mark.slow
@@ -156,19 +159,80 @@ def test_a_drone_that_was_lost_for_long_leaves_its_place(
     monkeypatch.setattr(causal, "FORGOTTEN_S", 0.8)
     tracker = _tracker()
     nothing = np.zeros_like(coverage[:60])
-    again = np.concatenate([coverage[:40], nothing, coverage[:40], nothing, coverage[:40]])
+    again = np.concatenate([coverage[:50], nothing, coverage[:50], nothing, coverage[:50]])
     rows = _track(tracker, again)
-    assert rows[95] == []
+    assert rows[109] == []
     # The drone comes back under a new number each time, and the places are used again.
-    assert [row.drone for row in rows[139]] == [1]
-    assert [row.drone for row in rows[239]] == [2]
+    assert [row.drone for row in rows[159]] == [1]
+    assert [row.drone for row in rows[269]] == [2]
     assert len(tracker._number) == causal.CAPACITIES[0]
 
 
 @pytest.mark.slow
 def test_more_drones_than_allowed_are_left_out(coverage: np.ndarray, optimised: None) -> None:
-    rows = _track(_tracker(drones=1), coverage[:80])
+    rows = _track(_tracker(drones=1), coverage[:110])
     assert {row.drone for frame in rows for row in frame} == {0}
+
+
+class _LateSearch:
+    """A search whose results and updates come some frames late."""
+
+    def __init__(self, tracker: CausalTracker, num_frames: int) -> None:
+        self._search, self._num_frames = tracker.search, num_frames
+        self._waiting: list[list[FoundCandidates]] = []
+
+    def compile(self) -> None:
+        self._search.compile()
+
+    def see(self, frame: SeenFrame) -> list[FoundCandidates]:
+        self._waiting.append(self._search.see(frame))
+        return self._waiting.pop(0) if len(self._waiting) > self._num_frames else []
+
+
+@pytest.mark.slow
+def test_the_result_of_a_search_beside_the_tracker_begins_at_the_same_frame(
+    tracked: list[list[CausalRow]], coverage: np.ndarray
+) -> None:
+    """A result that comes in time changes nothing; a late one begins later, where the drone is by then."""
+    in_time, late = _tracker(), _tracker()
+    arrival_frames = round(candidate_search.ARRIVAL_S * FPS)
+    in_time.search, late.search = _LateSearch(in_time, arrival_frames), _LateSearch(late, arrival_frames + 3)
+    for rows, same in zip(tracked[:60], _track(in_time, coverage[:60]), strict=True):
+        assert [row.drone for row in rows] == [row.drone for row in same]
+        for one, two in zip(rows, same, strict=True):
+            np.testing.assert_array_equal(one.position_m, two.position_m)
+    assert in_time.num_late == 0
+    rows = _track(late, coverage[:110])
+    began, began_late = (next(frame for frame, found in enumerate(each) if found) for each in (tracked, rows))
+    assert late.num_late == 2
+    assert began < began_late <= began + 4
+    for frame in range(SOON + 15, AWAY.start):
+        assert _error_m(rows[frame], 0, TRUTH_M[frame, 0]) < CELL_M
+    assert {row.drone for row in rows[-1]} == {0, 1}
+
+
+@pytest.mark.slow
+def test_a_result_that_is_too_old_begins_no_track(coverage: np.ndarray, optimised: None) -> None:
+    tracker = _tracker()
+    tracker.search = _LateSearch(tracker, round((causal.STALE_S + candidate_search.ARRIVAL_S) * FPS) + 1)
+    assert not any(_track(tracker, coverage[: AWAY.start]))
+    assert tracker.num_late == 0
+
+
+@pytest.mark.slow
+def test_a_drone_that_appears_while_another_one_is_followed_has_a_track_soon(
+    coverage: np.ndarray, optimised: None
+) -> None:
+    """It is found in the first search after the tracks of the others began, in frames before that."""
+    flight_m = np.array([0.9, -0.9, 1.0]) + np.arange(80)[:, None] / FPS * [0.1, 0.3, 0.0]
+    both = coverage[:80].copy()
+    for frame in range(20, 80):
+        later = draw_coverage(RIG, flight_m[frame, None], SIZE_M[:1], REDUCTION)
+        both[frame] = np.maximum(both[frame], later)
+    rows = _track(_tracker(), both)
+    begun = [next(frame for frame, found in enumerate(rows) if len(found) >= count) for count in (1, 2)]
+    assert begun[1] - begun[0] <= round(BEGIN_S * FPS) + candidate_search.SEARCH_EVERY + 1
+    assert _error_m(rows[-1], 1, flight_m[-1]) < CELL_M
 
 
 @pytest.mark.parametrize(

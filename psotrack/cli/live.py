@@ -118,7 +118,7 @@ def live(
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
     from psotrack.datasets import open_recording
-    from psotrack.live import JsonLines, LiveSession, UdpLines, live_cameras
+    from psotrack.live import WAIT_S, JsonLines, LiveSession, UdpLines, live_cameras
     from psotrack.pipeline import environment
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
@@ -138,10 +138,17 @@ def live(
     names = camera_names(cameras)
     used = [camera for camera in used if names is None or camera.name in names]
     first_s = float(recording.timeline().time_s[0]) if replay else 0.0
-    session = LiveSession(recording, used, chosen, most_drones=most_drones, first_s=first_s)
+    session = LiveSession(
+        recording,
+        used,
+        chosen,
+        most_drones=most_drones,
+        first_s=first_s,
+        # In a slow replay everything may take longer.
+        wait_s=WAIT_S / min(1.0, speed) if replay else WAIT_S,
+    )
     outputs: list[Any] = [JsonLines(sys.stdout)] if lines else []
     outputs += [] if udp is None else [UdpLines(udp)]
-    session.compile()
     with _Table(quiet or lines) as table, _ended_by_ctrl_c(session):
         show = table.show if seconds is None else _until(seconds, session, table.show)
         if out is None:
@@ -177,6 +184,7 @@ def _record(result: LiveResult) -> dict[str, Any]:
         "live": True,
         "frames": result.instants,
         "left_out": result.left_out,
+        "late_searches": result.late_searches,
         "drones": sorted(result.drones, key=int),
         "seconds": round(result.seconds, 3),
         "delay_s": {

@@ -1,3 +1,4 @@
+from .candidate_search import CandidateSearch, DroneSearch, FoundCandidates, SeenFrame
 from .common_sightings import CommonSightings, count_common
 from .cut_off import find_cut_off, find_outside
 from .initial_state import (
@@ -10,7 +11,7 @@ from .initial_state import (
 )
 from .initialisation import FLOOR_CLEARANCE_M, InitialState
 from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
-from .new_tracks import KnownDrones, TrackCandidate, compile_search, find_candidates
+from .new_tracks import FollowedCandidate, KnownDrones, Sighted, TrackCandidate, find_candidates
 from .reidentification import (
     NEW,
     SPEED_SHARE,
@@ -26,16 +27,21 @@ __all__ = [
     "FLOOR_CLEARANCE_M",
     "NEW",
     "SPEED_SHARE",
+    "CandidateSearch",
     "CommonSightings",
+    "DroneSearch",
     "FlightVolume",
+    "FollowedCandidate",
+    "FoundCandidates",
     "InitialState",
     "KnownDrones",
     "LostTracks",
     "MovingPoints",
     "PlannedStarts",
+    "SeenFrame",
+    "Sighted",
     "StartSource",
     "TrackCandidate",
-    "compile_search",
     "complete_initial_state",
     "count_common",
     "find_candidates",

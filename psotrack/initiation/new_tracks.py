@@ -43,6 +43,8 @@ SIZE_RATIO, SPANS_M = 2.0, (0.1, 1.5)
 MIN_TRAVEL = 0.04
 #: A candidate moves if its last place is farther from its first than this share of its span.
 MIN_DISPLACEMENT = 0.5
+#: Candidates are followed in groups of a multiple of this number, so that few programs are compiled.
+_CANDIDATE_STEP = 16
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,6 @@ class TrackCandidate:
         num_cameras: number of cameras that see the drone in this frame.
         moves: whether the drone moves. A candidate that does not move may be a ghost: foreground at a place where a
             drone stood while the background was learned.
-        last: the drone in the last frame in which it is found; None where it is not known.
     """
 
     frame: int
@@ -103,10 +104,28 @@ class TrackCandidate:
     size_m: Float[np.ndarray, "3"]
     num_cameras: int
     moves: bool
-    last: Sighted | None = None
 
 
-def find_candidates(
+@dataclass(frozen=True)
+class FollowedCandidate(TrackCandidate):
+    """A drone without a track that was followed through the frames.
+
+    Attributes:
+        last: the drone in the last frame in which it is found.
+    """
+
+    last: Sighted
+
+
+def search_volume(
+    cameras: Camera, bounds_m: Float[np.ndarray, "2 3"], reduction: int, min_viewpoints: int | None
+) -> SearchVolume:
+    """The region where new drones are searched: the room without the floor, on which shadows lie."""
+    clear_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
+    return SearchVolume(cameras, viewpoints(cameras), clear_m, reduction, min_viewpoints)
+
+
+def find_candidates(  # noqa: PLR0913  # A chunk, the rig, and what drones can do.
     cameras: Camera,
     coverage: UInt8[np.ndarray, "frames cameras height width"],
     known: KnownDrones,
@@ -115,7 +134,8 @@ def find_candidates(
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
     max_speed_m_s: float,
-) -> tuple[TrackCandidate, ...]:
+    measures_sizes: bool = True,
+) -> tuple[FollowedCandidate, ...]:
     """Find drones in a chunk of frames that are none of the known drones.
 
     Args:
@@ -126,17 +146,15 @@ def find_candidates(
         fps: frames per second.
         bounds_m: (2, 3), corners of the room; its lowest z is the floor, on which shadows lie.
         max_speed_m_s: largest speed of a drone.
+        measures_sizes: whether a candidate's size is measured in several frames, which takes most of the time; else it
+            is the size in the first frame.
 
     Returns:
         Candidates; an empty tuple for a chunk of fewer than `WINDOW_FRAMES` frames.
     """
-    clear_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
     spans_m = _span_limits(known.size_m)
-    volume = SearchVolume(cameras, viewpoints(cameras), clear_m, reduction, known.min_viewpoints)
-    explaining_m = np.where(known.explains[..., None], known.position_m, np.nan)
-    drones = replace(
-        project_drones(volume, explaining_m, known.size_m, known.moved_m), is_there=known.is_there
-    )
+    volume = search_volume(cameras, bounds_m, reduction, known.min_viewpoints)
+    drones = _known_ellipses(volume, known)
 
     # Candidates that appear together are measured in the same frames.
     @cache
@@ -150,7 +168,7 @@ def find_candidates(
             max_speed_m_s=max_speed_m_s,
         )
 
-    found: list[TrackCandidate] = []
+    found: list[FollowedCandidate] = []
     paths: list[list[Observation]] = []
     for frame in range(0, len(coverage) - WINDOW_FRAMES + SEARCH_STEP, SEARCH_STEP):
         proposals = _propose_places(volume, ResidualForeground(coverage[frame], drones, frame), spans_m)
@@ -164,7 +182,7 @@ def find_candidates(
             shift = (next_frame - frame) * _nearest_shift(place, size, next_places, max_speed_m_s / fps)
             path = _follow_place(volume, coverage, drones, frame, place, size, shift)
             candidate = _make_candidate(path, size, fps, max_speed_m_s)
-            if candidate is not None and candidate.moves:
+            if measures_sizes and candidate is not None and candidate.moves:
                 # The size decides what foreground is the drone's own, and a single frame in which known drones are near
                 # gives a poor size. So measure the size again, in the frames with most cameras.
                 best = _best_window(path)
@@ -181,8 +199,61 @@ def find_candidates(
     return tuple(found)
 
 
+def follow_candidates(
+    volume: SearchVolume,
+    coverage: UInt8[np.ndarray, "cameras height width"],
+    known: KnownDrones,
+    candidates: tuple[FollowedCandidate, ...],
+    *,
+    frame: int,
+    fps: float,
+    max_speed_m_s: float,
+) -> tuple[FollowedCandidate, ...]:
+    """Look for candidates in a later frame than those that were searched.
+
+    Args:
+        volume: the cameras, and the region where drones may be.
+        coverage: (cameras, height, width), silhouettes of the frame.
+        known: drones that are tracked in the frame: one frame.
+        candidates: candidates from `find_candidates`, or from this function.
+        frame: number of the frame, counted as the candidates' frames are.
+        fps: frames per second.
+        max_speed_m_s: largest speed of a drone.
+
+    Returns:
+        The candidates; where a candidate is seen, with the drone in this frame as `last`.
+    """
+    elapsed_s = np.array([(frame - each.last.frame) / fps for each in candidates])[:, None]
+    before_m, velocity_m_s = (
+        np.array([getattr(each.last, name) for each in candidates]) for name in ("position_m", "velocity_m_s")
+    )
+    expected_m = before_m + elapsed_s * velocity_m_s
+    # Each number of candidates would be compiled.
+    missing = -len(candidates) % _CANDIDATE_STEP
+    size_m = np.pad([each.size_m for each in candidates], ((0, missing), (0, 0)), constant_values=np.nan)
+    padded_m = np.pad(expected_m, ((0, missing), (0, 0)), constant_values=np.nan)
+    known_ellipses, ellipses = _known_ellipses(volume, known), project_drones(volume, padded_m[None], size_m)
+    followed = []
+    for row, before in enumerate(candidates):
+        drones = known_ellipses.join(ellipses.without(row))
+        seen = observe(volume, ResidualForeground(coverage, drones, 0), expected_m[row], size_m[row])
+        candidate = before
+        if seen.found:
+            # The mean over the last shifts, because a single shift is as noisy as the places.
+            velocity = (velocity_m_s[row] + (seen.position_m - before_m[row]) / elapsed_s[row]) / 2
+            velocity *= min(1.0, max_speed_m_s / max(float(np.linalg.norm(velocity)), 1e-9))
+            distance_m = float(np.linalg.norm(seen.position_m - before.position_m))
+            candidate = replace(
+                before,
+                last=Sighted(frame, seen.position_m, velocity),
+                moves=before.moves or distance_m > MIN_DISPLACEMENT * float(before.size_m.max()),
+            )
+        followed.append(candidate)
+    return tuple(followed)
+
+
 def compile_search(cameras: Camera, num_frames: int, num_drones: int, reduction: int) -> None:
-    """Compile what `find_candidates` calls, so that no frame of a live camera has to wait for it.
+    """Compile what `find_candidates` and `follow_candidates` call, so that no frame of a live camera waits for it.
 
     Args:
         cameras: cameras with one leading axis, for the full image.
@@ -191,10 +262,16 @@ def compile_search(cameras: Camera, num_frames: int, num_drones: int, reduction:
         reduction: image pixels per silhouette pixel, along each side.
     """
     volume = SearchVolume(cameras, viewpoints(cameras), np.zeros((2, 3)), reduction)
-    known_m, size_m = np.zeros((num_frames, num_drones, 3)), np.ones((num_drones, 3))
-    project_drones(volume, known_m, size_m, np.zeros((num_frames, num_drones, len(cameras.K), 3)))
     for frames in (1, num_frames):
+        known_m, size_m = np.zeros((frames, num_drones, 3)), np.ones((num_drones, 3))
+        project_drones(volume, known_m, size_m, np.zeros((frames, num_drones, len(cameras.K), 3)))
         project_drones(volume, np.zeros((frames, 1, 3)), np.ones((1, 3)))
+    project_drones(volume, np.zeros((1, _CANDIDATE_STEP, 3)), np.ones((_CANDIDATE_STEP, 3)))
+
+
+def _known_ellipses(volume: SearchVolume, known: KnownDrones) -> ProjectedDrones:
+    explaining_m = np.where(known.explains[..., None], known.position_m, np.nan)
+    return replace(project_drones(volume, explaining_m, known.size_m, known.moved_m), is_there=known.is_there)
 
 
 def _propose_places(
@@ -294,7 +371,7 @@ def _nearest_shift(
 
 def _make_candidate(
     path: list[Observation], size_m: Float[np.ndarray, "3"], fps: float, max_speed_m_s: float
-) -> TrackCandidate | None:
+) -> FollowedCandidate | None:
     """Make a candidate of a followed place; None if the place does not behave like a drone."""
     found = np.array([seen.found for seen in path])
     for frame in np.flatnonzero(found[: max(len(found) - WINDOW_FRAMES + 1, 0)]).tolist():
@@ -306,7 +383,7 @@ def _make_candidate(
             continue
         position, velocity = _state_at(frame, rows, places, fps, max_speed_m_s)
         last = np.flatnonzero(found)[-WINDOW_FRAMES:]
-        return TrackCandidate(
+        return FollowedCandidate(
             frame=frame,
             position_m=position,
             velocity_m_s=velocity,

@@ -6,7 +6,7 @@ count neither for nor against another drone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import jax
@@ -94,6 +94,15 @@ class ProjectedDrones:
             np.concatenate([self.middle, other.middle], axis=1),
             np.concatenate([self.half, other.half], axis=1),
             self.is_there,
+        )
+
+    def without(self, drone: int) -> ProjectedDrones:
+        """The same drones; one of them explains no foreground."""
+        keep = (np.arange(len(self.size_m)) != drone)[:, None]
+        return replace(
+            self,
+            position_m=np.where(keep, self.position_m, np.nan),
+            middle=np.where(keep[..., None], self.middle, np.nan),
         )
 
 

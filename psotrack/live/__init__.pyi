@@ -1,9 +1,10 @@
 from .meeting import CameraCounts, Instant, Meeting
 from .messages import JsonLines, UdpLines
-from .session import LiveCamera, LiveResult, LiveSession, live_cameras
+from .session import WAIT_S, LiveCamera, LiveResult, LiveSession, live_cameras
 from .sources import CameraStream, LiveSource, ReplayedVideo
 
 __all__ = [
+    "WAIT_S",
     "CameraCounts",
     "CameraStream",
     "Instant",

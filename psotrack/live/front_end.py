@@ -8,6 +8,7 @@ dies.
 from __future__ import annotations
 
 import contextlib
+import gc
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,12 +19,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from psotrack.live.packed_image import PackedImage
 from psotrack.live.sources import LiveSource
 from psotrack.silhouettes import LivingBackground, ScaledSettings, coverage, ignored_pixels, reduce_frame
 from psotrack.support import with_traceback
 
-#: A frame that waits for longer before it is processed is left out, seconds.
-_MOST_BEHIND_S = 0.1
 #: Longest time that a camera waits for the silhouettes of others before it learns, seconds.
 _LONGEST_TURN_S = 0.02
 #: Time that the cameras' threads have to end, seconds.
@@ -39,12 +39,14 @@ class FilmTask:
         source: source of its frames.
         settings: settings of the silhouettes.
         ignore: image that is white where nothing counts as foreground; None for no such image.
+        most_behind_s: a frame that has waited for longer is left out, so that the delay does not grow, seconds.
     """
 
     index: int
     source: LiveSource
     settings: ScaledSettings
     ignore: Path | None
+    most_behind_s: float
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class CameraSilhouette:
     camera: int
     time_s: float
     arrived_s: float
-    coverage: UInt8[np.ndarray, "rows columns"] | None
+    coverage: PackedImage | None
 
 
 @dataclass(frozen=True)
@@ -122,44 +124,56 @@ def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
         except OSError:  # the session has ended
             stopped.set()
 
-    send(Ready())
-    began_s = connection.recv()
-    turns = _Turns()
+    turns, start = _Turns(), _Start(len(tasks))
     threads = [
-        threading.Thread(target=_film_one, args=(task, began_s, stopped, send, turns), daemon=True)
+        threading.Thread(target=_film_one, args=(task, start, stopped, send, turns), daemon=True)
         for task in tasks
     ]
     for thread in threads:
         thread.start()
+    start.wait_for_sources()
+    # What was imported and made so far is not searched for garbage again and again.
+    gc.freeze()
+    send(Ready())
     with contextlib.suppress(EOFError, OSError):  # the session's process has died
+        start.give(connection.recv())
         connection.recv()
     stopped.set()
+    start.give(0.0)
     end_s = time.monotonic() + _END_S
     for thread in threads:
         thread.join(max(0.0, end_s - time.monotonic()))
 
 
 def _film_one(
-    task: FilmTask, began_s: float, stopped: threading.Event, send: Callable[[Message], None], turns: _Turns
+    task: FilmTask,
+    start: _Start,
+    stopped: threading.Event,
+    send: Callable[[Message], None],
+    turns: _Turns,
 ) -> None:
     """The thread of a camera: frames to silhouettes."""
     error: BaseException | None = None
     try:
+        _Silhouettes(task.settings, None).warm_up()
         silhouettes = _Silhouettes(task.settings, task.ignore)
-        with contextlib.closing(task.source.frames(began_s, stopped.is_set)) as frames:
+        with contextlib.closing(task.source.frames(start.begin, stopped.is_set)) as frames:
             for frame in frames:
                 if isinstance(frame, str):
                     send(Notice(task.index, frame))
                     continue
                 send(Arrived(task.index, frame.time_s))
-                # A frame that has waited for long is left out, so that the delay does not grow.
-                if frame.image is None or time.monotonic() - frame.arrived_s > _MOST_BEHIND_S:
+                if frame.image is None or time.monotonic() - frame.arrived_s > task.most_behind_s:
                     silhouettes.leave_out()
                     send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, None))
                     continue
                 with turns.of_frame():
                     silhouette = silhouettes.look(frame.image)
-                    send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, silhouette))
+                    send(
+                        CameraSilhouette(
+                            task.index, frame.time_s, frame.arrived_s, PackedImage.of(silhouette)
+                        )
+                    )
                 # What the tracker does not wait for.
                 turns.wait()
                 silhouettes.learn()
@@ -167,6 +181,41 @@ def _film_one(
         error = with_traceback(failed)
     finally:
         send(Ended(task.index, error))
+        start.leave()
+
+
+class _Start:
+    """The cameras of a worker begin together, when all of them are ready."""
+
+    def __init__(self, num_sources: int) -> None:
+        self._ready = threading.Semaphore(0)
+        self._num_sources = num_sources
+        self._given = threading.Event()
+        self._began_s = 0.0
+        self._of_thread = threading.local()
+
+    def begin(self) -> float:
+        """The source is ready; wait for the time at which the recording's clock showed 0."""
+        self.leave()
+        self._given.wait()
+        return self._began_s
+
+    def leave(self) -> None:
+        """Do not wait for the source of this thread any more."""
+        if not getattr(self._of_thread, "has_left", False):
+            self._of_thread.has_left = True
+            self._ready.release()
+
+    def wait_for_sources(self) -> None:
+        """Wait until all sources are ready or have ended."""
+        for _ in range(self._num_sources):
+            self._ready.acquire()
+
+    def give(self, began_s: float) -> None:
+        """Let the sources begin."""
+        if not self._given.is_set():
+            self._began_s = began_s
+            self._given.set()
 
 
 class _Turns:
@@ -225,6 +274,12 @@ class _Silhouettes:
         if self._ignored is not None:
             mask = np.where(self._ignored, np.uint8(0), mask)
         return coverage(mask, self._settings.reduction // self._settings.working_reduction)
+
+    def warm_up(self) -> None:
+        """Do once what is slow the first time."""
+        for level in (0, 9):
+            self.look(np.full((270, 480, 3), level, np.uint8))
+            self.learn()
 
     def learn(self) -> None:
         """Learn from the last frame."""

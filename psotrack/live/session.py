@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -18,6 +19,7 @@ import numpy as np
 from psotrack.errors import InputError, PsotrackError
 from psotrack.live.front_end import Arrived, CameraSilhouette, Ended, FilmTask, Message, Notice, Ready, film
 from psotrack.live.meeting import CameraCounts, Instant, Meeting
+from psotrack.live.search_process import search_beside
 from psotrack.live.sources import CameraStream, LiveSource, ReplayedVideo
 from psotrack.pipeline import CausalRun, causal_settings
 from psotrack.recordings import Recording
@@ -28,12 +30,16 @@ from psotrack.trajectories import Trajectories
 
 logger = logging.getLogger(__name__)
 
-#: How long an instant waits for cameras, seconds.
+#: How long an instant waits for cameras, and a frame for the processor, seconds.
 WAIT_S = 0.1
 #: Largest number of complete instants that wait for the tracker: more are left out, so that the delay does not grow.
 _MOST_WAITING = 3
+#: Longest time for which the session waits for messages before it looks whether it is to end, seconds.
+_LOOK_S = 0.1
 #: Time that a worker has to end, seconds.
 _END_S = 2.0
+#: Time from the start of the sources to the recording's time 0, seconds.
+_LEAD_S = 0.2
 #: Rate of a stream that does not tell its own, frames per second.
 _USUAL_HZ = 25.0
 
@@ -76,7 +82,10 @@ class LiveResult:
         delay_s: delay of each instant, from the arrival of its last frame to its rows; of the last hour at most.
         counts: counts of each camera, by name.
         drones: names of all drones.
-        seconds: wall time.
+        late_searches: number of searches for new drones whose result came too late: the drones' rows begin later than
+            those of `track --causal`.
+        compile_s: wall time before the first frame, in which programs are compiled and processes start, seconds.
+        seconds: wall time from then on, seconds.
     """
 
     instants: int = 0
@@ -84,6 +93,8 @@ class LiveResult:
     delay_s: list[float] = field(default_factory=list)
     counts: dict[str, CameraCounts] = field(default_factory=dict)
     drones: set[str] = field(default_factory=set)
+    late_searches: int = 0
+    compile_s: float = 0.0
     seconds: float = 0.0
 
 
@@ -132,7 +143,7 @@ class LiveSession:
         settings: settings of the run.
         most_drones: largest number of drones at one time.
         first_s: time of the first instant on the recording's clock, seconds.
-        wait_s: how long an instant waits for cameras, seconds of the wall clock.
+        wait_s: how long an instant waits for cameras, and a frame for the processor, seconds of the wall clock.
         jobs: largest number of worker processes; None is one per processor.
     """
 
@@ -169,20 +180,14 @@ class LiveSession:
             most_drones=most_drones,
         )
         self._stopped = threading.Event()
-        self._changed = threading.Condition()
+        self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
         self._said = [""] * len(cameras)
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
-    def compile(self) -> None:
-        """Compile what no frame should wait for."""
-        self._run.compile()
-
     def stop(self) -> None:
-        """End the session after the present instant."""
+        """End the session after the present instant; from any thread."""
         self._stopped.set()
-        with self._changed:
-            self._changed.notify_all()
 
     def run(
         self, outputs: list[RowsOutput], on_instant: Callable[[LiveResult, list[bool]], None] | None = None
@@ -198,10 +203,20 @@ class LiveSession:
             OutputError: an output fails.
         """
         tasks = self._tasks()
-        with worker_processes(film, tasks) as connections:
+        with (
+            worker_processes(film, tasks) as connections,
+            search_beside(self._run.search) as self._run.search,
+        ):
+            began_s = time.monotonic()
+            self._run.compile()
+            self.result.compile_s = time.monotonic() - began_s
             for connection in connections:
                 assert isinstance(connection.recv(), Ready)
-            began_s = time.monotonic()
+            # What was made so far is not searched for garbage again and again, which takes as long as a frame.
+            gc.collect()
+            gc.freeze()
+            # All sources are awake when the first frame comes.
+            began_s = time.monotonic() + _LEAD_S
             self._meeting = Meeting(
                 [each.fps for each in self._cameras],
                 self._rate_hz,
@@ -211,22 +226,21 @@ class LiveSession:
             )
             names = (each.name for each in self._cameras)
             self.result.counts = dict(zip(names, self._meeting.counts, strict=True))
-            listeners = [
-                threading.Thread(target=self._listen, args=(connection, of_worker), daemon=True)
-                for connection, of_worker in zip(connections, tasks, strict=True)
-            ]
+            self._workers = dict(zip(connections, tasks, strict=True))
             try:
-                for connection, listener in zip(connections, listeners, strict=True):
+                for connection in connections:
                     connection.send(began_s)
-                    listener.start()
                 self._track_all(began_s, outputs, on_instant)
             finally:
+                gc.unfreeze()
                 self.stop()
-                for connection in connections:
+                for connection in self._workers:
                     with contextlib.suppress(OSError):
                         connection.send(None)
-                for listener in listeners:
-                    listener.join(_END_S)
+                # A worker that has ended closes its pipe.
+                end_s = time.monotonic() + _END_S
+                while self._workers and time.monotonic() < end_s:
+                    self._receive(end_s - time.monotonic())
         bugs = [error for error in self._failed if not isinstance(error, PsotrackError)]
         if bugs or (self._failed and not self.result.instants):
             raise (bugs or self._failed)[0]
@@ -251,29 +265,26 @@ class LiveSession:
     def _tasks(self) -> list[list[FilmTask]]:
         """The cameras of each worker, dealt like cards."""
         tasks = [
-            FilmTask(index, camera.source, self._scaled, camera.ignore)
+            FilmTask(index, camera.source, self._scaled, camera.ignore, self._wait_s)
             for index, camera in enumerate(self._cameras)
         ]
         return [tasks[worker :: self._num_workers] for worker in range(self._num_workers)]
 
-    def _listen(self, connection: Connection, tasks: list[FilmTask]) -> None:
-        """Take the messages of a worker, until it ends; the other workers go on where one dies."""
-        while True:
+    def _receive(self, wait_s: float) -> None:
+        """Take the messages of the workers, and wait for one; the other workers go on where one dies."""
+        for ready in wait(list(self._workers), max(0.0, wait_s)):
+            assert isinstance(ready, Connection)
             try:
-                message: Message = connection.recv()
+                while ready.poll():
+                    self._take(ready.recv())
             except (OSError, EOFError):
-                break
-            with self._changed:
-                self._take(message)
-                self._changed.notify_all()
-        if not self._stopped.is_set():
-            died = PsotrackError(
-                "a worker process", expected="frames", found="that it died", remedy="is memory short?"
-            )
-            with self._changed:
-                for task in tasks:
-                    self._take(Ended(task.index, died))
-                self._changed.notify_all()
+                tasks = self._workers.pop(ready)
+                if not self._stopped.is_set():
+                    died = PsotrackError(
+                        "a worker process", expected="frames", found="that it died", remedy="is memory short?"
+                    )
+                    for task in tasks:
+                        self._take(Ended(task.index, died))
 
     def _take(self, message: Message) -> None:
         meeting = self._meeting
@@ -286,7 +297,7 @@ class LiveSession:
                 if coverage is None:
                     meeting.leave_out(index)
                 else:
-                    meeting.put(index, time_s, coverage, arrived_s)
+                    meeting.put(index, time_s, coverage.unpacked(), arrived_s)
             case Notice(index, line):
                 if line != self._said[index]:
                     logger.warning("camera %s: %s", self._cameras[index].name, line)
@@ -299,24 +310,25 @@ class LiveSession:
 
     def _instants(self) -> Iterator[tuple[Instant, int]]:
         """Yield instants that are complete, and how many were left out before each."""
+        meeting, wait_s = self._meeting, 0.0
         while not self._stopped.is_set():
+            self._receive(wait_s)
+            now_s = time.monotonic()
+            for index in meeting.stopped(now_s):
+                logger.warning("camera %s has stopped", self._cameras[index].name)
             ready: list[Instant] = []
-            with self._changed:
-                while not self._stopped.is_set():
-                    now_s = time.monotonic()
-                    for index in self._meeting.stopped(now_s):
-                        logger.warning("camera %s has stopped", self._cameras[index].name)
-                    while (instant := self._meeting.take(now_s)) is not None:
-                        ready.append(instant)
-                    if ready or self._meeting.has_ended:
-                        break
-                    deadline_s = self._meeting.deadline_s()
-                    self._changed.wait(0.2 if deadline_s is None else max(0.001, deadline_s - now_s))
-            if not ready:
-                return
+            while (instant := meeting.take(now_s)) is not None:
+                ready.append(instant)
             left_out = max(0, len(ready) - _MOST_WAITING)
             for position, instant in enumerate(ready[left_out:]):
                 yield instant, left_out if position == 0 else 0
+            if ready:
+                wait_s = 0.0
+            elif meeting.has_ended:
+                return
+            else:
+                deadline_s = meeting.deadline_s()
+                wait_s = _LOOK_S if deadline_s is None else min(max(0.001, deadline_s - now_s), _LOOK_S)
 
     def _track(self, instant: Instant, elapsed: int, outputs: list[RowsOutput]) -> None:
         count = len(self._cameras)
@@ -337,3 +349,4 @@ class LiveSession:
         del result.delay_s[: -round(3600 * self._rate_hz)]
         result.drones.update(rows.drones)
         self._run.look_ahead()
+        result.late_searches = self._run.num_late_searches

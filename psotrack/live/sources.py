@@ -6,6 +6,7 @@ stream that breaks off is opened again, once per second.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -43,11 +44,11 @@ class SourceFrame:
 class LiveSource(Protocol):
     """A source of one camera's frames."""
 
-    def frames(self, began_s: float, stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
+    def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """Yield frames, and a line of text where the source has broken off.
 
         Args:
-            began_s: when the recording's clock showed 0, `time.monotonic`.
+            begin: waits until all sources are ready, and tells when the recording's clock showed 0, `time.monotonic`.
             stopped: whether the session has ended.
 
         Raises:
@@ -72,11 +73,15 @@ class ReplayedVideo:
     speed: float = 1.0
     loops: int = 1
 
-    def frames(self, began_s: float, stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
+    def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """See `LiveSource`: a frame arrives when its time has come."""
         length_s = float(self.time_s[-1] - self.time_s[0]) * (1 + 1 / max(1, len(self.time_s) - 1))
+        images = read_frames(self.video)
+        # As if the camera had filmed before: to open a video takes as long as several frames.
+        first = next(images)
+        began_s = begin()
         for loop in range(self.loops):
-            images = read_frames(self.video)
+            images = read_frames(self.video) if loop else itertools.chain([first], images)
             for frame_s in self.time_s.tolist():
                 time_s = frame_s + loop * length_s
                 arrives_s = began_s + time_s / self.speed
@@ -101,8 +106,9 @@ class CameraStream:
     address: str | int
     image_size_wh: tuple[int, int]
 
-    def frames(self, began_s: float, stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
+    def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """See `LiveSource`: frames are timed when they arrive."""
+        began_s = begin()
         while not stopped():
             capture = self._opened()
             if capture is None:

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig
-from psotrack.initiation import flight_volume
+from psotrack.initiation import DroneSearch, flight_volume
 from psotrack.pipeline.results import environment
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
@@ -91,9 +91,24 @@ class CausalRun:
             most_drones=most_drones,
         )
 
+    @property
+    def search(self) -> DroneSearch:
+        """The search for new drones; may be replaced before the first frame."""
+        return self._tracker.search
+
+    @search.setter
+    def search(self, search: DroneSearch) -> None:
+        self._tracker.search = search
+
+    @property
+    def num_late_searches(self) -> int:
+        """Number of searches whose result came too late for the frame in which the tracks were to begin."""
+        return self._tracker.num_late
+
     def compile(self) -> None:
         """Compile what no frame should wait for."""
         self._tracker.compile()
+        self._tracker.search.compile()
 
     def step(
         self,

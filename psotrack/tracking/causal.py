@@ -1,9 +1,9 @@
 """Tracking frame by frame, without the future: for live cameras, and for recordings as if they were live.
 
-A drone's track begins in the frame after the search for new tracks has found it, from what the frames so far show. The
-arrays have places for more drones than are known, so that a new drone does not change their shapes: the program is
-compiled before the first frame, and again only when the places are used up. A drone that was lost for long is
-forgotten, and its place is free for another drone, so that neither memory nor time grows.
+A drone's track begins when the search for new tracks has found the drone and has followed it for a while, from what
+the frames so far show. The arrays have places for more drones than are known, so that a new drone does not change their
+shapes: the program is compiled before the first frame, and again only when the places are used up. A drone that was
+lost for long is forgotten, and its place is free for another drone, so that neither memory nor time grows.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from psotrack._typing import Array, Coverage
 from psotrack.geometry import Camera, Rig
 from psotrack.initiation import (
     NEW,
-    KnownDrones,
+    CandidateSearch,
+    DroneSearch,
+    FoundCandidates,
     LostTracks,
-    TrackCandidate,
-    compile_search,
-    find_candidates,
+    SeenFrame,
     find_false_tracks,
     find_lost_tracks,
     reidentify,
@@ -41,10 +41,12 @@ from psotrack.trajectories import Status
 
 logger = logging.getLogger(__name__)
 
-#: Frames in which new drones are searched for, and number of frames between two searches.
-SEARCHED_FRAMES, SEARCH_EVERY = 15, 5
 #: Number of frames between two updates of the drones' sizes.
 SIZES_EVERY = 25
+#: A result of the search for new drones that comes too late, and is older than this, is not used, seconds.
+STALE_S = 0.4
+#: Number of frames between two looks at whether a drone may begin, where all places are taken.
+_FULL_EVERY = 5
 #: A drone that was not seen for longer is forgotten, seconds; and what is remembered of the drones' flights.
 FORGOTTEN_S, REMEMBERED_S = 30.0, 60.0
 #: Numbers of drones for which the program is compiled.
@@ -74,12 +76,12 @@ class CausalRow:
 
 
 @dataclass(frozen=True)
-class _Remembered:
-    """What is remembered of a frame, in NumPy; arrays with an axis of places."""
+class _Flights:
+    """The drones in one frame or more, in NumPy; arrays with an axis of places, and one of frames before it."""
 
-    info: tracker.TrackerInfo
-    coverage: UInt8[np.ndarray, "cameras height width"] | None
-    exposures: Exposures
+    position_m: Float[np.ndarray, "*frames places 3"]
+    velocity_m_s: Float[np.ndarray, "*frames places 3"]
+    status: Int[np.ndarray, "*frames places"]
 
 
 class CausalTracker:
@@ -93,6 +95,10 @@ class CausalTracker:
         reduction: image pixels per silhouette pixel, along each side.
         shape: height and width of the silhouettes.
         most_drones: largest number of drones at one time.
+
+    Attributes:
+        search: searches for new drones; may be replaced before the first frame.
+        num_late: number of searches whose result came too late for the frame in which the tracks were to begin.
     """
 
     def __init__(
@@ -115,25 +121,41 @@ class CausalTracker:
         self._number = np.full(len(self._drones), -1)
         self._num_born = 0
         self._starts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._memory: deque[_Remembered] = deque(maxlen=max(1, round(REMEMBERED_S * fps)))
+        self._memory: deque[_Flights] = deque(maxlen=max(1, round(REMEMBERED_S * fps)))
         self._measured: list[SizeMeasurements] = []
         self._num_frames = 0
-        self._was_full = False
+        self._is_full, self._was_full = False, False
+        self._found: dict[int, FoundCandidates] = {}
+        self._num_begun = 0
+        self.num_late = 0
+        self.search: DroneSearch = CandidateSearch(
+            rig.cameras,
+            reduction=reduction,
+            fps=fps,
+            bounds_m=bounds_m,
+            max_speed_m_s=settings.motion.speed_limit_m_s,
+            min_viewpoints=settings.status.min_cameras_to_begin,
+            places=self.capacities,
+        )
+
+    @property
+    def capacities(self) -> tuple[int, ...]:
+        """Numbers of places for drones for which the program is compiled."""
+        found = [_capacity(1)]
+        while found[-1] < self._most:
+            found.append(_capacity(found[-1] + 1))
+        return tuple(found)
 
     def compile(self) -> None:
         """Compile the program for all numbers of drones that may come, so that no frame has to wait for it."""
         kept = self._drones, self._number
         coverage = np.zeros((len(self._rig), *self._shape), np.uint8)
         exposures = _all_missing(len(self._rig))
-        capacity = _capacity(1)
-        while True:
+        for capacity in self.capacities:
             self._drones, self._number = self._no_drones(capacity), np.full(capacity, -1)
             _, measured = self._run(coverage, exposures, 1)
             self._learn_sizes([measured] * SIZES_EVERY)
-            compile_search(self._rig.cameras, SEARCHED_FRAMES, capacity, self._reduction)
-            if capacity >= self._most:
-                break
-            capacity = _capacity(capacity + 1)
+        sizes.init(np.ones((1, 3), np.float32), np.full((1, 3), self._pinned), len(self._program.windows))
         self._drones, self._number = kept
 
     def step(
@@ -156,21 +178,34 @@ class CausalTracker:
         exposures = replace(exposures, is_there=is_there)
         info, measured = self._run(coverage, exposures, num_frames)
         self._measured.append(measured)
-        self._memory.append(_Remembered(info, coverage, exposures))
-        if len(self._memory) > SEARCHED_FRAMES:
-            old = self._memory[-1 - SEARCHED_FRAMES]
-            self._memory[-1 - SEARCHED_FRAMES] = replace(old, coverage=None)
+        self._memory.append(_Flights(*map(np.asarray, (info.position_m, info.velocity_m_s, info.status))))
+        self._last = coverage, exposures
         self._num_frames += 1
         return self._rows(info)
 
     def look_ahead(self) -> None:
-        """What need not be done before the rows of a frame are passed on: search for new drones, learn sizes."""
+        """What need not be done before the rows of a frame are passed on: search for new drones, learn sizes.
+
+        Tracks that begin do so in the next frame.
+        """
         if len(self._measured) >= SIZES_EVERY:
             self._learn_sizes(self._measured)
             self._measured = []
             self._forget()
-        if self._num_frames % SEARCH_EVERY == 0 and len(self._memory) >= SEARCHED_FRAMES:
-            self._search()
+        for found in self.search.see(self._seen()):
+            before = self._found.get(found.number)
+            # An update comes at no fixed frame, and counts only where the result itself is late.
+            if found.number > self._num_begun and (before is None or self._num_frames > before.begin_frame):
+                self._found[found.number] = found
+        for number, found in sorted(self._found.items()):
+            is_late = self._num_frames > found.begin_frame
+            # The candidates of a result that is too old are elsewhere by now; the search sends a newer one.
+            is_old = is_late and self._num_frames - found.last_frame > STALE_S * self._fps
+            if self._num_frames >= found.begin_frame and not is_old:
+                self.num_late += is_late
+                self._begin(found)
+                self._num_begun = number
+                del self._found[number]
 
     def _run(
         self, coverage: UInt8[np.ndarray, "cameras height width"], exposures: Exposures, num_frames: int
@@ -209,51 +244,61 @@ class CausalTracker:
 
     # New, lost and forgotten drones
 
-    def _search(self) -> None:
-        """Search the last frames for new drones and for drones that were lost; their tracks begin in the next frame."""
-        known, settings = self._known, self._settings
-        recent = list(self._memory)[-SEARCHED_FRAMES:]
-        position_m, velocity_m_s, tracked = self._flights(known)
-        size_m = np.asarray(self._drones.params.size_m, np.float64)[known]
-        lost = find_lost_tracks(
-            position_m, velocity_m_s, tracked, size_m, chunk_frames=len(recent), fps=self._fps
-        )
-        max_births = self._most - len(known)
-        if max_births <= 0 and not len(lost.drone):
-            self._say_full()
-            return
-        coverage = np.stack([frame.coverage for frame in recent if frame.coverage is not None])
-        candidates = find_candidates(
-            self._rig.cameras,
+    def _seen(self) -> SeenFrame:
+        """The last frame, for the search for new drones."""
+        (coverage, exposures), flights, state = self._last, self._memory[-1], self._drones.state
+        is_known = self._number >= 0
+        explains = np.asarray(state.present) & (np.asarray(state.missed) <= tracker.MAX_OCCLUDING_FRAMES)
+        size_m = np.asarray(self._drones.params.size_m, np.float64)
+        velocity_m_s = np.nan_to_num(np.asarray(flights.velocity_m_s, np.float64))
+        return SeenFrame(
+            self._num_frames - 1,
             coverage,
-            self._known_drones(recent),
-            reduction=self._reduction,
-            fps=self._fps,
-            bounds_m=self._bounds_m,
-            max_speed_m_s=settings.motion.speed_limit_m_s,
+            np.asarray(exposures.is_there),
+            np.asarray(flights.position_m, np.float64),
+            explains & is_known,
+            np.where(is_known[:, None], size_m, np.nan),
+            moved_by(jax.tree.map(lambda leaf: leaf[None], exposures), velocity_m_s[None])[0],
+            is_wanted=not self._nothing_may_begin(),
+            begun=self._num_begun,
         )
+
+    def _nothing_may_begin(self) -> bool:
+        """Whether all places are taken, and no drone is lost that could come back."""
+        if len(self._known) < self._most:
+            self._is_full = False
+        elif not self._is_full or self._num_frames % _FULL_EVERY == 0:
+            self._is_full = not len(self._lost(self._known, 1).drone)
+            if self._is_full:
+                self._say_full()
+        return self._is_full
+
+    def _lost(self, known: list[int], chunk_frames: int) -> LostTracks:
+        """The drones that were lost, at the beginning of the last `chunk_frames` frames."""
+        flights = self._flights(known)
+        return find_lost_tracks(
+            flights.position_m,
+            flights.velocity_m_s,
+            flights.status == Status.TRACKED,
+            np.asarray(self._drones.params.size_m, np.float64)[known],
+            chunk_frames=chunk_frames,
+            fps=self._fps,
+        )
+
+    def _begin(self, found: FoundCandidates) -> None:
+        """Let the tracks of the candidates begin in the next frame, as new drones or as drones that were lost."""
+        known = self._known
+        # The candidates' frames are counted from the first frame of all.
+        lost = self._lost(known, self._num_frames)
         assignment = reidentify(
-            candidates,
+            found.candidates,
             lost,
             fps=self._fps,
             bounds_m=self._bounds_m,
-            max_speed_m_s=settings.motion.speed_limit_m_s,
-            max_births=max_births,
+            max_speed_m_s=self._settings.motion.speed_limit_m_s,
+            max_births=self._most - len(known),
         )
-        self._begin(candidates, assignment, lost, known)
-
-    def _begin(
-        self,
-        candidates: tuple[TrackCandidate, ...],
-        assignment: Int[np.ndarray, "candidates"],
-        lost: LostTracks,
-        known: list[int],
-    ) -> None:
-        for candidate, row in zip(candidates, assignment.tolist(), strict=True):
-            last = candidate.last
-            # A drone that was last found some frames ago was lost again.
-            if last is None or last.frame < SEARCHED_FRAMES - 1 - tracker.MAX_OCCLUDING_FRAMES:
-                continue
+        for candidate, row in zip(found.candidates, assignment.tolist(), strict=True):
             if row >= 0:
                 place = known[int(lost.drone[row])]
                 logger.info("drone %d is back", self._number[place])
@@ -262,7 +307,8 @@ class CausalTracker:
                 logger.info("drone %d is new", self._number[place])
             else:
                 continue
-            ago_s = (SEARCHED_FRAMES - last.frame) / self._fps
+            last = candidate.last
+            ago_s = (self._num_frames - last.frame) / self._fps
             self._starts[place] = (last.position_m + ago_s * last.velocity_m_s, last.velocity_m_s)
 
     def _new_place(self, size_m: Float[np.ndarray, "3"]) -> int:
@@ -289,9 +335,9 @@ class CausalTracker:
         self._drones = TrackedDrones(state, replace(params, size_m=jnp.asarray(all_m)), learned)
         # What was remembered of this place is of another drone.
         for index, frame in enumerate(self._memory):
-            status = np.array(frame.info.status)
+            status = np.array(frame.status)
             status[place : place + 1] = Status.LOST  # none in frames before the places were extended
-            self._memory[index] = replace(frame, info=replace(frame.info, status=status))
+            self._memory[index] = replace(frame, status=status)
         return place
 
     def _forget(self) -> None:
@@ -299,10 +345,11 @@ class CausalTracker:
         known = self._known
         if not known:
             return
-        position_m, _, tracked = self._flights(known)
+        flights = self._flights(known)
+        tracked = flights.status == Status.TRACKED
         size_m = np.asarray(self._drones.params.size_m, np.float64)[known]
         num_recent = round(FORGOTTEN_S * self._fps)
-        gone = find_false_tracks(position_m, tracked, size_m)
+        gone = find_false_tracks(flights.position_m, tracked, size_m)
         if len(tracked) > num_recent:
             gone |= ~tracked[-num_recent:].any(axis=0)
         if not gone.any():
@@ -316,41 +363,16 @@ class CausalTracker:
         state = replace(self._drones.state, present=jnp.asarray(present))
         self._drones = replace(self._drones, state=state)
 
-    def _flights(
-        self, places: list[int]
-    ) -> tuple[Float[np.ndarray, "frames drones 3"], Float[np.ndarray, "frames drones 3"], np.ndarray]:
-        """Positions and velocities of drones in all frames that are remembered, and whether they were found."""
-        frames = list(self._memory)
-        shape = (len(frames), len(self._number))
+    def _flights(self, places: list[int]) -> _Flights:
+        """The drones of some places in all frames that are remembered."""
+        shape = (len(self._memory), len(self._number))
         position_m, velocity_m_s = np.full((2, *shape, 3), np.nan)
-        tracked = np.zeros(shape, bool)
-        for row, frame in enumerate(frames):
-            count = len(frame.info.status)  # fewer before the places were extended
-            position_m[row, :count], velocity_m_s[row, :count] = (
-                frame.info.position_m,
-                frame.info.velocity_m_s,
-            )
-            tracked[row, :count] = frame.info.status == Status.TRACKED
-        return position_m[:, places], velocity_m_s[:, places], tracked[:, places]
-
-    def _known_drones(self, recent: list[_Remembered]) -> KnownDrones:
-        """The drones of all places in the last frames; places without a drone explain no foreground."""
-        position_m, velocity_m_s, tracked = self._flights(list(range(len(self._number))))
-        is_known = self._number >= 0
-        explains = np.array(tracked)
-        for shift in range(1, tracker.MAX_OCCLUDING_FRAMES + 1):
-            explains[shift:] |= tracked[: len(tracked) - shift]
-        count = len(recent)
-        exposures = jax.tree.map(lambda *each: np.stack(each), *[frame.exposures for frame in recent])
-        size_m = np.asarray(self._drones.params.size_m, np.float64)
-        return KnownDrones(
-            position_m[-count:],
-            explains[-count:] & is_known,
-            np.where(is_known[:, None], size_m, np.nan),
-            moved_m=moved_by(exposures, np.nan_to_num(velocity_m_s[-count:])),
-            is_there=exposures.is_there,
-            min_viewpoints=self._settings.status.min_cameras_to_begin,
-        )
+        status = np.full(shape, int(Status.LOST))
+        for row, frame in enumerate(self._memory):
+            count = len(frame.status)  # fewer before the places were extended
+            position_m[row, :count], velocity_m_s[row, :count] = frame.position_m, frame.velocity_m_s
+            status[row, :count] = frame.status
+        return _Flights(position_m[:, places], velocity_m_s[:, places], status[:, places])
 
     def _say_full(self) -> None:
         if not self._was_full and self._settings.drones.count is None:
