@@ -29,11 +29,11 @@ from psotrack.initiation.new_tracks import (
 SEARCHED_FRAMES, SEARCH_EVERY = 15, 5
 #: Time from the last frame that is searched to the first frame of the tracks, seconds: for the search, more for each
 #: candidate, and for the result to arrive; in this last part candidates need not be followed. With 8 cameras, one
-#: processor takes 0.15 s for each candidate; the other half is for processors that have more to do.
-SEARCH_S, CANDIDATE_S, ARRIVAL_S = 0.24, 0.12, 0.16
-#: Time between two frames in which candidates are followed, seconds. A drone leaves its course by 5 cm in this time,
+#: processor takes 0.05 to 0.08 s for each candidate; cameras and tracker take the rest of the time.
+SEARCH_S, CANDIDATE_S, ARRIVAL_S = 0.3, 0.15, 0.16
+#: Time between two frames in which candidates are followed, seconds. A drone leaves its course by 13 cm in this time,
 #: with an acceleration of 10 m/s².
-FOLLOW_EVERY_S = 0.1
+FOLLOW_EVERY_S = 0.16
 #: A candidate that was not seen for longer is given up, seconds.
 _MOST_MISSED_S = 0.5
 #: A candidate that is hidden for more frames at the end of the frames that are searched is none.

@@ -19,6 +19,11 @@ from psotrack.live.front_end import Ready
 from psotrack.live.packed_image import PackedImage
 from psotrack.support import with_traceback, worker_processes
 
+#: Priority of the search below that of the cameras and the tracker, as of `nice`.
+_NICE = 5
+#: Number of frames that wait for the search; where it is farther behind, frames are left out.
+_MOST_WAITING = 50
+
 
 @contextlib.contextmanager
 def search_beside(search: DroneSearch) -> Iterator[SearchProcess]:
@@ -91,8 +96,12 @@ def _search(search: DroneSearch, connection: Connection) -> None:
     # What was made so far is not searched for garbage again and again.
     gc.freeze()
     connection.send(Ready())
-    _yield_to_others()
+    # The search gets what the cameras leave, and a quarter of a processor where they leave nothing.
+    with contextlib.suppress(AttributeError):  # there is no such thing on Windows
+        os.nice(_NICE)
     while (packed := frames.get()) is not None:
+        if frames.qsize() > _MOST_WAITING:
+            continue
         try:
             found = search.see(_unpacked(*packed))
         except Exception as error:
@@ -100,12 +109,3 @@ def _search(search: DroneSearch, connection: Connection) -> None:
             return
         if found:
             connection.send(found)
-
-
-def _yield_to_others() -> None:
-    """Let this thread run only while a processor has nothing else to do, where the system can do so."""
-    with contextlib.suppress(AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        return
-    with contextlib.suppress(AttributeError, OSError):
-        os.nice(19)

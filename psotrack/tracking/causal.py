@@ -126,7 +126,7 @@ class CausalTracker:
         self._num_frames = 0
         self._is_full, self._was_full = False, False
         self._found: dict[int, FoundCandidates] = {}
-        self._num_begun = 0
+        self._num_begun, self._num_told = 0, 0
         self.num_late = 0
         self.search: DroneSearch = CandidateSearch(
             rig.cameras,
@@ -199,10 +199,12 @@ class CausalTracker:
                 self._found[found.number] = found
         for number, found in sorted(self._found.items()):
             is_late = self._num_frames > found.begin_frame
+            if is_late and number > self._num_told:
+                self._say_late()
+                self._num_told = number
             # The candidates of a result that is too old are elsewhere by now; the search sends a newer one.
             is_old = is_late and self._num_frames - found.last_frame > STALE_S * self._fps
             if self._num_frames >= found.begin_frame and not is_old:
-                self.num_late += is_late
                 self._begin(found)
                 self._num_begun = number
                 del self._found[number]
@@ -373,6 +375,11 @@ class CausalTracker:
             position_m[row, :count], velocity_m_s[row, :count] = frame.position_m, frame.velocity_m_s
             status[row, :count] = frame.status
         return _Flights(position_m[:, places], velocity_m_s[:, places], status[:, places])
+
+    def _say_late(self) -> None:
+        if not self.num_late:
+            logger.warning("new drones are found late: the computer is too slow")
+        self.num_late += 1
 
     def _say_full(self) -> None:
         if not self._was_full and self._settings.drones.count is None:
