@@ -16,7 +16,7 @@ oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python 
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow lint format bench bench-end-to-end bench-gpu notebooks table4 table5 table5-quick table7 docs results results-check clean
+.PHONY: help demo test test-slow lint format bench bench-end-to-end bench-live bench-gpu notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -55,6 +55,12 @@ bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
 
 bench-end-to-end: $(VENV)/.installed  ## from videos to tracks, stage by stage: as fast as the cameras? twenty minutes
 	@$(BIN)/python experiments/benchmarks/end_to_end.py $(if $(DATA),--data $(DATA))
+
+bench-live: $(VENV)/.installed  ## live: delay of the rows, memory over an hour, cameras that stop; half an hour
+	@$(call install,bench)
+	@$(BIN)/python experiments/benchmarks/live.py delay $(if $(DATA),--data $(DATA))
+	@$(BIN)/python experiments/benchmarks/live.py memory $(if $(DATA),--data $(DATA))
+	@$(BIN)/python experiments/benchmarks/live.py stops $(if $(DATA),--data $(DATA))
 
 bench-gpu: $(VENV)/.installed  ## a GPU against two cores: Table 5's grid, 64 runs at once, equal tracks; JAX for it: pip install -e '.[cuda]'
 	@$(BIN)/python experiments/benchmarks/gpu.py $(if $(DATA),--data $(DATA))
