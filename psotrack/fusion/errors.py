@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Int
 
 from psotrack.camera_errors import (
@@ -73,6 +72,8 @@ def _fused_lasting(
     fusion: Fusion, swarm: TrackErrors | None, lines: TrackErrors | None
 ) -> LastingCovariances:
     """Covariances of the fused positions by errors that last: the weighted means of both methods' covariances."""
+    import pandas as pd  # takes 0.2 s, and only fused tracks need it
+
     num_drones = fusion.tracks.num_drones
     num_swarm = 0 if swarm is None else swarm.lasting.absolute_m2.shape[1]
     in_swarm = np.where(np.arange(num_drones) < num_swarm, np.arange(num_drones), -1)
