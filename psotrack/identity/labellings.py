@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack._typing import Array, Positions
 from psotrack.motion import Covariances, MotionParams, MotionState, kalman
+from psotrack.support import stored_jit
 
 #: Smallest log probability of a labelling, so that an improbable labelling can recover, and no number is infinite.
 LEAST_LOG = -300.0
@@ -109,7 +110,7 @@ def change_log_probability(
     return np.log(np.maximum(expected, np.exp(LEAST_LOG)))
 
 
-@jax.jit
+@stored_jit
 def step(
     bank: Bank,
     dt_s: Float[Array, ""],
@@ -173,7 +174,7 @@ def _merge(weight: Float[Array, "before after"], state: MotionState) -> MotionSt
     return kalman.state_from_mean(mean, spread, mean_of(state.noise_m2))
 
 
-@jax.jit
+@stored_jit
 def begin(
     measured_m: Float[Array, "frames 3"],
     measured_covariance_m2: Float[Array, "frames 3 3"],

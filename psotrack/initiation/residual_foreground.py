@@ -22,6 +22,7 @@ from psotrack.geometry import (
     project_boxes,
     triangulate_linearly,
 )
+from psotrack.support import stored_jit
 
 #: A known drone's ellipse is enlarged by this factor and by this number of cells, because outlines are no ellipses, and
 #: rotors blur.
@@ -306,14 +307,14 @@ def _ellipses(
     return middle, half
 
 
-@jax.jit
+@stored_jit
 def _project_boxes(
     cameras: Camera, size_m: Float[jax.Array, "drones 3"], position_m: Float[jax.Array, "frames drones 3"]
 ) -> Boxes:
     return project_boxes(make_extents(cameras, size_m), position_m)
 
 
-@jax.jit
+@stored_jit
 def _project_moved_boxes(
     cameras: Camera,
     size_m: Float[jax.Array, "drones 3"],

@@ -20,6 +20,7 @@ from psotrack.errors import InputError
 from psotrack.estimation import backward_step
 from psotrack.motion import kalman
 from psotrack.motion.kalman import MotionParams, MotionState
+from psotrack.support import stored_jit
 
 #: Grid of log10 jerk densities, m²/s⁵: from a drone that hovers to one in violent manoeuvres.
 _JERK_DECADES = np.arange(-4.0, 7.0)
@@ -214,7 +215,7 @@ def _filtered(
     return predicted, states, log_densities
 
 
-@jax.jit
+@stored_jit
 def _filter(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
 ) -> tuple[Array, Array, Array, Array]:
@@ -227,7 +228,7 @@ def _without_error(states: MotionState) -> tuple[Array, Array, Array, Array]:
     return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
 
 
-@jax.jit
+@stored_jit
 def _smoothed(
     time_s: Array, measured_m: Array, covariance_m2: Array, was_measured: Array, params: MotionParams
 ) -> tuple[Array, Array, Array, Array]:
@@ -256,7 +257,7 @@ def _smoothed(
     return _without_error(states)
 
 
-@jax.jit
+@stored_jit
 def _log_likelihoods(
     time_s: Array,
     measured_m: Array,

@@ -36,7 +36,7 @@ from psotrack.pipeline.stages import (
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, load_ahead, no_progress
 from psotrack.tracking import tracker_settings
 
 
@@ -100,6 +100,7 @@ def track_recording(
             all_videos=settings.needs_each_video,
             report=report,
         )
+    load_ahead()
     (tracked,) = track_runs(recording, silhouettes, [settings], parts=parts, report=report)
     if isinstance(tracked, InputError):
         raise tracked

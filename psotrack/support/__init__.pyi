@@ -8,6 +8,7 @@ from .progress import Advance, Report, no_progress, progress_bar
 from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
+from .stored_programs import load_ahead, stored_jit
 
 __all__ = [
     "COLOURS",
@@ -28,6 +29,7 @@ __all__ = [
     "drop_programs_if_many",
     "identify",
     "keep_compiled",
+    "load_ahead",
     "make_plugin",
     "map_in_processes",
     "nearest",
@@ -44,6 +46,7 @@ __all__ = [
     "save_figure",
     "short_repr",
     "standard_error",
+    "stored_jit",
     "toml_key",
     "toml_value",
     "user_cache",

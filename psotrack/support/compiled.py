@@ -11,6 +11,8 @@ from typing import Any
 
 import jax
 
+from psotrack.support.stored_programs import forget_programs, store_programs
+
 logger = logging.getLogger(__name__)
 
 #: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
@@ -25,6 +27,9 @@ _UNREADABLE_ENTRY = re.compile(r"persistent compilation cache entry for '([\w.]+
 def keep_compiled(folder: Path | str) -> None:
     """Let JAX store compiled programs in a folder, and load programs that other processes stored there.
 
+    The largest programs of this package are also stored whole there (`stored_jit`), and loaded without tracing. The
+    folder's files are run, so nobody else may be allowed to write to it.
+
     For programs, not for libraries: the function changes JAX, and the display of warnings, for the whole process. It
     changes nothing if the user has already chosen a folder (`JAX_COMPILATION_CACHE_DIR`).
 
@@ -35,6 +40,7 @@ def keep_compiled(folder: Path | str) -> None:
     folder = Path(folder)
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
+    store_programs(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_S)
     show = warnings.showwarning
@@ -73,6 +79,7 @@ def drop_programs_if_many(most_maps: int | None = None) -> bool:
     if maps <= limit:
         return False
     jax.clear_caches()
+    forget_programs()
     # Programs are freed with the functions that refer to each other.
     gc.collect()
     logger.info("dropped compiled programs from memory, because the process had %d memory maps", maps)

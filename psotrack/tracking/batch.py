@@ -20,6 +20,7 @@ from jaxtyping import Int, UInt8
 from psotrack._typing import Array
 from psotrack.geometry import Camera
 from psotrack.silhouettes import Exposures
+from psotrack.support import stored_jit
 from psotrack.tracking import sizes, tracker
 from psotrack.tracking.devices import computes_side_by_side
 from psotrack.tracking.sizes import SizeMeasurements, SizeProgram, SizeState
@@ -104,7 +105,7 @@ def track_batch(
     return _track_batch(*arguments, program, side_by_side)[: len(runs)]
 
 
-@partial(jax.jit, static_argnames=("program", "side_by_side"))
+@partial(stored_jit, static_argnames=("program", "side_by_side"))
 def _track_batch(
     runs: tuple[tuple[TrackedDrones, tracker.TrackStarts], ...],
     count: Int[Array, ""],

@@ -19,6 +19,7 @@ from jaxtyping import Float, UInt8
 from psotrack._typing import Array, Positions
 from psotrack.geometry import Boxes, Camera, make_extents, project_boxes
 from psotrack.silhouettes import Exposures, Silhouettes
+from psotrack.support import stored_jit
 from psotrack.tracking.chunks import on_device
 from psotrack.tracking.patches import FULL, ExpectedDrones, Windows, cut_windows
 from psotrack.tracking.sizes import MIN_FILLED, SizeProgram, usable_views
@@ -44,7 +45,7 @@ class CameraMiddles:
     half_px: Float[Array, "*frames drones cameras 2"]
 
 
-@partial(jax.jit, static_argnames="program")
+@partial(stored_jit, static_argnames="program")
 def camera_middles(
     coverage: UInt8[Array, "frames cameras height width"],
     position_m: Float[Array, "frames drones 3"],

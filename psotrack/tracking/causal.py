@@ -32,6 +32,7 @@ from psotrack.initiation import (
     reidentify,
 )
 from psotrack.silhouettes import Exposures, foreground_is_everywhere, moved_by
+from psotrack.support import stored_jit
 from psotrack.tracking import sizes, tracker
 from psotrack.tracking.batch import TrackedDrones
 from psotrack.tracking.chunks import on_device
@@ -445,7 +446,7 @@ def _all_missing(num_cameras: int) -> Exposures:
     return Exposures(zero, np.zeros(num_cameras, bool), zero + 1, zero)
 
 
-@partial(jax.jit, static_argnames="program")
+@partial(stored_jit, static_argnames="program")
 def _step(
     drones: TrackedDrones,
     starts: tracker.TrackStarts,
@@ -474,7 +475,7 @@ def _step(
     return replace(drones, state=state), info, jax.tree.map(lambda leaf: leaf[0], measured)
 
 
-@jax.jit
+@stored_jit
 def _with_learned_sizes(drones: TrackedDrones, measured: SizeMeasurements) -> TrackedDrones:
     learned = sizes.learn_sizes(drones.sizes, measured)
     return replace(drones, params=replace(drones.params, size_m=learned.size_m), sizes=learned)

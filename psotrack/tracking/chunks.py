@@ -34,7 +34,7 @@ from psotrack.initiation import (
 )
 from psotrack.motion import motion_params
 from psotrack.silhouettes import Silhouettes, moved_by
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, no_progress, stored_jit
 from psotrack.tracking import sizes, tracker
 from psotrack.tracking.batch import BatchResult, Chunk, TrackedDrones, track_batch
 from psotrack.tracking.devices import largest_share, num_used_devices, share_among_devices
@@ -220,7 +220,7 @@ def _tracks(run: _Run) -> Tracks:
     )
 
 
-@jax.jit
+@stored_jit
 def _size_std_m(state: SizeState) -> Float[Array, "drones 3"]:
     return state.std_m
 
@@ -338,7 +338,7 @@ def _begin(inputs: RunInputs, setting: _Setting) -> _Run:
     return _Run(inputs, program, drones, _History.empty(len(drones)))
 
 
-@partial(jax.jit, static_argnames=("is_pinned", "num_windows"))
+@partial(stored_jit, static_argnames=("is_pinned", "num_windows"))
 def _first_drones(
     key: Key,
     position_m: Positions,
