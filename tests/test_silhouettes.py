@@ -34,7 +34,9 @@ from psotrack.silhouettes import (
     usual_drone_px,
 )
 from psotrack.silhouettes import store as silhouette_store
+from psotrack.silhouettes.first_look import look_first
 from psotrack.silhouettes.foreground import coverage, foreground
+from psotrack.silhouettes.living_background import Living
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
@@ -133,6 +135,21 @@ def test_stored_silhouettes_equal_direct_computation(folder: Path, tmp_path: Pat
     np.testing.assert_array_equal(all_frames, _expected(recording))
     assert all_frames.any(axis=(2, 3)).all(), "every frame of every camera shows a disc"
     assert _unfinished_folders(tmp_path / "cache") == []
+
+
+def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kept(
+    folder: Path, tmp_path: Path
+) -> None:
+    """The store decodes each frame over the one before; here all frames are kept."""
+    recording = _make_recording(folder)
+    settings = SilhouetteSettings(background="living", reduction=4, working_reduction=2, min_blob_px=64)
+    silhouettes = compute(recording, settings, cache=tmp_path / "cache", jobs=1)
+    scaled = settings.scaled([SIZE_WH])
+    for camera, video in enumerate(recording.videos.values()):
+        looked_at = look_first(video, iter(list(read_frames(video))), scaled)
+        masks = [coverage(mask, 2) for mask in Living(scaled).masks(*looked_at)]
+        assert np.any(masks)
+        np.testing.assert_array_equal(_read_all(silhouettes)[:, camera], masks)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)])

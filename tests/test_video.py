@@ -72,6 +72,14 @@ def test_a_step_reads_every_nth_frame(tmp_path, step):
     np.testing.assert_array_equal(selected, all_frames[::step])
 
 
+def test_frames_that_are_written_over_each_other_are_the_same_frames(tmp_path):
+    video = probe(write(tmp_path / "v.avi", noise(9)))
+    apart = list(read_frames(video, 2))
+    over = [(frame, frame.copy()) for frame in read_frames(video, 2, into_one=True)]
+    np.testing.assert_array_equal([then for _, then in over], apart)
+    assert len({frame.ctypes.data for frame, _ in over}) == 1
+
+
 def test_leading_frames_only(tmp_path):
     video = probe(write(tmp_path / "a.avi", noise(11)))
     assert len(list(read_frames(replace(video, num_frames=4)))) == 4

@@ -129,10 +129,17 @@ def digest_video(video: VideoInfo) -> str:
     return digest_record([digest_file(path, expected="a readable image") for path in video.images])
 
 
-def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def read_frames(
+    video: VideoInfo, step: int = 1, *, into_one: bool = False
+) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
     The codec must decode the frames in between, but they are not converted to BGR.
+
+    Args:
+        video: the video.
+        step: distance between two frames.
+        into_one: whether each frame of a video file is written over the one before, which is faster.
 
     Raises:
         InputError: the file ends or is damaged before its last frame, or a frame has another size.
@@ -147,13 +154,15 @@ def read_frames(video: VideoInfo, step: int = 1) -> Iterator[UInt8[np.ndarray, "
             yield frame
         return
     capture = _open(video.path)
+    place: UInt8[np.ndarray, "height width 3"] | None = None
     try:
         for index in range(video.num_frames):
             if not capture.grab():
                 raise TruncatedVideoError(video, index)
             if index % step:
                 continue
-            decoded, frame = capture.retrieve()
+            decoded, frame = capture.retrieve(place)
+            place = frame if into_one else None
             if not decoded:
                 raise TruncatedVideoError(video, index)
             _check_size(video.path, video, frame, f" in frame {index}")

@@ -223,7 +223,12 @@ def foreground_of(
     """
     video, settings = task.video, task.settings
     background = Mog2(settings) if task.background is None else task.background
-    frames = _decoded(read_frames(video), seconds, advance)
+    if isinstance(background, Living) and settings.working_reduction > 1:
+        # Only reduced frames are kept. A model that the user brings may keep what it is given.
+        read = read_frames(video, into_one=True)
+    else:
+        read = read_frames(video)
+    frames = _decoded(read, seconds, advance)
     if isinstance(background, Living) and settings.first_look:
         masks = background.masks(*look_first(video, frames, settings))
     elif isinstance(background, Living):

@@ -41,9 +41,9 @@ def foreground_is_everywhere(
         return np.zeros(0, bool)
     # Without foreground in most rows there is none in most parts, which is told much faster.
     rows, columns = np.arange(0, height, side), np.arange(0, width, side)
-    of_rows = np.maximum.reduceat(silhouettes, rows, axis=1)
-    everywhere = (of_rows.max(axis=2) >= MIN_COVERAGE).mean(axis=1) > _MOST_PARTS
-    most = np.maximum.reduceat(of_rows[everywhere], columns, axis=2)
+    of_rows = np.maximum.reduceat(silhouettes.max(axis=2), rows, axis=1)
+    everywhere = (of_rows >= MIN_COVERAGE).mean(axis=1) > _MOST_PARTS
+    most = np.maximum.reduceat(np.maximum.reduceat(silhouettes[everywhere], rows, axis=1), columns, axis=2)
     everywhere[everywhere] = (most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS
     return everywhere
 

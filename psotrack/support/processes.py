@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import signal
 import sys
 import threading
@@ -28,6 +29,13 @@ GRACE_S = 1.0
 _PROGRESS_S = 0.1
 #: Time that they have after that to remove their temporary files before they are killed, seconds.
 _CLEAN_UP_S = 5.0
+#: Variables of the workers, where the user has not set them. The workers are as many as the processors, so threads of
+#: NumPy's linear algebra would only wait. Memory of an image is kept for the next image (glibc's names), bytes.
+_VARIABLES = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_MMAP_THRESHOLD_": f"{32 * 2**20}",
+    "MALLOC_TRIM_THRESHOLD_": f"{256 * 2**20}",
+}
 
 
 def map_in_processes(
@@ -92,7 +100,7 @@ def worker_processes(
     connections: list[Connection] = []
     processes = []
     try:
-        with _sigint_ignored():
+        with _sigint_ignored(), _variables_of_workers():
             for task in tasks:
                 here, there = context.Pipe()
                 process = context.Process(target=_run, args=(target, task, there), daemon=True)
@@ -125,6 +133,18 @@ def _sigint_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, previous)
+
+
+@contextlib.contextmanager
+def _variables_of_workers() -> Iterator[None]:
+    """Processes that start in this block have `_VARIABLES`."""
+    added = {name: value for name, value in _VARIABLES.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
 
 
 def _receive(connection: Connection) -> Any:
