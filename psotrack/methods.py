@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from psotrack.camera_errors import (
     TrackErrors,
+    views_of_middles,
     views_of_sightings,
-    views_of_silhouettes,
     with_camera_errors,
 )
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
@@ -32,7 +32,7 @@ from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, digest_file, no_progress
-from psotrack.tracking import RunInputs, track_silhouettes
+from psotrack.tracking import FoundDrones, RunInputs, middles_in_cameras, track_silhouettes
 from psotrack.trajectories import Status, Tracks
 
 
@@ -310,16 +310,38 @@ def fuse_methods(
 
 
 def add_errors_of_silhouettes(
-    result: MethodResult, rig: Rig, silhouettes: Silhouettes, settings: TrackSettings, fps: float
-) -> MethodResult:
-    """The result of the swarm, with covariances that hold for the errors that the silhouettes show."""
+    results: Sequence[MethodResult],
+    rig: Rig,
+    silhouettes: Silhouettes,
+    settings: Sequence[TrackSettings],
+    fps: float,
+) -> list[MethodResult]:
+    """The results of the swarm, with covariances that hold for the errors that the silhouettes show.
+
+    The silhouettes are read once for all runs. On a CPU each result has the same bits as from the run alone.
+
+    Args:
+        results: the results of one or more runs; each has drones.
+        rig: the cameras.
+        silhouettes: silhouettes of all cameras.
+        settings: settings of each run.
+        fps: frames per second.
+    """
     began = time.perf_counter()
-    tracks = result.tracks
-    position_m, velocity_m_s = _found(tracks)
-    size_m = np.asarray(tracks.sizes.size_m, np.float64)
-    views = views_of_silhouettes(rig.cameras, silhouettes, size_m, position_m, velocity_m_s)
-    corrected, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, fps)
-    return _with_errors(result, corrected, errors, began)
+    drones = [
+        FoundDrones(np.asarray(result.tracks.sizes.size_m, np.float64), *_found(result.tracks))
+        for result in results
+    ]
+    middles = middles_in_cameras(rig.cameras, silhouettes, drones)
+    found = []
+    for result, of_run, seen, chosen in zip(results, drones, middles, settings, strict=True):
+        views = views_of_middles(rig.cameras, silhouettes.exposures, seen, of_run)
+        found.append(with_camera_errors(result.tracks, views, chosen.motion, chosen.errors, fps))
+    share_s = (time.perf_counter() - began) / len(results)
+    return [
+        _with_errors(result, tracks, errors, share_s)
+        for result, (tracks, errors) in zip(results, found, strict=True)
+    ]
 
 
 def add_errors_of_detections(
@@ -329,7 +351,7 @@ def add_errors_of_detections(
     began = time.perf_counter()
     views = views_of_sightings(rig.cameras, detections.sightings, *_found(result.tracks))
     corrected, errors = with_camera_errors(result.tracks, views, settings.motion, settings.errors, fps)
-    return _with_errors(result, corrected, errors, began)
+    return _with_errors(result, corrected, errors, time.perf_counter() - began)
 
 
 def _found(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
@@ -342,8 +364,8 @@ def _found(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
     return position_m, velocity_m_s
 
 
-def _with_errors(result: MethodResult, tracks: Tracks, errors: TrackErrors, began: float) -> MethodResult:
-    seconds = {**result.seconds, "finish": result.seconds.get("finish", 0.0) + time.perf_counter() - began}
+def _with_errors(result: MethodResult, tracks: Tracks, errors: TrackErrors, taken_s: float) -> MethodResult:
+    seconds = {**result.seconds, "finish": result.seconds.get("finish", 0.0) + taken_s}
     return replace(result, tracks=tracks, errors=errors, seconds=seconds)
 
 

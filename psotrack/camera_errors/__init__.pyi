@@ -5,7 +5,7 @@ from .filtered_variance import MeasurementErrors, filtered_variances
 from .learning import CameraErrors, learn_camera_errors
 from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
-from .views import CameraViews, views_of_places, views_of_sightings, views_of_silhouettes
+from .views import CameraViews, views_of_middles, views_of_places, views_of_sightings
 
 __all__ = [
     "CameraErrors",
@@ -24,8 +24,8 @@ __all__ = [
     "learn_camera_errors",
     "noise_covariance",
     "noise_ratios",
+    "views_of_middles",
     "views_of_places",
     "views_of_sightings",
-    "views_of_silhouettes",
     "with_camera_errors",
 ]

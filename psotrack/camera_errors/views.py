@@ -17,8 +17,8 @@ from psotrack.geometry import (
     project_with_jacobian,
     to_camera,
 )
-from psotrack.silhouettes import Exposures, Silhouettes, moved_by
-from psotrack.tracking import middles_in_cameras
+from psotrack.silhouettes import Exposures, moved_by
+from psotrack.tracking import CameraMiddles, FoundDrones
 
 #: A detection is of a drone if it is at most this many standard deviations from the drone's projection.
 _GATE = 5.0
@@ -177,29 +177,27 @@ def _without_outliers(views: CameraViews) -> CameraViews:
     )
 
 
-def views_of_silhouettes(
+def views_of_middles(
     cameras: Camera,
-    silhouettes: Silhouettes,
-    size_m: Float[np.ndarray, "drones 3"],
-    position_m: Float[np.ndarray, "frames drones 3"],
-    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+    exposures: Exposures | None,
+    middles: CameraMiddles,
+    drones: FoundDrones,
 ) -> CameraViews:
     """The views, from the middles of the foreground.
 
     Args:
         cameras: cameras with one leading axis.
-        silhouettes: silhouettes of all cameras.
-        size_m: (drones, 3), full lengths of the drones, metres.
-        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
+        exposures: exposures of the silhouettes; None where all cameras' frames were exposed at the instant.
+        middles: the middles (see `psotrack.tracking.middles_in_cameras`).
+        drones: the drones of the run.
     """
-    middles = middles_in_cameras(cameras, silhouettes, size_m, position_m, velocity_m_s)
     # The score changes with a shift relative to the box, so a view counts by the square of this share.
     weight = np.nan_to_num(np.square(1 / np.asarray(middles.half_px, np.float64)))
     return views_of_places(
         cameras,
         np.asarray(middles.middle_px, np.float64),
         weight,
-        position_m,
-        velocity_m_s,
-        _moved(silhouettes.exposures, velocity_m_s),
+        drones.position_m,
+        drones.velocity_m_s,
+        _moved(exposures, drones.velocity_m_s),
     )

@@ -31,7 +31,8 @@ from psotrack.pipeline.stages import (
     track_detections,
     track_silhouettes,
     track_with_plugin,
-    with_errors_of_cameras,
+    with_errors_of_detections,
+    with_errors_of_silhouettes,
 )
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
@@ -171,11 +172,12 @@ def _track_at_instants(
     by_lines = [track_detections(recording, run, report) for run in runs]
     initial = initial_states(recording, silhouettes, runs, by_lines)
     by_swarm = track_silhouettes(recording, silhouettes, runs, initial, parts, report)
+    by_swarm = with_errors_of_silhouettes(recording, silhouettes, runs, by_swarm)
     by_plugin = [
         track_with_plugin(recording, silhouettes, run, state, report)
         for run, state in zip(runs, initial, strict=True)
     ]
     return [
-        (run, plugin or with_errors_of_cameras(recording, silhouettes, run, swarm, lines))
+        (run, plugin or with_errors_of_detections(recording, run, swarm, lines))
         for run, lines, swarm, plugin in zip(runs, by_lines, by_swarm, by_plugin, strict=True)
     ]

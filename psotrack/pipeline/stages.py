@@ -123,21 +123,45 @@ def track_with_plugin(
     return track_by_plugin(run.plugin, inputs, report)
 
 
-def with_errors_of_cameras(
+def with_errors_of_silhouettes(
     recording: Recording,
     silhouettes: Silhouettes | None,
+    runs: Sequence[PreparedRun],
+    by_swarm: Sequence[MethodResult | None],
+) -> list[MethodResult | None]:
+    """The results of the swarm with the cameras' errors in the covariances, for all runs together."""
+    corrected = list(by_swarm)
+    found = {number: result for number, result in enumerate(by_swarm) if result and result.tracks.num_drones}
+    if not found:
+        return corrected
+    assert silhouettes is not None
+    settings = [runs[number].settings for number in found]
+    results = add_errors_of_silhouettes(
+        list(found.values()), recording.rig, silhouettes, settings, recording.fps
+    )
+    for number, result in zip(found, results, strict=True):
+        corrected[number] = result
+    return corrected
+
+
+def with_errors_of_detections(
+    recording: Recording,
     run: PreparedRun,
     swarm: MethodResult | None,
     lines: MethodResult | None,
 ) -> MethodResult:
-    """The result of swarm or projection lines, or of both fused, with the cameras' errors in the covariances."""
-    rig, settings, fps = recording.rig, run.settings, recording.fps
-    if swarm is not None and swarm.tracks.num_drones:
-        assert silhouettes is not None
-        swarm = add_errors_of_silhouettes(swarm, rig, silhouettes, settings, fps)
+    """The result of swarm or projection lines, or of both fused, with the cameras' errors in the covariances.
+
+    Args:
+        recording: the recording.
+        run: the run.
+        swarm: result of the swarm, with the errors of the cameras.
+        lines: result of the projection lines.
+    """
+    settings, fps = run.settings, recording.fps
     if lines is not None and lines.tracks.num_drones:
         assert run.detections is not None
-        lines = add_errors_of_detections(lines, rig, run.detections, settings, fps)
+        lines = add_errors_of_detections(lines, recording.rig, run.detections, settings, fps)
     if swarm is not None and lines is not None:
         return fuse_methods(swarm, lines, settings, fps)
     result = swarm or lines

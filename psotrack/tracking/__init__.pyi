@@ -1,4 +1,4 @@
-from .camera_middles import CameraMiddles, middles_in_cameras
+from .camera_middles import CameraMiddles, FoundDrones, middles_in_cameras
 from .causal import CausalRow, CausalTracker
 from .chunks import RunInputs, on_device, track_silhouettes
 from .fitness import (
@@ -20,6 +20,7 @@ __all__ = [
     "CameraMiddles",
     "CausalRow",
     "CausalTracker",
+    "FoundDrones",
     "ParticleSwarm",
     "RunInputs",
     "Score",

@@ -137,6 +137,7 @@ def track_silhouettes(
     runs: Sequence[RunInputs],
     *,
     fps: float,
+    side_by_side: bool | None = None,
     report: Report = no_progress,
 ) -> list[tuple[Tracks, float]]:
     """Track the drones of one or more runs through all frames; the runs share all devices (`jax.devices()`).
@@ -146,6 +147,8 @@ def track_silhouettes(
         silhouettes: silhouettes of all cameras of the rig.
         runs: inputs of each run.
         fps: frames per second.
+        side_by_side: whether a device computes its runs side by side, not one after the other; None is the choice for
+            the device (see `track_batch`).
         report: shows the progress in frames; all runs go through the frames together.
 
     Returns:
@@ -153,7 +156,7 @@ def track_silhouettes(
     """
     kinds = [_kind(tracker_program(run.settings, silhouettes.reduction), run.settings) for run in runs]
     capacity = {kind: largest_share(kinds, kind) for kind in set(kinds)}
-    work = partial(_track_through_chunks, rig, silhouettes, fps, capacity)
+    work = partial(_track_through_chunks, rig, silhouettes, fps, capacity, side_by_side)
     tracked = share_among_devices(runs, kinds, work, report)
     # All devices compile at the same time, so the time of compiling is counted once.
     return [(tracks, compile_s / num_used_devices(len(runs))) for tracks, compile_s in tracked]
@@ -169,18 +172,19 @@ def _kind(program: tracker.Program, settings: TrackerSettings) -> Hashable:
     return program, jax.tree.structure(settings.search)
 
 
-def _track_through_chunks(
+def _track_through_chunks(  # noqa: PLR0913  # A share of runs is given like `track_silhouettes` itself.
     rig: Rig,
     silhouettes: Silhouettes,
     fps: float,
     capacity: dict[Hashable, int],
+    side_by_side: bool | None,
     inputs: list[RunInputs],
     device: jax.Device,
     report: Report,
 ) -> list[tuple[Tracks, float]]:
     """Track some runs together through all chunks, on one device."""
     setting = _Setting(rig, on_device(rig.cameras), silhouettes.reduction, fps, device)
-    batches = _Batches(setting, _blank_chunk(silhouettes), capacity)
+    batches = _Batches(setting, _blank_chunk(silhouettes), capacity, side_by_side)
     runs = [_begin(each, setting) for each in inputs]
     with report("track", silhouettes.num_frames) as advance:
         for first, chunk in _chunks(silhouettes):
@@ -233,11 +237,13 @@ class _Batches:
         setting: _Setting,
         blank: Chunk,
         capacity: dict[Hashable, int],
+        side_by_side: bool | None,
     ) -> None:
         self.compile_s = 0.0
         self._setting = setting
         self._blank = blank
         self._capacity = capacity
+        self._side_by_side = side_by_side
         self._compiled: set[Hashable] = set()
 
     def track(
@@ -260,6 +266,7 @@ class _Batches:
                 program=program,
                 capacity=self._capacity[kind],
                 device=self._setting.device,
+                side_by_side=self._side_by_side,
             )
             if shape not in self._compiled:
                 began = time.perf_counter()
