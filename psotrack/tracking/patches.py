@@ -320,16 +320,20 @@ def _read(coverage: Coverage, grid: _Grid) -> Int[Array, "drones cameras side si
     shape = (num_cameras, (height + -height % step) // 2, (width + -width % step) // 4)
     two = jax.lax.cond((grid.level > 0).any(), halved, lambda: jnp.zeros(shape, jnp.uint32))
 
+    def with_level(number: int, level: Array, value: Array) -> Array:
+        value = jnp.where(grid.is_at(number), _mean(grid.pixels(level, number), number), value)
+        if number + 1 == NUM_LEVELS:
+            return value
+
+        def with_coarser() -> Array:
+            rows = level[:, 0::2] + level[:, 1::2]
+            return with_level(number + 1, rows[..., 0::2] + rows[..., 1::2], value)
+
+        return jax.lax.cond((grid.level > number).any(), with_coarser, lambda: value)
+
     def coarse() -> Array:
         rows = two[:, 0::2] + two[:, 1::2]
-        levels = [(rows & 0xFFFF) + (rows >> 16)]
-        for _ in range(3, NUM_LEVELS):
-            rows = levels[-1][:, 0::2] + levels[-1][:, 1::2]
-            levels.append(rows[..., 0::2] + rows[..., 1::2])
-        value = none
-        for number, level in enumerate(levels, 2):
-            value = jnp.where(grid.is_at(number), _mean(grid.pixels(level, number), number), value)
-        return value
+        return with_level(2, (rows & 0xFFFF) + (rows >> 16), none)
 
     # Only drones that are very near have coarser windows.
     value = jax.lax.cond((grid.level > 1).any(), coarse, lambda: none)
