@@ -192,15 +192,7 @@ def _wide(
         solved = inverse @ shares[part]
         least_shown = np.sqrt(2 / np.vdot(solved, solved.T))
         scales.append(np.sqrt(likeliest[part] + least_shown) * _SCALES)
-    grid = np.stack(np.meshgrid(*scales, indexing="ij"), axis=-1)
-    variances = np.zeros((*grid.shape[:-1], 2))
-    variances[..., there] = np.square(grid)
-    inverse = np.linalg.inv(_total(shares, variances))
-    log_likelihood = (np.linalg.slogdet(inverse)[1] - np.einsum("...ij,i,j->...", inverse, seen, seen)) / 2
-    # Fisher information about the logarithms of the standard deviations.
-    changes = [variances[..., part, None, None] * (inverse @ shares[part]) for part in there]
-    information = np.array([[2 * np.einsum("...ij,...ji->...", a, b) for b in changes] for a in changes])
-    determinant = np.linalg.det(np.moveaxis(information, (0, 1), (-2, -1)))
+    log_likelihood, determinant = _on_grid(seen, [shares[part] for part in there], scales)
     posterior = np.exp(log_likelihood - log_likelihood.max()) * np.sqrt(np.maximum(determinant, 0.0))
     for axis in range(len(there)):
         steps = np.gradient(np.log(_SCALES))
@@ -209,6 +201,51 @@ def _wide(
         share = posterior.sum(axis=tuple(other for other in range(len(there)) if other != axis))
         wide[part] = _wide_variance(np.square(scales[axis]), share / share.sum())
     return wide
+
+
+def _on_grid(
+    seen: Float[np.ndarray, "seen"], shares: list[Float[np.ndarray, "seen seen"]], scales: list[np.ndarray]
+) -> tuple[Float[np.ndarray, "*grid"], Float[np.ndarray, "*grid"]]:
+    """Log likelihoods on a grid of one or two standard deviations, and determinants of their Fisher informations.
+
+    The information is about the logarithms of the standard deviations. The covariance 1 + a A + b B has no inverse of
+    its own at each point of the grid, which would take minutes for many cameras. For each a, one basis makes 1 + a A
+    the identity and B diagonal. Then a sum over the diagonal gives the likelihood for any b.
+    """
+    a, b = (np.square(scale) for scale in (scales[0], scales[-1]))
+    own, axes = np.linalg.eigh(shares[0])
+    own, seen = np.maximum(own, 0.0), axes.T @ seen
+    if len(shares) == 1:
+        total = 1 + a[:, None] * own
+        log_likelihood = -(np.log(total) + np.square(seen) / total).sum(axis=-1) / 2
+        return log_likelihood, 2 * np.square(a[:, None] * own / total).sum(axis=-1)
+    other = axes.T @ shares[1] @ axes
+    rows = [_for_one_variance(seen, own, other, each, b) for each in a]
+    log_likelihood, determinant = (np.stack(of) for of in zip(*rows, strict=True))
+    return log_likelihood, determinant
+
+
+def _for_one_variance(
+    seen: Float[np.ndarray, "seen"],
+    own: Float[np.ndarray, "seen"],
+    other: Float[np.ndarray, "seen seen"],
+    a: float,
+    b: Float[np.ndarray, "grid"],
+) -> tuple[Float[np.ndarray, "grid"], Float[np.ndarray, "grid"]]:
+    """One row of `_on_grid`: A is diagonal, with the elements `own`; B is `other`."""
+    root = 1 / np.sqrt(1 + a * own)
+    values, vectors = np.linalg.eigh(root[:, None] * other * root)
+    values = np.maximum(values, 0.0)
+    total = 1 + b[:, None] * values
+    squares = np.square(vectors.T @ (root * seen))
+    log_likelihood = -(np.log1p(a * own).sum() + (np.log(total) + squares / total).sum(axis=-1)) / 2
+    # a A and b B in this basis, times the inverse covariance: their products have these traces.
+    by_a = (vectors.T * (a * own * np.square(root))) @ vectors
+    by_b = b[:, None] * values / total
+    both_a = ((1 / total) @ np.square(by_a) / total).sum(axis=-1)
+    both_b = np.square(by_b).sum(axis=-1)
+    crossed = (by_b / total * np.diag(by_a)).sum(axis=-1)
+    return log_likelihood, 4 * (both_a * both_b - np.square(crossed))
 
 
 def _wide_variance(variance: Float[np.ndarray, "grid"], share: Float[np.ndarray, "grid"]) -> float:
