@@ -14,6 +14,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pandas as pd
 import pytest
 from sweeps import all_rows, grid_file, make_older, psotrack, small_sequence, stamps
@@ -147,6 +148,10 @@ def test_one_row_per_cell_and_run(swept: Path) -> None:
     assert (rows["frames"] > 0).all()
     assert {"seconds.track", "versions.jax", "device.kind", "device.processor", "commit"} <= set(rows.columns)
     assert {"perturbation.flipped", "runs_in_batch", "seconds.compile"} <= set(rows.columns)
+    # Six frames at 25 frames per second, over the run's share of the seconds of all runs; three decimals are stored.
+    share_s = rows["seconds.batch"] / rows["runs_in_batch"]
+    np.testing.assert_allclose(rows["real_time_factor"], 6 / 25 / share_s, atol=0.0006)
+    assert (rows["real_time_factor_running"] > rows["real_time_factor"]).all()
     # The folder is one Parquet data set, with failures, errors and a manifest in it.
     data_set = pd.read_parquet(swept / "results")
     pd.testing.assert_frame_equal(data_set, Store(swept / "results").rows(), check_dtype=False)
@@ -192,6 +197,9 @@ def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str])
     assert code == 0
     assert "usual" in lines[0]
     assert "calm" in lines[0]
+    code, lines, _ = called(capsys, *words[:-2], "--value", "real_time_factor")
+    assert code == 0
+    assert lines[0].startswith("real_time_factor: mean")
     # If the rows are methods, the default columns are the sequences.
     code, lines, _ = called(capsys, "table", swept / "results", "--rows", "method")
     assert code == 0

@@ -1,6 +1,6 @@
 from .causal_run import CausalRecording, CausalRun, causal_settings
 from .parts import Parts
-from .results import TrackedRecording, environment, with_real_time
+from .results import TrackedRecording, environment, real_time_factors, with_real_time
 from .running import track_recording, track_runs
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "TrackedRecording",
     "causal_settings",
     "environment",
+    "real_time_factors",
     "track_recording",
     "track_runs",
     "with_real_time",

@@ -154,13 +154,26 @@ def with_real_time(record: Mapping[str, Any], wall_s: float, *, start_s: float =
         wall_s: time from the first byte that was read to the last row, seconds.
         start_s: part of it that the program took to start.
     """
-    video_s = record["frames"] / record["rate_hz"]
-    running_s = max(wall_s - start_s - record["seconds"]["compile"], 1e-3)
+    not_running_s = start_s + record["seconds"]["compile"]
     return {
         **record,
         "seconds": {**record["seconds"], "total": round(wall_s, 4)},
+        **real_time_factors(record, wall_s, not_running_s),
+    }
+
+
+def real_time_factors(record: Mapping[str, Any], wall_s: float, not_running_s: float) -> dict[str, float]:
+    """Seconds of video per second of wall clock, and the same without the start of the program and compilation.
+
+    Args:
+        record: record of a run.
+        wall_s: seconds of wall clock that the run took.
+        not_running_s: part of these seconds in which the program started and compiled.
+    """
+    video_s = record["frames"] / record["rate_hz"]
+    return {
         "real_time_factor": round(video_s / wall_s, 3),
-        "real_time_factor_running": round(video_s / running_s, 3),
+        "real_time_factor_running": round(video_s / max(wall_s - not_running_s, 1e-3), 3),
     }
 
 

@@ -45,7 +45,9 @@ def sweep(
     Returns:
         Rows of the grid's cells and seeds only, in the grid's order. Settings are columns with dots
         (`settings.swarm.particles`), and metrics have units in their names. `seconds.*`, `device.*`, `versions.*` and
-        `commit` record the time and the origin of a row. `attrs["errors"]` lists failed cells by title.
+        `commit` record the time and the origin of a row. `real_time_factor` is seconds of video per second of wall
+        clock of a run's share of its batch, with stored silhouettes; `real_time_factor_running` is the same without
+        compilation. `attrs["errors"]` lists failed cells by title.
 
     Raises:
         InputError: a sequence does not exist, or every cell failed.

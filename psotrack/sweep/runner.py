@@ -16,7 +16,7 @@ import pandas as pd
 
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
-from psotrack.pipeline import TrackedRecording, track_runs
+from psotrack.pipeline import TrackedRecording, real_time_factors, track_runs
 from psotrack.support import Report, drop_programs_if_many, no_progress
 from psotrack.sweep.cells import Cell, cell_key, failure_name, title
 from psotrack.sweep.grid_files import Grid, cameras_label
@@ -244,12 +244,22 @@ def _run_seeds(
     of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
     origin = {"cell": key, "input": input_name} | dict(flatten(provenance()))
     runs = list(zip(seeds, results, strict=True))
-    rows = [of_cell | {"seed": seed} | of_batch | _figures(result, given) | origin for seed, result in runs]
+    figures = [_figures(result, given, total_s / len(seeds)) for result in results]
+    rows = [
+        of_cell | {"seed": seed} | of_batch | of_run | origin
+        for seed, of_run in zip(seeds, figures, strict=True)
+    ]
     return pd.DataFrame(rows), pd.concat([_errors(seed, result, given) for seed, result in runs])
 
 
-def _figures(result: TrackedRecording | InputError, given: Input) -> dict[str, Any]:
-    """Evaluation and duration of a run. A run that finds no drones has missed all drones."""
+def _figures(result: TrackedRecording | InputError, given: Input, wall_s: float) -> dict[str, Any]:
+    """Evaluation and duration of a run. A run that finds no drones has missed all drones.
+
+    Args:
+        result: result of the run.
+        given: input of the run.
+        wall_s: the run's share of the seconds of wall clock of all runs.
+    """
     # All runs have the same columns, so that programs can read all cells as one data set.
     if isinstance(result, InputError):
         metrics = [field.name for field in fields(Evaluation) if field.name not in ("frames", "per_drone")]
@@ -260,6 +270,8 @@ def _figures(result: TrackedRecording | InputError, given: Input) -> dict[str, A
     figures = {"note": ""} | {name: np.nan if value is None else value for name, value in errors.items()}
     seconds = result.record["seconds"]
     figures |= {f"seconds.{stage}": value for stage, value in seconds.items()}
+    # A sweep reads stored silhouettes and starts once for all cells, so neither is in the seconds of a run.
+    figures |= real_time_factors(result.record, wall_s, not_running_s=seconds["compile"])
     return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.recording.num_frames}
 
 
