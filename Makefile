@@ -16,7 +16,7 @@ oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python 
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow lint format bench bench-end-to-end bench-live bench-gpu notebooks table4 table5 table5-quick table7 docs results results-check clean
+.PHONY: help demo test test-slow lint format bench bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -64,6 +64,9 @@ bench-live: $(VENV)/.installed  ## live: delay of the rows, memory over an hour,
 
 bench-gpu: $(VENV)/.installed  ## a GPU against two cores: Table 5's grid, 64 runs at once, equal tracks; JAX for it: pip install -e '.[cuda]'
 	@$(BIN)/python experiments/benchmarks/gpu.py $(if $(DATA),--data $(DATA))
+
+bench-scaling: $(VENV)/.installed  ## cost per frame against cameras, drones, particles, image size; what breaks first; ten minutes
+	@$(BIN)/python experiments/benchmarks/scaling.py
 
 notebooks: $(VENV)/.installed  ## run the notebooks and write them with their output; commit the changed files
 	@cd notebooks && ../$(BIN)/python _refresh.py

@@ -22,6 +22,9 @@ BOUNDS_M = np.array([[-6.0, -5.0, -0.2], [6.0, 5.0, 4.0]])
 #: Full lengths of every drone, metres.
 DRONE_SIZE_M = np.array([0.48, 0.48, 0.24])
 
+#: Full lengths of the drones of a formation, metres.
+SMALL_DRONE_SIZE_M = DRONE_SIZE_M / 2
+
 #: Period of the closed paths, frames.
 PERIOD_FRAMES = 250
 
@@ -45,6 +48,15 @@ class Scene:
     position_m: np.ndarray
     velocity_m_s: np.ndarray
     size_m: np.ndarray
+
+    def picture(self, background: np.ndarray, camera: int, frame: int) -> np.ndarray:
+        """(height, width, 3), uint8: a camera's picture of dark drones before a background of the image's size."""
+        image = background.copy()
+        one = self.rig.cameras[camera]
+        for centre_m, size_m in zip(self.position_m[frame], self.size_m, strict=True):
+            points = np.round(_outline_px(one, centre_m, size_m) * 2**_SHIFT).astype(np.int32)
+            cv2.fillConvexPoly(image, points, (30, 30, 30), cv2.LINE_AA, _SHIFT)
+        return image
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -71,13 +83,6 @@ def scene(num_frames: int, num_drones: int, num_cameras: int) -> Scene:
     Cameras hang on an ellipse of 10 x 8 m, 3 m high, and look at the middle of the room. Drones fly on Lissajous
     curves at up to about 2 m/s, one above another, so that they never touch but occlude each other in images.
     """
-    named = {}
-    for index in range(num_cameras):
-        angle = 2 * np.pi * (index + 0.5) / num_cameras
-        R, t_m = look_at((5 * np.cos(angle), 4 * np.sin(angle), 3.0), (0.0, 0.0, 1.2))
-        K = np.array([[1156.3, 0.0, 960.0], [0.0, 1156.3, 540.0], [0.0, 0.0, 1.0]])
-        named[f"camera{index}"] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=IMAGE_SIZE_WH)
-
     rate = 2 * np.pi / PERIOD_FRAMES * FPS
     time_s = np.arange(num_frames)[:, None] / FPS
     drone = np.arange(num_drones)
@@ -89,11 +94,50 @@ def scene(num_frames: int, num_drones: int, num_cameras: int) -> Scene:
     position_m = amplitudes_m * np.sin(angles)
     position_m[..., 2] += level_m
     return Scene(
-        rig=make_rig(named),
+        rig=_ring(num_cameras, IMAGE_SIZE_WH),
         position_m=position_m,
         velocity_m_s=amplitudes_m * turns * np.cos(angles),
         size_m=np.tile(DRONE_SIZE_M, (num_drones, 1)),
     )
+
+
+def formation(num_frames: int, num_drones: int, num_cameras: int, image_size_wh: tuple[int, int]) -> Scene:
+    """A scene for up to 60 drones, which fly a circle together, each at its own place of a grid.
+
+    Places are 0.95 m apart in the plane and 0.8 m in height, so that drones never touch and the room does not get
+    denser where few drones are added. The circle has a radius of 0.7 m and takes 3 s. The drones are small, because
+    fifty large ones hide each other.
+
+    Args:
+        num_frames, num_drones, num_cameras: numbers of frames, drones and cameras.
+        image_size_wh: width and height of the images, pixels; lenses have the same angle of view at all sizes.
+    """
+    grid_m = np.stack(np.meshgrid(np.arange(5), np.arange(4), np.arange(3), indexing="ij"), axis=-1)
+    places_m = (grid_m.reshape(-1, 3) - [2.0, 1.5, 0.0]) * [0.95, 0.95, 0.8] + [0.0, 0.0, 0.6]
+    places_m = np.random.default_rng(0).permutation(places_m)[:num_drones]
+    turn = 2 * np.pi / 3.0
+    angle = turn * np.arange(num_frames) / FPS
+    moved_m = 0.7 * np.stack([np.cos(angle), np.sin(angle), np.zeros(num_frames)], axis=-1)
+    velocity_m_s = 0.7 * turn * np.stack([-np.sin(angle), np.cos(angle), np.zeros(num_frames)], axis=-1)
+    return Scene(
+        rig=_ring(num_cameras, image_size_wh),
+        position_m=moved_m[:, None] + places_m,
+        velocity_m_s=np.repeat(velocity_m_s[:, None], num_drones, axis=1),
+        size_m=np.tile(SMALL_DRONE_SIZE_M, (num_drones, 1)),
+    )
+
+
+def _ring(num_cameras: int, image_size_wh: tuple[int, int]) -> Rig:
+    """Cameras on an ellipse of 10 x 8 m, 3 m high, that look at the middle of the room."""
+    width, height = image_size_wh
+    focal_px = 1156.3 / 1920 * width
+    K = np.array([[focal_px, 0.0, width / 2], [0.0, focal_px, height / 2], [0.0, 0.0, 1.0]])
+    named = {}
+    for index in range(num_cameras):
+        angle = 2 * np.pi * (index + 0.5) / num_cameras
+        R, t_m = look_at((5 * np.cos(angle), 4 * np.sin(angle), 3.0), (0.0, 0.0, 1.2))
+        named[f"camera{index}"] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
+    return make_rig(named)
 
 
 def _outline_px(one: Camera, centre_m: np.ndarray, size_m: np.ndarray) -> np.ndarray:
