@@ -142,7 +142,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--axes", nargs="+", choices=AXES, default=list(AXES), help="what changes")
-    parser.add_argument("--repeats", type=int, default=2, help="timings of which the best one counts")
+    parser.add_argument("--repeats", type=int, default=6, help="timings of which the best one counts")
     parser.add_argument("--small", action="store_true", help="few small values: for a test of this program")
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/scaling.png"))
     parser.add_argument("--results", type=Path, help="write the result and its record into this folder")
