@@ -9,6 +9,8 @@ from helpers import ROOM_M, draw_coverage, ring_rig, track_settings
 
 from psotrack.identity import postprocess
 from psotrack.initiation import InitialState
+from psotrack.pipeline import track_runs
+from psotrack.recordings import FrameTimes, Recording
 from psotrack.silhouettes import Silhouettes
 from psotrack.tracking import (
     FoundDrones,
@@ -18,7 +20,7 @@ from psotrack.tracking import (
     tracker_settings,
 )
 from psotrack.tracking.devices import computes_side_by_side
-from psotrack.trajectories import Status
+from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0
 REDUCTION = 2
@@ -162,3 +164,26 @@ def test_middles_side_by_side_are_those_one_after_another(silhouettes):
     for one, other in zip(side_by_side, middles(silhouettes, FOUND, side_by_side=False), strict=True):
         # Float32 of places up to 480 px: rounding is below 1e-4 px, a thousandth of the noise of a camera.
         np.testing.assert_allclose(one, other, atol=1e-3)
+
+
+def test_runs_together_have_the_covariances_and_camera_errors_of_each_run_alone(silhouettes, tmp_path):
+    """The errors of the cameras are learned from all runs' middles, which are found together."""
+    frame = np.arange(NUM_FRAMES)
+    truth = Trajectories(frame, frame / FPS, ("first", "second"), TRUTH_M)
+    times = {name: FrameTimes(NUM_FRAMES, FPS) for name in RIG.names}
+    bounds_m = tuple(ROOM_M.T.ravel().tolist())
+    recording = Recording("drawn", tmp_path, RIG, {}, truth, frame_times=times, bounds_m=bounds_m)
+    settings = [
+        track_settings(**EFFORT, seed=seed, init="truth", **{"drones.size_m": tuple(SIZE_M[0].tolist())})
+        for seed in (0, 5)
+    ]
+    together = track_runs(recording, silhouettes, settings)
+    for one, of_run in zip(settings, together, strict=True):
+        (alone,) = track_runs(recording, silhouettes, [one])
+        for name in ("position_m", "covariance_m2", "relative_covariance_m2"):
+            np.testing.assert_array_equal(
+                getattr(of_run.trajectories, name), getattr(alone.trajectories, name)
+            )
+        assert of_run.record["camera_errors"] == alone.record["camera_errors"]
+    # Each run has its own errors: other seeds place the drones by other roundings.
+    assert together[0].record["camera_errors"] != together[1].record["camera_errors"]

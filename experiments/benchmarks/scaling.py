@@ -4,7 +4,7 @@
     python experiments/benchmarks/scaling.py --axes cameras drones --repeats 5
     python experiments/benchmarks/scaling.py --small --picture scaling.png --results results     # a minute, for a test
 
-One quantity changes, and the others stay as they are: 8 cameras of 640 x 360 pixels at 25 frames per second, 4 drones,
+One quantity changes, and the others stay as they are: 8 cameras of 960 x 540 pixels at 25 frames per second, 4 drones,
 30 particles for each drone. Each measurement is a process of its own, which draws videos, makes the silhouettes, tracks
 from the reference's first frame, and prints the cost per instant, which is one frame of all cameras:
 
@@ -91,7 +91,7 @@ class Shape:
     cameras: int = 8
     drones: int = 4
     particles: int = 30
-    width: int = 640
+    width: int = 960
     frames: int = 75
 
     @property
@@ -105,7 +105,7 @@ AXES = {
     "cameras": (2, 4, 8, 16, 32, 64),
     "drones": (1, 2, 5, 10, 20, 50),
     "particles": (10, 30, 100, 300),
-    "width": (320, 640, 1280, 1920),
+    "width": (480, 960, 1440, 1920),
 }
 #: A minute: three values on two axes, few frames.
 SMALL_AXES = {"cameras": (2, 3, 4), "drones": (1, 2, 3), "particles": (8,), "width": (320,)}
