@@ -10,7 +10,8 @@ from the reference's first frame, and prints the cost per instant, which is one 
 
 - front end: decoding and foreground, the first look at the videos included, in one process, processor milliseconds;
 - start: the volume in which things move and the drones' first positions are found, processor seconds, once for a
-  recording; the other parts are given the volume and the reference's first positions;
+  recording, and measured with few cameras and drones only, because it takes minutes with many; the other parts are
+  given the volume and the reference's first positions;
 - track: the swarm and the search for new drones, milliseconds; the best of some repeats without compilation;
 - finish: errors of the cameras, identities, smoothing, milliseconds; in the same way;
 - meeting: frames of live cameras meet at an instant, milliseconds; in the same way;
@@ -69,6 +70,8 @@ import _results
 INSTANT_MS = 1e3 / _scene.FPS
 #: Longest start and longest compilation, seconds.
 LONGEST_S = 60.0
+#: Largest number of cameras times drones with which the start is measured.
+MOST_AT_START = 80
 #: No further repeat begins after this time, seconds.
 REPEATING_S = 15.0
 #: A part does not break on an axis if its line reaches the limit farther beyond the largest measurement.
@@ -92,7 +95,7 @@ class Shape:
     drones: int = 4
     particles: int = 30
     width: int = 960
-    frames: int = 75
+    frames: int = 50
 
     @property
     def size_wh(self) -> tuple[int, int]:
@@ -208,7 +211,8 @@ def measure(shape: Shape, repeats: int) -> dict[str, float]:
                 raise tracked
             spent_s += processor_s[-1] if runs else 0.0
             runs.append(tracked)
-        found_s = start_s(recording, silhouettes)
+        few = shape.cameras * shape.drones <= MOST_AT_START
+        found_s = start_s(recording, silhouettes) if few else math.nan
     assert recording.truth is not None
     judged = evaluate(runs[-1].trajectories, recording.truth).to_dict()
     left_out = sum(stop - start for of_camera in silhouettes.left_out.values() for start, stop in of_camera)
@@ -292,19 +296,20 @@ def meeting_ms(num_cameras: int) -> float:
 
 
 def fitted(rows: pd.DataFrame) -> dict[str, dict[str, dict[str, float]]]:
-    """Exponent, its standard error, and the factor, by axis and part. An axis with fewer than three values has none.
+    """Exponent, its standard error, and the factor, by axis and part. Fewer than three values have none.
 
     The standard error contains noise and how far the cost is from a power.
     """
     fits: dict[str, dict[str, dict[str, float]]] = {}
     for axis, of_axis in rows.groupby("axis", sort=False):
-        if len(of_axis) < 3:
-            continue
-        x = np.log(of_axis["value"].to_numpy(float))
-        design = np.stack([x, np.ones_like(x)], axis=-1)
         fits[str(axis)] = {}
         for name, part in parts().items():
-            y = np.log(np.maximum(of_axis[part.column].to_numpy(float), 1e-6))
+            known = of_axis[of_axis[part.column].notna()]
+            if len(known) < 3:
+                continue
+            x = np.log(known["value"].to_numpy(float))
+            y = np.log(np.maximum(known[part.column].to_numpy(float), 1e-6))
+            design = np.stack([x, np.ones_like(x)], axis=-1)
             (exponent, factor), *_ = np.linalg.lstsq(design, y)
             left = y - design @ (exponent, factor)
             variance = left @ left / (len(x) - 2) / np.square(x - x.mean()).sum()
