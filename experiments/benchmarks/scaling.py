@@ -2,6 +2,7 @@
 
     python experiments/benchmarks/scaling.py
     python experiments/benchmarks/scaling.py --axes cameras drones --repeats 5
+    python experiments/benchmarks/scaling.py --kept data/scaling --seconds 40        # call again until it is done
     python experiments/benchmarks/scaling.py --small --picture scaling.png --results results     # a minute, for a test
 
 One quantity changes, and the others stay as they are: 8 cameras of 960 x 540 pixels at 25 frames per second, 4 drones,
@@ -30,6 +31,7 @@ the front end for each processor), a minute of compilation, the memory of this m
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import multiprocessing
 import os
@@ -156,10 +158,16 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="few small values: for a test of this program")
     parser.add_argument("--picture", type=Path, default=Path("experiments/pictures/scaling.png"))
     parser.add_argument("--results", type=Path, help="write the result and its record into this folder")
+    parser.add_argument("--kept", type=Path, help="keep measurements in this folder; the same call continues")
+    parser.add_argument(
+        "--seconds", type=float, default=math.inf, help="begin no measurement after this time"
+    )
     options = parser.parse_args()
     run = _results.Run("scaling")
     axes, usual = (SMALL_AXES, SMALL) if options.small else (AXES, Shape())
-    rows = pd.DataFrame(list(measured({axis: axes[axis] for axis in options.axes}, usual, options.repeats)))
+    kept = None if options.kept is None else options.kept / f"{run.code_state}.json"
+    chosen = {axis: axes[axis] for axis in options.axes}
+    rows = pd.DataFrame(measured(chosen, usual, options.repeats, kept, options.seconds))
     fits = fitted(rows)
     broken = breaking(rows, fits)
     print_results(rows, fits, broken)
@@ -169,21 +177,40 @@ def main() -> None:
         run.save(options.results, rows=rows, figures=figures, files=[options.picture])
 
 
-def measured(axes: Mapping[str, Sequence[int]], usual: Shape, repeats: int) -> list[dict[str, Any]]:
-    """One row for each value of each axis. What two axes share is measured once."""
-    known: dict[Shape, dict[str, Any]] = {}
-    rows = []
+def measured(
+    axes: Mapping[str, Sequence[int]], usual: Shape, repeats: int, kept: Path | None, most_s: float
+) -> list[dict[str, Any]]:
+    """One row for each value of each axis. What two axes share is measured once.
+
+    Args:
+        axes: values on each axis.
+        usual: what does not change.
+        repeats: timings of which the best one counts.
+        kept: file of measurements of earlier calls in the same state of the code, which is continued; None keeps none.
+        most_s: time after which no measurement begins, seconds; the program then ends, and says so.
+    """
+    began = time.monotonic()
+    known = json.loads(kept.read_text(encoding="utf-8")) if kept is not None and kept.exists() else {}
+    shapes = {
+        (axis, value): replace(usual, **{axis: value}) for axis, values in axes.items() for value in values
+    }
     spawn = multiprocessing.get_context("spawn")
-    for axis, values in axes.items():
-        for value in values:
-            shape = replace(usual, **{axis: value})
-            if shape not in known:
-                # A process of its own, so that its peak of memory is that of this shape alone.
-                with ProcessPoolExecutor(1, mp_context=spawn) as process:
-                    known[shape] = process.submit(measure, shape, repeats).result()
-                print(shape, {key: round(cost, 3) for key, cost in known[shape].items()}, flush=True)
-            rows.append({"axis": axis, "value": value, **asdict(shape), **known[shape]})
-    return rows
+    for shape in dict.fromkeys(shapes.values()):
+        if str(shape) in known:
+            continue
+        if time.monotonic() - began > most_s:
+            sys.exit(f"scaling: {len(known)} measurements are done; the same call measures the others")
+        # A process of its own, so that its peak of memory is that of this shape alone.
+        with ProcessPoolExecutor(1, mp_context=spawn) as process:
+            known[str(shape)] = process.submit(measure, shape, repeats).result()
+        print(shape, {key: round(cost, 3) for key, cost in known[str(shape)].items()}, flush=True)
+        if kept is not None:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_text(json.dumps(known), encoding="utf-8")
+    return [
+        {"axis": axis, "value": value, **asdict(shape), **known[str(shape)]}
+        for (axis, value), shape in shapes.items()
+    ]
 
 
 def measure(shape: Shape, repeats: int) -> dict[str, float]:
