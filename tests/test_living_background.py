@@ -187,6 +187,19 @@ def test_a_place_that_drones_cross_stays_calm() -> None:
     assert _f1(background.step(_exposed(pale, rng)), drone) > 0.9
 
 
+def test_flashes_that_were_learned_long_ago_leave_no_invalid_numbers() -> None:
+    """OpenCV's blur gave numbers below 0 after some minutes, and their roots were no numbers."""
+    rng = np.random.default_rng(0)
+    calm = np.full((60, 80, 3), 100, np.uint8)
+    background = LivingBackground(ForegroundSettings(), calm)
+    with np.errstate(invalid="raise"):
+        for frame in range(2500):
+            image = calm.copy()
+            if frame % 300 == 0:
+                image[rng.random((60, 80)) < 0.02] = rng.integers(0, 255)
+            background.step(image, num_frames=3)
+
+
 def test_what_a_tracker_knows_is_not_learned() -> None:
     """Where a tracker says that a drone is, even a difference without edges of its own stays."""
     rng = np.random.default_rng(6)

@@ -269,7 +269,8 @@ class LivingBackground:
 
     def _restlessness(self) -> Float[np.ndarray, "height width"]:
         """(height, width), difference that leaves, screens, waves and noise make at a place, grey levels."""
-        deviation = np.sqrt(cv2.blur(self._square, _USUAL_WINDOW))
+        # OpenCV's running sums give numbers below 0 beside numbers that are many times larger.
+        deviation = np.sqrt(np.maximum(cv2.blur(self._square, _USUAL_WINDOW), 0))
         change = cv2.blur(self._change, _USUAL_WINDOW)
         return np.maximum(_DEVIATIONS * deviation, _CHANGES * change)
 
