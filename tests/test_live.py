@@ -137,10 +137,25 @@ def test_a_replay_without_losses_gives_the_tracks_of_the_offline_twin(
     assert live.returncode == 0, live.stderr
     record = json.loads((tmp_path / "live.json").read_text())
     assert record["frames"] == NUM_FRAMES
-    assert record["left_out"] == 0
+    assert record["frames_left_out"] == 0
     assert record["late_searches"] == 0
-    assert not any(camera["left_out"] for camera in record["cameras"].values())
+    assert not any(camera["left_out"] for camera in record["camera_frames"].values())
     assert (tmp_path / "live.csv").read_bytes() == (tmp_path / "offline.csv").read_bytes()
+    twin = json.loads((tmp_path / "offline.json").read_text())
+    for key in (
+        "sequence",
+        "causal",
+        "cameras",
+        "rate_hz",
+        "settings",
+        "seed",
+        "volume",
+        "drones",
+        "versions",
+    ):
+        assert record[key] == twin[key], key
+    # 3.6 seconds of video at a fifth of their rate: at least 17.8 s, when the last frame comes.
+    assert 0 < record["real_time_factor"] < record["real_time_factor_running"] <= 0.203
     tracks = read_trajectories(tmp_path / "live.csv")
     assert tracks.num_drones >= 3
     # No row depends on a later frame: a shorter recording gives the beginning of the same table.
@@ -216,8 +231,8 @@ def test_cameras_on_the_network_stop_and_come_back(
     assert live.returncode == 0, err
     assert "4 drones" in out or "3 drones" in out
     record = json.loads((tmp_path / "live.json").read_text())
-    assert record["cameras"]["cam3"]["stops"] >= 1
-    assert record["cameras"]["cam3"]["frames"] > 0
+    assert record["camera_frames"]["cam3"]["stops"] >= 1
+    assert record["camera_frames"]["cam3"]["frames"] > 0
     assert "camera cam3: " in err
     assert "has broken off" in err
     # Said once, not once per frame.
@@ -240,8 +255,8 @@ def test_a_stream_that_does_not_answer_is_one_line(
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("does not answer") == 1
     record = json.loads((tmp_path / "live.json").read_text())
-    assert record["cameras"][names[0]]["frames"] == 0
-    assert record["cameras"][names[1]]["frames"] > 10
+    assert record["camera_frames"][names[0]]["frames"] == 0
+    assert record["camera_frames"][names[1]]["frames"] > 10
 
 
 def test_a_camera_of_another_size_is_left_out_and_none_ends_the_command(

@@ -17,18 +17,20 @@ from psotrack.cli.options import (
     CACHE,
     CAMERAS,
     FORCE,
+    ITERATIONS,
     JSON,
+    MOST_DRONES,
+    PARTICLES,
     QUIET,
     SEQUENCE,
-    TRACK,
     camera_names,
     compiled_folder,
+    setting_name,
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, write_json
 from psotrack.errors import SettingsError
-from psotrack.settings import RENAMED, TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.settings import TrackSettings
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
@@ -63,24 +65,10 @@ _SHOWN_S = 0.5
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after this time.")
 @click.option("--lines", is_flag=True, help="Write each row as a line of JSON to stdout.")
 @click.option("--udp", metavar="HOST:PORT", help="Send each row as a line of JSON by UDP.")
-@click.option(
-    "--particles",
-    type=int,
-    default=TRACK.swarm.particles,
-    show_default=True,
-    help="Particles of every swarm.",
-)
-@click.option(
-    "--iterations", type=int, default=TRACK.swarm.iterations, show_default=True, help="Iterations per frame."
-)
+@PARTICLES
+@ITERATIONS
 @click.option("--drones", type=int, metavar="N", help="Number of drones, if it is known.")
-@click.option(
-    "--most-drones",
-    type=click.IntRange(min=1),
-    default=16,
-    show_default=True,
-    help="Largest number of drones at one time.",
-)
+@MOST_DRONES
 @silhouette_options
 @CAMERAS
 @CACHE
@@ -117,9 +105,10 @@ def live(
       psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
+    started = click.get_current_context().obj or time.perf_counter()
     from psotrack.datasets import open_recording
     from psotrack.live import WAIT_S, JsonLines, LiveSession, UdpLines, live_cameras
-    from psotrack.pipeline import environment
+    from psotrack.pipeline import environment, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
@@ -129,8 +118,9 @@ def live(
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
     for path in () if out is None else (out, out.with_suffix(".json")):
         refuse_to_overwrite(path, force)
-    chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
+    chosen = TrackSettings().changed({setting_name(option): value for option, value in settings.items()})
     keep_compiled(compiled_folder(cache))
+    start_s = time.perf_counter() - started
     recording = open_recording(sequence)
     if replay:
         recording = recording.usable(camera_names(cameras))
@@ -156,7 +146,8 @@ def live(
         else:
             with RowStream(out, force=force) as rows:
                 result = session.run([rows, *outputs], show)
-    record = _record(result) | environment()
+    record = {"sequence": recording.name, **session.record, **_record(result), **environment()}
+    record = with_real_time(record, time.perf_counter() - started, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), record)
     output_json(json_path, record, force)
@@ -168,31 +159,26 @@ def live(
     )
 
 
-def _setting_name(option: str) -> str:
-    """Dotted name of the setting that an option sets."""
-    if option in SilhouetteSettings.__struct_fields__:
-        return f"silhouettes.{option}"
-    return RENAMED.get(option, option)
-
-
 def _record(result: LiveResult) -> dict[str, Any]:
-    """What a session has done, fit for JSON."""
+    """What a session has done, fit for JSON, in the words of `psotrack track --causal` where it means the same."""
     import numpy as np
 
     delay_s = np.array(result.delay_s or [np.nan])
     return {
+        "causal": True,
         "live": True,
         "frames": result.instants,
-        "left_out": result.left_out,
+        "frames_left_out": result.left_out,
         "late_searches": result.late_searches,
-        "drones": sorted(result.drones, key=int),
-        "seconds": round(result.seconds, 3),
+        "cameras": list(result.counts),
+        "camera_frames": {name: dict(vars(counts)) for name, counts in result.counts.items()},
+        "drones": len(result.drones),
         "delay_s": {
             "median": float(np.median(delay_s)),
             "p99": float(np.quantile(delay_s, 0.99)),
             "max": float(delay_s.max()),
         },
-        "cameras": {name: dict(vars(counts)) for name, counts in result.counts.items()},
+        "seconds": {"compile": round(result.compile_s, 4), "session": round(result.seconds, 4)},
     }
 
 

@@ -11,7 +11,7 @@ import click
 import platformdirs
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.settings import TrackSettings
+from psotrack.settings import RENAMED, ErrorSettings, TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
 
 if TYPE_CHECKING:
@@ -85,6 +85,27 @@ CAMERAS = click.option(
     "--cameras",
     metavar="NAME,NAME...",
     help="Use these cameras only.  [default: all cameras of the calibration]",
+)
+PARTICLES = click.option(
+    "--particles",
+    type=int,
+    default=TRACK.swarm.particles,
+    show_default=True,
+    help="Number of particles of every swarm.",
+)
+ITERATIONS = click.option(
+    "--iterations",
+    type=int,
+    default=TRACK.swarm.iterations,
+    show_default=True,
+    help="Number of iterations per frame.",
+)
+MOST_DRONES = click.option(
+    "--most-drones",
+    type=click.IntRange(min=1),
+    default=16,
+    show_default=True,
+    help="Largest number of drones at one time, where no frame uses a later one.",
 )
 
 
@@ -236,6 +257,17 @@ def silhouette_options(command: Command) -> Command:
     ):
         command = option(command)
     return command
+
+
+def setting_name(option: str) -> str:
+    """Dotted name of the setting of `TrackSettings` that an option sets."""
+    if option in SilhouetteSettings.__struct_fields__:
+        return f"silhouettes.{option}"
+    if option in ErrorSettings.__struct_fields__:
+        return f"errors.{option}"
+    if option == "min_cameras_to_begin":
+        return "status.min_cameras_to_begin"
+    return "swarm.search" if option == "search" else RENAMED.get(option, option)
 
 
 def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:

@@ -13,8 +13,11 @@ from psotrack.cli.options import (
     CAMERAS,
     DETECTOR_SIZE,
     FORCE,
+    ITERATIONS,
     JOBS,
     JSON,
+    MOST_DRONES,
+    PARTICLES,
     QUIET,
     SEQUENCE,
     TRACK,
@@ -23,12 +26,12 @@ from psotrack.cli.options import (
     camera_names,
     compiled_folder,
     frames_option,
+    setting_name,
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to, write_json
 from psotrack.errors import SettingsError
-from psotrack.settings import RENAMED, USUAL_SPEED_M_S, Clocks, ErrorSettings, SwarmKind, TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.settings import USUAL_SPEED_M_S, Clocks, SwarmKind, TrackSettings
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
@@ -72,20 +75,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Side of the network's square input, in pixels.",
 )
-@click.option(
-    "--particles",
-    type=int,
-    default=TRACK.swarm.particles,
-    show_default=True,
-    help="Number of particles of every swarm.",
-)
-@click.option(
-    "--iterations",
-    type=int,
-    default=TRACK.swarm.iterations,
-    show_default=True,
-    help="Number of iterations per frame.",
-)
+@PARTICLES
+@ITERATIONS
 @click.option(
     "--swarm",
     type=click.Choice(get_args(SwarmKind)),
@@ -201,13 +192,7 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.",
 )
-@click.option(
-    "--most-drones",
-    type=click.IntRange(min=1),
-    default=16,
-    show_default=True,
-    help="Largest number of drones at one time, for --causal.",
-)
+@MOST_DRONES
 @silhouette_options
 @CAMERAS
 @frames_option
@@ -261,7 +246,7 @@ def track(
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
     for path in (out, record_path) if causal else (out, record_path, ambiguity_path):
         refuse_to_overwrite(path, force)
-    chosen = TrackSettings().changed({_setting_name(option): value for option, value in settings.items()})
+    chosen = TrackSettings().changed({setting_name(option): value for option, value in settings.items()})
     parts = Parts(
         detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
     )
@@ -342,14 +327,3 @@ def _track_causally(
         f"{out}: {record['drones']} drones, {record['frames']} frames, {record['seconds']['total']:.1f} s, "
         f"{record['real_time_factor']:.2g} of real time",
     )
-
-
-def _setting_name(option: str) -> str:
-    """Dotted name of the setting that an option sets."""
-    if option in SilhouetteSettings.__struct_fields__:
-        return f"silhouettes.{option}"
-    if option in ErrorSettings.__struct_fields__:
-        return f"errors.{option}"
-    if option == "min_cameras_to_begin":
-        return "status.min_cameras_to_begin"
-    return "swarm.search" if option == "search" else RENAMED.get(option, option)

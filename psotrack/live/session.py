@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import msgspec
 import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
@@ -145,6 +146,10 @@ class LiveSession:
         first_s: time of the first instant on the recording's clock, seconds.
         wait_s: how long an instant waits for cameras, and a frame for the processor, seconds of the wall clock.
         jobs: largest number of worker processes; None is one per processor.
+
+    Attributes:
+        result: what the session has done so far.
+        record: rate, settings, seed and volume of the run, fit for JSON.
     """
 
     def __init__(
@@ -179,6 +184,12 @@ class LiveSession:
             shape=self._shape,
             most_drones=most_drones,
         )
+        self.record = {
+            "rate_hz": self._rate_hz,
+            "settings": msgspec.to_builtins(settings),
+            "seed": settings.seed,
+            "volume": self._run.volume,
+        }
         self._stopped = threading.Event()
         self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
