@@ -192,6 +192,36 @@ def test_rows_come_as_lines_and_by_udp(sequence: Path, cache: Path, tmp_path: Pa
     assert [row["frame"] for row in rows] == sorted(row["frame"] for row in rows)
 
 
+def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> None:
+    client = pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
+    port = _free_port()
+    live = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "psotrack", "live", f"{sequence}", "--replay", "--speed", "0.2"),
+            *("--websocket", f"{port}", "--lines", "--json", f"{tmp_path / 'live.json'}"),
+            *("--cameras", ",".join(CAMERAS), "--cache", f"{cache}", *EFFORT),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    for _ in range(1200):
+        with socket.socket() as one:
+            if one.connect_ex(("127.0.0.1", port)) == 0:
+                break
+        assert live.poll() is None, live.communicate()
+        time.sleep(0.1)
+    # The server listens before anything is compiled, so a client that comes then gets all rows.
+    with client.connect(f"ws://127.0.0.1:{port}") as connection:
+        received = list(connection)
+    out, err = live.communicate(timeout=60)
+    assert live.returncode == 0, err
+    assert received == out.splitlines()
+    assert json.loads(received[-1])["status"] == "tracked"
+    expected = {"clients": 1, "messages_left_out": 0}
+    assert json.loads((tmp_path / "live.json").read_text())["websocket"] == expected
+
+
 def test_cameras_on_the_network_stop_and_come_back(
     sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
 ) -> None:
@@ -286,10 +316,11 @@ def test_a_camera_of_another_size_is_left_out_and_none_ends_the_command(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--replay"], "--out: expected --out FILE, --lines or --udp"),
+        (["--replay"], "--out: expected --out FILE, --lines, --udp or --websocket"),
         (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
         (["--replay", "--out", "tracks.txt"], "ends in .csv or .parquet"),
         (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
+        (["--replay", "--websocket", "nowhere"], "--websocket: expected PORT or HOST:PORT"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(

@@ -65,6 +65,12 @@ _SHOWN_S = 0.5
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after this time.")
 @click.option("--lines", is_flag=True, help="Write each row as a line of JSON to stdout.")
 @click.option("--udp", metavar="HOST:PORT", help="Send each row as a line of JSON by UDP.")
+@click.option(
+    "--websocket",
+    metavar="[HOST:]PORT",
+    help="Send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer. "
+    "[default of HOST: 127.0.0.1, which only programs on this computer reach]",
+)
 @PARTICLES
 @ITERATIONS
 @click.option("--drones", type=int, metavar="N", help="Number of drones, if it is known.")
@@ -84,6 +90,7 @@ def live(
     seconds: float | None,
     lines: bool,
     udp: str | None,
+    websocket: str | None,
     most_drones: int,
     cameras: str | None,
     cache: Path | None,
@@ -102,18 +109,20 @@ def live(
     Examples:
       psotrack live lab/recording.toml --out tracks.csv
       psotrack live lab/recording.toml --udp 127.0.0.1:9000
+      psotrack live lab/recording.toml --websocket 9000
       psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
     started = click.get_current_context().obj or time.perf_counter()
     from psotrack.datasets import open_recording
-    from psotrack.live import WAIT_S, JsonLines, LiveSession, UdpLines, live_cameras
+    from psotrack.live import WAIT_S, JsonLines, LiveSession, UdpLines, WebSocketLines, live_cameras
     from psotrack.pipeline import environment, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
-    if out is None and not lines and udp is None:
-        raise SettingsError("--out", expected="--out FILE, --lines or --udp", found="none of them")
+    if out is None and not lines and udp is None and websocket is None:
+        expected = "--out FILE, --lines, --udp or --websocket"
+        raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None and out.suffix not in {".csv", ".parquet"}:
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
     for path in () if out is None else (out, out.with_suffix(".json")):
@@ -137,16 +146,22 @@ def live(
         # In a slow replay everything may take longer.
         wait_s=WAIT_S / min(1.0, speed) if replay else WAIT_S,
     )
-    outputs: list[Any] = [JsonLines(sys.stdout)] if lines else []
-    outputs += [] if udp is None else [UdpLines(udp)]
-    with _Table(quiet or lines) as table, _ended_by_ctrl_c(session):
-        show = table.show if seconds is None else _until(seconds, session, table.show)
-        if out is None:
-            result = session.run(outputs, show)
-        else:
-            with RowStream(out, force=force) as rows:
-                result = session.run([rows, *outputs], show)
+    with contextlib.ExitStack() as stack:
+        outputs: list[Any] = [JsonLines(sys.stdout)] if lines else []
+        outputs += [] if udp is None else [UdpLines(udp)]
+        server = (
+            None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
+        )
+        outputs += [] if server is None else [server]
+        rows = [] if out is None else [stack.enter_context(RowStream(out, force=force))]
+        table = stack.enter_context(_Table(quiet or lines))
+        stack.enter_context(_ended_by_ctrl_c(session))
+        result = session.run(
+            [*rows, *outputs], table.show if seconds is None else _until(seconds, session, table.show)
+        )
     record = {"sequence": recording.name, **session.record, **_record(result), **environment()}
+    if server is not None:
+        record["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}
     record = with_real_time(record, time.perf_counter() - started, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), record)

@@ -2,6 +2,7 @@ from .meeting import CameraCounts, Instant, Meeting
 from .messages import JsonLines, UdpLines
 from .session import WAIT_S, LiveCamera, LiveResult, LiveSession, live_cameras
 from .sources import CameraStream, LiveSource, ReplayedVideo
+from .websocket import WebSocketLines
 
 __all__ = [
     "WAIT_S",
@@ -16,5 +17,6 @@ __all__ = [
     "Meeting",
     "ReplayedVideo",
     "UdpLines",
+    "WebSocketLines",
     "live_cameras",
 ]

@@ -1,0 +1,207 @@
+"""Rows by WebSocket: real clients over real sockets, also one that never reads."""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from psotrack.errors import OutputError, SettingsError
+from psotrack.live import WebSocketLines
+from psotrack.live.messages import lines_of
+from psotrack.trajectories import Status, Trajectories
+
+client = pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
+exceptions = pytest.importorskip("websockets.exceptions")
+
+
+def rows_of(frame: int, num_drones: int = 4) -> Trajectories:
+    generator = np.random.default_rng(frame)
+    return Trajectories(
+        frame=np.array([frame]),
+        time_s=np.array([frame / 25]),
+        drones=tuple(f"{drone}" for drone in range(num_drones)),
+        position_m=generator.normal(size=(1, num_drones, 3)),
+        velocity_m_s=generator.normal(size=(1, num_drones, 3)),
+        fitness=np.ones((1, num_drones)),
+        num_cameras=np.full((1, num_drones), 4),
+        status=np.full((1, num_drones), int(Status.TRACKED)),
+        covariance_m2=np.broadcast_to(np.eye(3), (1, num_drones, 3, 3)).copy(),
+    )
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+def server(port: int) -> Iterator[WebSocketLines]:
+    server = WebSocketLines(f"{port}")
+    yield server
+    server.close()
+
+
+def wait_until(condition, what: str) -> None:
+    for _ in range(1000):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError(what)
+
+
+def connected(port: int, server: WebSocketLines, **options: object):
+    """A client, once the server knows it."""
+    before = server.num_clients
+    connection = client.connect(f"ws://127.0.0.1:{port}", **options)
+    wait_until(lambda: server.num_clients > before, "the server does not know its client")
+    return connection
+
+
+def deaf_client(port: int, server: WebSocketLines) -> socket.socket:
+    """A client that connects and never reads a message."""
+    before = server.num_clients
+    one = socket.socket()
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    one.connect(("127.0.0.1", port))
+    one.sendall(
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+    )
+    wait_until(lambda: server.num_clients > before, "the server does not know its client")
+    return one
+
+
+def test_all_clients_get_every_row_as_a_message(port: int, server: WebSocketLines) -> None:
+    server.write(rows_of(0))  # nobody listens yet
+    with connected(port, server) as first, connected(port, server) as second:
+        for frame in range(1, 11):
+            server.write(rows_of(frame))
+        expected = [line for frame in range(1, 11) for line in lines_of(rows_of(frame))]
+        for connection in (first, second):
+            assert [connection.recv(timeout=10) for _ in expected] == expected
+    row = json.loads(expected[0])
+    assert row["frame"] == 1
+    assert row["status"] == "tracked"
+    assert np.allclose(row["position_m"], rows_of(1).position_m[0, 0])
+
+
+def test_a_client_that_never_reads_slows_nobody(
+    port: int, server: WebSocketLines, caplog: pytest.LogCaptureFixture
+) -> None:
+    received: list[str] = []
+
+    def read(connection) -> None:
+        for message in connection:
+            received.append(message)
+
+    def came(count: int) -> bool:
+        for _ in range(1000):
+            if len(received) == count:
+                return True
+            time.sleep(0.01)
+        return False
+
+    deaf = deaf_client(port, server)
+    with connected(port, server) as connection:
+        reader = threading.Thread(target=read, args=(connection,))
+        reader.start()
+        longest_s, frame = 0.0, 0
+        with caplog.at_level(logging.WARNING):
+            # Until the system's buffers for the deaf client are full, some megabytes, and its queue in the server too.
+            while not server.left_out:
+                assert frame < 20_000, "no row is left out for the client that never reads"
+                for _ in range(20):
+                    rows = rows_of(frame, num_drones=16)
+                    began_s = time.perf_counter()
+                    server.write(rows)
+                    longest_s = max(longest_s, time.perf_counter() - began_s)
+                    frame += 1
+                assert came(16 * frame), "the other client does not get its rows"
+            server.write(rows_of(frame))
+            assert came(16 * frame + 4), "the other client gets no more rows"
+        # A blocked socket would wait for the client's pong, 20 s; a busy machine may keep a thread waiting for a while.
+        assert longest_s < 2.0
+        assert (
+            [record.getMessage() for record in caplog.records].count(
+                "a client of --websocket reads too slowly: rows are left out for it"
+            )
+            == len(caplog.records)
+            > 0
+        )
+        began_s = time.perf_counter()
+        server.close()
+        # A second for the last rows, a second for the deaf client to close, and what a busy machine needs.
+        assert time.perf_counter() - began_s < 10
+        reader.join(timeout=10)
+        assert not reader.is_alive()
+    deaf.close()
+
+
+def test_clients_that_vanish_do_no_harm(port: int, server: WebSocketLines) -> None:
+    vanished = deaf_client(port, server)
+    # A reset instead of an orderly end.
+    vanished.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\x00\x00\x00\x00\x00\x00\x00")
+    vanished.close()
+    with socket.create_connection(("127.0.0.1", port)) as stranger:
+        stranger.sendall(b"this is no WebSocket client\r\n\r\n")
+    with connected(port, server) as connection:
+        for frame in range(5):
+            server.write(rows_of(frame, 1))
+        assert [json.loads(connection.recv(timeout=10))["frame"] for _ in range(5)] == list(range(5))
+
+
+def test_the_last_rows_come_before_the_end(port: int) -> None:
+    server = WebSocketLines(f"127.0.0.1:{port}")
+    with connected(port, server) as connection:
+        for frame in range(30):
+            server.write(rows_of(frame, 1))
+        closing = threading.Thread(target=server.close)
+        closing.start()
+        assert [json.loads(message)["frame"] for message in connection] == list(range(30))
+        closing.join()
+
+
+def test_only_pages_of_this_computer_may_read(port: int, server: WebSocketLines) -> None:
+    with connected(port, server, origin="http://localhost:8000") as connection:
+        server.write(rows_of(0, 1))
+        assert json.loads(connection.recv(timeout=10))["frame"] == 0
+    with pytest.raises(exceptions.InvalidStatus, match="403"):
+        client.connect(f"ws://127.0.0.1:{port}", origin="https://example.com")
+
+
+def test_a_port_in_use_is_one_line(port: int, server: WebSocketLines) -> None:
+    with pytest.raises(OutputError, match="expected an address of this computer that is free") as refused:
+        WebSocketLines(f"{port}")
+    assert "\n" not in str(refused.value)
+    assert "in use" in str(refused.value)
+
+
+@pytest.mark.parametrize("address", ["", "nowhere", "127.0.0.1:", "9000:", "0", "70000", "-1", "1.5", "٣"])
+def test_an_address_that_is_none(address: str) -> None:
+    with pytest.raises(SettingsError, match="--websocket: expected PORT or HOST:PORT"):
+        WebSocketLines(address)
+
+
+def test_a_host_that_is_unknown() -> None:
+    with pytest.raises(OutputError, match="an address of this computer"):
+        WebSocketLines("no.such.host.invalid:9000")
+
+
+def test_without_the_package_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    with pytest.raises(SettingsError, match=r"pip install 'psotrack\[live\]'"):
+        WebSocketLines("9000")
