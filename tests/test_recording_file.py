@@ -3,6 +3,7 @@
 import re
 import shutil
 import tomllib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -202,6 +203,34 @@ def test_timestamps(folder):
     (folder / "times.csv").write_text("frame,time_s\n" + "".join(f"{i},{t}\n" for i, t in enumerate(times)))
     path = write(folder, camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE), RIGHT)
     assert open_recording(path).frame_times["left"].time_s.tolist() == times
+
+
+def unfinished(path: Path, num_frames: int) -> None:
+    """Write a video, and take from it what a killed program would not have written: the index and the counts."""
+    size_wh = (64, 48)
+    with VideoWriter(path, 25.0, size_wh) as writer:
+        for index in range(num_frames):
+            writer.write(np.full((size_wh[1], size_wh[0], 3), index, np.uint8))
+    data = bytearray(path.read_bytes())
+    del data[data.rindex(b"idx1") :]
+    for chunk, place in ((b"avih", 24), (b"strh", 40), (b"RIFF", 4), (b"movi", -4)):
+        start = data.index(chunk) + place
+        data[start : start + 4] = bytes(4)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("num_times", [4, 10, 15])
+def test_video_and_times_of_a_program_that_was_stopped(folder, num_times, caplog):
+    """One of them is longer: both are used as far as there are both; the last frame may be incomplete."""
+    unfinished(folder / "left.avi", 10)
+    rows = "".join(f"{index},{index / 25}\n" for index in range(num_times))
+    (folder / "times.csv").write_text(f"frame,time_s\n{rows}")
+    path = write(folder, camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE), RIGHT)
+    recording = open_recording(path)
+    used = min(num_times, 9)
+    assert recording.videos["left"].num_frames == recording.frame_times["left"].num_frames == used
+    assert f"the video was not finished; its first {used} frames are used" in caplog.text
+    assert len(list(read_frames(recording.videos["left"]))) == used
 
 
 class TestCalibration:

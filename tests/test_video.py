@@ -186,6 +186,33 @@ def test_a_video_without_frames(tmp_path):
         probe(path)
 
 
+def test_a_video_whose_writer_was_killed_is_read(tmp_path):
+    """What the killed process had written is read, but for the last frame, which may be incomplete."""
+    path = tmp_path / "a.avi"
+    script = textwrap.dedent(
+        """
+        import os, sys
+        import cv2
+        import numpy as np
+        writer = cv2.VideoWriter(sys.argv[1], cv2.VideoWriter.fourcc(*"XVID"), 25, (640, 480))
+        rng = np.random.default_rng(0)
+        for level in range(100):
+            writer.write(rng.integers(0, 2 * level + 2, (480, 640, 3), dtype=np.uint8))
+        os.kill(os.getpid(), 9)
+        """
+    )
+    subprocess.run([sys.executable, "-c", script, path], check=False)
+    video = probe(path)
+    # FFmpeg holds back the last 32 KiB, a few frames of this noise.
+    assert 80 < video.num_frames < 100
+    assert not video.is_finished
+    means = [frame.mean() for frame in read_frames(video)]
+    assert means == pytest.approx([level + 0.5 for level in range(video.num_frames)], abs=4)
+    check_end(video)
+    # It has no index, so no frame is reached by seeking.
+    assert list(read_near(video, [20, 60])) == []
+
+
 def test_opening_restores_log_levels(tmp_path, monkeypatch):
     path = write(tmp_path / "a.avi", noise(1))
     level, environment = cv2.utils.logging.getLogLevel(), dict(os.environ)

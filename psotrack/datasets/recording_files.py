@@ -147,6 +147,13 @@ def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
     if table.detections is not None:
         detections = _existing(folder, table.detections, path, f"{place}.detections")
     times = None if stream else _times(path, name, table, video, detections)
+    if video is not None and times is not None and not video.is_finished:
+        # The program that wrote video and times was stopped: the one that is longer is cut.
+        video = replace(video, num_frames=min(video.num_frames, times.num_frames))
+        times = times.cut(video.num_frames)
+        _logger.warning(
+            "%s: the video was not finished; its first %d frames are used", video.path, video.num_frames
+        )
     ignore = None
     if table.ignore is not None:
         ignore = _existing(folder, table.ignore, path, f"{place}.ignore")
@@ -240,7 +247,7 @@ def _times(
     """Times of the frames of a camera; without video it lasts until its last detection."""
     if table.timestamps is not None:
         file = _existing(path.parent, table.timestamps, path, f"cameras.{name}.timestamps")
-        times = read_timestamps(file, None if video is None else video.num_frames)
+        times = read_timestamps(file, video.num_frames if video is not None and video.is_finished else None)
         if video is not None and not video.images:
             _check_seconds(file, times, video)
         return times

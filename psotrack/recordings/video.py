@@ -47,6 +47,8 @@ class VideoInfo:
         image_size_wh: width and height of the frames in pixels.
         images: the image files that are the frames, in order; empty for a video file.
         depth_bits: number of bits that the values of images of 16 bits use; frames have the upper 8 of them.
+        is_finished: False for a video whose program was stopped before it wrote the number of frames into the header,
+            and the index with which frames are sought.
     """
 
     path: Path
@@ -55,10 +57,13 @@ class VideoInfo:
     image_size_wh: tuple[int, int]
     images: tuple[Path, ...] = ()
     depth_bits: int = 16
+    is_finished: bool = True
 
 
 def probe(path: Path | str) -> VideoInfo:
     """Read the header of a video. No frame is decoded, so that only `read_frames` notices a file that is cut short.
+
+    The frames of a video that was not finished are counted. Its last frame is not used, because it may be incomplete.
 
     Raises:
         InputError: the file does not exist, is empty, is not a video, or has no frames.
@@ -73,11 +78,14 @@ def probe(path: Path | str) -> VideoInfo:
         )
     finally:
         capture.release()
+    is_finished = num_frames >= 1
+    if not is_finished:
+        num_frames = _count_packets(path) - 1
     if num_frames < 1:
         raise InputError(path, expected="a video with frames", found="no frames")
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(path, expected="a video with a frame rate", found=f"{fps:g} frames per second")
-    return VideoInfo(path, num_frames, fps, (width, height))
+    return VideoInfo(path, num_frames, fps, (width, height), is_finished=is_finished)
 
 
 def check_end(video: VideoInfo) -> None:
@@ -177,7 +185,8 @@ def read_near(
     """Yield frames near some places, and their numbers, without decoding the video up to there.
 
     A frame of a video file is one shortly after the key frame that is nearest to the place. Places with the same key
-    frame yield one frame, so a video with few key frames yields few. A frame that cannot be decoded is left out.
+    frame yield one frame, so a video with few key frames yields few. A frame that cannot be decoded is left out, and so
+    are all frames of a video that was not finished, because it has no index.
 
     Args:
         video: the video.
@@ -187,7 +196,7 @@ def read_near(
         for place in places:
             yield place, read_image(video.images[place], video.depth_bits)
         return
-    if not places:
+    if not places or not video.is_finished:
         return
     key_frames = np.array(_key_frames(video))
     if not len(key_frames):
