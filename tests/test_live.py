@@ -222,6 +222,35 @@ def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> 
     assert json.loads((tmp_path / "live.json").read_text())["websocket"] == expected
 
 
+def test_a_session_that_is_recorded_is_tracked_again(sequence: Path, cache: Path, tmp_path: Path) -> None:
+    common = ["--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
+    live = _psotrack(
+        "live", sequence, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv",
+        "--record", tmp_path / "kept", *common,
+    )  # fmt: skip
+    assert live.returncode == 0, live.stderr
+    recorded = json.loads((tmp_path / "live.json").read_text())["recorded"]
+    kept = open_recording(tmp_path / "kept" / "recording.toml")
+    source = open_recording(sequence)
+    for name in CAMERAS:
+        counts = recorded[name]
+        assert counts["frames"] + counts["left_out"] == NUM_FRAMES
+        assert kept.videos[name].num_frames == counts["frames"]
+        # A busy machine leaves frames out; the others have the times at which they were filmed.
+        assert counts["frames"] >= 0.8 * NUM_FRAMES
+        assert set(kept.frame_times[name].time_s) <= set(source.frame_times[name].time_s)
+    again = _psotrack("track", tmp_path / "kept", "--out", tmp_path / "again.csv", "--cache", cache, *EFFORT)
+    assert again.returncode == 0, again.stderr
+    assert read_trajectories(tmp_path / "again.csv").num_drones >= 3
+    refused = _psotrack(
+        "live", sequence, "--replay", "--lines", "--record", tmp_path / "kept", "--cache", cache, *EFFORT
+    )
+    assert refused.returncode == 2
+    assert (
+        "kept: expected a new or an empty folder, found a folder with files; pass --force" in refused.stderr
+    )
+
+
 def test_cameras_on_the_network_stop_and_come_back(
     sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
 ) -> None:

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -71,6 +72,12 @@ _SHOWN_S = 0.5
     help="Send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer. "
     "[default of HOST: 127.0.0.1, which only programs on this computer reach]",
 )
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Keep what the cameras film in FOLDER, as a recording that can be tracked again.",
+)
 @PARTICLES
 @ITERATIONS
 @click.option("--drones", type=int, metavar="N", help="Number of drones, if it is known.")
@@ -91,6 +98,7 @@ def live(
     lines: bool,
     udp: str | None,
     websocket: str | None,
+    record: Path | None,
     most_drones: int,
     cameras: str | None,
     cache: Path | None,
@@ -110,12 +118,21 @@ def live(
       psotrack live lab/recording.toml --out tracks.csv
       psotrack live lab/recording.toml --udp 127.0.0.1:9000
       psotrack live lab/recording.toml --websocket 9000
+      psotrack live lab/recording.toml --out tracks.csv --record flight
       psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
     started = click.get_current_context().obj or time.perf_counter()
     from psotrack.datasets import open_recording
-    from psotrack.live import WAIT_S, JsonLines, LiveSession, UdpLines, WebSocketLines, live_cameras
+    from psotrack.live import (
+        WAIT_S,
+        JsonLines,
+        LiveSession,
+        RecordingFolder,
+        UdpLines,
+        WebSocketLines,
+        live_cameras,
+    )
     from psotrack.pipeline import environment, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
@@ -136,6 +153,10 @@ def live(
     used = live_cameras(recording, replay=replay, speed=speed, loops=loops)
     names = camera_names(cameras)
     used = [camera for camera in used if names is None or camera.name in names]
+    kept = None
+    if record is not None:
+        kept = RecordingFolder(record, recording, [camera.name for camera in used], force=force)
+        used = [replace(camera, recorder=kept.recorder(camera.name, camera.fps)) for camera in used]
     first_s = float(recording.timeline().time_s[0]) if replay else 0.0
     session = LiveSession(
         recording,
@@ -153,24 +174,27 @@ def live(
             None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
         )
         outputs += [] if server is None else [server]
+        if kept is not None:
+            kept.begin()
+            stack.callback(kept.end)
         rows = [] if out is None else [stack.enter_context(RowStream(out, force=force))]
         table = stack.enter_context(_Table(quiet or lines))
         stack.enter_context(_ended_by_ctrl_c(session))
         result = session.run(
             [*rows, *outputs], table.show if seconds is None else _until(seconds, session, table.show)
         )
-    record = {"sequence": recording.name, **session.record, **_record(result), **environment()}
+    report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
     if server is not None:
-        record["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}
-    record = with_real_time(record, time.perf_counter() - started, start_s=start_s)
+        report["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}
+    report = with_real_time(report, time.perf_counter() - started, start_s=start_s)
     if out is not None:
-        write_json(out.with_suffix(".json"), record)
-    output_json(json_path, record, force)
+        write_json(out.with_suffix(".json"), report)
+    output_json(json_path, report, force)
     print_line(
         quiet or lines,
         json_path,
-        f"{out or 'live'}: {len(result.drones)} drones, {result.instants} frames, "
-        f"delay {1e3 * record['delay_s']['median']:.0f} ms, {result.left_out} frames left out",
+        f"{out or 'live'}: {report['drones']} drones, {result.instants} frames, "
+        f"delay {1e3 * report['delay_s']['median']:.0f} ms, {result.left_out} frames left out",
     )
 
 
@@ -187,6 +211,7 @@ def _record(result: LiveResult) -> dict[str, Any]:
         "late_searches": result.late_searches,
         "cameras": list(result.counts),
         "camera_frames": {name: dict(vars(counts)) for name, counts in result.counts.items()},
+        "recorded": {name: dict(vars(counts)) for name, counts in result.recorded.items()},
         "drones": len(result.drones),
         "delay_s": {
             "median": float(np.median(delay_s)),

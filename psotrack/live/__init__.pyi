@@ -1,5 +1,6 @@
 from .meeting import CameraCounts, Instant, Meeting
 from .messages import JsonLines, UdpLines
+from .recorder import CameraRecorder, RecordedCounts, RecordingFolder
 from .session import WAIT_S, LiveCamera, LiveResult, LiveSession, live_cameras
 from .sources import CameraStream, LiveSource, ReplayedVideo
 from .websocket import WebSocketLines
@@ -7,6 +8,7 @@ from .websocket import WebSocketLines
 __all__ = [
     "WAIT_S",
     "CameraCounts",
+    "CameraRecorder",
     "CameraStream",
     "Instant",
     "JsonLines",
@@ -15,6 +17,8 @@ __all__ = [
     "LiveSession",
     "LiveSource",
     "Meeting",
+    "RecordedCounts",
+    "RecordingFolder",
     "ReplayedVideo",
     "UdpLines",
     "WebSocketLines",

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from psotrack.live.packed_image import PackedImage
+from psotrack.live.recorder import CLOSE_S, CameraRecorder, RecordedCounts
 from psotrack.live.sources import LiveSource
 from psotrack.silhouettes import LivingBackground, ScaledSettings, coverage, ignored_pixels, reduce_frame
 from psotrack.support import with_traceback
@@ -40,6 +41,7 @@ class FilmTask:
         settings: settings of the silhouettes.
         ignore: image that is white where nothing counts as foreground; None for no such image.
         most_behind_s: a frame that has waited for longer is left out, so that the delay does not grow, seconds.
+        recorder: keeps the frames; None where they are not kept.
     """
 
     index: int
@@ -47,6 +49,7 @@ class FilmTask:
     settings: ScaledSettings
     ignore: Path | None
     most_behind_s: float
+    recorder: CameraRecorder | None = None
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,31 @@ class Ended:
     error: BaseException | None
 
 
-Message = Ready | Arrived | CameraSilhouette | Notice | Ended
+@dataclass(frozen=True)
+class RecordingNotice:
+    """A line of text about the recording of the frames.
+
+    Attributes:
+        line: the text.
+    """
+
+    line: str
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The files of a camera's recording are finished.
+
+    Attributes:
+        camera: number of the camera.
+        counts: what happened to its frames.
+    """
+
+    camera: int
+    counts: RecordedCounts
+
+
+Message = Ready | Arrived | CameraSilhouette | Notice | Ended | RecordingNotice | Recorded
 
 
 def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
@@ -143,6 +170,12 @@ def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
     end_s = time.monotonic() + _END_S
     for thread in threads:
         thread.join(max(0.0, end_s - time.monotonic()))
+    recorders = {task.index: task.recorder for task in tasks if task.recorder is not None}
+    for recorder in recorders.values():
+        recorder.finish()
+    end_s = time.monotonic() + CLOSE_S
+    for index, recorder in recorders.items():
+        send(Recorded(index, recorder.close(max(0.0, end_s - time.monotonic()))))
 
 
 def _film_one(
@@ -163,20 +196,19 @@ def _film_one(
                     send(Notice(task.index, frame))
                     continue
                 send(Arrived(task.index, frame.time_s))
-                if frame.image is None or time.monotonic() - frame.arrived_s > task.most_behind_s:
+                image = frame.image
+                if image is None or time.monotonic() - frame.arrived_s > task.most_behind_s:
                     silhouettes.leave_out()
                     send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, None))
-                    continue
-                with turns.of_frame():
-                    silhouette = silhouettes.look(frame.image)
-                    send(
-                        CameraSilhouette(
-                            task.index, frame.time_s, frame.arrived_s, PackedImage.of(silhouette)
-                        )
-                    )
-                # What the tracker does not wait for.
-                turns.wait()
-                silhouettes.learn()
+                else:
+                    with turns.of_frame():
+                        silhouette = PackedImage.of(silhouettes.look(image))
+                        send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, silhouette))
+                    # What the tracker does not wait for.
+                    turns.wait()
+                    silhouettes.learn()
+                if task.recorder is not None and (line := task.recorder.write(image, frame.time_s)):
+                    send(RecordingNotice(line))
     except Exception as failed:
         error = with_traceback(failed)
     finally:

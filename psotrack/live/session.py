@@ -18,8 +18,20 @@ import msgspec
 import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.live.front_end import Arrived, CameraSilhouette, Ended, FilmTask, Message, Notice, Ready, film
+from psotrack.live.front_end import (
+    Arrived,
+    CameraSilhouette,
+    Ended,
+    FilmTask,
+    Message,
+    Notice,
+    Ready,
+    Recorded,
+    RecordingNotice,
+    film,
+)
 from psotrack.live.meeting import CameraCounts, Instant, Meeting
+from psotrack.live.recorder import CLOSE_S, CameraRecorder, RecordedCounts
 from psotrack.live.search_process import search_beside
 from psotrack.live.sources import CameraStream, LiveSource, ReplayedVideo
 from psotrack.pipeline import CausalRun, causal_settings
@@ -64,6 +76,7 @@ class LiveCamera:
         fps: frames per second.
         line_time_s: time from row to row of a rolling shutter, seconds; 0 for a global shutter.
         ignore: image that is white where nothing counts as foreground; None for no such image.
+        recorder: keeps the frames; None where they are not kept.
     """
 
     name: str
@@ -71,6 +84,7 @@ class LiveCamera:
     fps: float
     line_time_s: float = 0.0
     ignore: Path | None = None
+    recorder: CameraRecorder | None = None
 
 
 @dataclass
@@ -82,6 +96,7 @@ class LiveResult:
         left_out: number of instants that were left out, because the computer was too slow.
         delay_s: delay of each instant, from the arrival of its last frame to its rows; of the last hour at most.
         counts: counts of each camera, by name.
+        recorded: what happened to the frames that are kept, by the camera's name.
         drones: names of all drones.
         late_searches: number of searches for new drones whose result came too late: the drones' rows begin later than
             those of `track --causal`.
@@ -93,6 +108,7 @@ class LiveResult:
     left_out: int = 0
     delay_s: list[float] = field(default_factory=list)
     counts: dict[str, CameraCounts] = field(default_factory=dict)
+    recorded: dict[str, RecordedCounts] = field(default_factory=dict)
     drones: set[str] = field(default_factory=set)
     late_searches: int = 0
     compile_s: float = 0.0
@@ -194,6 +210,7 @@ class LiveSession:
         self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
         self._said = [""] * len(cameras)
+        self._said_of_recording: set[str] = set()
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
     def stop(self) -> None:
@@ -249,7 +266,8 @@ class LiveSession:
                     with contextlib.suppress(OSError):
                         connection.send(None)
                 # A worker that has ended closes its pipe.
-                end_s = time.monotonic() + _END_S
+                is_recorded = any(each.recorder is not None for each in self._cameras)
+                end_s = time.monotonic() + _END_S + (CLOSE_S if is_recorded else 0.0)
                 while self._workers and time.monotonic() < end_s:
                     self._receive(end_s - time.monotonic())
         bugs = [error for error in self._failed if not isinstance(error, PsotrackError)]
@@ -276,7 +294,7 @@ class LiveSession:
     def _tasks(self) -> list[list[FilmTask]]:
         """The cameras of each worker, dealt like cards."""
         tasks = [
-            FilmTask(index, camera.source, self._scaled, camera.ignore, self._wait_s)
+            FilmTask(index, camera.source, self._scaled, camera.ignore, self._wait_s, camera.recorder)
             for index, camera in enumerate(self._cameras)
         ]
         return [tasks[worker :: self._num_workers] for worker in range(self._num_workers)]
@@ -313,6 +331,13 @@ class LiveSession:
                 if line != self._said[index]:
                     logger.warning("camera %s: %s", self._cameras[index].name, line)
                 self._said[index] = line
+            case RecordingNotice(line):
+                # All cameras share a disk and a processor.
+                if line not in self._said_of_recording:
+                    logger.warning("%s", line)
+                self._said_of_recording.add(line)
+            case Recorded(index, counts):
+                self.result.recorded[self._cameras[index].name] = counts
             case Ended(index, error):
                 meeting.end(index)
                 if error is not None:
