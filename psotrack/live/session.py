@@ -210,7 +210,6 @@ class LiveSession:
         self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
         self._said = [""] * len(cameras)
-        self._said_of_recording: set[str] = set()
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
     def stop(self) -> None:
@@ -332,10 +331,7 @@ class LiveSession:
                     logger.warning("camera %s: %s", self._cameras[index].name, line)
                 self._said[index] = line
             case RecordingNotice(line):
-                # All cameras share a disk and a processor.
-                if line not in self._said_of_recording:
-                    logger.warning("%s", line)
-                self._said_of_recording.add(line)
+                logger.warning("%s", line)
             case Recorded(index, counts):
                 self.result.recorded[self._cameras[index].name] = counts
             case Ended(index, error):

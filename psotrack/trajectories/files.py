@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -222,14 +222,21 @@ def parquet_table(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> pa.Table
     """The columns as a table with units and schema version."""
     import pyarrow as pa
 
+    schema = parquet_schema(list(columns))
+    arrays = [
+        pa.array(columns[field.name], field.type, mask=~_known(columns[field.name])) for field in schema
+    ]
+    return pa.table(arrays, schema=schema)
+
+
+def parquet_schema(names: Sequence[str]) -> pa.Schema:
+    """Types of some columns, with units and schema version."""
+    import pyarrow as pa
+
     types = {"frame": pa.int64(), "drone": pa.string(), "num_cameras": pa.int32(), "status": pa.string()}
-    arrays = {
-        name: pa.array(column, types.get(name, pa.float64()), mask=~_known(column))
-        for name, column in columns.items()
-    }
-    units = {name: _READ[name] for name in columns}
+    units = {name: _READ[name] for name in names}
     metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
-    return pa.table(arrays).replace_schema_metadata(metadata)
+    return pa.schema([(name, types.get(name, pa.float64())) for name in names], metadata)
 
 
 def _known(column: Shaped[np.ndarray, "rows"]) -> Shaped[np.ndarray, "rows"]:

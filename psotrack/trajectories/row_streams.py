@@ -1,32 +1,38 @@
-"""Tables of trajectories that are written while the rows come: CSV row by row, Parquet in pieces.
+"""Tables of trajectories that are written while the rows come.
 
 The bytes of a CSV file are those of `write_trajectories` for the same rows. A CSV file can be read while it grows. A
-Parquet file appears when it is complete, because a part of one cannot be read.
+Parquet file cannot be read before it is complete, and so appears at the end. Until then its rows are in a CSV file
+beside it, which a crash or a full disk leaves behind.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
-import os
-import secrets
+import io
+import logging
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from psotrack.errors import InputError, OutputError
-from psotrack.support import refuse_to_overwrite
-from psotrack.trajectories.files import columns_of, parquet_table, words_of
+from psotrack.support import atomic_write, refuse_to_overwrite
+from psotrack.trajectories.files import columns_of, parquet_schema, words_of
 from psotrack.trajectories.trajectories import Trajectories
 
 if TYPE_CHECKING:
-    import pyarrow.parquet as pq
+    import pyarrow as pa
 
-#: Number of frames whose rows a Parquet file takes at once.
-_PIECE_FRAMES = 500
+logger = logging.getLogger(__name__)
 
 
 class RowStream:
     """A table to which the rows of frames are added, as a context manager.
+
+    The rows of a Parquet file NAME.parquet are in NAME.rows.csv until the end of the `with` block. Where the block ends
+    with an error, or rows could not be written, they stay there, a line says so, and no Parquet file appears.
 
     Args:
         path: path that ends in .csv or .parquet.
@@ -34,8 +40,8 @@ class RowStream:
 
     Raises:
         InputError: the path has another suffix.
-        OutputError: the file exists and `force` is not set, or it cannot be written. The rows of a CSV file so far
-            stay.
+        OutputError: the file, or NAME.rows.csv, exists and `force` is not set, or it cannot be written. All complete
+            rows so far stay.
     """
 
     def __init__(self, path: Path | str, *, force: bool = False) -> None:
@@ -43,55 +49,44 @@ class RowStream:
         if self._path.suffix not in {".csv", ".parquet"}:
             expected = "a name that ends in .csv or .parquet"
             raise InputError(self._path, expected=expected, found=repr(self._path.name))
-        refuse_to_overwrite(self._path, force)
-        self._pieces: list[Trajectories] = []
-        self._parquet: pq.ParquetWriter | None = None
-        self._has_header = False
-        hidden = f".{self._path.name}.{secrets.token_hex(4)}.partial"
-        is_csv = self._path.suffix == ".csv"
-        self._temporary = self._path if is_csv else self._path.with_name(hidden)
+        self._is_parquet = self._path.suffix == ".parquet"
+        self._rows_path = self._path.with_suffix(".rows.csv") if self._is_parquet else self._path
+        for each in (self._path, self._rows_path):
+            refuse_to_overwrite(each, force)
+        self._types: dict[str, np.dtype] = {}
+        self._num_bytes = 0
+        self._has_failed = False
 
     def __enter__(self) -> RowStream:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self._temporary.open("w", encoding="utf-8", newline="") if self._is_csv else None
+            # Not buffered: what a full disk does not take is known at once, and not written later.
+            self._file = self._rows_path.open("wb", buffering=0)
         except OSError as error:
             raise self._error(error) from error
         return self
 
-    @property
-    def _is_csv(self) -> bool:
-        return self._path.suffix == ".csv"
-
     def write(self, frame: Trajectories) -> None:
         """Add the rows of a frame, or of some frames, that come after those before."""
+        columns = columns_of(frame)
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        if not self._num_bytes:
+            self._types = {name: column.dtype for name, column in columns.items()}
+            writer.writerow(columns)
+        writer.writerows(words_of(columns))
+        rows = text.getvalue().encode()
         try:
-            if self._file is not None:
-                columns = columns_of(frame)
-                writer = csv.writer(self._file, lineterminator="\n")
-                if not self._has_header:
-                    writer.writerow(columns)
-                    self._has_header = True
-                writer.writerows(words_of(columns))
-                self._file.flush()
-                return
-            self._pieces.append(frame)
-            if len(self._pieces) >= _PIECE_FRAMES:
-                self._write_pieces()
+            rest = memoryview(rows)
+            while rest:
+                rest = rest[self._file.write(rest) :]
         except OSError as error:
+            self._has_failed = True
+            # A row that is cut off would make the table unreadable.
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._num_bytes)
             raise self._error(error) from error
-
-    def _write_pieces(self) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        if not self._pieces:
-            return
-        table = pa.concat_tables([parquet_table(columns_of(piece)) for piece in self._pieces])
-        if self._parquet is None:
-            self._parquet = pq.ParquetWriter(self._temporary, table.schema)
-        self._parquet.write_table(table)
-        self._pieces = []
+        self._num_bytes += len(rows)
 
     def __exit__(
         self,
@@ -100,20 +95,52 @@ class RowStream:
         traceback: TracebackType | None,
     ) -> None:
         try:
-            if self._file is not None:
-                self._file.close()
-                return
-            self._write_pieces()
-            if self._parquet is not None:
-                self._parquet.close()
-                os.replace(self._temporary, self._path)
+            self._file.close()
         except OSError as failed:
             raise self._error(failed) from failed
+        if not self._is_parquet:
+            return
+        is_published = False
+        try:
+            if kind is None and not self._has_failed:
+                if self._num_bytes:
+                    self._publish()
+                is_published = True
+        finally:
+            if is_published or not self._num_bytes:
+                self._rows_path.unlink(missing_ok=True)
+            else:
+                logger.warning("%s is not written; the rows so far are in %s", self._path, self._rows_path)
+
+    def _publish(self) -> None:
+        """Write the Parquet file from the rows, piece by piece."""
+        import pyarrow as pa
+        import pyarrow.csv as pc
+        import pyarrow.parquet as pq
+
+        schema = parquet_schema(list(self._types))
+        # Numbers are read in the precision in which they were written, because they have the fewest digits for it.
+        options = pc.ConvertOptions(column_types={name: _read_as(each) for name, each in self._types.items()})
+        parsing = pc.ParseOptions(newlines_in_values=True)
+        with (
+            pc.open_csv(self._rows_path, parse_options=parsing, convert_options=options) as pieces,
+            atomic_write(self._path) as temporary,
+            pq.ParquetWriter(temporary, schema) as parquet,
+        ):
+            for piece in pieces:
+                parquet.write_table(pa.Table.from_batches([piece]).cast(schema))
 
     def _error(self, error: OSError) -> OutputError:
+        where = f"the rows that were written before stay in {self._rows_path.name}"
         return OutputError(
             self._path,
             expected="to write rows",
-            found=error.strerror or f"{error}",
-            remedy="the rows that were written before stay" if self._is_csv else "",
+            found=(error.strerror or f"{error}").lower(),
+            remedy=where if self._num_bytes else "",
         )
+
+
+def _read_as(dtype: np.dtype) -> pa.DataType:
+    import pyarrow as pa
+
+    return pa.string() if dtype.kind in "UO" else pa.from_numpy_dtype(dtype)
