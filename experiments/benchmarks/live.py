@@ -163,8 +163,10 @@ def memory(data: Path, minutes: float, speed: float, results: Path | None) -> No
         record = json.loads(Path(out, "tracks.json").read_text(encoding="utf-8"))
     table = pd.DataFrame(rows[:-1])
     table["seconds"] -= table["seconds"].iloc[0]
-    figures = _growth(table) | {"minutes": minutes, "speed": speed, **_delays(record)}
+    figures = _growth(table) | {"minutes": minutes, "speed": speed}
     click.echo(json.dumps(figures))
+    figures |= _delays(record)
+    click.echo(json.dumps(_delays(record)))
     if results:
         run.save(results, rows=table, figures=figures)
 
