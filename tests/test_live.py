@@ -16,59 +16,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import make_once
+from network_cameras import (
+    CAMERAS,
+    EFFORT,
+    NUM_FRAMES,
+    Cameras,
+    film,
+    film_on_the_network,
+    free_port,
+    laboratory_of,
+    live_sequence,
+    psotrack,
+)
 
 from psotrack.datasets import open_recording
-from psotrack.rig_files import write_rig
-from psotrack.simulation import SimulationSettings, simulate
 from psotrack.trajectories import read_trajectories
 
 pytestmark = pytest.mark.slow
 
-#: Few, small cameras: a machine that is busy with other tests must keep up with the replay.
-CAMERAS, NUM_FRAMES, SCALE = ("cam1", "cam3", "cam5", "cam7"), 90, 0.35
-EFFORT = ["--particles", "20", "--iterations", "15"]
-
-#: A camera on the network: sends the frames of a video again and again as JPEG images over HTTP, 10 per second, because
-#: a busy machine must keep up.
-CAMERA = """
-import http.server, itertools, sys, time
-import cv2
-
-path, port = sys.argv[1], int(sys.argv[2])
-capture, images = cv2.VideoCapture(path), []
-while True:
-    there, frame = capture.read()
-    if not there:
-        break
-    images.append(cv2.imencode(".jpg", frame)[1].tobytes())
-
-class Camera(http.server.BaseHTTPRequestHandler):
-    def do_GET(self):
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.end_headers()
-        while True:
-            # All cameras show the same moment, as cameras of one room do.
-            image = images[int(time.time() * 10) % len(images)]
-            head = f"--frame\\r\\nContent-Type: image/jpeg\\r\\nContent-Length: {len(image)}\\r\\n\\r\\n"
-            self.wfile.write(head.encode() + image + b"\\r\\n")
-            time.sleep(0.1 - time.time() % 0.1)
-
-    def log_message(self, *arguments):
-        pass
-
-http.server.ThreadingHTTPServer(("127.0.0.1", port), Camera).serve_forever()
-"""
-
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    def make(folder: Path) -> None:
-        settings = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
-        simulate("S02_D4_A", folder, settings, jobs=2)
-
-    return make_once(tmp_path_factory, "live_sequence", make) / "Simulated_Data" / "S02_D4_A"
+    return live_sequence(tmp_path_factory)
 
 
 @pytest.fixture
@@ -76,64 +45,20 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.getbasetemp() / "live_cache"
 
 
-def _psotrack(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "psotrack", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-        **more,  # type: ignore[call-overload]
-    )
-
-
-def _free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
 @pytest.fixture
-def cameras() -> Iterator[dict[int, subprocess.Popen[bytes]]]:
-    """Processes of cameras, by port; ended after the test."""
-    processes: dict[int, subprocess.Popen[bytes]] = {}
-    yield processes
-    for process in processes.values():
-        process.kill()
-        process.wait()
-
-
-def _film(processes: dict[int, subprocess.Popen[bytes]], video: Path, port: int) -> None:
-    """Start a camera, and wait until it answers."""
-    processes[port] = subprocess.Popen([sys.executable, "-c", CAMERA, str(video), str(port)])
-    for _ in range(300):
-        with socket.socket() as one:
-            if one.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.1)
-    raise AssertionError(f"no camera answers at port {port}")
-
-
-def _laboratory(folder: Path, sequence: Path, addresses: dict[str, str]) -> Path:
-    """A recording.toml of cameras on the network, with the rig of a sequence."""
-    rig = open_recording(sequence).rig.select(list(addresses))
-    write_rig(folder / "rig.toml", rig)
-    lines = ["version = 1", 'calibration = "rig.toml"']
-    for name, address in addresses.items():
-        lines += [f"[cameras.{name}]", f'video = "{address}"', "fps = 10"]
-    path = folder / "recording.toml"
-    path.write_text("\n".join(lines) + "\n")
-    return path
+def cameras() -> Iterator[Cameras]:
+    with film_on_the_network() as processes:
+        yield processes
 
 
 def test_a_replay_without_losses_gives_the_tracks_of_the_offline_twin(
     sequence: Path, cache: Path, tmp_path: Path
 ) -> None:
     common = ["--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
-    offline = _psotrack("track", sequence, "--causal", "--out", tmp_path / "offline.csv", *common)
+    offline = psotrack("track", sequence, "--causal", "--out", tmp_path / "offline.csv", *common)
     assert offline.returncode == 0, offline.stderr
     # Slow enough for a machine that is busy with other tests.
-    live = _psotrack("live", sequence, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv", *common)
+    live = psotrack("live", sequence, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv", *common)
     assert live.returncode == 0, live.stderr
     record = json.loads((tmp_path / "live.json").read_text())
     assert record["frames"] == NUM_FRAMES
@@ -159,7 +84,7 @@ def test_a_replay_without_losses_gives_the_tracks_of_the_offline_twin(
     tracks = read_trajectories(tmp_path / "live.csv")
     assert tracks.num_drones >= 3
     # No row depends on a later frame: a shorter recording gives the beginning of the same table.
-    short = _psotrack("track", sequence, "--causal", "--frames", 70, "--out", tmp_path / "short.csv", *common)
+    short = psotrack("track", sequence, "--causal", "--frames", 70, "--out", tmp_path / "short.csv", *common)
     assert short.returncode == 0, short.stderr
     assert (tmp_path / "live.csv").read_text().startswith((tmp_path / "short.csv").read_text())
 
@@ -169,7 +94,7 @@ def test_rows_come_as_lines_and_by_udp(sequence: Path, cache: Path, tmp_path: Pa
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(1.0)
         port = receiver.getsockname()[1]
-        done = _psotrack(
+        done = psotrack(
             "live", sequence, "--replay", "--speed", "0.2", "--lines", "--udp", f"127.0.0.1:{port}",
             "--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT,
         )  # fmt: skip
@@ -194,7 +119,7 @@ def test_rows_come_as_lines_and_by_udp(sequence: Path, cache: Path, tmp_path: Pa
 
 def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> None:
     client = pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
-    port = _free_port()
+    port = free_port()
     live = subprocess.Popen(
         [
             *(sys.executable, "-m", "psotrack", "live", f"{sequence}", "--replay", "--speed", "0.2"),
@@ -224,7 +149,7 @@ def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> 
 
 def test_a_session_that_is_recorded_is_tracked_again(sequence: Path, cache: Path, tmp_path: Path) -> None:
     common = ["--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
-    live = _psotrack(
+    live = psotrack(
         "live", sequence, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv",
         "--record", tmp_path / "kept", *common,
     )  # fmt: skip
@@ -239,10 +164,10 @@ def test_a_session_that_is_recorded_is_tracked_again(sequence: Path, cache: Path
         # A busy machine leaves frames out; the others have the times at which they were filmed.
         assert counts["frames"] >= 0.8 * NUM_FRAMES
         assert set(kept.frame_times[name].time_s) <= set(source.frame_times[name].time_s)
-    again = _psotrack("track", tmp_path / "kept", "--out", tmp_path / "again.csv", "--cache", cache, *EFFORT)
+    again = psotrack("track", tmp_path / "kept", "--out", tmp_path / "again.csv", "--cache", cache, *EFFORT)
     assert again.returncode == 0, again.stderr
     assert read_trajectories(tmp_path / "again.csv").num_drones >= 3
-    refused = _psotrack(
+    refused = psotrack(
         "live", sequence, "--replay", "--lines", "--record", tmp_path / "kept", "--cache", cache, *EFFORT
     )
     assert refused.returncode == 2
@@ -252,12 +177,12 @@ def test_a_session_that_is_recorded_is_tracked_again(sequence: Path, cache: Path
 
 
 def test_cameras_on_the_network_stop_and_come_back(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
+    sequence: Path, cache: Path, tmp_path: Path, cameras: Cameras
 ) -> None:
-    ports = {name: _free_port() for name in CAMERAS}
+    ports = {name: free_port() for name in CAMERAS}
     for name, port in ports.items():
-        _film(cameras, sequence / f"{name}i_s.avi", port)
-    laboratory = _laboratory(
+        film(cameras, sequence / f"{name}i_s.avi", port)
+    laboratory = laboratory_of(
         tmp_path, sequence, {name: f"http://127.0.0.1:{port}/" for name, port in ports.items()}
     )
     options = ["--out", f"{tmp_path / 'live.csv'}", "--cache", f"{cache}", "--most-drones", "4", *EFFORT]
@@ -283,7 +208,7 @@ def test_cameras_on_the_network_stop_and_come_back(
     cameras[gone].kill()
     cameras[gone].wait()
     wait_for_rows(60)
-    _film(cameras, sequence / "cam3i_s.avi", gone)
+    film(cameras, sequence / "cam3i_s.avi", gone)
     wait_for_rows(60)
     live.send_signal(signal.SIGINT)
     out, err = live.communicate(timeout=60)
@@ -300,15 +225,15 @@ def test_cameras_on_the_network_stop_and_come_back(
 
 
 def test_a_stream_that_does_not_answer_is_one_line(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
+    sequence: Path, cache: Path, tmp_path: Path, cameras: Cameras
 ) -> None:
     names = CAMERAS[:3]
-    ports = [_free_port() for _ in names]
+    ports = [free_port() for _ in names]
     for name, port in zip(names[1:], ports[1:], strict=True):
-        _film(cameras, sequence / f"{name}i_s.avi", port)
+        film(cameras, sequence / f"{name}i_s.avi", port)
     addresses = {name: f"http://127.0.0.1:{port}/" for name, port in zip(names, ports, strict=True)}
-    laboratory = _laboratory(tmp_path, sequence, addresses)
-    done = _psotrack(
+    laboratory = laboratory_of(tmp_path, sequence, addresses)
+    done = psotrack(
         "live", laboratory, "--out", tmp_path / "live.csv", "--cache", cache, "--seconds", "8", *EFFORT
     )
     assert done.returncode == 0, done.stderr
@@ -319,9 +244,9 @@ def test_a_stream_that_does_not_answer_is_one_line(
 
 
 def test_a_camera_of_another_size_is_left_out_and_none_ends_the_command(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: dict[int, subprocess.Popen[bytes]]
+    sequence: Path, cache: Path, tmp_path: Path, cameras: Cameras
 ) -> None:
-    port = _free_port()
+    port = free_port()
     small = tmp_path / "small.avi"
     simulate_small = textwrap.dedent("""
         import cv2, sys
@@ -332,11 +257,11 @@ def test_a_camera_of_another_size_is_left_out_and_none_ends_the_command(
         writer.release()
     """)
     subprocess.run([sys.executable, "-c", simulate_small, str(small)], check=True)
-    _film(cameras, small, port)
-    laboratory = _laboratory(
+    film(cameras, small, port)
+    laboratory = laboratory_of(
         tmp_path, sequence, {name: f"http://127.0.0.1:{port}/{name}" for name in CAMERAS[:2]}
     )
-    done = _psotrack("live", laboratory, "--lines", "--cache", cache, "--seconds", "20", *EFFORT)
+    done = psotrack("live", laboratory, "--lines", "--cache", cache, "--seconds", "20", *EFFORT)
     assert done.returncode == 2
     assert "expected images of 672 x 378 pixels, as the rig says, found 64 x 48" in done.stderr
     assert "Traceback" not in done.stderr
@@ -356,7 +281,7 @@ def test_what_cannot_be_done_is_one_line(
     sequence: Path, cache: Path, tmp_path: Path, options: list[str], words: str
 ) -> None:
     copy = shutil.copytree(sequence, tmp_path / "copy")
-    done = _psotrack("live", copy, "--cache", cache, *options, cwd=tmp_path, env=dict(os.environ))
+    done = psotrack("live", copy, "--cache", cache, *options, cwd=tmp_path, env=dict(os.environ))
     assert done.returncode == 2
     assert words in done.stderr
     assert done.stderr.count("\n") == 1

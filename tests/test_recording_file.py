@@ -514,6 +514,35 @@ class TestFaults:
         assert recording.usable(["right"]).rig.names == ("right",)
         path = write(folder, camera("left", "video = 0"), RIGHT)
         assert open_recording(path).streams == {"left": "device 0"}
+        path = write(folder, camera("left", 'video = "/dev/v4l/by-id/left"'), RIGHT)
+        assert open_recording(path).streams == {"left": "device /dev/v4l/by-id/left"}
+
+    @pytest.mark.parametrize(
+        ("video", "words"),
+        [
+            (
+                '"rtps://left/1"',
+                "a file, the number of a device, or an address that begins with rtsp://, rtsps://",
+            ),
+            ('"rtsp://"', "expected an address with a host, and a port below 65536 if any, found rtsp://"),
+            ('"rtsp:///stream"', "expected an address with a host"),
+            ('"http://left:99999/"', "expected an address with a host, and a port below 65536"),
+            ('"http://left:eight/"', "expected an address with a host, and a port below 65536"),
+            ('"gstreamer://"', "expected an address with a host"),
+            ("-1", "expected the number of a device, from 0, found -1"),
+        ],
+    )
+    def test_addresses_that_are_none(self, folder, video, words):
+        assert_fails(
+            write(folder, camera("left", f"video = {video}", PLACE), RIGHT), "cameras.left.video", words
+        )
+
+    @pytest.mark.parametrize(
+        "video", ["udp://@:1234", "udp://239.0.0.1:1234", "gstreamer://videotestsrc ! appsink"]
+    )
+    def test_addresses_without_the_name_of_a_host(self, folder, video):
+        path = write(folder, camera("left", f'video = "{video}"', PLACE, "size = [64, 48]"), RIGHT)
+        assert open_recording(path).streams == {"left": video}
 
     def test_what_is_no_recording(self, folder, tmp_path):
         (tmp_path / "S01.zip").write_bytes(b"PK")

@@ -178,11 +178,20 @@ def main(started: float | None = None) -> None:
         sys.exit(2)
     except PsotrackError as error:
         sys.stderr.write(f"psotrack: {error}\n")
+        try:
+            sys.stdout.flush()
+        except OSError:  # a full disk, which is the error that was said
+            _drop_output()
         sys.exit(2)
     except BrokenPipeError:
         # The program that reads the output has ended, as `head` does.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         sys.exit(2)
+
+
+def _drop_output() -> None:
+    """Let the end of the interpreter write what stdout did not take to nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _keep_near_suggestions(error: click.ClickException) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -150,9 +150,7 @@ def live(
     recording = open_recording(sequence)
     if replay:
         recording = recording.usable(camera_names(cameras))
-    used = live_cameras(recording, replay=replay, speed=speed, loops=loops)
-    names = camera_names(cameras)
-    used = [camera for camera in used if names is None or camera.name in names]
+    used = live_cameras(recording, camera_names(cameras), replay=replay, speed=speed, loops=loops)
     kept = None
     if record is not None:
         kept = RecordingFolder(record, recording, [camera.name for camera in used], force=force)
@@ -169,7 +167,8 @@ def live(
     )
     with contextlib.ExitStack() as stack:
         outputs: list[Any] = [JsonLines(sys.stdout)] if lines else []
-        outputs += [] if udp is None else [UdpLines(udp)]
+        if udp is not None:
+            outputs.append(stack.enter_context(contextlib.closing(UdpLines(udp))))
         server = (
             None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
         )
@@ -180,9 +179,7 @@ def live(
         rows = [] if out is None else [stack.enter_context(RowStream(out, force=force))]
         table = stack.enter_context(_Table(quiet or lines))
         stack.enter_context(_ended_by_ctrl_c(session))
-        result = session.run(
-            [*rows, *outputs], table.show if seconds is None else _until(seconds, session, table.show)
-        )
+        result = session.run([*rows, *outputs], table.show, longest_s=seconds or float("inf"))
     report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}
@@ -196,13 +193,16 @@ def live(
         f"{out or 'live'}: {report['drones']} drones, {result.instants} frames, "
         f"delay {1e3 * report['delay_s']['median']:.0f} ms, {result.left_out} frames left out",
     )
+    # Said before, while the other outputs went on.
+    if result.failed_outputs:
+        raise result.failed_outputs[0]
 
 
 def _record(result: LiveResult) -> dict[str, Any]:
     """What a session has done, fit for JSON, in the words of `psotrack track --causal` where it means the same."""
     import numpy as np
 
-    delay_s = np.array(result.delay_s or [np.nan])
+    delay_s = np.array(result.delay_s)
     return {
         "causal": True,
         "live": True,
@@ -264,19 +264,6 @@ class _Table:
                 name, "films" if there else "silent", *(f"{value}" for value in vars(counts).values())
             )
         self._live.update(table, refresh=True)
-
-
-def _until(
-    seconds: float, session: LiveSession, show: Callable[[LiveResult, list[bool]], None]
-) -> Callable[[LiveResult, list[bool]], None]:
-    """Show the result, and end the session after a time."""
-
-    def shown(result: LiveResult, films: list[bool]) -> None:
-        show(result, films)
-        if result.seconds >= seconds:
-            session.stop()
-
-    return shown
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
@@ -42,6 +43,8 @@ _UNKNOWN_WH = (1, 1)
 _UNKNOWN_HZ = 1.0
 #: Largest deviation of a rate from a thousandth of another one at which the unit of time was mistaken, not the rate.
 _SLIP_SHARE = 0.05
+#: How addresses of streams begin that OpenCV reads, with FFmpeg or with GStreamer.
+_SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtp", "udp", "tcp", "srt", "gstreamer")
 _LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "tvec")
 
 
@@ -117,7 +120,7 @@ class _Opened:
     Attributes:
         size_wh: width and height of the images, pixels; None where only the calibration may know it.
         video: its video, or None.
-        stream: address of its stream, or number of its device; empty where it has none.
+        stream: address of its stream, or "device" and number or path of its device; empty where it has none.
         times: times of its frames; None for a stream.
         ignore: image of what is ignored, or None.
         detections: file of its detections, or None.
@@ -133,7 +136,7 @@ class _Opened:
 
 def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
     folder, place = path.parent, f"cameras.{name}"
-    stream = _stream(folder, table.video)
+    stream = _stream(path, f"{place}.video", table.video)
     video = None if stream else _open_video(path, name, table)
     if video is not None and table.size is not None and table.size != video.image_size_wh:
         raise _error(
@@ -202,11 +205,32 @@ def _check_shutter(path: Path, name: str, table: CameraTable, opened: _Opened) -
         raise _error(path, f"cameras.{name}.line_time_s", expected, f"{table.line_time_s:g}")
 
 
-def _stream(folder: Path, video: str | int | None) -> str:
-    """Address of a stream or number of a device; empty for a file."""
+def _stream(path: Path, place: str, video: str | int | None) -> str:
+    """Address of a stream, or "device" and number or path of a device; empty for a file."""
     if isinstance(video, int):
+        if video < 0:
+            raise _error(path, place, "the number of a device, from 0", f"{video}")
         return f"device {video}"
-    return video if video is not None and "://" in video else ""
+    if video is None:
+        return ""
+    if video.startswith("/dev/"):
+        return f"device {video}"
+    scheme, separator, rest = video.partition("://")
+    if not separator:
+        return ""
+    if scheme not in _SCHEMES:
+        expected = (
+            f"a file, the number of a device, or an address that begins with {'://, '.join(_SCHEMES)}://"
+        )
+        raise _error(path, place, expected, f"{scheme}://")
+    try:
+        parts = urlsplit(video)
+        is_whole = bool(parts.hostname or rest.startswith("@")) and parts.port != 0
+    except ValueError:
+        is_whole = False
+    if not (bool(rest) if scheme == "gstreamer" else is_whole):
+        raise _error(path, place, "an address with a host, and a port below 65536 if any", video)
+    return video
 
 
 def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:

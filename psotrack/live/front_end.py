@@ -176,6 +176,8 @@ def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
     end_s = time.monotonic() + CLOSE_S
     for index, recorder in recorders.items():
         send(Recorded(index, recorder.close(max(0.0, end_s - time.monotonic()))))
+        if recorder.loss is not None:
+            send(RecordingNotice(recorder.loss))
 
 
 def _film_one(

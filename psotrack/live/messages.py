@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 from typing import Any, TextIO
 
 from psotrack.errors import OutputError, SettingsError
 from psotrack.trajectories import Status, Trajectories
+
+logger = logging.getLogger(__name__)
 
 
 def lines_of(rows: Trajectories) -> list[str]:
@@ -31,16 +34,28 @@ def lines_of(rows: Trajectories) -> list[str]:
 
 
 class JsonLines:
-    """Writes rows to a stream of text, such as stdout."""
+    """Writes rows to a stream of text, such as stdout.
+
+    Raises:
+        OutputError: the stream takes no more, because the disk is full for instance.
+        BrokenPipeError: the program that reads the stream has ended.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, rows: Trajectories) -> None:
         """Write the rows of an instant."""
-        for line in lines_of(rows):
-            self._stream.write(line + "\n")
-        self._stream.flush()
+        try:
+            for line in lines_of(rows):
+                self._stream.write(line + "\n")
+            self._stream.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise OutputError(
+                "--lines", expected="to write rows", found=(error.strerror or f"{error}").lower()
+            ) from error
 
 
 class UdpLines:
@@ -66,17 +81,18 @@ class UdpLines:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
 
     def write(self, rows: Trajectories) -> None:
-        """Send the rows of an instant.
-
-        Raises:
-            OutputError: the network refuses.
-        """
+        """Send the rows of an instant; where the network refuses them, say so and go on: it may come back."""
         try:
             for line in lines_of(rows):
                 self._socket.sendto(line.encode(), self._target)
         except ConnectionRefusedError:
             return  # nobody listens on this machine yet
         except OSError as error:
-            raise OutputError(
-                self._address, expected="to send rows", found=error.strerror or f"{error}"
-            ) from error
+            found = (error.strerror or f"{error}").lower()
+            logger.warning(
+                "--udp %s: expected to send rows, found %s; tracking goes on", self._address, found
+            )
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()

@@ -81,6 +81,8 @@ class CameraRecorder:
     Attributes:
         counts: what happened to the frames, complete when the recorder is closed.
         video, times: paths of the video and of the file of times.
+        loss: a line of text where frames that were handed over did not reach the disk, which only `close` finds out;
+            else None.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class CameraRecorder:
         self.least_free_bytes = least_free_bytes
         self.video, self.times = folder / f"{name}{_SUFFIX}", folder / f"{name}_times.csv"
         self.counts = RecordedCounts()
+        self.loss: str | None = None
         self._encoder: _Encoder | None = None
         self._said: set[str] = set()
         self._last_s = -np.inf
@@ -141,7 +144,13 @@ class CameraRecorder:
             encoder.join(wait_s)
             # Counted in the file: FFmpeg does not report what did not reach the disk.
             self.counts.frames = min(encoder.num_encoded, readable_frames(self.video))
-            self.counts.left_out += encoder.num_taken - self.counts.frames
+            num_lost = encoder.num_taken - self.counts.frames
+            self.counts.left_out += num_lost
+            if num_lost and encoder.failure is None:
+                self.loss = (
+                    f"{self.video}: expected {encoder.num_taken} frames, found {self.counts.frames}; "
+                    "is the disk full, or too slow?"
+                )
         return self.counts
 
 
@@ -151,12 +160,13 @@ class _Encoder:
     Attributes:
         num_taken: number of different frames that were handed over.
         num_encoded: number of them that were encoded.
+        failure: why recording has ended early, a line of text; None where it has not.
     """
 
     def __init__(self, recorder: CameraRecorder) -> None:
         self._recorder = recorder
         self._waiting: queue.SimpleQueue[tuple[np.ndarray, float] | None] = queue.SimpleQueue()
-        self._failure: str | None = None
+        self.failure: str | None = None
         width, height = recorder.image_size_wh
         # Each block of 16 x 16 pixels takes at least a bit, and a frame two headers of together 15 bytes.
         self._least_bytes = (-(-width // 16) * -(-height // 16)) // 8 + 15
@@ -167,8 +177,8 @@ class _Encoder:
 
     def put(self, image: np.ndarray | None, time_s: float) -> str | None:
         """Let a frame wait to be encoded; return why it is left out."""
-        if self._failure is not None:
-            return self._failure
+        if self.failure is not None:
+            return self.failure
         if image is None or self._waiting.qsize() >= _MOST_WAITING:
             return f"{self._recorder.folder}: frames are left out of the recording, because the computer is too slow"
         self._waiting.put((image, time_s))
@@ -196,7 +206,7 @@ class _Encoder:
                     writer.release()
         except OSError as error:
             found = error.strerror.lower() if error.strerror else f"{error}"
-            self._failure = (
+            self.failure = (
                 f"{recorder.folder}: expected to record, found {found}; "
                 "what was recorded before stays, tracking goes on"
             )
@@ -332,14 +342,30 @@ class RecordingFolder:
         self._write(self._names)
 
     def end(self) -> None:
-        """Leave cameras out of the recording.toml that have no two frames.
+        """Leave cameras out of the recording.toml that have no two frames; where no camera has, remove all files.
 
         Raises:
             OutputError: the recording.toml cannot be written; then it still names all cameras.
         """
         there = [name for name in self._names if readable_frames(self.recorder(name, 1.0).video) >= 2]
-        if there and there != self._names:
+        if not there:
+            self._remove()
+        elif there != self._names:
             self._write(there)
+
+    def _remove(self) -> None:
+        """Remove what was written, so that the folder can be used again."""
+        recording = self._recording
+        files = ["rig.toml", RECORDING_FILE, *map(self._ignore_name, recording.ignore)]
+        if recording.marker_corners is not None:
+            files.append(recording.marker_corners.name)
+        for name in self._names:
+            recorder = self.recorder(name, 1.0)
+            files += [recorder.video.name, recorder.times.name]
+        with contextlib.suppress(OSError):
+            for file in files:
+                (self._folder / file).unlink(missing_ok=True)
+            self._folder.rmdir()
 
     def _write(self, names: Sequence[str]) -> None:
         recording = self._recording

@@ -8,7 +8,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Protocol, runtime_checkable
 import msgspec
 import numpy as np
 
-from psotrack.errors import InputError, PsotrackError
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.live.front_end import (
     Arrived,
     CameraSilhouette,
@@ -97,6 +97,7 @@ class LiveResult:
         delay_s: delay of each instant, from the arrival of its last frame to its rows; of the last hour at most.
         counts: counts of each camera, by name.
         recorded: what happened to the frames that are kept, by the camera's name.
+        failed_outputs: errors of outputs that were given up while others went on.
         drones: names of all drones.
         late_searches: number of searches for new drones whose result came too late: the drones' rows begin later than
             those of `track --causal`.
@@ -109,6 +110,7 @@ class LiveResult:
     delay_s: list[float] = field(default_factory=list)
     counts: dict[str, CameraCounts] = field(default_factory=dict)
     recorded: dict[str, RecordedCounts] = field(default_factory=dict)
+    failed_outputs: list[OutputError] = field(default_factory=list)
     drones: set[str] = field(default_factory=set)
     late_searches: int = 0
     compile_s: float = 0.0
@@ -116,13 +118,29 @@ class LiveResult:
 
 
 def live_cameras(
-    recording: Recording, *, replay: bool, speed: float = 1.0, loops: int = 1
+    recording: Recording,
+    names: Sequence[str] | None = None,
+    *,
+    replay: bool,
+    speed: float = 1.0,
+    loops: int = 1,
 ) -> list[LiveCamera]:
     """The cameras of a recording that have a source of frames: streams and devices, or videos that are replayed.
 
+    Args:
+        recording: the recording.
+        names: names of the cameras to use; None: all that have a source.
+        replay: play the videos.
+        speed: seconds of video per second.
+        loops: how often the videos are played.
+
     Raises:
         InputError: fewer than two cameras have a source.
+        SettingsError: a name is unknown.
     """
+    unknown = sorted(set(names or ()) - set(recording.rig.names))
+    if unknown:
+        raise SettingsError("cameras", expected=f"some of {', '.join(recording.rig.names)}", found=unknown[0])
     found = []
     for index, name in enumerate(recording.rig.names):
         source: LiveSource
@@ -132,10 +150,11 @@ def live_cameras(
         elif not replay and name in recording.streams:
             address = recording.streams[name]
             size_wh = recording.rig.cameras.image_size_wh[index].astype(int).tolist()
-            device = address.removeprefix("device ")
-            source = CameraStream(int(device) if device.isdigit() else address, (size_wh[0], size_wh[1]))
+            source = CameraStream(address, (size_wh[0], size_wh[1]))
             fps = recording.frame_times[name].fps if name in recording.frame_times else _USUAL_HZ
         else:
+            continue
+        if names is not None and name not in names:
             continue
         found.append(
             LiveCamera(name, source, fps, recording.line_time_s.get(name, 0.0), recording.ignore.get(name))
@@ -209,6 +228,9 @@ class LiveSession:
         self._stopped = threading.Event()
         self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
+        #: Cameras that have filmed, and those that have never filmed or will not film again.
+        self._have_filmed: set[int] = set()
+        self._missing: set[int] = set()
         self._said = [""] * len(cameras)
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
@@ -217,19 +239,25 @@ class LiveSession:
         self._stopped.set()
 
     def run(
-        self, outputs: list[RowsOutput], on_instant: Callable[[LiveResult, list[bool]], None] | None = None
+        self,
+        outputs: Sequence[RowsOutput],
+        on_instant: Callable[[LiveResult, list[bool]], None] | None = None,
+        *,
+        longest_s: float = float("inf"),
     ) -> LiveResult:
-        """Track until all sources have ended, or `stop` is called.
+        """Track until all sources have ended, `stop` is called, or the time is over.
 
         Args:
-            outputs: what takes the rows.
+            outputs: what takes the rows. One that fails is given up with a warning, and the others go on.
             on_instant: is told of the result so far, and which cameras film, after each instant.
+            longest_s: time after which the session ends, seconds.
 
         Raises:
-            InputError: no source can bring frames.
-            OutputError: an output fails.
+            InputError: fewer than two cameras can film, or no frame came.
+            OutputError: the last output has failed.
         """
         tasks = self._tasks()
+        outputs = list(outputs)
         with (
             worker_processes(film, tasks) as connections,
             search_beside(self._run.search) as self._run.search,
@@ -244,6 +272,7 @@ class LiveSession:
             gc.freeze()
             # All sources are awake when the first frame comes.
             began_s = time.monotonic() + _LEAD_S
+            self._ends_s = began_s + longest_s
             self._meeting = Meeting(
                 [each.fps for each in self._cameras],
                 self._rate_hz,
@@ -270,9 +299,25 @@ class LiveSession:
                 while self._workers and time.monotonic() < end_s:
                     self._receive(end_s - time.monotonic())
         bugs = [error for error in self._failed if not isinstance(error, PsotrackError)]
-        if bugs or (self._failed and not self.result.instants):
-            raise (bugs or self._failed)[0]
+        if bugs:
+            raise bugs[0]
+        if not self._can_track:
+            raise self._error(
+                "at least two cameras that film",
+                f"{len(self._cameras) - len(self._missing)} of {len(self._cameras)}",
+            )
+        if not self.result.instants:
+            raise self._error("frames", "none until the session ended")
         return self.result
+
+    @property
+    def _can_track(self) -> bool:
+        """Whether two cameras film, or have filmed and may come back."""
+        return len(self._cameras) - len(self._missing) >= 2
+
+    def _error(self, expected: str, found: str) -> InputError:
+        remedy = "the lines above say why" if self._missing else ""
+        return InputError("the cameras", expected=expected, found=found, remedy=remedy)
 
     def _track_all(
         self,
@@ -319,6 +364,8 @@ class LiveSession:
         match message:
             case Arrived(index, time_s):
                 self._said[index] = ""
+                self._have_filmed.add(index)
+                self._missing.discard(index)
                 if meeting.announce(index, time_s, time.monotonic()):
                     logger.warning("camera %s films again", self._cameras[index].name)
             case CameraSilhouette(index, time_s, arrived_s, coverage):
@@ -330,6 +377,8 @@ class LiveSession:
                 if line != self._said[index]:
                     logger.warning("camera %s: %s", self._cameras[index].name, line)
                 self._said[index] = line
+                if index not in self._have_filmed:
+                    self._missing.add(index)
             case RecordingNotice(line):
                 logger.warning("%s", line)
             case Recorded(index, counts):
@@ -339,11 +388,12 @@ class LiveSession:
                 if error is not None:
                     logger.warning("camera %s: %s", self._cameras[index].name, error)
                     self._failed.append(error)
+                    self._missing.add(index)
 
     def _instants(self) -> Iterator[tuple[Instant, int]]:
         """Yield instants that are complete, and how many were left out before each."""
         meeting, wait_s = self._meeting, 0.0
-        while not self._stopped.is_set():
+        while not self._stopped.is_set() and self._can_track and time.monotonic() < self._ends_s:
             self._receive(wait_s)
             now_s = time.monotonic()
             for index in meeting.stopped(now_s):
@@ -373,8 +423,15 @@ class LiveSession:
             instant.offset_s.astype(np.float32), is_there, is_there.astype(np.float32), self._line_time_s
         )
         rows = self._run.step(instant.number, instant.time_s, images, exposures, num_frames=elapsed)
-        for output in outputs:
-            output.write(rows)
+        for output in list(outputs):
+            try:
+                output.write(rows)
+            except OutputError as error:
+                outputs.remove(output)
+                if not outputs:
+                    raise
+                logger.warning("%s; tracking goes on with the other outputs", error)
+                self.result.failed_outputs.append(error)
         result = self.result
         result.instants += 1
         result.delay_s.append(time.monotonic() - instant.arrived_s)

@@ -17,10 +17,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError
+from psotrack.live.addresses import ANSWER_S, device_of, shown_address, why_silent
 from psotrack.recordings import VideoInfo, read_frames, silence_opencv
 
-#: How long a stream may take to answer and to bring a frame, seconds, and how long it is left alone after it broke off.
-_ANSWER_S, _AGAIN_S = 5.0, 1.0
+#: How long a stream is left alone after it broke off, seconds.
+_AGAIN_S = 1.0
 #: A frame that is read in less time was waiting: the program is behind the camera, seconds.
 _WAITING_S = 0.002
 
@@ -99,33 +100,36 @@ class CameraStream:
     """A device, or the address of a stream.
 
     Attributes:
-        address: number of a device, or an address such as rtsp://camera/1, http://camera/video or gstreamer://PIPELINE.
+        address: an address such as rtsp://camera/1, http://camera/video or gstreamer://PIPELINE; or a device, such as
+            "device 0" or "device /dev/v4l/by-id/left".
         image_size_wh: width and height of the images that the rig expects, pixels.
     """
 
-    address: str | int
+    address: str
     image_size_wh: tuple[int, int]
 
     def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """See `LiveSource`: frames are timed when they arrive."""
         began_s = begin()
         while not stopped():
+            asked_s = time.monotonic()
             capture = self._opened()
-            if capture is None:
-                yield f"{self.address} does not answer"
+            if not capture.isOpened():
+                why = why_silent(self.address, time.monotonic() - asked_s)
+                yield f"expected frames of {shown_address(self.address)}, found {why}; it is tried again every second"
             else:
                 try:
                     yield from self._read(capture, began_s, stopped)
                 finally:
                     capture.release()
                 if not stopped():
-                    yield f"{self.address} has broken off"
+                    yield f"{shown_address(self.address)} has broken off; it is tried again every second"
             for _ in range(10):
                 if not stopped():
                     time.sleep(_AGAIN_S / 10)
 
-    def _opened(self) -> cv2.VideoCapture | None:
-        milliseconds = round(1000 * _ANSWER_S)
+    def _opened(self) -> cv2.VideoCapture:
+        milliseconds = round(1000 * ANSWER_S)
         timeouts = [
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
             milliseconds,
@@ -133,13 +137,18 @@ class CameraStream:
             milliseconds,
         ]
         with silence_opencv():
-            if isinstance(self.address, int):
-                capture = cv2.VideoCapture(self.address)
-            elif self.address.startswith("gstreamer://"):
-                capture = cv2.VideoCapture(self.address.removeprefix("gstreamer://"), cv2.CAP_GSTREAMER)
-            else:
-                capture = cv2.VideoCapture(self.address, cv2.CAP_FFMPEG, timeouts)
-        return capture if capture.isOpened() else None
+            if (device := device_of(self.address)) is not None:
+                return cv2.VideoCapture(device)
+            if self.address.startswith("gstreamer://"):
+                if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
+                    raise InputError(
+                        self.address,
+                        expected="a build of OpenCV with GStreamer",
+                        found="OpenCV without GStreamer",
+                        remedy="build OpenCV from source with GStreamer, or take an address of RTSP or HTTP",
+                    )
+                return cv2.VideoCapture(self.address.removeprefix("gstreamer://"), cv2.CAP_GSTREAMER)
+            return cv2.VideoCapture(self.address, cv2.CAP_FFMPEG, timeouts)
 
     def _read(
         self, capture: cv2.VideoCapture, began_s: float, stopped: Callable[[], bool]
@@ -154,8 +163,9 @@ class CameraStream:
             if there and image is not None and image.shape[1::-1] != self.image_size_wh:
                 width, height = self.image_size_wh
                 raise InputError(
-                    self.address,
+                    shown_address(self.address),
                     expected=f"images of {width} x {height} pixels, as the rig says",
                     found=f"{image.shape[1]} x {image.shape[0]}",
+                    remedy="let the camera send this size, or calibrate the camera at the size that it sends",
                 )
             yield SourceFrame(arrived_s - began_s, image if there else None, arrived_s)

@@ -33,7 +33,7 @@ class CameraTable(_Table, frozen=True, kw_only=True):
     """Table `[cameras.NAME]`: what is known of one camera.
 
     Attributes:
-        video: a video file, a folder of pictures, the address of a stream, or the number of a device.
+        video: a video file, a folder of pictures, the address of a stream, or the number or path of a device.
         images: pattern of image files, which are the frames in natural order.
         ignore: image file, white where nothing counts as foreground.
         detections: file of detections, in the layout of the dataset's dl_data.

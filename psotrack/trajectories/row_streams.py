@@ -98,18 +98,21 @@ class RowStream:
             self._file.close()
         except OSError as failed:
             raise self._error(failed) from failed
+        if not self._num_bytes:
+            # An empty file would only be in the way of the next session. Links to devices stay.
+            if self._rows_path.is_file():
+                self._rows_path.unlink()
+            return
         if not self._is_parquet:
             return
         is_published = False
         try:
             if kind is None and not self._has_failed:
-                if self._num_bytes:
-                    self._publish()
+                self._publish()
+                self._rows_path.unlink()
                 is_published = True
         finally:
-            if is_published or not self._num_bytes:
-                self._rows_path.unlink(missing_ok=True)
-            else:
+            if not is_published:
                 logger.warning("%s is not written; the rows so far are in %s", self._path, self._rows_path)
 
     def _publish(self) -> None:

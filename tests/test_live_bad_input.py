@@ -1,0 +1,282 @@
+"""What goes wrong with cameras, devices and disks while `psotrack live` runs: one line, and the others go on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import resource
+import socket
+import stat
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from network_cameras import (
+    CAMERAS,
+    EFFORT,
+    NUM_FRAMES,
+    Cameras,
+    film,
+    film_on_the_network,
+    free_port,
+    laboratory_of,
+    live_sequence,
+    psotrack,
+)
+
+from psotrack.datasets import open_recording
+from psotrack.errors import InputError
+from psotrack.live import CameraStream, UdpLines
+from psotrack.recordings import read_frames
+from psotrack.trajectories import Trajectories, read_trajectories
+
+pytestmark = pytest.mark.slow
+
+SIZE_WH = (64, 48)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return live_sequence(tmp_path_factory)
+
+
+@pytest.fixture
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.getbasetemp() / "live_cache"
+
+
+@pytest.fixture
+def cameras() -> Iterator[Cameras]:
+    with film_on_the_network() as processes:
+        yield processes
+
+
+@pytest.fixture
+def small_video(tmp_path: Path) -> Path:
+    """A video whose images are smaller than those of the rig."""
+    path = tmp_path / "small.avi"
+    writer = cv2.VideoWriter(f"{path}", cv2.VideoWriter.fourcc(*"XVID"), 10, SIZE_WH)
+    for level in range(30):
+        writer.write(np.full((*SIZE_WH[::-1], 3), level, np.uint8))
+    writer.release()
+    return path
+
+
+def first_line(address: str) -> str:
+    """What a source says first."""
+    with_frames = CameraStream(address, SIZE_WH).frames(time.monotonic, lambda: False)
+    line = next(with_frames)
+    with_frames.close()
+    assert isinstance(line, str)
+    return line
+
+
+def test_each_reason_why_a_stream_is_silent_is_said(small_video: Path, cameras: Cameras) -> None:
+    again = "it is tried again every second"
+    silent = free_port()
+    address = f"http://me:secret@127.0.0.1:{silent}/1"
+    assert first_line(address) == (
+        f"expected frames of http://me:***@127.0.0.1:{silent}/1, "
+        f"found that it does not answer: connection refused; {again}"
+    )
+    # A host that accepts, and says nothing.
+    with socket.create_server(("127.0.0.1", 0)) as dumb:
+        address = f"rtsp://127.0.0.1:{dumb.getsockname()[1]}/1"
+        expected = f"expected frames of {address}, found that it does not answer within 5 s; {again}"
+        assert first_line(address) == expected
+    port = free_port()
+    film(cameras, small_video, port)
+    address = f"http://127.0.0.1:{port}/nothing"
+    expected = f"expected frames of {address}, found no video there; are path, user name and password right?"
+    assert first_line(address) == f"{expected}; {again}"
+
+
+def test_each_reason_why_a_device_is_silent_is_said(tmp_path: Path) -> None:
+    again = "it is tried again every second"
+    expected = "expected frames of device 63, found no /dev/video63; is the camera plugged in?"
+    assert first_line("device 63") == f"{expected}; {again}"
+    file = tmp_path / "video0"
+    file.touch()
+    expected = f"expected frames of device {file}, found no camera at {file}, or another program that uses it"
+    assert first_line(f"device {file}") == f"{expected}; {again}"
+
+
+def test_a_device_without_permission(tmp_path: Path) -> None:
+    file = tmp_path / "video0"
+    file.touch(mode=0)
+    for folder in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+        folder.chmod(folder.stat().st_mode | stat.S_IXOTH)
+    # Root may open every file: a process of root becomes another user, when everything is imported.
+    script = """
+        import os, sys, time
+        from psotrack.live import CameraStream
+        frames = CameraStream(sys.argv[1], (64, 48)).frames(time.monotonic, lambda: False)
+        if os.getuid() == 0:
+            os.setgroups([])
+            os.setgid(65534)
+            os.setuid(65534)
+        print(next(frames))
+    """
+    command = [sys.executable, "-B", "-c", textwrap.dedent(script), f"device {file}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == (
+        f"expected frames of device {file}, found no permission for {file}; is this user in the group that owns it, "
+        "mostly `video`?; it is tried again every second"
+    ), done.stderr
+
+
+@pytest.mark.skipif(
+    cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER), reason="this OpenCV has GStreamer, as few builds have"
+)
+def test_a_pipeline_without_gstreamer() -> None:
+    with pytest.raises(InputError, match="expected a build of OpenCV with GStreamer, found OpenCV without"):
+        first_line("gstreamer://videotestsrc ! appsink")
+
+
+def test_the_other_cameras_go_on(
+    sequence: Path, cache: Path, tmp_path: Path, small_video: Path, cameras: Cameras
+) -> None:
+    """A device that is not there, and a camera that sends another size, beside two that film."""
+    ports = [free_port() for _ in range(3)]
+    for port, video in zip(ports, ("cam1i_s.avi", "cam3i_s.avi", small_video), strict=True):
+        film(cameras, sequence / video, port)
+    videos = [f"http://127.0.0.1:{ports[0]}/", f"http://127.0.0.1:{ports[1]}/", 63]
+    laboratory = laboratory_of(
+        tmp_path,
+        sequence,
+        dict(zip(CAMERAS, [*videos, f"http://me:secret@127.0.0.1:{ports[2]}/"], strict=True)),
+    )
+    options = ["--cache", cache, "--seconds", "5", "--record", tmp_path / "kept", *EFFORT]
+    done = psotrack("live", laboratory, "--out", tmp_path / "live.csv", *options)
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    missing = "camera cam5: expected frames of device 63, found no /dev/video63; is the camera plugged in?"
+    assert lines.count(f"psotrack: warning: {missing}; it is tried again every second") == 1
+    size = (
+        "expected images of 672 x 378 pixels, as the rig says, found 64 x 48; let the camera send this size"
+    )
+    assert sum(f"camera cam7: http://me:***@127.0.0.1:{ports[2]}/: {size}" in line for line in lines) == 1
+    assert "secret" not in done.stderr
+    assert "Traceback" not in done.stderr
+    record = json.loads((tmp_path / "live.json").read_text())
+    assert record["frames"] > 10
+    assert open_recording(tmp_path / "kept").rig.names == CAMERAS[:2]
+    unknown = psotrack("live", laboratory, "--lines", "--cameras", "cam1,cam9", "--cache", cache)
+    assert unknown.returncode == 2
+    assert unknown.stderr.startswith("psotrack: cameras: expected some of cam1, cam3, cam5, cam7, found cam9")
+
+
+def test_without_two_cameras_that_film_the_command_ends(
+    sequence: Path, cache: Path, tmp_path: Path, cameras: Cameras
+) -> None:
+    port, silent = free_port(), free_port()
+    film(cameras, sequence / "cam1i_s.avi", port)
+    address = f"http://127.0.0.1:{silent}/"
+    videos = {"cam1": f"http://127.0.0.1:{port}/", "cam3": address, "cam5": 63}
+    laboratory = laboratory_of(tmp_path, sequence, videos)
+    done = psotrack(
+        "live", laboratory, "--out", tmp_path / "live.parquet", "--record", tmp_path / "kept", "--cache", cache, *EFFORT
+    )  # fmt: skip
+    assert done.returncode == 2
+    *lines, last = done.stderr.splitlines()
+    assert last == (
+        "psotrack: the cameras: expected at least two cameras that film, found 1 of 3; the lines above say why"
+    )
+    assert sorted(line.split(", found")[0] for line in lines if "expected" in line) == [
+        f"psotrack: warning: camera cam3: expected frames of {address}",
+        "psotrack: warning: camera cam5: expected frames of device 63",
+    ]
+    # Nothing is in the way of the next attempt, but what cam1 has filmed is kept.
+    assert not list(tmp_path.glob("live*"))
+
+
+class TestFullDisk:
+    """A full disk: no space, as /dev/full has none, or a limit on the size of files."""
+
+    @pytest.fixture
+    def command(self, sequence: Path, cache: Path) -> list[object]:
+        return ["live", sequence, "--replay", "--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
+
+    @pytest.fixture
+    def full_table(self, tmp_path: Path) -> Path:
+        if not os.path.exists("/dev/full"):
+            pytest.skip("needs /dev/full")
+        (tmp_path / "live.csv").symlink_to("/dev/full")
+        return tmp_path / "live.csv"
+
+    def test_rows_that_cannot_be_written_end_the_command(
+        self, command: list[object], full_table: Path
+    ) -> None:
+        done = psotrack(*command, "--out", full_table, "--force")
+        assert done.returncode == 2
+        line = f"psotrack: {full_table}: expected to write rows, found no space left on device"
+        assert done.stderr.splitlines()[-1] == line
+        assert "Traceback" not in done.stderr
+
+    def test_other_outputs_go_on(self, command: list[object], full_table: Path) -> None:
+        done = psotrack(*command, "--out", full_table, "--force", "--lines", "--speed", "0.3")
+        assert done.returncode == 2
+        line = f"{full_table}: expected to write rows, found no space left on device"
+        assert f"psotrack: warning: {line}; tracking goes on with the other outputs" in done.stderr
+        assert done.stderr.splitlines()[-1] == f"psotrack: {line}"
+        rows = [json.loads(line) for line in done.stdout.splitlines()]
+        # To the end of the video: a busy machine leaves out a few of its frames.
+        assert max(row["frame"] for row in rows) >= NUM_FRAMES - 10
+
+    def test_lines_to_a_full_disk(self, command: list[object], full_table: Path) -> None:
+        with full_table.open("w") as full:
+            done = psotrack(*command, "--lines", "--speed", "0.3", stdout=full)
+        assert done.returncode == 2
+        assert (
+            done.stderr.splitlines()[-1]
+            == "psotrack: --lines: expected to write rows, found no space left on device"
+        )
+        assert "Exception ignored" not in done.stderr
+
+    def test_a_recording_that_does_not_fit_keeps_what_fits(
+        self, command: list[object], tmp_path: Path
+    ) -> None:
+        """Tracking goes on to the end, and the record says how many frames are on the disk."""
+        options = [*command, "--speed", "0.3"]
+        assert psotrack(*options, "--seconds", "2", "--lines").returncode == 0  # compiled programs are stored
+        most = 150_000
+        done = psotrack(
+            *options, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept",
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
+            env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert "Traceback" not in done.stderr
+        record = json.loads((tmp_path / "live.json").read_text())
+        assert record["frames"] >= NUM_FRAMES - 10
+        assert read_trajectories(tmp_path / "live.csv").frame.max() >= NUM_FRAMES - 10
+        kept = open_recording(tmp_path / "kept")
+        for name in CAMERAS:
+            counts = record["recorded"][name]
+            assert counts["frames"] + counts["left_out"] == NUM_FRAMES
+            assert 10 < counts["frames"] < NUM_FRAMES - 10
+            assert len(list(read_frames(kept.videos[name]))) == counts["frames"]
+            assert f"{name}.avi: expected " in done.stderr
+
+
+def test_an_unreachable_network_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    frame = Trajectories(
+        np.array([0]), np.array([0.0]), ("1",), np.zeros((1, 1, 3)), velocity_m_s=np.zeros((1, 1, 3)),
+        covariance_m2=np.zeros((1, 1, 3, 3)), status=np.zeros((1, 1), int),
+    )  # fmt: skip
+    # The system refuses to send to all hosts unless a program asks for it.
+    with (
+        caplog.at_level(logging.WARNING, "psotrack"),
+        contextlib.closing(UdpLines("255.255.255.255:9")) as udp,
+    ):
+        udp.write(frame)
+    found = "expected to send rows, found permission denied; tracking goes on"
+    assert caplog.messages == [f"--udp 255.255.255.255:9: {found}"]
