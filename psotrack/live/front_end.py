@@ -125,7 +125,7 @@ class RecordingNotice:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class FilesFinished:
     """The files of a camera's recording are finished.
 
     Attributes:
@@ -137,7 +137,7 @@ class Recorded:
     counts: RecordedCounts
 
 
-Message = Ready | Arrived | CameraSilhouette | Notice | Ended | RecordingNotice | Recorded
+Message = Ready | Arrived | CameraSilhouette | Notice | Ended | RecordingNotice | FilesFinished
 
 
 def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
@@ -175,7 +175,7 @@ def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
         recorder.finish()
     end_s = time.monotonic() + CLOSE_S
     for index, recorder in recorders.items():
-        send(Recorded(index, recorder.close(max(0.0, end_s - time.monotonic()))))
+        send(FilesFinished(index, recorder.close(max(0.0, end_s - time.monotonic()))))
         if recorder.loss is not None:
             send(RecordingNotice(recorder.loss))
 

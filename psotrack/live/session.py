@@ -22,11 +22,11 @@ from psotrack.live.front_end import (
     Arrived,
     CameraSilhouette,
     Ended,
+    FilesFinished,
     FilmTask,
     Message,
     Notice,
     Ready,
-    Recorded,
     RecordingNotice,
     film,
 )
@@ -381,7 +381,7 @@ class LiveSession:
                     self._missing.add(index)
             case RecordingNotice(line):
                 logger.warning("%s", line)
-            case Recorded(index, counts):
+            case FilesFinished(index, counts):
                 self.result.recorded[self._cameras[index].name] = counts
             case Ended(index, error):
                 meeting.end(index)
