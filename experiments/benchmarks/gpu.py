@@ -120,7 +120,7 @@ class TimedBatches:
     def __call__(self, *arguments: Any, **named: Any) -> list[BatchResult]:
         """Track a chunk, and wait for the result."""
         began = time.perf_counter()
-        result = track_batch(*arguments, **named, side_by_side=self.side_by_side)
+        result = track_batch(*arguments, **named | {"side_by_side": self.side_by_side})
         result = jax.block_until_ready(result)
         with self._lock:
             self.seconds += time.perf_counter() - began
