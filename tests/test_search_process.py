@@ -63,11 +63,12 @@ def test_the_process_finds_what_the_search_finds() -> None:
             found += beside.see(frame)
         # Frames without a drone bring no results, but results of before arrive with them.
         for number in range(40, 400):
-            if len(found) == len(expected):
+            if found and found[-1].last_frame >= expected[-1].last_frame:
                 break
             time.sleep(0.05)
             empty = _frame(number)
             found += beside.see(replace(empty, coverage=np.zeros_like(empty.coverage)))
+    found = [each for each in found if each.last_frame < 40]
     assert [(each.number, each.begin_frame, each.last_frame) for each in found] == [
         (each.number, each.begin_frame, each.last_frame) for each in expected
     ]
