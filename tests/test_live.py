@@ -127,16 +127,19 @@ def test_rows_come_as_lines_and_by_udp(sequence: Path, cache: Path, tmp_path: Pa
 def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> None:
     client = pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
     port = free_port()
-    live = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "psotrack", "live", f"{sequence}", "--replay", "--speed", "0.2"),
-            *("--websocket", f"{port}", "--lines", "--json", f"{tmp_path / 'live.json'}"),
-            *("--cameras", ",".join(CAMERAS), "--cache", f"{cache}", *EFFORT),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    # A pipe that nobody reads takes 64 KiB, and then stops the program.
+    lines = tmp_path / "lines.txt"
+    with lines.open("w") as out:
+        live = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "psotrack", "live", f"{sequence}", "--replay", "--speed", "0.2"),
+                *("--websocket", f"{port}", "--lines", "--json", f"{tmp_path / 'live.json'}"),
+                *("--cameras", ",".join(CAMERAS), "--cache", f"{cache}", *EFFORT),
+            ],
+            stdout=out,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
     for _ in range(1200):
         with socket.socket() as one:
             if one.connect_ex(("127.0.0.1", port)) == 0:
@@ -146,9 +149,10 @@ def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> 
     # The server listens before anything is compiled, so a client that comes then gets all rows.
     with client.connect(f"ws://127.0.0.1:{port}") as connection:
         received = list(connection)
-    out, err = live.communicate(timeout=60)
+    _, err = live.communicate(timeout=60)
     assert live.returncode == 0, err
-    assert received == out.splitlines()
+    assert received == lines.read_text().splitlines()
+    assert received, (tmp_path / "live.json").read_text()
     assert json.loads(received[-1])["status"] == "tracked"
     expected = {"clients": 1, "messages_left_out": 0}
     assert json.loads((tmp_path / "live.json").read_text())["websocket"] == expected
