@@ -71,8 +71,13 @@ def live_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def psotrack(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
     """Run the program."""
+    return python("-m", "psotrack", *arguments, **more)
+
+
+def python(*arguments: object, **more: object) -> subprocess.CompletedProcess[str]:
+    """Run Python."""
     return subprocess.run(
-        [sys.executable, "-m", "psotrack", *map(str, arguments)],
+        [sys.executable, *map(str, arguments)],
         **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **more},  # type: ignore[call-overload]
         text=True,
         timeout=300,

@@ -283,7 +283,8 @@ def test_cameras_on_the_network_stop_and_come_back(
     assert "has broken off" in err
     # Said once, not once per frame.
     assert len(err.splitlines()) < 20
-    assert read_trajectories(table).num_frames > 50
+    # Three times 60 lines, of four drones at most.
+    assert read_trajectories(table).num_frames >= 3 * 60 // 4
 
 
 def test_a_stream_that_does_not_answer_is_one_line(

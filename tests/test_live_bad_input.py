@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import os
-import resource
 import socket
 import stat
 import subprocess
@@ -14,6 +13,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -30,12 +30,14 @@ from network_cameras import (
     laboratory_of,
     live_sequence,
     psotrack,
+    python,
 )
 
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError
-from psotrack.live import CameraStream, UdpLines
+from psotrack.live import CameraStream, LiveSession, ReplayedVideo, UdpLines, live_cameras
 from psotrack.recordings import read_frames
+from psotrack.settings import TrackSettings
 from psotrack.trajectories import Trajectories, read_trajectories
 
 pytestmark = pytest.mark.slow
@@ -247,10 +249,13 @@ class TestFullDisk:
         """Tracking goes on to the end, and the record says how many frames are on the disk."""
         options = [*command, "--speed", "0.3"]
         assert psotrack(*options, "--seconds", "2", "--lines").returncode == 0  # compiled programs are stored
-        most = 150_000
-        done = psotrack(
-            *options, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept",
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
+        limited = (
+            "import resource, sys; sys.dont_write_bytecode = True; "
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)); "
+            "from psotrack.cli import main; main()"
+        )
+        done = python(
+            "-c", limited, *options, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept",
             env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
@@ -280,3 +285,51 @@ def test_an_unreachable_network_stops_nothing(caplog: pytest.LogCaptureFixture) 
         udp.write(frame)
     found = "expected to send rows, found permission denied; tracking goes on"
     assert caplog.messages == [f"--udp 255.255.255.255:9: {found}"]
+
+
+def test_a_video_that_is_gone_when_the_session_begins(
+    sequence: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recording = open_recording(sequence)
+    cameras = live_cameras(recording, CAMERAS, replay=True)
+    gone = cameras[0]
+    assert isinstance(gone.source, ReplayedVideo)
+    video = replace(gone.source.video, path=tmp_path / "gone.avi")
+    cameras[0] = replace(gone, source=replace(gone.source, video=video))
+    settings = TrackSettings().changed({"swarm.particles": 20, "swarm.iterations": 15})
+    session = LiveSession(recording, cameras, settings, most_drones=4)
+    result = session.run([], longest_s=1.0)
+    assert result.instants > 0
+    assert result.counts[gone.name].frames == 0
+    assert [
+        line for line in caplog.messages if line.startswith(f"camera {gone.name}: ") and "gone.avi" in line
+    ]
+
+
+def test_a_signal_that_comes_while_another_one_stops_the_session(sequence: Path) -> None:
+    """A signal handler that interrupted itself waited for ever."""
+    script = """
+        import os, signal, sys, threading, time
+        from psotrack.datasets import open_recording
+        from psotrack.live import LiveSession, live_cameras
+        from psotrack.settings import TrackSettings
+
+        recording = open_recording(sys.argv[1])
+        session = LiveSession(recording, live_cameras(recording, replay=True), TrackSettings())
+        signal.signal(signal.SIGINT, lambda *_: session.stop())
+        ends_s = time.monotonic() + 2
+
+        def send():
+            while time.monotonic() < ends_s:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(1e-4)  # so that not more handlers interrupt each other than Python allows
+
+        threading.Thread(target=send, daemon=True).start()
+        while time.monotonic() < ends_s:
+            session.stop()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        print("ended")
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), f"{sequence}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=40, check=False)
+    assert done.stdout == "ended\n", done.stderr

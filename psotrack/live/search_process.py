@@ -13,6 +13,8 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
 
+import jax
+
 from psotrack.errors import PsotrackError
 from psotrack.initiation import DroneSearch, FoundCandidates, SeenFrame
 from psotrack.live.front_end import Ready
@@ -82,6 +84,8 @@ def _search(search: DroneSearch, connection: Connection) -> None:
     """The worker process: compile, tell that all is ready, search in the frames that come."""
     # Where the session ends, nothing needs to be cleaned up.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # JAX would take most of a GPU's memory, which the tracker needs.
+    jax.config.update("jax_platforms", "cpu")
     search.compile()
     frames: queue.SimpleQueue[tuple[SeenFrame, PackedImage] | None] = queue.SimpleQueue()
 

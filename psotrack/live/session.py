@@ -6,7 +6,6 @@ import contextlib
 import gc
 import logging
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -225,7 +224,8 @@ class LiveSession:
             "seed": settings.seed,
             "volume": self._run.volume,
         }
-        self._stopped = threading.Event()
+        # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
+        self._is_stopped = False
         self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
         #: Cameras that have filmed, and those that have never filmed or will not film again.
@@ -235,8 +235,8 @@ class LiveSession:
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
     def stop(self) -> None:
-        """End the session after the present instant; from any thread."""
-        self._stopped.set()
+        """End the session after the present instant; from any thread or signal handler."""
+        self._is_stopped = True
 
     def run(
         self,
@@ -265,8 +265,7 @@ class LiveSession:
             began_s = time.monotonic()
             self._run.compile()
             self.result.compile_s = time.monotonic() - began_s
-            for connection in connections:
-                assert isinstance(connection.recv(), Ready)
+            early = [message for connection in connections for message in _until_ready(connection)]
             # What was made so far is not searched for garbage again and again, which takes as long as a frame.
             gc.collect()
             gc.freeze()
@@ -283,9 +282,12 @@ class LiveSession:
             names = (each.name for each in self._cameras)
             self.result.counts = dict(zip(names, self._meeting.counts, strict=True))
             self._workers = dict(zip(connections, tasks, strict=True))
+            for message in early:
+                self._take(message)
             try:
                 for connection in connections:
-                    connection.send(began_s)
+                    with contextlib.suppress(OSError):  # the worker has died
+                        connection.send(began_s)
                 self._track_all(began_s, outputs, on_instant)
             finally:
                 gc.unfreeze()
@@ -352,7 +354,7 @@ class LiveSession:
                     self._take(ready.recv())
             except (OSError, EOFError):
                 tasks = self._workers.pop(ready)
-                if not self._stopped.is_set():
+                if not self._is_stopped:
                     died = PsotrackError(
                         "a worker process", expected="frames", found="that it died", remedy="is memory short?"
                     )
@@ -393,7 +395,7 @@ class LiveSession:
     def _instants(self) -> Iterator[tuple[Instant, int]]:
         """Yield instants that are complete, and how many were left out before each."""
         meeting, wait_s = self._meeting, 0.0
-        while not self._stopped.is_set() and self._can_track and time.monotonic() < self._ends_s:
+        while not self._is_stopped and self._can_track and time.monotonic() < self._ends_s:
             self._receive(wait_s)
             now_s = time.monotonic()
             for index in meeting.stopped(now_s):
@@ -439,3 +441,10 @@ class LiveSession:
         result.drones.update(rows.drones)
         self._run.look_ahead()
         result.late_searches = self._run.num_late_searches
+
+
+def _until_ready(connection: Connection) -> Iterator[Message]:
+    """What a worker sends before it is ready: that a source has failed. A worker that dies is noticed later."""
+    with contextlib.suppress(EOFError, OSError):
+        while not isinstance(message := connection.recv(), Ready):
+            yield message
