@@ -58,3 +58,19 @@ def test_in_small_it_runs_on_the_cpu(tmp_path):
     assert np.isfinite(list(figures["mog2"]["frames_per_s"].values())).all()
     for name in ("ratio of throughputs", "distance of tracks", "another identity", "Table 5's grid", "MOG2"):
         assert name in done.stdout
+
+
+@pytest.mark.slow
+def test_a_part_alone_and_an_unknown_part(tmp_path: Path) -> None:
+    path = tmp_path / "figures.json"
+    small = ("--device", "cpu", "--small", "--data", tmp_path / "data")
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = benchmark(*small, "--only", "mog2", "--repeats", "1", "--json", path, **environment)
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(path.read_text())
+    assert figures["runs"] == []
+    assert "grid" not in figures
+    assert figures["mog2"]["same_labels"] >= 0.999
+    wrong = benchmark(*small, "--only", "S99", **environment)
+    assert wrong.returncode == 2
+    assert wrong.stderr.endswith("--only: expected some of S01_D2_A, grid, mog2, found S99\n")

@@ -1,6 +1,7 @@
 """A GPU against two cores of the same machine: Table 5's grid, many runs at once, equal tracks, background subtraction.
 
     make bench-gpu                                              # needs a GPU; simulates the sequences unless they exist
+    python experiments/benchmarks/gpu.py --only S02_D4_A mog2 --repeats 1   # parts of it
     python experiments/benchmarks/gpu.py --device cpu --small   # the same code in small, on a machine without a GPU
 
 Prints device, versions, shapes and medians, each beside what is to be reached:
@@ -152,7 +153,14 @@ def main() -> None:
     parser.add_argument("--device", choices=["gpu", "cpu"], default="gpu")
     parser.add_argument("--small", action="store_true", help="a few runs of a very short sequence")
     parser.add_argument("--data", type=Path, default=Path("data"), help="root folder of the data")
-    parser.add_argument("--json", type=Path, help="write the figures into this file, too")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="PART",
+        help="some parts in this order: names of sequences (many runs at once), grid, mog2; all by default",
+    )
+    parser.add_argument("--repeats", type=_at_least_one, help="timed calls of the runs; 3 by default")
+    parser.add_argument("--json", type=Path, help="write the figures into this file, too, after each part")
     options = parser.parse_args()
     try:
         use_device(options.device)
@@ -162,23 +170,48 @@ def main() -> None:
             "`.venv/bin/python experiments/benchmarks/gpu.py --device cpu --small` runs the same code in small on a CPU"
         )
     size = SMALL if options.small else Size()
+    if options.repeats:
+        size = replace(size, repeats=options.repeats)
+    sequences = list(_grid(size).sequences)
+    parts = options.only or [*sequences, "grid", "mog2"]
+    if unknown := sorted({*parts} - {*sequences, "grid", "mog2"}):
+        parser.error(
+            f"--only: expected some of {', '.join(sequences)}, grid, mog2, found {', '.join(unknown)}"
+        )
     cache = options.data / "silhouettes"
     keep_compiled(cache / "compiled")
     # On a CPU the same program as on a GPU, which a CPU would not choose itself.
     batches = TimedBatches(side_by_side=True)
-    figures: dict[str, Any] = {"machine": _results.machine(), "versions": _results.versions()}
+    figures: dict[str, Any] = {
+        "machine": _results.machine(),
+        "versions": _results.versions(),
+        "repeats": size.repeats,
+        "runs": [],
+    }
     print(json.dumps(figures), flush=True)
     spawn = multiprocessing.get_context("spawn")
     with (
         patch.object(chunks, "track_batch", batches),
         ProcessPoolExecutor(1, mp_context=spawn, initializer=_use_two_cores, initargs=(cache,)) as cores,
     ):
-        folders = [folder_of(name, options.data, size) for name in _grid(size).sequences]
-        figures["runs"] = [compare_runs(folder, cache, size, batches, cores) for folder in folders]
-        figures["grid"] = time_grid(folders[0].parents[1], cache, size, batches)
-        figures["mog2"] = compare_mog2(size, cores)
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        for part in parts:
+            if part == "grid":
+                folders = [folder_of(name, options.data, size) for name in sequences]
+                figures["grid"] = time_grid(folders[0].parents[1], cache, size, batches)
+            elif part == "mog2":
+                figures["mog2"] = compare_mog2(size, cores)
+            else:
+                folder = folder_of(part, options.data, size)
+                figures["runs"].append(compare_runs(folder, cache, size, batches, cores))
+            if options.json:
+                options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+def _at_least_one(text: str) -> int:
+    """A number of repeats."""
+    if (number := int(text)) < 1:
+        raise ValueError(text)
+    return number
 
 
 def _use_two_cores(cache: Path) -> None:
