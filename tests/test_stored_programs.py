@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -192,3 +193,20 @@ def test_a_program_with_a_class_from_outside_of_the_package_is_not_stored(tmp_pa
         assert traces(log, "multiplied")
     assert not list(tmp_path.glob("*multiplied*.program"))
     assert os.listdir(tmp_path)
+
+
+def test_programs_that_nobody_uses_any_more_are_removed(filled: tuple[Path, str], tmp_path: Path) -> None:
+    """A program that is loaded counts as used; the time limit is a month."""
+    folder = tmp_path / "programs"
+    shutil.copytree(filled[0], folder)
+    used = stored(folder)
+    unused, recent = folder / "unused.program", folder / "recent.program"
+    for path, days in ((used, 31), (unused, 31), (recent, 29)):
+        path.touch()
+        os.utime(path, (time.time() - days * 86400,) * 2)
+    run(SMOOTHING, folder)
+    _, log = run(OTHERS, folder)  # stores a program
+    assert "removed the compiled program unused.program" in log
+    assert used.exists()
+    assert recent.exists()
+    assert not unused.exists()

@@ -18,6 +18,7 @@ import os
 import pickle
 import platform
 import threading
+import time
 import zlib
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -49,6 +50,9 @@ _IDLE_SETTINGS = ("cache", "log", "no_tracing")
 #: Beginnings of the lines that name the processor and its features, on x86 and ARM.
 _CPU_INFO, _CPU_LINES = Path("/proc/cpuinfo"), ("model name", "flags", "Features", "CPU part")
 
+#: A program that no process has used for this time is removed when another one is stored: nothing loads the programs
+#: of an older source again. Seconds.
+_KEPT_S = 30 * 24 * 3600
 #: Largest number of programs that are loaded ahead: a run of one recording uses fewer.
 _MOST_AHEAD = 10
 
@@ -192,7 +196,18 @@ def _make(path: Path, jitted: Any, static: dict[str, Any], arguments: dict[str, 
         logger.info("%s", error)
     else:
         logger.info("stored the compiled program %s", path.name)
+        _remove_unused(path.parent)
     return compiled
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove the programs that were not used for a long time."""
+    oldest_s = time.time() - _KEPT_S
+    for path in folder.glob("*.program"):
+        with contextlib.suppress(OSError):  # another process may remove or replace the file
+            if path.stat().st_mtime < oldest_s:
+                path.unlink()
+                logger.info("removed the compiled program %s, which was not used for a long time", path.name)
 
 
 @contextlib.contextmanager
