@@ -250,7 +250,7 @@ class TestFullDisk:
         options = [*command, "--speed", "0.3"]
         assert psotrack(*options, "--seconds", "2", "--lines").returncode == 0  # compiled programs are stored
         limited = (
-            "import resource, sys; sys.dont_write_bytecode = True; "
+            "import resource; "
             "resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)); "
             "from psotrack.cli import main; main()"
         )

@@ -159,7 +159,7 @@ def main() -> None:
         metavar="PART",
         help="some parts in this order: names of sequences (many runs at once), grid, mog2; all by default",
     )
-    parser.add_argument("--repeats", type=_at_least_one, help="timed calls of the runs; 3 by default")
+    parser.add_argument("--repeats", type=int, help="timed calls of the runs; 3 by default")
     parser.add_argument("--json", type=Path, help="write the figures into this file, too, after each part")
     options = parser.parse_args()
     try:
@@ -170,7 +170,9 @@ def main() -> None:
             "`.venv/bin/python experiments/benchmarks/gpu.py --device cpu --small` runs the same code in small on a CPU"
         )
     size = SMALL if options.small else Size()
-    if options.repeats:
+    if options.repeats is not None:
+        if options.repeats < 1:
+            parser.error(f"--repeats: expected at least 1, found {options.repeats}")
         size = replace(size, repeats=options.repeats)
     sequences = list(_grid(size).sequences)
     parts = options.only or [*sequences, "grid", "mog2"]
@@ -205,13 +207,6 @@ def main() -> None:
                 figures["runs"].append(compare_runs(folder, cache, size, batches, cores))
             if options.json:
                 options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-
-
-def _at_least_one(text: str) -> int:
-    """A number of repeats."""
-    if (number := int(text)) < 1:
-        raise ValueError(text)
-    return number
 
 
 def _use_two_cores(cache: Path) -> None:

@@ -444,7 +444,7 @@ class LiveSession:
 
 
 def _until_ready(connection: Connection) -> Iterator[Message]:
-    """What a worker sends before it is ready: that a source has failed. A worker that dies is noticed later."""
+    """The messages of a worker up to `Ready`, such as that a source has failed. A worker that dies is noticed later."""
     with contextlib.suppress(EOFError, OSError):
         while not isinstance(message := connection.recv(), Ready):
             yield message
