@@ -337,7 +337,8 @@ def test_gradients_equal_those_of_the_oracle(images, shift_m):
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         value, gradients = _gradients(RIG.cameras, images, place_m, SIZES_M, offset_m)
     of_place, of_size, of_offset = (np.asarray(gradient) for gradient in gradients)
-    np.testing.assert_allclose(of_offset, of_place, rtol=1e-9)
+    # A drone whose windows are outside the images has a gradient of zero: what float64 leaves of it, far below 1 / m.
+    np.testing.assert_allclose(of_offset, of_place, rtol=1e-9, atol=1e-15)
     for drone in range(2):
 
         def oracle(off, larger, drone=drone):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import box_sum, of_packed_box_sums, pack, summed_area_table
+from psotrack.silhouettes import box_sum, pack, packed_box_sums, summed_area_table
 from psotrack.silhouettes.summed_area import LOW_BITS
 
 table_of = jax.jit(summed_area_table)
@@ -148,15 +148,11 @@ def both_sums(low, high, boxes):
     """(2, sets, boxes), of the low and the high image, from one table; boxes (sets, boxes, 4)."""
 
     @jax.jit
-    def one(table, part, *edges):
-        def pick(low, high, part):
-            return (1 - part) * low + part * high
+    def sums(low, high, *edges):
+        table = summed_area_table(pack(low, high))
+        return packed_box_sums(table, jnp.zeros(edges[0].shape[1], jnp.int32), *edges)
 
-        return of_packed_box_sums(pick, table, jnp.zeros(edges[0].shape[1], jnp.int32), *edges, part)
-
-    table = jax.jit(lambda low, high: summed_area_table(pack(low, high)))(low, high)
-    edges = jnp.moveaxis(jnp.asarray(boxes, jnp.float32), -1, 0)
-    return np.stack([one(table, jnp.full_like(edges[0], part), *edges) for part in (0, 1)])
+    return np.stack(sums(low, high, *jnp.moveaxis(jnp.asarray(boxes, jnp.float32), -1, 0)))
 
 
 def test_packed_sums_are_those_of_either_image():
@@ -185,9 +181,8 @@ def test_gradient_of_packed_sums_is_that_of_either_image():
 
     def packed_product(edges):
         table = summed_area_table(pack(jnp.asarray(low), jnp.asarray(high)))
-        return of_packed_box_sums(
-            lambda low, high: low * high, table, jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)
-        ).sum()
+        low_sum, high_sum = packed_box_sums(table, jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1))
+        return (low_sum * high_sum).sum()
 
     def separate_product(edges):
         box_sums = (

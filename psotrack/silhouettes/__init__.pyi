@@ -16,7 +16,7 @@ from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, frames_to_decode, ignored_pixels, key_of, open_stored, reduced_shape
-from .summed_area import box_sum, of_packed_box_sums, pack, summed_area_table
+from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
 __all__ = [
@@ -49,9 +49,9 @@ __all__ = [
     "key_of",
     "masks_out",
     "moved_by",
-    "of_packed_box_sums",
     "open_stored",
     "pack",
+    "packed_box_sums",
     "reduce_frame",
     "reduced_shape",
     "scaled_settings",

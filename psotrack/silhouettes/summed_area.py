@@ -64,67 +64,60 @@ def pack(low: Integer[Array, "*image"], high: Bool[Array, "*image"]) -> Int[Arra
 def box_sum(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
-    x0: Float[Array, "sets *#boxes"],
-    y0: Float[Array, "sets *#boxes"],
-    x1: Float[Array, "sets *#boxes"],
-    y1: Float[Array, "sets *#boxes"],
-) -> Float[Array, "sets *boxes"]:
-    """Sums over sets of fractional boxes, each box in the table of its camera.
+    x0: Float[Array, "*#boxes"],
+    y0: Float[Array, "*#boxes"],
+    x1: Float[Array, "*#boxes"],
+    y1: Float[Array, "*#boxes"],
+) -> Float[Array, "*boxes"]:
+    """Sums over fractional boxes, each box in the table of its camera.
 
     Boxes are clipped at the image's border. A box outside the image, or with edges in the wrong order, has sum 0. The
     sums are differentiable in the corners almost everywhere.
 
     Args:
         tables: (height + 1, cameras, width + 1), from `summed_area_table`.
-        camera: index of the table that each box of a set reads.
-        x0, y0, x1, y1: (sets, ...), edges in pixels of the image, half-open.
+        camera: index of the table that each box reads.
+        x0, y0, x1, y1: edges in pixels of the image, half-open.
 
     Returns:
-        (sets, ...), float32, in units of the image times pixels.
+        Sums, float32, in units of the image times pixels.
     """
-    return _map_sets(tables, camera, (x0, y0, x1, y1), _unpacked_part, lambda total: total)
+    (total,) = _box_sums(tables, camera, (x0, y0, x1, y1), lambda total: (total,))
+    return total
 
 
-def of_packed_box_sums(
-    then: Callable[..., Array],
+def packed_box_sums(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
-    x0: Float[Array, "sets *#boxes"],
-    y0: Float[Array, "sets *#boxes"],
-    x1: Float[Array, "sets *#boxes"],
-    y1: Float[Array, "sets *#boxes"],
-    *given: Float[Array, "sets *#boxes"],
-) -> Float[Array, "sets *boxes"]:
-    """Apply a function to the box sums of two images that are packed into one table; boxes as in `box_sum`.
+    x0: Float[Array, "*#boxes"],
+    y0: Float[Array, "*#boxes"],
+    x1: Float[Array, "*#boxes"],
+    y1: Float[Array, "*#boxes"],
+) -> tuple[Float[Array, "*boxes"], Float[Array, "*boxes"]]:
+    """Sums of two images that are packed into one table; boxes as in `box_sum`.
 
     Args:
-        then: function of one set's sums of the first image, sums of the second image, and values of `given`. It is
-            called inside the loop, because XLA on a CPU would read the tables twice for two results.
         tables, camera, x0, y0, x1, y1: as in `box_sum`; the tables are of images from `pack`.
-        given: (sets, ...), further arguments of `then`.
+
+    Returns:
+        Sums of the first image, and sums of the second image.
     """
-    return _map_sets(tables, camera, (x0, y0, x1, y1), _packed_parts, then, *given)
+    low, high = _box_sums(tables, camera, (x0, y0, x1, y1), _unpacked)
+    return low, high
 
 
-def _unpacked_part(total: Array, dtype: Any) -> tuple[Array, ...]:
-    return (total.astype(dtype),)
-
-
-def _packed_parts(total: Array, dtype: Any) -> tuple[Array, ...]:
+def _unpacked(total: Array) -> tuple[Array, Array]:
     # A logical shift, because the highest bit belongs to the number and is no sign.
-    low, high = total & ((1 << LOW_BITS) - 1), jax.lax.shift_right_logical(total, jnp.int32(LOW_BITS))
-    return low.astype(dtype), high.astype(dtype)
+    return total & ((1 << LOW_BITS) - 1), jax.lax.shift_right_logical(total, jnp.int32(LOW_BITS))
 
 
-def _map_sets(
+def _box_sums(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
-    edges: tuple[Float[Array, "sets *#boxes"], ...],
-    parts: Callable[[Array, Any], tuple[Array, ...]],
-    then: Callable[..., Array],
-    *given: Float[Array, "sets *#boxes"],
-) -> Float[Array, "sets *boxes"]:
-    """Apply `then` to the sums of each set of boxes; `parts` splits a sum into the sums of the packed images."""
+    edges: tuple[Float[Array, "*#boxes"], ...],
+    unpacked: Callable[[Array], tuple[Array, ...]],
+) -> tuple[Float[Array, "*boxes"], ...]:
+    """Sums of boxes; `unpacked` splits whole sums into those of the images that share the tables."""
     x0, y0, x1, y1 = edges
     height1, num_cameras, width1 = tables.shape
     flat, row = jnp.reshape(tables, -1), num_cameras * width1
@@ -141,32 +134,26 @@ def _map_sets(
 
     def read(index: Array) -> Array:
         # Indices are in bounds by construction, and a check in the tracker's innermost loop would cost time.
-        return flat.at[index].get(mode="promise_in_bounds")
+        return flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    def floats(total: Array) -> tuple[Array, ...]:
+        return tuple(part.astype(x0.dtype) for part in unpacked(total))
 
     def corner(index: Array, fx: Array, fy: Array) -> tuple[Array, tuple[Array, ...]]:
         # The table at the cell's corner, and the part that bilinear interpolation adds. Integers are subtracted before
         # the conversion to float32, because the sums of a 1080p image exceed 2^24. Each difference is the sum over a
-        # box, so `parts` can split it.
+        # box, so `unpacked` can split the difference.
         here, right, below, across = (read(index + step) for step in (0, 1, row, row + 1))
-        steps = (
-            parts(step, fx.dtype) for step in (right - here, below - here, across - below - right + here)
-        )
+        steps = (floats(step) for step in (right - here, below - here, across - below - right + here))
         added = tuple(
             fx * right + fy * below + (fx * fy) * across for right, below, across in zip(*steps, strict=True)
         )
         return here, added
 
-    def one_set(of_set: tuple[Array, ...]) -> Array:
-        index00, index10, index01, index11, fx0, fx1, fy0, fy1, *rest = of_set
-        (c00, f00), (c10, f10) = corner(index00, fx0, fy0), corner(index10, fx1, fy0)
-        (c01, f01), (c11, f11) = corner(index01, fx0, fy1), corner(index11, fx1, fy1)
-        whole = parts((c11 - c01) - (c10 - c00), fx0.dtype)
-        sums = (
-            of + ((a11 - a01) - (a10 - a00))
-            for of, a00, a10, a01, a11 in zip(whole, f00, f10, f01, f11, strict=True)
-        )
-        return then(*sums, *rest)
-
-    # One set at a time, because XLA on a CPU would else compute all indices again for each of the sixteen reads.
-    cells = (row0 + i0, row0 + i1, row1 + i0, row1 + i1)
-    return jax.lax.map(one_set, (*cells, fx0, fx1, fy0, fy1, *given))
+    (c00, f00), (c10, f10) = corner(row0 + i0, fx0, fy0), corner(row0 + i1, fx1, fy0)
+    (c01, f01), (c11, f11) = corner(row1 + i0, fx0, fy1), corner(row1 + i1, fx1, fy1)
+    whole = floats((c11 - c01) - (c10 - c00))
+    return tuple(
+        of + ((a11 - a01) - (a10 - a00))
+        for of, a00, a10, a01, a11 in zip(whole, f00, f10, f01, f11, strict=True)
+    )
