@@ -22,6 +22,13 @@ def benchmark(*words: object, **environment: str) -> subprocess.CompletedProcess
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
+def benchmark_in_small(*words: object) -> subprocess.CompletedProcess[str]:
+    # With the suite's cache of compiled programs. The benchmark chooses its own number of devices, as it does where
+    # XLA_FLAGS says nothing.
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    return benchmark("--device", "cpu", "--small", *words, **environment)
+
+
 @pytest.mark.slow
 def test_without_a_gpu_a_line_says_what_to_do(tmp_path):
     # An empty list of visible devices hides a GPU from JAX.
@@ -39,10 +46,7 @@ def test_without_a_gpu_a_line_says_what_to_do(tmp_path):
 def test_in_small_it_runs_on_the_cpu(tmp_path):
     """The figures of time say nothing here; tracks and labels must be the same as on a GPU."""
     path = tmp_path / "figures.json"
-    # With the suite's cache of compiled programs. The benchmark chooses its own number of devices, as it does where
-    # XLA_FLAGS says nothing.
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = benchmark("--device", "cpu", "--small", "--data", tmp_path / "data", "--json", path, **environment)
+    done = benchmark_in_small("--data", tmp_path / "data", "--json", path)
     assert done.returncode == 0, done.stderr
     figures = json.loads(path.read_text())
     (runs,) = figures["runs"]
@@ -63,14 +67,13 @@ def test_in_small_it_runs_on_the_cpu(tmp_path):
 @pytest.mark.slow
 def test_a_part_alone_and_an_unknown_part(tmp_path: Path) -> None:
     path = tmp_path / "figures.json"
-    small = ("--device", "cpu", "--small", "--data", tmp_path / "data")
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = benchmark(*small, "--only", "mog2", "--repeats", "1", "--json", path, **environment)
+    data = ("--data", tmp_path / "data")
+    done = benchmark_in_small(*data, "--only", "mog2", "--repeats", "1", "--json", path)
     assert done.returncode == 0, done.stderr
     figures = json.loads(path.read_text())
     assert figures["runs"] == []
     assert "grid" not in figures
     assert figures["mog2"]["same_labels"] >= 0.999
-    wrong = benchmark(*small, "--only", "S99", **environment)
+    wrong = benchmark_in_small(*data, "--only", "S99")
     assert wrong.returncode == 2
     assert wrong.stderr.endswith("--only: expected some of S01_D2_A, grid, mog2, found S99\n")

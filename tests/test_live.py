@@ -301,6 +301,7 @@ def test_a_stream_that_does_not_answer_is_one_line(
     )
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("does not answer") == 1
+    assert "has stopped" not in done.stderr
     record = json.loads((tmp_path / "live.json").read_text())
     assert record["camera_frames"][names[0]]["frames"] == 0
     assert record["camera_frames"][names[1]]["frames"] > 10

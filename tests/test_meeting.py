@@ -153,6 +153,18 @@ def test_a_camera_that_stops_is_not_waited_for_and_comes_back() -> None:
     assert meeting.films == [True, True, True]
 
 
+def test_a_camera_that_begins_late_has_not_stopped() -> None:
+    meeting = _meeting(2)
+    _put(meeting, 0, 0, 1.1, 1.1)
+    assert meeting.stopped(1.2) == [1]
+    assert meeting.films == [True, False]
+    assert _put(meeting, 1, 1, 2.0, 2.0)
+    assert meeting.films[1]
+    assert meeting.counts[1].stops == 0
+    assert meeting.stopped(3.5) == [0, 1]
+    assert [counts.stops for counts in meeting.counts] == [1, 1]
+
+
 @pytest.mark.parametrize("drift", [-3e-3, 3e-3])
 def test_a_clock_that_drifts_drops_or_doubles_a_frame_at_times(drift: float) -> None:
     meeting = _meeting(2)

@@ -23,8 +23,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.pipeline import environment, track_runs
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
-from psotrack.support import keep_compiled
-from psotrack.sweep import share_processors
+from psotrack.support import keep_compiled, share_processors
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

@@ -47,8 +47,8 @@ from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute
 from psotrack.silhouettes.mog2_jax import Mog2Params, mog2_init, mog2_step
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.support import keep_compiled, progress_bar
-from psotrack.sweep import read_grid, share_processors, sweep, use_device
+from psotrack.support import keep_compiled, progress_bar, share_processors, use_device
+from psotrack.sweep import read_grid, sweep
 from psotrack.tracking import chunks
 from psotrack.tracking.batch import BatchResult, track_batch
 from psotrack.trajectories import Status, Trajectories

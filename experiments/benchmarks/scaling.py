@@ -59,7 +59,7 @@ from psotrack.pipeline.stages import initial_states
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import COLOURS, no_progress, save_figure
+from psotrack.support import COLOURS, no_progress, processors, save_figure
 from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -412,11 +412,6 @@ def draw(figure: Figure, rows: pd.DataFrame, fits: Mapping[str, Mapping[str, Map
         panel.minorticks_off()
         panel.legend(fontsize=7)
         panel.grid(alpha=0.3)
-
-
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def peak_gb() -> float:

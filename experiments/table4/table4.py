@@ -105,8 +105,7 @@ def at_hand(data: Path) -> list[str]:
 
 def tracked(cells: dict, out: Path, data: Path) -> pd.DataFrame:
     """One row per sequence and method; cells that are finished in `out` are not run again."""
-    from psotrack.support import keep_compiled
-    from psotrack.sweep import share_processors
+    from psotrack.support import keep_compiled, share_processors
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")

@@ -87,8 +87,7 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
 
 def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
     """One row per cell and run; cells that are finished in `out` are not run again."""
-    from psotrack.support import keep_compiled
-    from psotrack.sweep import share_processors
+    from psotrack.support import keep_compiled, share_processors
 
     share_processors()
     keep_compiled(out / "cache" / "compiled")

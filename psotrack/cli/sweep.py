@@ -11,10 +11,10 @@ import click
 from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, cache_folder, compiled_folder
 from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.errors import SettingsError
-from psotrack.support import Report, refuse_to_overwrite
+from psotrack.support import Device, Report, refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.sweep import Cluster, Device, Grid, Inputs, Store, SweepOutcome
+    from psotrack.sweep import Cluster, Grid, Inputs, Store, SweepOutcome
 
 
 @click.command()
@@ -131,8 +131,8 @@ def _run_here(
     report: Report,
 ) -> SweepOutcome:
     """Run the cells in this process."""
-    from psotrack.support import keep_compiled
-    from psotrack.sweep import run_in_process, share_processors, use_device
+    from psotrack.support import keep_compiled, share_processors, use_device
+    from psotrack.sweep import run_in_process
 
     share_processors()
     if device is not None:
@@ -145,7 +145,8 @@ def _run_on_cluster(
     grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster, report: Report
 ) -> SweepOutcome:
     """Run the cells as tasks of a cluster's workers."""
-    from psotrack.sweep import run_on_cluster, use_device
+    from psotrack.support import use_device
+    from psotrack.sweep import run_on_cluster
 
     use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
     return run_on_cluster(grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=report)

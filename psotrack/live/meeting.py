@@ -74,7 +74,8 @@ class _Camera:
     last_time_s: float = -np.inf
     last_came_s: float = -np.inf
     in_work_s: float | None = None
-    films: bool = False
+    films: bool = True
+    has_filmed: bool = False
     has_ended: bool = False
     counts: CameraCounts = field(default_factory=CameraCounts)
 
@@ -99,7 +100,6 @@ class Meeting:
         self._cameras = [_Camera(1 / each) for each in fps]
         for camera in self._cameras:
             camera.last_came_s = began_s
-            camera.films = True
         self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
         self._wait_s, self._first_s = wait_s, first_s
         self._next = 0
@@ -118,11 +118,12 @@ class Meeting:
         """A frame of a camera has come, and is in work: its instant waits for `put` or `leave_out`.
 
         Returns:
-            Whether the camera has come back with it.
+            Whether the camera was not waited for until now.
         """
         camera = self._cameras[index]
         is_back = not camera.films and not camera.has_ended
-        camera.films, camera.last_came_s, camera.in_work_s = True, now_s, time_s
+        camera.films, camera.has_filmed = True, True
+        camera.last_came_s, camera.in_work_s = now_s, time_s
         return is_back
 
     def leave_out(self, index: int) -> None:
@@ -162,12 +163,12 @@ class Meeting:
         camera.films, camera.has_ended = False, True
 
     def stopped(self, now_s: float) -> list[int]:
-        """Cameras that have just stopped; they are not waited for until they film again."""
+        """Cameras that have just stopped, or have not begun in time; they are not waited for until they film."""
         found = []
         for index, camera in enumerate(self._cameras):
             if camera.films and now_s - camera.last_came_s > STOPPED_S:
                 camera.films = False
-                camera.counts.stops += 1
+                camera.counts.stops += camera.has_filmed
                 found.append(index)
         return found
 

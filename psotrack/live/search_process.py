@@ -13,13 +13,11 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from typing import Any
 
-import jax
-
 from psotrack.errors import PsotrackError
 from psotrack.initiation import DroneSearch, FoundCandidates, SeenFrame
 from psotrack.live.front_end import Ready
 from psotrack.live.packed_image import PackedImage
-from psotrack.support import with_traceback, worker_processes
+from psotrack.support import use_device, with_traceback, worker_processes
 
 #: Priority of the search below that of the cameras and the tracker, as of `nice`.
 _NICE = 5
@@ -84,8 +82,7 @@ def _search(search: DroneSearch, connection: Connection) -> None:
     """The worker process: compile, tell that all is ready, search in the frames that come."""
     # Where the session ends, nothing needs to be cleaned up.
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    # JAX would take most of a GPU's memory, which the tracker needs.
-    jax.config.update("jax_platforms", "cpu")
+    use_device("cpu")  # JAX would take most of a GPU's memory, which the tracker needs.
     search.compile()
     frames: queue.SimpleQueue[tuple[SeenFrame, PackedImage] | None] = queue.SimpleQueue()
 

@@ -366,10 +366,11 @@ class LiveSession:
         match message:
             case Arrived(index, time_s):
                 self._said[index] = ""
-                self._have_filmed.add(index)
                 self._missing.discard(index)
                 if meeting.announce(index, time_s, time.monotonic()):
-                    logger.warning("camera %s films again", self._cameras[index].name)
+                    again = " again" if index in self._have_filmed else ""
+                    logger.warning("camera %s films%s", self._cameras[index].name, again)
+                self._have_filmed.add(index)
             case CameraSilhouette(index, time_s, arrived_s, coverage):
                 if coverage is None:
                     meeting.leave_out(index)
@@ -399,7 +400,10 @@ class LiveSession:
             self._receive(wait_s)
             now_s = time.monotonic()
             for index in meeting.stopped(now_s):
-                logger.warning("camera %s has stopped", self._cameras[index].name)
+                if index in self._have_filmed:
+                    logger.warning("camera %s has stopped", self._cameras[index].name)
+                elif not self._said[index]:  # else it is said already why
+                    logger.warning("camera %s: no frame came so far", self._cameras[index].name)
             ready: list[Instant] = []
             while (instant := meeting.take(now_s)) is not None:
                 ready.append(instant)

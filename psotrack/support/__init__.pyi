@@ -1,5 +1,6 @@
 from .compiled import drop_programs_if_many, keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
+from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, drone_colour, save_figure
 from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
@@ -14,6 +15,7 @@ __all__ = [
     "COLOURS",
     "Advance",
     "Column",
+    "Device",
     "PluginKind",
     "Report",
     "Table",
@@ -36,6 +38,7 @@ __all__ = [
     "no_progress",
     "plain",
     "plugin_names",
+    "processors",
     "progress_bar",
     "read_rows",
     "read_table",
@@ -44,11 +47,13 @@ __all__ = [
     "refuse_to_overwrite",
     "register_plugin",
     "save_figure",
+    "share_processors",
     "short_repr",
     "standard_error",
     "stored_jit",
     "toml_key",
     "toml_value",
+    "use_device",
     "user_cache",
     "with_traceback",
     "worker_processes",

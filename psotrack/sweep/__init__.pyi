@@ -3,7 +3,6 @@ from .estimates import estimate
 from .frames import sweep
 from .grid_files import Cell, Grid, Perturbation, cameras_label, cell_key, grid, read_grid
 from .inputs import Inputs
-from .machine import Device, share_processors, use_device
 from .perturbations import delays_frames, perturb
 from .printing import render_table
 from .runner import SweepOutcome, run_in_process
@@ -13,7 +12,6 @@ from .tables import pivot
 __all__ = [
     "Cell",
     "Cluster",
-    "Device",
     "Grid",
     "Inputs",
     "Perturbation",
@@ -30,7 +28,5 @@ __all__ = [
     "render_table",
     "run_in_process",
     "run_on_cluster",
-    "share_processors",
     "sweep",
-    "use_device",
 ]

@@ -20,12 +20,20 @@ from typing import TYPE_CHECKING, Any
 
 from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.silhouettes import compute
-from psotrack.support import Report, keep_compiled, no_progress
+from psotrack.support import (
+    Device,
+    Report,
+    keep_compiled,
+    no_progress,
+    processors,
+    share_processors,
+    use_device,
+)
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.locks import POLL_S
-from psotrack.sweep.machine import Device, processors, provenance, share_processors, use_device
+from psotrack.sweep.machine import provenance
 from psotrack.sweep.runner import (
     Result,
     SweepOutcome,

@@ -1,63 +1,17 @@
-"""Choice of the device, and the origin of results: device, processor, versions and commit."""
+"""The origin of results: device, processor, versions and commit."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import platform
 import subprocess
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from psotrack.errors import SettingsError
 from psotrack.pipeline import environment
-
-Device = Literal["cpu", "gpu"]
+from psotrack.support import processors
 
 _PACKAGE = Path(__file__).parents[1]
-
-
-def use_device(device: Device) -> None:
-    """Make JAX compute on a device. Call it before JAX uses any device.
-
-    Raises:
-        SettingsError: JAX does not find the device, or already uses another device.
-    """
-    import jax
-
-    jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    remedy = "a GPU needs NVIDIA's driver and `pip install 'psotrack[cuda]'`" if device == "gpu" else ""
-    try:
-        found = jax.default_backend()
-    except (RuntimeError, AssertionError) as error:
-        # JAX raises AssertionError if it is installed without support for the device.
-        why = str(error).partition("\n")[0] or "no device that JAX can use"
-        raise SettingsError("--device", expected=f"a {device}", found=why, remedy=remedy) from error
-    if found != device:
-        raise SettingsError(
-            "--device", expected=f"a {device}", found=f"{found} in use already", remedy=remedy
-        )
-
-
-def share_processors(count: int | None = None) -> None:
-    """Make JAX treat processors as separate devices, which share the runs of a batch. Call it before JAX uses a device.
-
-    Nothing changes if the user has set XLA_FLAGS, or if JAX already uses a device.
-
-    Args:
-        count: number of devices; None is one per processor that this process may use.
-    """
-    import jax
-
-    if "XLA_FLAGS" not in os.environ:
-        with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", count or processors())
-
-
-def processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def provenance() -> dict[str, Any]:
