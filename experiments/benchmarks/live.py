@@ -6,8 +6,9 @@
 
 `delay` replays eight videos of 1920 x 1080 pixels at their own rate, in a program of its own, and prints how long the
 rows come after the last camera's frame. `memory` replays four small videos again and again and prints the memory of the
-program and its processes. `stops` lets one of five small cameras stop for 10 s, again and again, and prints for how
-many frames a drone was lost although three other cameras had it in view. Recordings are simulated unless they exist.
+program and its processes. `stops` lets one of five small cameras stop for 10 s, again and again, in sessions of a
+minute, and prints for how many frames a drone was lost although three other cameras had it in view. Recordings are
+simulated unless they exist.
 """
 
 from __future__ import annotations
@@ -215,8 +216,21 @@ def _is_stopped(time_s: float | np.ndarray) -> Any:
 def stops(data: Path, stops: int, camera: str, results: Path | None) -> None:
     """Lose a camera for 10 s and get it back, again and again: drones that three other cameras see are not lost."""
     run = _results.Run("live_stops")
-    seconds = stops * (_STOPPED_S + _FILMS_S)
-    recording = open_recording(_small(data, round(seconds))).usable(["cam1", "cam2", "cam3", "cam5", "cam7"])
+    recording = open_recording(_small(data)).usable(["cam1", "cam2", "cam3", "cam5", "cam7"])
+    each = int(_SMALL_S // (_STOPPED_S + _FILMS_S))
+    rows = []
+    for session in range(-(-stops // each)):
+        rows.append({"session": session} | _with_stops(recording, camera))
+        click.echo(json.dumps(rows[-1]))
+    table = pd.DataFrame(rows)
+    figures = table.drop(columns=["session", "drones"]).sum().astype(int).to_dict()
+    click.echo(json.dumps(figures))
+    if results:
+        run.save(results, rows=table, figures=figures)
+
+
+def _with_stops(recording: Recording, camera: str) -> dict[str, int]:
+    """A session in which a camera stops again and again."""
     cameras = [
         replace(each, source=_Stopping(each.source)) if each.name == camera else each  # type: ignore[arg-type]
         for each in live_cameras(recording, replay=True)
@@ -226,15 +240,12 @@ def stops(data: Path, stops: int, camera: str, results: Path | None) -> None:
         with RowStream(Path(out) / "tracks.csv") as rows:
             result = session.run([rows])
         found = read_trajectories(Path(out) / "tracks.csv")
-    figures = _lost(recording, found, camera) | {
+    return _lost(recording, found, camera) | {
         "stops": result.counts[camera].stops,
         "instants": result.instants,
         "instants_left_out": result.left_out,
         "drones": len(result.drones),
     }
-    click.echo(json.dumps(figures))
-    if results:
-        run.save(results, figures=figures)
 
 
 def _lost(recording: Recording, found: Any, camera: str) -> dict[str, int]:
@@ -267,13 +278,13 @@ def _runs(flags: np.ndarray) -> np.ndarray:
     return np.argwhere(change < 0)[:, 1] - np.argwhere(change > 0)[:, 1]
 
 
-def _small(data: Path, seconds: int = _SMALL_S) -> Path:
+def _small(data: Path) -> Path:
     """A recording of small videos, which is made if it is missing."""
-    root = data / f"live_{seconds}s"
+    root = data / f"live_{_SMALL_S}s"
     folder = root / "Simulated_Data" / "S02_D4_A"
     if not folder.exists():
         recipe = change_scenario(
-            scenario("S02_D4_A"), {"num_frames": seconds * FPS, "limits.min_distance_m": 0.3}
+            scenario("S02_D4_A"), {"num_frames": _SMALL_S * FPS, "limits.min_distance_m": 0.3}
         )
         settings = SimulationSettings(scale=_SCALE, masks=False, onboard=False)
         simulate(recipe, root, settings, report=progress_bar)
