@@ -1,7 +1,7 @@
 """`psotrack live` with replayed cameras: delay of the rows, memory over an hour, and cameras that stop and come back.
 
     python experiments/benchmarks/live.py delay --data data
-    python experiments/benchmarks/live.py memory --data data --minutes 60 --speed 6
+    python experiments/benchmarks/live.py memory --data data --minutes 60 --speed 3
     python experiments/benchmarks/live.py stops --data data --stops 20
 
 `delay` replays eight videos of 1920 x 1080 pixels at their own rate, in a program of its own, and prints how long the
@@ -124,7 +124,9 @@ def _delays(record: dict[str, Any]) -> dict[str, float]:
 @main.command()
 @_DATA
 @click.option("--minutes", default=60.0, help="Minutes of video that are replayed.")
-@click.option("--speed", default=6.0, help="Seconds of video per second.")
+@click.option(
+    "--speed", default=3.0, help="Seconds of video per second; two cores track four small cameras at 3."
+)
 @_RESULTS
 def memory(data: Path, minutes: float, speed: float, results: Path | None) -> None:
     """Memory of the program and its processes while four small videos are replayed again and again."""
