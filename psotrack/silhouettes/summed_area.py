@@ -72,8 +72,10 @@ def box_sum(
     """Sums over fractional boxes, each box in the table of its camera.
 
     Boxes are clipped at the image's border. A box outside the image, or with edges in the wrong order, has sum 0. The
-    sums are differentiable in the corners almost everywhere. Boxes about the same middles in several sizes are faster one
-    size at a time, in `jax.lax.map`, because XLA on a CPU would compute all indices again for each of the sixteen reads.
+    sums are differentiable in the corners almost everywhere.
+
+    Boxes about the same middles in several sizes are faster one size at a time, in `jax.lax.map`, because XLA on a CPU
+    would compute all indices again for each of the sixteen reads.
 
     Args:
         tables: (height + 1, cameras, width + 1), from `summed_area_table`.
