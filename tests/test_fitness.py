@@ -255,6 +255,20 @@ def test_a_particle_alone_scores_the_same():
     np.testing.assert_allclose(together[:3], alone, atol=1e-4)
 
 
+@SETTINGS
+def test_a_particle_costs_the_same_among_many(settings):
+    """From 4,096 scores on, XLA once divided the program and computed one part again and again."""
+
+    def operations(count):
+        cameras, size_m = float32((RIG.cameras, SIZES_M))
+        inputs = score_inputs(cameras, size_m, summed_area_table(IMAGES), settings, reduction=2)
+        of_inputs = jax.jit(partial(drone_fitness, inputs))
+        return of_inputs.lower(float32(particles(count))).compile().cost_analysis()["flops"]
+
+    # The program may be divided otherwise, but it may not compute twice as much for each particle.
+    assert operations(1000) < 1.2 * 10 * operations(100)
+
+
 @given(st.lists(st.floats(-20, 20, width=32), min_size=6, max_size=6), st.integers(0, 2**16))
 def test_fitness_is_in_0_to_1_or_undefined(position_m, seed):
     """Positions are inside and outside the room, behind and inside cameras; silhouettes are noise."""

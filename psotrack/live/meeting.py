@@ -114,6 +114,11 @@ class Meeting:
         """Whether each camera films."""
         return [camera.films for camera in self._cameras]
 
+    @property
+    def have_filmed(self) -> list[bool]:
+        """Whether each camera has filmed."""
+        return [camera.has_filmed for camera in self._cameras]
+
     def announce(self, index: int, time_s: float, now_s: float) -> bool:
         """A frame of a camera has come, and is in work: its instant waits for `put` or `leave_out`.
 

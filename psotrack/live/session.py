@@ -228,8 +228,7 @@ class LiveSession:
         self._is_stopped = False
         self._workers: dict[Connection, list[FilmTask]] = {}
         self._failed: list[BaseException] = []
-        #: Cameras that have filmed, and those that have never filmed or will not film again.
-        self._have_filmed: set[int] = set()
+        #: Cameras that have never filmed or will not film again.
         self._missing: set[int] = set()
         self._said = [""] * len(cameras)
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
@@ -367,10 +366,9 @@ class LiveSession:
             case Arrived(index, time_s):
                 self._said[index] = ""
                 self._missing.discard(index)
+                again = " again" if meeting.have_filmed[index] else ""
                 if meeting.announce(index, time_s, time.monotonic()):
-                    again = " again" if index in self._have_filmed else ""
                     logger.warning("camera %s films%s", self._cameras[index].name, again)
-                self._have_filmed.add(index)
             case CameraSilhouette(index, time_s, arrived_s, coverage):
                 if coverage is None:
                     meeting.leave_out(index)
@@ -380,7 +378,7 @@ class LiveSession:
                 if line != self._said[index]:
                     logger.warning("camera %s: %s", self._cameras[index].name, line)
                 self._said[index] = line
-                if index not in self._have_filmed:
+                if not meeting.have_filmed[index]:
                     self._missing.add(index)
             case RecordingNotice(line):
                 logger.warning("%s", line)
@@ -400,7 +398,7 @@ class LiveSession:
             self._receive(wait_s)
             now_s = time.monotonic()
             for index in meeting.stopped(now_s):
-                if index in self._have_filmed:
+                if meeting.have_filmed[index]:
                     logger.warning("camera %s has stopped", self._cameras[index].name)
                 elif not self._said[index]:  # else it is said already why
                     logger.warning("camera %s: no frame came so far", self._cameras[index].name)

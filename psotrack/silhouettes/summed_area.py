@@ -74,8 +74,8 @@ def box_sum(
     Boxes are clipped at the image's border. A box outside the image, or with edges in the wrong order, has sum 0. The
     sums are differentiable in the corners almost everywhere.
 
-    Boxes about the same middles in several sizes are faster one size at a time, in `jax.lax.map`, because XLA on a CPU
-    would compute all indices again for each of the sixteen reads.
+    Boxes about the same middles in several sizes are faster one size at a time, in several calls: with an axis of
+    sizes, XLA on a CPU computes all indices again for each of the sixteen reads.
 
     Args:
         tables: (height + 1, cameras, width + 1), from `summed_area_table`.

@@ -123,12 +123,12 @@ class SoftIoU:
         patches, rounded = inputs.patches, self.whole_pixels
         in_ring, _ = _foreground_and_area(patches, boxes, self.ring, rounded)
 
-        def iou(scale: Float[Array, ""]) -> Array:
+        def iou(scale: float) -> Array:
             foreground, area = _foreground_and_area(patches, boxes, scale, rounded)
             # Rounding alone can make the foreground of a window larger than that of the ring.
             return foreground / jnp.maximum(area + jnp.maximum(in_ring - foreground, 0.0), 1e-6)
 
-        score = jax.lax.map(iou, jnp.asarray(self.windows, boxes.x_half.dtype)).mean(axis=0)
+        score = jnp.stack([iou(scale) for scale in self.windows]).mean(axis=0)
         return score, camera_weights(inputs, boxes)
 
 
@@ -166,10 +166,9 @@ def foreground_and_area(
     Both are cut at the image's border, and without the foreground that another drone may cover.
     """
     patches, rounded = inputs.patches, inputs.score.whole_pixels
-    return jax.lax.map(
-        lambda scale: _foreground_and_area(patches, boxes, scale, rounded),
-        jnp.asarray(scales, boxes.x_half.dtype),
-    )
+    of_scales = [_foreground_and_area(patches, boxes, scale, rounded) for scale in scales]
+    foreground, area = (jnp.stack(values) for values in zip(*of_scales, strict=True))
+    return foreground, area
 
 
 def camera_weights(inputs: ScoreInputs, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:
@@ -210,7 +209,11 @@ def drone_fitness(
     """
     score, weight = camera_scores(inputs, position_m)
     total = weight.sum(axis=-1)
-    mean = (weight * score).sum(axis=-1) / jnp.maximum(total, 1e-6)
+    # XLA on a CPU gives a sum of 4,096 numbers or more to a library (YNNPACK), together with the multiplications and
+    # additions that come before the sum. The rest of the score is then computed again for each read of a table, which
+    # takes up to ten times as long. The library computes no choices: this one keeps the score in one piece.
+    weighted = jnp.where(weight > 0, weight * score, 0.0)
+    mean = weighted.sum(axis=-1) / jnp.maximum(total, 1e-6)
     least = inputs.score.min_cameras
     enough = ((weight > MIN_WEIGHT).sum(axis=-1) >= least) & (total > least / 2)
     return jnp.where(enough, mean, jnp.nan)
@@ -222,13 +225,12 @@ def joint_fitness(inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3
 
 
 def _foreground_and_area(
-    patches: Patches, boxes: Boxes, scale: Float[Array, ""] | float, whole_pixels: bool = False
+    patches: Patches, boxes: Boxes, scale: float, whole_pixels: bool = False
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """Foreground in the boxes scaled about their middles and cut at the image, and the area of these boxes.
 
     Both are in pixels of the patches, without the foreground that other drones may cover. Several scales are several
-    steps of a loop: with an axis of scales, or for many particles without the loop, XLA on a CPU computes each place in
-    the tables again for each of its sixteen reads, which takes up to ten times as long.
+    calls: with an axis of scales, XLA on a CPU computes each place in the tables again for each of its sixteen reads.
     """
 
     def interval(middle: Array, half: Array, length_px: Array, first_px: Array) -> tuple[Array, Array]:
