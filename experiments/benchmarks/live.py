@@ -1,7 +1,7 @@
 """`psotrack live` with replayed cameras: delay of the rows, memory over an hour, and cameras that stop and come back.
 
     python experiments/benchmarks/live.py delay --data data
-    python experiments/benchmarks/live.py memory --data data --minutes 60 --speed 3
+    python experiments/benchmarks/live.py memory --data data --minutes 60 --speed 2
     python experiments/benchmarks/live.py stops --data data --stops 20
 
 `delay` replays eight videos of 1920 x 1080 pixels at their own rate, in a program of its own, and prints how long the
@@ -125,7 +125,7 @@ def _delays(record: dict[str, Any]) -> dict[str, float]:
 @_DATA
 @click.option("--minutes", default=60.0, help="Minutes of video that are replayed.")
 @click.option(
-    "--speed", default=3.0, help="Seconds of video per second; two cores track four small cameras at 3."
+    "--speed", default=2.0, help="Seconds of video per second; two cores track four small cameras at 2."
 )
 @_RESULTS
 def memory(data: Path, minutes: float, speed: float, results: Path | None) -> None:
