@@ -56,7 +56,7 @@ bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
 bench-end-to-end: $(VENV)/.installed  ## from videos to tracks, stage by stage: as fast as the cameras? twenty minutes
 	@$(BIN)/python experiments/benchmarks/end_to_end.py $(if $(DATA),--data $(DATA))
 
-bench-live: $(VENV)/.installed  ## live: delay of the rows, memory over an hour, cameras that stop; half an hour
+bench-live: $(VENV)/.installed  ## live: delay of the rows, memory over an hour, cameras that stop; three quarters of an hour
 	@$(call install,bench)
 	@$(BIN)/python experiments/benchmarks/live.py delay $(if $(DATA),--data $(DATA))
 	@$(BIN)/python experiments/benchmarks/live.py memory $(if $(DATA),--data $(DATA))
