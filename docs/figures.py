@@ -54,7 +54,7 @@ def all_rows(name: str) -> pd.DataFrame:
     return pd.read_csv(folder / tables[0])
 
 
-def rows(name: str, **where: Any) -> pd.DataFrame:
+def rows(name: str, /, **where: Any) -> pd.DataFrame:
     """Rows of a result whose columns have the given values.
 
     Args:
@@ -71,7 +71,7 @@ def rows(name: str, **where: Any) -> pd.DataFrame:
     return table
 
 
-def column(name: str, value: str, **where: Any) -> pd.Series:
+def column(name: str, value: str, /, **where: Any) -> pd.Series:
     """One column of the rows of a result."""
     table = rows(name, **where)
     if value not in table:
@@ -79,22 +79,22 @@ def column(name: str, value: str, **where: Any) -> pd.Series:
     return table[value]
 
 
-def mean(name: str, value: str, **where: Any) -> float:
+def mean(name: str, value: str, /, **where: Any) -> float:
     """Mean of a column over the rows of a result."""
     return float(column(name, value, **where).mean())
 
 
-def least(name: str, value: str, **where: Any) -> float:
+def least(name: str, value: str, /, **where: Any) -> float:
     """Smallest value of a column over the rows of a result."""
     return float(column(name, value, **where).min())
 
 
-def most(name: str, value: str, **where: Any) -> float:
+def most(name: str, value: str, /, **where: Any) -> float:
     """Largest value of a column over the rows of a result."""
     return float(column(name, value, **where).max())
 
 
-def total(name: str, value: str, **where: Any) -> float:
+def total(name: str, value: str, /, **where: Any) -> float:
     """Sum of a column over the rows of a result."""
     return float(column(name, value, **where).sum())
 
