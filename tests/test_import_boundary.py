@@ -56,6 +56,7 @@ ROOMS = [
     "live",
     "api",
     "evaluation",
+    "flights",
     "simulation",
     "demo",
     "sweep",

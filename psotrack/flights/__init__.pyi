@@ -1,0 +1,29 @@
+from .ellipsoids import Ellipsoids, ellipsoids_90
+from .events import Event, EventKind, find_events
+from .flight import USUAL_SIZE_M, Flight, FlightTracks, read_flight, read_tracks_file
+from .image_views import ImageEllipses, boxes_in_images, ellipses_in_images, shown_frames
+from .quality import camera_quality, drone_quality
+from .run_record import DroneRecord, EncounterRecord, RunRecord, read_run_record
+
+__all__ = [
+    "USUAL_SIZE_M",
+    "DroneRecord",
+    "Ellipsoids",
+    "EncounterRecord",
+    "Event",
+    "EventKind",
+    "Flight",
+    "FlightTracks",
+    "ImageEllipses",
+    "RunRecord",
+    "boxes_in_images",
+    "camera_quality",
+    "drone_quality",
+    "ellipses_in_images",
+    "ellipsoids_90",
+    "find_events",
+    "read_flight",
+    "read_run_record",
+    "read_tracks_file",
+    "shown_frames",
+]
