@@ -3,18 +3,18 @@ from .events import Event, EventKind, find_events
 from .flight import USUAL_SIZE_M, Flight, FlightTracks, read_flight, read_tracks_file
 from .image_views import ImageEllipses, boxes_in_images, ellipses_in_images, shown_frames
 from .quality import camera_quality, drone_quality
-from .run_record import DroneRecord, EncounterRecord, RunRecord, read_run_record
+from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record
 
 __all__ = [
     "USUAL_SIZE_M",
-    "DroneRecord",
     "Ellipsoids",
-    "EncounterRecord",
     "Event",
     "EventKind",
     "Flight",
     "FlightTracks",
     "ImageEllipses",
+    "LearnedDrone",
+    "MeetingRecord",
     "RunRecord",
     "boxes_in_images",
     "camera_quality",

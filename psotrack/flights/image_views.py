@@ -90,7 +90,7 @@ def boxes_in_images(
         )
         there = np.asarray(boxes.in_front) & seen[part, :, None] & shown.is_there[part, None]
         boxes_px[part] = np.where(there[..., None], np.asarray(boxes.xyxy), np.nan)
-    return _inside(boxes_px, recording.rig.cameras.image_size_wh)
+    return _inside(boxes_px, np.asarray(recording.rig.cameras.image_size_wh))
 
 
 def ellipses_in_images(recording: Recording, trajectories: Trajectories) -> ImageEllipses | None:
@@ -109,7 +109,7 @@ def ellipses_in_images(recording: Recording, trajectories: Trajectories) -> Imag
     middle_px, _, jacobian = project_with_jacobian(recording.rig.cameras, at_m)
     visible = np.stack(
         [
-            in_images(recording.rig.cameras[[camera]], at_m[:, :, camera])[..., 0]
+            np.asarray(in_images(recording.rig.cameras[[camera]], at_m[:, :, camera]))[..., 0]
             for camera in range(len(recording.rig))
         ],
         axis=-1,
@@ -130,7 +130,7 @@ def _exposure_offsets_s(
     offset_s = np.repeat(shown.offset_s[:, None], trajectories.num_drones, axis=1)
     if shown.line_time_s is None:
         return offset_s
-    height_px = recording.rig.cameras.image_size_wh[:, 1]
+    height_px = np.asarray(recording.rig.cameras.image_size_wh)[:, 1]
     position_m = np.asarray(trajectories.position_m, np.float64)[:, :, None]
     row_px = np.asarray(project_visible(recording.rig.cameras, position_m)[0])[..., 1] + 0.5
     row_px = np.clip(np.nan_to_num(row_px, nan=0.0), 0.0, height_px)

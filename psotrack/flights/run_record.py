@@ -12,7 +12,7 @@ from psotrack.errors import InputError
 from psotrack.support import convert, read_text
 
 
-class DroneRecord(msgspec.Struct, frozen=True):
+class LearnedDrone(msgspec.Struct, frozen=True):
     """What a run learned of one drone.
 
     Attributes:
@@ -26,7 +26,7 @@ class DroneRecord(msgspec.Struct, frozen=True):
     size_std_m: tuple[float | None, float | None, float | None] = (None, None, None)
 
 
-class EncounterRecord(msgspec.Struct, frozen=True):
+class MeetingRecord(msgspec.Struct, frozen=True):
     """Two drones that met: see `identity.Encounter`."""
 
     drones: tuple[int, int]
@@ -57,8 +57,8 @@ class RunRecord(msgspec.Struct, frozen=True):
 
     sequence: str = ""
     rate_hz: float | None = None
-    drones: int | tuple[DroneRecord, ...] = ()
-    encounters: tuple[EncounterRecord, ...] = ()
+    drones: int | tuple[LearnedDrone, ...] = ()
+    encounters: tuple[MeetingRecord, ...] = ()
     left_out: dict[str, list[tuple[int, int]]] = {}
     camera_errors: dict[str, Any] = {}
     settings: dict[str, Any] = {}
