@@ -96,6 +96,9 @@ COMMANDS = {
     "track": LazyCommand(
         "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
     ),
+    "view": LazyCommand(
+        "psotrack.cli.view", "Show TRACKS and their recording in space and time, in the viewer Rerun."
+    ),
 }
 
 _COMPLETION_VARIABLE = "_PSOTRACK_COMPLETE"

@@ -1,6 +1,6 @@
 from .ellipsoids import Ellipsoids, ellipsoids_90
 from .events import Event, EventKind, find_events
-from .flight import USUAL_SIZE_M, Flight, FlightTracks, read_flight, read_tracks_file
+from .flight import USUAL_SIZE_M, Flight, FlightTracks, first_instants, read_flight, read_tracks_file
 from .image_views import ImageEllipses, boxes_in_images, ellipses_in_images, shown_frames
 from .quality import camera_quality, drone_quality
 from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record
@@ -22,6 +22,7 @@ __all__ = [
     "ellipses_in_images",
     "ellipsoids_90",
     "find_events",
+    "first_instants",
     "read_flight",
     "read_run_record",
     "read_tracks_file",
