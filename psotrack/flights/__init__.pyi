@@ -1,6 +1,6 @@
 from .ellipsoids import Ellipsoids, ellipsoids_90
 from .events import Event, EventKind, find_events
-from .flight import USUAL_SIZE_M, Flight, FlightTracks, read_flight, read_tracks_file
+from .flight import USUAL_SIZE_M, FlightTracks, TrackedFlight, read_flight, read_tracks_file
 from .image_views import ImageEllipses, boxes_in_images, ellipses_in_images, shown_frames
 from .quality import camera_quality, drone_quality
 from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record
@@ -10,12 +10,12 @@ __all__ = [
     "Ellipsoids",
     "Event",
     "EventKind",
-    "Flight",
     "FlightTracks",
     "ImageEllipses",
     "LearnedDrone",
     "MeetingRecord",
     "RunRecord",
+    "TrackedFlight",
     "boxes_in_images",
     "camera_quality",
     "drone_quality",

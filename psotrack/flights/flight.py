@@ -43,7 +43,7 @@ class FlightTracks:
 
 
 @dataclass(frozen=True, repr=False)
-class Flight:
+class TrackedFlight:
     """Tracks, and the recording that they belong to.
 
     Attributes:
@@ -79,7 +79,7 @@ def read_flight(
     sequence: Path | str | None = None,
     *,
     cameras: Sequence[str] | None = None,
-) -> Flight:
+) -> TrackedFlight:
     """Read tracks, their records and their recording.
 
     Args:
@@ -106,7 +106,7 @@ def read_flight(
     for each in read:
         if recording is not None:
             _check_fits(each, recording)
-    return Flight(recording.name if recording is not None else _name_of(read[0]), read, recording)
+    return TrackedFlight(recording.name if recording is not None else _name_of(read[0]), read, recording)
 
 
 def read_tracks_file(path: Path | str, label: str, recording: Recording | None = None) -> FlightTracks:
