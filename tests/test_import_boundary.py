@@ -57,6 +57,8 @@ ROOMS = [
     "api",
     "evaluation",
     "flights",
+    "viewer",
+    "overlay",
     "simulation",
     "demo",
     "sweep",

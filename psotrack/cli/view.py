@@ -26,7 +26,7 @@ from psotrack.errors import SettingsError
 from psotrack.support import atomic_write, refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.flights import Flight
+    from psotrack.flights import TrackedFlight
     from psotrack.viewer import WrittenFlight
 
 
@@ -151,7 +151,7 @@ def _say_page(page: str) -> None:
         webbrowser.open(page)
 
 
-def _sentence(name: str, flight: Flight, has_silhouettes: bool, written: WrittenFlight) -> str:
+def _sentence(name: str, flight: TrackedFlight, has_silhouettes: bool, written: WrittenFlight) -> str:
     """What was made smaller or left out, in one line."""
     parts = [f"{name}: {written.num_bytes / 1e6:.1f} MB"]
     if written.plan.num_images:

@@ -1,7 +1,15 @@
+from .colours import colour_rgb, status_colours, statuses
 from .ellipsoids import Ellipsoids, ellipsoids_90
 from .events import Event, EventKind, find_events
-from .flight import USUAL_SIZE_M, Flight, FlightTracks, first_instants, read_flight, read_tracks_file
-from .image_views import ImageEllipses, boxes_in_images, ellipses_in_images, shown_frames
+from .flight import (
+    USUAL_SIZE_M,
+    FlightTracks,
+    TrackedFlight,
+    first_instants,
+    read_flight,
+    read_tracks_file,
+)
+from .image_views import ImageEllipses, boxes_in_images, ellipse_outlines_px, ellipses_in_images, shown_frames
 from .quality import camera_quality, drone_quality
 from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record
 
@@ -10,15 +18,17 @@ __all__ = [
     "Ellipsoids",
     "Event",
     "EventKind",
-    "Flight",
     "FlightTracks",
     "ImageEllipses",
     "LearnedDrone",
     "MeetingRecord",
     "RunRecord",
+    "TrackedFlight",
     "boxes_in_images",
     "camera_quality",
+    "colour_rgb",
     "drone_quality",
+    "ellipse_outlines_px",
     "ellipses_in_images",
     "ellipsoids_90",
     "find_events",
@@ -27,4 +37,6 @@ __all__ = [
     "read_run_record",
     "read_tracks_file",
     "shown_frames",
+    "status_colours",
+    "statuses",
 ]

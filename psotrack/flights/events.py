@@ -11,7 +11,7 @@ from jaxtyping import Bool
 
 from psotrack.errors import InputError
 from psotrack.evaluation import errors_over_time
-from psotrack.flights.flight import Flight, FlightTracks
+from psotrack.flights.flight import FlightTracks, TrackedFlight
 from psotrack.trajectories import Status, Trajectories
 
 #: Shortest time of coasting that is an event, seconds: shorter gaps are usual where drones cover each other.
@@ -52,7 +52,7 @@ class Event:
     tracks: str
 
 
-def find_events(flight: Flight) -> tuple[Event, ...]:
+def find_events(flight: TrackedFlight) -> tuple[Event, ...]:
     """The events of all tracks of a flight, in the order of their times.
 
     Begins, losses and coasting come from the status of the tracks; encounters and cameras that were left out from the

@@ -44,7 +44,7 @@ class FlightTracks:
 
 
 @dataclass(frozen=True, repr=False)
-class Flight:
+class TrackedFlight:
     """Tracks, and the recording that they belong to.
 
     Attributes:
@@ -80,7 +80,7 @@ def read_flight(
     sequence: Path | str | None = None,
     *,
     cameras: Sequence[str] | None = None,
-) -> Flight:
+) -> TrackedFlight:
     """Read tracks, their records and their recording.
 
     Args:
@@ -107,10 +107,10 @@ def read_flight(
     for each in read:
         if recording is not None:
             _check_fits(each, recording)
-    return Flight(recording.name if recording is not None else _name_of(read[0]), read, recording)
+    return TrackedFlight(recording.name if recording is not None else _name_of(read[0]), read, recording)
 
 
-def first_instants(flight: Flight, num_frames: int) -> Flight:
+def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
     """The first instants of a flight: of its recording, of the cameras on drones, of the reference and of all tracks.
 
     Args:

@@ -27,6 +27,8 @@ from psotrack.trajectories import Trajectories
 
 #: Number of instants that are projected together, which bounds the memory of long flights.
 _TOGETHER = 5000
+#: Number of points on the outline of an ellipse.
+_OUTLINE_POINTS = 25
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,6 @@ def boxes_in_images(
     cameras = jax.tree.map(
         lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float32), recording.rig.cameras
     )
-    extents = make_extents(cameras, jnp.asarray(size_m, jnp.float32))
     boxes_px = np.full((trajectories.num_frames, trajectories.num_drones, len(recording.rig), 4), np.nan)
     offset_s = _exposure_offsets_s(recording, trajectories, shown)
     velocity_m_s, seen = _velocities_m_s(trajectories), trajectories.seen
@@ -85,6 +86,7 @@ def boxes_in_images(
         part = slice(first, first + _TOGETHER)
         moved_m = velocity_m_s[part, :, None] * offset_s[part, ..., None]
         position_m = np.where(seen[part, :, None], trajectories.position_m[part], 0.0)
+        extents = make_extents(cameras, jnp.asarray(np.broadcast_to(size_m, position_m.shape), jnp.float32))
         boxes = project_boxes(
             moved_extents(extents, jnp.asarray(moved_m, jnp.float32)), jnp.asarray(position_m, jnp.float32)
         )
@@ -123,6 +125,17 @@ def ellipses_in_images(recording: Recording, trajectories: Trajectories) -> Imag
     )
 
 
+def ellipse_outlines_px(
+    middle_px: Float[np.ndarray, "*ellipses 2"], shape_px2: Float[np.ndarray, "*ellipses 2 2"]
+) -> Float[np.ndarray, "*ellipses points 2"]:
+    """Points on the outlines of ellipses (x - middle)ᵀ S⁻¹ (x - middle) = 1; the last point is the first one again."""
+    square, directions = np.linalg.eigh(shape_px2)
+    half_px = np.sqrt(np.maximum(square, 0.0))
+    turn = np.linspace(0.0, 2 * np.pi, _OUTLINE_POINTS)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return middle_px[..., None, :] + np.einsum("...ij,...j,pj->...pi", directions, half_px, circle)
+
+
 def _exposure_offsets_s(
     recording: Recording, trajectories: Trajectories, shown: Timeline
 ) -> Float[np.ndarray, "frames drones cameras"]:
@@ -150,5 +163,6 @@ def _inside(
     boxes_px: Float[np.ndarray, "frames drones cameras 4"], image_size_wh: Float[np.ndarray, "cameras 2"]
 ) -> Float[np.ndarray, "frames drones cameras 4"]:
     """The boxes, NaN where no part of the box is in the image."""
-    inside = (boxes_px[..., 2:] > 0).all(axis=-1) & (boxes_px[..., :2] < image_size_wh).all(axis=-1)
-    return np.where(inside[..., None], boxes_px, np.nan)
+    outside = (boxes_px[..., 2:] <= 0).any(axis=-1) | (boxes_px[..., :2] >= image_size_wh).any(axis=-1)
+    boxes_px[outside] = np.nan
+    return boxes_px

@@ -21,10 +21,11 @@ def drone_quality(tracks: FlightTracks) -> DataFrame:
     """One row per drone.
 
     Returns:
-        Columns `drone`; `seen`, share of the frames in which the drone is seen; `coasting`, share of the
-        frames in which it is predicted only; `first_s`, `last_s`, times of the first and the last frame in which it is seen; `fitness`
-        and `num_cameras`, means over the frames in which it is seen; `radius_90_m`, median of the longest half axis of
-        the 90 % ellipsoid; `speed_m_s`, mean speed; `size_x_m`, `size_y_m`, `size_z_m`, lengths. NaN where unknown.
+        Columns `drone`; `seen`, share of the frames in which the drone is seen; `coasting`, share of the frames in
+        which it is predicted only; `first_s`, `last_s`, times of the first and the last frame in which it is seen;
+        `fitness`, `num_cameras`, means over the frames in which it is seen; `radius_90_m`, median of the longest half
+        axis of the 90 % ellipsoid; `speed_m_s`, mean speed; `size_x_m`, `size_y_m`, `size_z_m`, lengths. NaN where
+        unknown.
     """
     import pandas as pd
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from psotrack.flights import Flight
+from psotrack.flights import TrackedFlight
 from psotrack.recordings import VideoInfo
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, map_in_processes, no_progress
@@ -21,8 +21,11 @@ from psotrack.viewer.camera_images import (
     encode_images,
     plan_images,
 )
+from psotrack.viewer.entity_log import EntityLog
+from psotrack.viewer.image_marks import log_images, log_marks
 from psotrack.viewer.layout import blueprint_of
-from psotrack.viewer.scene import FlightScene
+from psotrack.viewer.plots import log_plots
+from psotrack.viewer.space import log_drones, log_world
 
 #: Largest size by default: this number of bytes per second of the recording, up to the second number.
 _BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
@@ -64,8 +67,8 @@ class ViewContent:
 
 def write_flight(
     path: Path,
-    flight: Flight,
-    content: ViewContent = ViewContent(),  # noqa: B008  frozen
+    flight: TrackedFlight,
+    content: ViewContent = ViewContent(),
     *,
     jobs: int | None = None,
     report: Report = no_progress,
@@ -89,31 +92,33 @@ def write_flight(
     try:
         stream.send_recording_name(flight.name)
         videos = _videos(flight, content.onboard)
-        scene = FlightScene(stream, flight)
+        log = EntityLog(stream)
         stream.send_blueprint(blueprint_of(flight, has_images=bool(videos), has_onboard=content.onboard))
-        scene.log_world()
-        scene.log_tracks()
+        log_world(log, flight)
+        log_drones(log, flight)
+        log_plots(log, flight)
         stream.flush()
         most = _max_bytes(flight, content)
         plan = plan_images(videos, _IMAGES_SHARE * (most - path.stat().st_size))
-        scene.log_marks(plan.step)
+        log_marks(log, flight, plan.step)
         stream.flush()
         left = _IMAGES_SHARE * (most - path.stat().st_size)
         with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
             tasks = _tasks(content, videos, plan, Path(folder), left)
+            processes = jobs or os.cpu_count() or 1
             with report("images", plan.num_images) as advance:
                 encoded = map_in_processes(
-                    encode_images, list(tasks.values()), jobs=jobs or os.cpu_count() or 1, advance=advance
+                    encode_images, list(tasks.values()), jobs=processes, advance=advance
                 )
             for camera, images in zip(tasks, encoded, strict=True):
-                cell_px = tasks[camera].cell_px
-                scene.log_images(camera, images, plan.reduction[camera], cell_px)
+                task = tasks[camera]
+                log_images(log, flight, camera, images, (task.reduction, task.cell_px))
     finally:
         stream.disconnect()
     return WrittenFlight(path.stat().st_size, plan)
 
 
-def _max_bytes(flight: Flight, content: ViewContent) -> float:
+def _max_bytes(flight: TrackedFlight, content: ViewContent) -> float:
     if content.max_bytes is not None:
         return content.max_bytes
     assert flight.recording is not None or not content.onboard
@@ -122,7 +127,7 @@ def _max_bytes(flight: Flight, content: ViewContent) -> float:
     return min(_MOST_BYTES, _BYTES_PER_S * max(1.0, flight.recording.num_frames / flight.recording.fps))
 
 
-def _videos(flight: Flight, with_onboard: bool) -> dict[CameraKey, VideoInfo]:
+def _videos(flight: TrackedFlight, with_onboard: bool) -> dict[CameraKey, VideoInfo]:
     """The videos that are shown."""
     recording = flight.recording
     if recording is None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from psotrack.flights import Flight
+from psotrack.flights import TrackedFlight
 from psotrack.viewer.camera_images import CameraKey
-from psotrack.viewer.scene import TIME, camera_path, key_path, part
+from psotrack.viewer.entity_log import TIME, camera_path, drone_path
 
 #: Time for which a drone's trail is shown, seconds.
 _TRAIL_S = 3.0
@@ -21,7 +23,7 @@ _PLOTS = {
 }
 
 
-def blueprint_of(flight: Flight, *, has_images: bool, has_onboard: bool = False) -> rrb.Blueprint:
+def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool = False) -> rrb.Blueprint:
     """The arrangement for a flight.
 
     Args:
@@ -72,13 +74,17 @@ def live_blueprint() -> rrb.Blueprint:
     )
 
 
-def _space_view(flight: Flight) -> rrb.Spatial3DView:
+def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
     last = rr.VisibleTimeRange(
         TIME,
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL_S),
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
-    trails = {f"{path}/trail": rrb.VisibleTimeRanges([last]) for path in drone_paths(flight)}
+    trails: dict[Any, Any] = {
+        f"{drone_path('world/drones', flight, tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
+        for tracks in flight.tracks
+        for drone in tracks.trajectories.drones
+    }
     return rrb.Spatial3DView(
         origin="/world",
         # Marks in the images would hide the drones in space.
@@ -97,7 +103,7 @@ def _space_view(flight: Flight) -> rrb.Spatial3DView:
     )
 
 
-def _eye(flight: Flight) -> rrb.EyeControls3D | None:
+def _eye(flight: TrackedFlight) -> rrb.EyeControls3D | None:
     """A look from a corner above, so that all cameras and drones are in view."""
     parts = [each.trajectories.position_m.reshape(-1, 3) for each in flight.tracks]
     if flight.recording is not None and len(flight.recording.rig):
@@ -115,17 +121,7 @@ def _eye(flight: Flight) -> rrb.EyeControls3D | None:
     )
 
 
-def drone_paths(flight: Flight) -> list[str]:
-    """Paths of the entities of all drones."""
-    single = len(flight.tracks) == 1
-    return [
-        "/".join(["world/drones", *([] if single else [part(tracks.label)]), part(drone)])
-        for tracks in flight.tracks
-        for drone in tracks.trajectories.drones
-    ]
-
-
-def _plots(flight: Flight) -> rrb.Tabs:
+def _plots(flight: TrackedFlight) -> rrb.Tabs:
     has_truth = flight.truth is not None
     return rrb.Tabs(
         *(
@@ -154,12 +150,12 @@ def _events() -> rrb.TextLogView:
     )
 
 
-def _cameras(flight: Flight, has_onboard: bool) -> rrb.Container:
+def _cameras(flight: TrackedFlight, has_onboard: bool) -> rrb.Container:
     assert flight.recording is not None
     onboard = (flight.recording.onboard or {}) if has_onboard else {}
     names = flight.recording.rig.names
     grid = rrb.Grid(
-        *(rrb.Spatial2DView(origin=f"/{camera_path(name)}", name=name) for name in names),
+        *(rrb.Spatial2DView(origin=f"/{camera_path(CameraKey(name))}", name=name) for name in names),
         grid_columns=2 if len(names) <= 8 else int(np.ceil(np.sqrt(len(names)))),
         name="cameras",
     )
@@ -167,7 +163,7 @@ def _cameras(flight: Flight, has_onboard: bool) -> rrb.Container:
         return grid
     on_drones = rrb.Grid(
         *(
-            rrb.Spatial2DView(origin=f"/{key_path(CameraKey(name, on_drone=True))}", name=name)
+            rrb.Spatial2DView(origin=f"/{camera_path(CameraKey(name, on_drone=True))}", name=name)
             for name in onboard
         ),
         grid_columns=2,

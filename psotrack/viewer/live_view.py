@@ -10,14 +10,16 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Float
 
-from psotrack.flights import USUAL_SIZE_M, Flight, ellipsoids_90
+from psotrack.flights import USUAL_SIZE_M, TrackedFlight, ellipsoids_90, status_colours
 from psotrack.recordings import Recording
 from psotrack.support import COLOURS
 from psotrack.trajectories import Status, Trajectories
+from psotrack.viewer.entity_log import FRAME, TIME, EntityLog, part, shown_rgb
 from psotrack.viewer.flight_file import APPLICATION
 from psotrack.viewer.layout import live_blueprint
+from psotrack.viewer.plots import log_status_words
 from psotrack.viewer.programs import viewer_program
-from psotrack.viewer.scene import FRAME, TIME, FlightScene, colours_of, part, quaternions_xyzw, rgb
+from psotrack.viewer.space import log_world, quaternions_xyzw, status_label
 
 #: Number of positions in a drone's trail: three seconds at 25 per second.
 _TRAIL_ROWS = 75
@@ -54,7 +56,8 @@ class LiveView:
             self._stream.connect_grpc(program.address)
             stack.callback(self._close)
             self._stream.send_blueprint(live_blueprint())
-            FlightScene(self._stream, Flight(self._recording.name, (), self._recording)).log_world()
+            self._entities = EntityLog(self._stream)
+            log_world(self._entities, TrackedFlight(self._recording.name, (), self._recording))
             self._ends = stack.pop_all()
         return self
 
@@ -67,6 +70,8 @@ class LiveView:
             del self._trails[name]
         for index, name in enumerate(rows.drones):
             status = int(rows.status[0, index]) if rows.status is not None else int(Status.TRACKED)
+            if name not in self._status:
+                log_status_words(self._entities, f"status/{part(name)}")
             if status != self._status.get(name):
                 self._log(f"status/{part(name)}", rr.StateChange(state=Status(status).label))
                 self._status[name] = status
@@ -76,15 +81,15 @@ class LiveView:
             trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
             trail.append(position_m)
             number = int(name) if name.isdecimal() else len(self._trails)
-            rgba = colours_of(np.array([status]), rgb(COLOURS[number % len(COLOURS)]))
-            label = name if status == Status.TRACKED else f"{name} {Status(status).label}"
+            rgb = status_colours(np.array([status]), shown_rgb(COLOURS[number % len(COLOURS)]))
+            label = status_label(name, status)
             path = f"world/drones/{part(name)}"
             half_m = np.array(USUAL_SIZE_M) / 2
             self._log(
                 f"{path}/body",
-                rr.Boxes3D(centers=[position_m], half_sizes=[half_m], colors=rgba, labels=[label]),
+                rr.Boxes3D(centers=[position_m], half_sizes=[half_m], colors=rgb, labels=[label]),
             )
-            self._log(f"{path}/trail", rr.LineStrips3D([np.stack(trail)], colors=rgba))
+            self._log(f"{path}/trail", rr.LineStrips3D([np.stack(trail)], colors=rgb))
             self._log(f"plots/height_m/{part(name)}", rr.Scalars(position_m[2]))
             if rows.covariance_m2 is not None and np.isfinite(rows.covariance_m2[0, index]).all():
                 covariance_m2 = rows.covariance_m2[0, index].astype(np.float64)
@@ -95,7 +100,7 @@ class LiveView:
                         centers=[position_m],
                         half_sizes=[ellipsoid.half_axes_m],
                         quaternions=quaternions_xyzw(ellipsoid.rotation[None]),
-                        colors=rgba,
+                        colors=rgb,
                     ),
                 )
                 deviation_mm = 1e3 * float(np.sqrt(np.trace(covariance_m2)))

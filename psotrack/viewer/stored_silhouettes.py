@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 
 from psotrack.errors import InputError
-from psotrack.flights import Flight
+from psotrack.flights import TrackedFlight
 from psotrack.silhouettes import (
     Silhouettes,
     SilhouetteSettings,
@@ -20,7 +20,7 @@ from psotrack.support import Report, no_progress
 
 
 def find_silhouettes(
-    flight: Flight,
+    flight: TrackedFlight,
     cache: Path,
     *,
     make: bool = False,
@@ -51,7 +51,7 @@ def find_silhouettes(
     return compute(recording, settings, cache=cache, jobs=jobs, all_videos=False, report=report)
 
 
-def _settings(flight: Flight) -> SilhouetteSettings:
+def _settings(flight: TrackedFlight) -> SilhouetteSettings:
     """The settings of the first tracks with a record of them, else the defaults."""
     for tracks in flight.tracks:
         if tracks.record is not None and "silhouettes" in tracks.record.settings:

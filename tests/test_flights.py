@@ -1,0 +1,272 @@
+"""The room `flights`: where cameras show drones, ellipsoids, events and tables, from files as users have them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers import ring_rig
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.flights import (
+    EventKind,
+    boxes_in_images,
+    camera_quality,
+    drone_quality,
+    ellipses_in_images,
+    ellipsoids_90,
+    find_events,
+    read_flight,
+    shown_frames,
+)
+from psotrack.recordings import FrameTimes, Recording
+from psotrack.trajectories import Status, Trajectories, write_trajectories
+
+RATE_HZ = 10.0
+SIZE_M = np.array([[0.4, 0.4, 0.2], [0.3, 0.3, 0.1]])
+
+
+def recording_of(rig, num_frames=20, **fields) -> Recording:
+    times = {name: FrameTimes(num_frames, RATE_HZ) for name in rig.names}
+    return Recording("lab", Path("lab"), rig, {}, frame_times=times | fields.pop("frame_times", {}), **fields)
+
+
+def straight_tracks(num_frames=20, speed_m_s=2.0) -> Trajectories:
+    """Two drones that fly along y, 1 m apart, with covariances of 1 to 3 cm."""
+    time_s = np.arange(num_frames) / RATE_HZ
+    position_m = np.zeros((num_frames, 2, 3))
+    position_m[..., 0] = [-0.5, 0.5]
+    position_m[..., 1] = (speed_m_s * (time_s - time_s.mean()))[:, None]
+    position_m[..., 2] = 1.2
+    velocity_m_s = np.zeros_like(position_m)
+    velocity_m_s[..., 1] = speed_m_s
+    return Trajectories(
+        frame=np.arange(num_frames),
+        time_s=time_s,
+        drones=("0", "1"),
+        position_m=position_m,
+        velocity_m_s=velocity_m_s,
+        status=np.full((num_frames, 2), Status.TRACKED),
+        num_cameras=np.full((num_frames, 2), 3),
+        fitness=np.full((num_frames, 2), 0.5),
+        covariance_m2=np.broadcast_to(np.diag([1e-4, 4e-4, 9e-4]), (num_frames, 2, 3, 3)).copy(),
+    )
+
+
+def with_status(tracks: Trajectories, drone: int, frames: slice, status: Status) -> Trajectories:
+    changed = tracks.status.copy()
+    changed[frames, drone] = status
+    return replace(tracks, status=changed)
+
+
+def pixels_by_opencv(rig, camera: int, points_m):
+    """(points, 2), pixels by OpenCV's own projection, as an oracle."""
+    cam = rig.cameras[camera]
+    rotation, _ = cv2.Rodrigues(cam.T_cam_world[:3, :3])
+    pixels, _ = cv2.projectPoints(
+        np.ascontiguousarray(points_m), rotation, cam.T_cam_world[:3, 3], cam.K, np.array(cam.dist)
+    )
+    return pixels[:, 0]
+
+
+def write_flight(folder, tracks, record=None):
+    """Files of tracks, with a record if one is given."""
+    path = folder / "tracks.csv"
+    write_trajectories(path, tracks)
+    if record is not None:
+        path.with_suffix(".json").write_text(json.dumps(record), encoding="utf-8")
+    return path
+
+
+class TestImages:
+    def test_boxes_hold_the_surface_of_each_drone(self):
+        """The oracle projects points of the ellipsoids' surfaces by OpenCV."""
+        rig, tracks = ring_rig(3, coefficients=5), straight_tracks()
+        boxes_px = boxes_in_images(recording_of(rig), tracks, SIZE_M)
+        assert boxes_px.shape == (20, 2, 3, 4)
+        direction = np.random.default_rng(0).normal(size=(4000, 3))
+        sphere = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        for drone, camera in ((0, 1), (1, 2)):
+            surface_m = tracks.position_m[7, drone] + sphere * SIZE_M[drone] / 2
+            pixels = pixels_by_opencv(rig, camera, surface_m) + 0.5
+            expected = [*pixels.min(axis=0), *pixels.max(axis=0)]
+            # 4,000 random points miss the outermost point of the surface by less than a fifth of a pixel.
+            np.testing.assert_allclose(boxes_px[7, drone, camera], expected, atol=0.2)
+
+    def test_a_late_camera_shows_drones_where_they_are_then(self):
+        rig, tracks = ring_rig(3), straight_tracks()
+        late = recording_of(rig, frame_times={"c1": FrameTimes(20, RATE_HZ, time_offset_s=0.03)})
+        boxes_px = boxes_in_images(late, tracks, SIZE_M)
+        moved = replace(tracks, position_m=tracks.position_m + 0.03 * tracks.velocity_m_s)
+        expected = boxes_in_images(recording_of(rig), moved, SIZE_M)
+        # float32 keeps 320 pixels to 3e-5; each box has about ten operations.
+        np.testing.assert_allclose(boxes_px[:, :, 1], expected[:, :, 1], atol=1e-2)
+        assert (shown_frames(late, tracks).frame[:, 1] == np.arange(20)).all()
+
+    def test_rows_of_a_rolling_shutter_are_exposed_one_after_the_other(self):
+        rig, tracks = ring_rig(3), straight_tracks(speed_m_s=3.0)
+        rolling = recording_of(rig, line_time_s={"c0": 1e-4})
+        boxes_px = boxes_in_images(rolling, tracks, SIZE_M)[5, 0, 0]
+        row_px = boxes_in_images(recording_of(rig), tracks, SIZE_M)[5, 0, 0, [1, 3]].mean()
+        # A rolling shutter's frame has the time of its middle row: frame 5 is exposed half a readout later.
+        late_s = 1e-4 * 240 / 2 + 1e-4 * (row_px - 120)
+        moved = replace(tracks, position_m=tracks.position_m + late_s * tracks.velocity_m_s)
+        expected = boxes_in_images(recording_of(rig), moved, SIZE_M)[5, 0, 0]
+        # During the exposure of the drone the row itself moves by less than two rows, 0.6 mm of flight, 0.05 pixels.
+        np.testing.assert_allclose(boxes_px, expected, atol=0.05)
+
+    def test_no_box_where_a_drone_is_lost_behind_or_outside_or_the_camera_has_no_frame(self):
+        rig, tracks = ring_rig(3), straight_tracks()
+        tracks = with_status(tracks, 1, slice(3, 5), Status.LOST)
+        tracks.position_m[8, 0] = 30.0, 0.0, 1.2
+        short = recording_of(rig, frame_times={"c2": FrameTimes(6, RATE_HZ)})
+        boxes_px = boxes_in_images(short, tracks, SIZE_M)
+        shown = np.isfinite(boxes_px).all(axis=-1)
+        assert not shown[3:5, 1].any()
+        assert not shown[7:, :, 2].any()
+        assert not shown[8, 0].all()
+        assert shown[:3].all()
+
+    def test_ellipses_are_the_outlines_of_the_90_percent_ellipsoids(self):
+        """The oracle projects points of an ellipsoid's surface by OpenCV: none is outside, some are at the border."""
+        rig, tracks = ring_rig(3, coefficients=5), straight_tracks()
+        ellipses = ellipses_in_images(recording_of(rig), tracks)
+        direction = np.random.default_rng(1).normal(size=(3000, 3))
+        sphere = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        half_m = np.sqrt(np.diag(tracks.covariance_m2[4, 0]) * chi2.ppf(0.9, 3))
+        pixels = pixels_by_opencv(rig, 1, tracks.position_m[4, 0] + sphere * half_m)
+        off = pixels - ellipses.middle_px[4, 0, 1]
+        radius2 = np.einsum("ni,ij,nj->n", off, np.linalg.inv(ellipses.shape_px2[4, 0, 1]), off)
+        # The linear approximation is exact to the ellipsoid's size over its distance, 8 cm of 4 m.
+        assert 0.97 < radius2.max() < 1.06
+
+    def test_tracks_without_covariances_have_no_ellipses(self):
+        tracks = replace(straight_tracks(), covariance_m2=None)
+        assert ellipses_in_images(recording_of(ring_rig(2)), tracks) is None
+
+
+class TestEllipsoids:
+    @given(seed=st.integers(0, 2**32 - 1))
+    def test_nine_of_ten_normal_points_are_inside(self, seed):
+        rng = np.random.default_rng(seed)
+        factor = rng.normal(size=(3, 3))
+        covariance_m2 = factor @ factor.T
+        found = ellipsoids_90(covariance_m2)
+        own = rng.multivariate_normal(np.zeros(3), covariance_m2, 4000) @ found.rotation
+        inside = (np.square(own / found.half_axes_m).sum(axis=1) <= 1).mean()
+        # The standard deviation of the share is sqrt(0.9 * 0.1 / 4000) = 0.0047; six of it.
+        assert abs(inside - 0.9) < 0.029
+        np.testing.assert_allclose(np.linalg.det(found.rotation), 1.0, rtol=1e-9)
+
+    def test_unknown_covariances_have_unknown_ellipsoids(self):
+        found = ellipsoids_90(np.full((2, 3, 3), np.nan))
+        assert np.isnan(found.half_axes_m).all()
+        assert np.isfinite(found.rotation).all()
+
+
+class TestEvents:
+    def test_lost_found_again_and_coasting(self, tmp_path):
+        tracks = with_status(straight_tracks(), 0, slice(5, 9), Status.LOST)
+        tracks = with_status(tracks, 1, slice(0, 2), Status.LOST)
+        tracks = with_status(tracks, 1, slice(12, 15), Status.COASTING)
+        tracks = with_status(tracks, 0, slice(14, 15), Status.COASTING)  # too short for an event
+        events = find_events(read_flight([write_flight(tmp_path, tracks)]))
+        assert [(event.frame, event.kind, event.drones) for event in events] == [
+            (2, EventKind.BEGINS, ("1",)),
+            (5, EventKind.LOST, ("0",)),
+            (9, EventKind.FOUND_AGAIN, ("0",)),
+            (12, EventKind.COASTING, ("1",)),
+        ]
+        assert events[3].text == "drone 1 is predicted for 0.30 s, without measurements"
+
+    def test_encounters_and_left_out_frames_come_from_the_record(self, tmp_path):
+        met = {
+            "drones": [0, 1],
+            "first_frame": 3,
+            "closest_frame": 6,
+            "distance_m": 0.31,
+            "last_frame": 9,
+            "log_odds": 5.0,
+            "outcome": "swapped",
+        }
+        record = {"sequence": "lab", "encounters": [met], "left_out": {"c1": [[4, 6]]}}
+        events = find_events(read_flight([write_flight(tmp_path, straight_tracks(), record)]))
+        assert [(event.frame, event.text) for event in events] == [
+            (4, "camera c1 is left out in 2 frames: foreground is everywhere"),
+            (6, "drones 0 and 1 meet at 0.31 m; their labels: swapped"),
+        ]
+
+
+class TestQuality:
+    def test_drones(self, tmp_path):
+        tracks = with_status(straight_tracks(), 0, slice(0, 5), Status.LOST)
+        tracks = with_status(tracks, 0, slice(10, 12), Status.COASTING)
+        record = {"drones": [{"drone": 0, "size_m": [0.4, 0.4, 0.2], "size_std_m": [None, None, None]}]}
+        (read,) = read_flight([write_flight(tmp_path, tracks, record)]).tracks
+        first, second = drone_quality(read).to_dict("records")
+        assert (first["seen"], first["coasting"], first["first_s"], first["last_s"]) == (
+            0.75,
+            0.1,
+            0.5,
+            pytest.approx(1.9),
+        )
+        assert (first["num_cameras"], first["fitness"], first["speed_m_s"]) == (3, 0.5, pytest.approx(2.0))
+        assert first["radius_90_m"] == pytest.approx(0.03 * np.sqrt(chi2.ppf(0.9, 3)))
+        assert (first["size_z_m"], second["size_z_m"]) == (0.2, 0.3)
+
+    def test_cameras(self, tmp_path):
+        record = {
+            "camera_errors": {"cameras": {"c1": {"noise_px": [3.0, 4.0], "lasting_px": [0.1, 0.1]}}},
+            "left_out": {"c2": [[0, 4], [6, 7]]},
+        }
+        (read,) = read_flight([write_flight(tmp_path, straight_tracks(), record)]).tracks
+        short = recording_of(ring_rig(3), frame_times={"c2": FrameTimes(10, RATE_HZ)})
+        rows = camera_quality(read, short).set_index("camera")
+        assert rows["frames"].tolist() == [1.0, 1.0, 0.5]
+        assert rows.loc["c1", "noise_px"] == pytest.approx(np.sqrt(12.5))
+        assert rows["left_out"].tolist() == [0, 0, 5]
+        assert (rows["in_view"] <= 1).all()
+
+
+class TestReading:
+    def test_neither_tracks_nor_a_recording(self):
+        with pytest.raises(InputError, match="expected files of tracks, or a recording, found neither"):
+            read_flight()
+
+    def test_cameras_need_a_recording(self, tmp_path):
+        path = write_flight(tmp_path, straight_tracks())
+        with pytest.raises(SettingsError, match="cameras: expected a recording"):
+            read_flight([path], cameras=["c1"])
+
+    def test_files_of_one_name_are_told_apart_by_their_folders(self, tmp_path):
+        paths = [write_flight(folder, straight_tracks()) for folder in (tmp_path / "a", tmp_path / "b")]
+        flight = read_flight(paths)
+        assert [each.label for each in flight.tracks] == ["a/tracks", "b/tracks"]
+        assert len({*flight.colours(0), *flight.colours(1)}) == 2
+        with pytest.raises(InputError, match="found one file twice"):
+            read_flight([paths[0], paths[0]])
+
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            ("{", r"tracks.json: expected JSON"),
+            ("[1]", r"tracks.json: expected the record of a run, found JSON with a list"),
+            ('{"encounters": 3}', r"tracks.json, encounters: expected a list"),
+        ],
+    )
+    def test_a_damaged_record(self, tmp_path, content, message):
+        path = write_flight(tmp_path, straight_tracks())
+        path.with_suffix(".json").write_text(content, encoding="utf-8")
+        with pytest.raises(InputError, match=message):
+            read_flight([path])
+
+    def test_tracks_of_another_recording(self, tmp_path, monkeypatch):
+        path = write_flight(tmp_path, straight_tracks(), {"sequence": "barn"})
+        monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: recording_of(ring_rig(2)))
+        with pytest.raises(InputError, match="expected tracks of lab, found tracks of barn"):
+            read_flight([path], "lab")
