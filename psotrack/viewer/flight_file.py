@@ -29,8 +29,8 @@ from psotrack.viewer.space import log_drones, log_world
 
 #: Largest size by default: this number of bytes per second of the recording, up to the second number.
 _BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
-#: Share of the rest of the size that images take; the others are the file's own.
-_IMAGES_SHARE = 0.97
+#: Share of the rest of the size that images take, and bytes of the list of contents at the end of the file.
+_IMAGES_SHARE, _CONTENTS_BYTES = 0.96, 250e3
 #: Name of the program in Rerun; arrangements that a user changes are kept under it.
 APPLICATION = "psotrack"
 
@@ -99,12 +99,11 @@ def write_flight(
         log_plots(log, flight)
         stream.flush()
         most = _max_bytes(flight, content)
-        plan = plan_images(videos, _IMAGES_SHARE * (most - path.stat().st_size))
+        plan = plan_images(videos, _left_bytes(path, most))
         log_marks(log, flight, plan.step)
         stream.flush()
-        left = _IMAGES_SHARE * (most - path.stat().st_size)
         with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
-            tasks = _tasks(content, videos, plan, Path(folder), left)
+            tasks = _tasks(content, videos, plan, Path(folder), _left_bytes(path, most))
             processes = jobs or os.cpu_count() or 1
             with report("images", plan.num_images) as advance:
                 encoded = map_in_processes(
@@ -116,6 +115,11 @@ def write_flight(
     finally:
         stream.disconnect()
     return WrittenFlight(path.stat().st_size, plan)
+
+
+def _left_bytes(path: Path, max_bytes: float) -> float:
+    """Bytes that are left for images."""
+    return max(0.0, _IMAGES_SHARE * (max_bytes - path.stat().st_size - _CONTENTS_BYTES))
 
 
 def _max_bytes(flight: TrackedFlight, content: ViewContent) -> float:

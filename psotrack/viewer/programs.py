@@ -19,6 +19,8 @@ from pathlib import Path
 from psotrack.errors import OutputError, SettingsError
 
 _HOST = "127.0.0.1"
+#: `python -m rerun_cli` ends with exit code 0 after an error.
+_START = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 #: Time that a program of Rerun has to start, and to end, seconds.
 _START_S, _END_S = 30.0, 3.0
 #: Time between two looks whether a program has ended, seconds.
@@ -117,7 +119,7 @@ def viewer_program(path: Path | None = None, *, web: bool = False) -> Iterator[V
         with log.open("wb") as said:
             # A session of its own: Ctrl-C shall reach this program alone, which then ends the other.
             process = subprocess.Popen(
-                [sys.executable, "-m", "rerun_cli", *arguments],
+                [sys.executable, "-c", _START, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=said,
                 stderr=said,
@@ -142,13 +144,13 @@ def _free_port() -> int:
 def _until_listening(program: ViewerProgram, ports: list[int]) -> None:
     end_s = time.monotonic() + _START_S
     for port in ports:
-        while True:
-            _check_runs(program)
+        while program.process.poll() is None:
             with contextlib.suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
                 break
             if time.monotonic() > end_s:
                 raise _failed(f"nothing at port {port} after {_START_S:.0f} s")
             time.sleep(_LOOK_S)
+    _check_runs(program)
 
 
 def _wait(program: ViewerProgram) -> None:
