@@ -1,4 +1,4 @@
-"""The files of a small flight: videos of three cameras that film two drones, rig, reference, tracks and their record."""
+"""The files of a small flight: videos of three cameras that film two drones, rig, reference, tracks and a record."""
 
 from __future__ import annotations
 
@@ -45,8 +45,13 @@ def make_tracks(error_m: float = 0.0) -> Trajectories:
     )
 
 
-def make_sequence(folder: Path) -> Path:
-    """A recording.toml with videos of grey noise in which the drones are dark squares."""
+def make_sequence(folder: Path, repeat: int = 1) -> Path:
+    """A recording.toml with videos of grey noise in which the drones are dark squares.
+
+    Args:
+        folder: folder of the files.
+        repeat: how often the videos show the flight.
+    """
     rig, truth = ring_rig(len(CAMERAS), image_size_wh=IMAGE_SIZE_WH), make_tracks()
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(folder / "rig.toml", rig)
@@ -55,7 +60,7 @@ def make_sequence(folder: Path) -> Path:
     for index, name in enumerate(rig.names):
         pixels, _ = project(rig.cameras[index], truth.position_m)
         with VideoWriter(folder / f"{name}.avi", RATE_HZ, IMAGE_SIZE_WH) as writer:
-            for frame in range(NUM_FRAMES):
+            for frame in [*range(NUM_FRAMES)] * repeat:
                 image = random.integers(110, 140, (height, width, 3), np.uint8)
                 for column, row in np.rint(pixels[frame]).astype(int):
                     image[max(row - 4, 0) : row + 5, max(column - 8, 0) : column + 9] = 20

@@ -75,6 +75,10 @@ COMMANDS = {
         "psotrack.cli.map_markers",
         "Write the table of a room's marker corners from SOURCE, or check such a table.",
     ),
+    "overlay": LazyCommand(
+        "psotrack.cli.overlay",
+        "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
+    ),
     "silhouettes": LazyCommand(
         "psotrack.cli.silhouettes",
         "Compute and store the silhouettes of SEQ, which `track` reads, or write them as images or as a video.",

@@ -1,4 +1,4 @@
-from .colours import colour_rgb, status_colours, statuses
+from .colours import colour_rgb, status_colours, status_rgb, statuses
 from .ellipsoids import Ellipsoids, ellipsoids_90
 from .events import Event, EventKind, find_events
 from .flight import (
@@ -38,5 +38,6 @@ __all__ = [
     "read_tracks_file",
     "shown_frames",
     "status_colours",
+    "status_rgb",
     "statuses",
 ]

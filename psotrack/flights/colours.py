@@ -33,18 +33,22 @@ def colour_rgb(colour: str, lighter: float = 0.0) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def status_colours(
-    status: Int[np.ndarray, "*drones"], rgb: tuple[int, int, int]
-) -> UInt8[np.ndarray, "*drones 3"]:
-    """Colours by status: the drone's own where it is tracked, paler where it is predicted, grey where it is lost.
+def status_rgb(status: int, rgb: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Colour by status: the drone's own where it is tracked, paler where it is predicted, grey where it is lost.
 
     Args:
-        status: values of `Status`.
+        status: a value of `Status`.
         rgb: the drone's own colour.
     """
-    own = np.array(rgb, float)
-    table = np.zeros((len(Status), 3))
-    table[Status.TRACKED] = own
-    table[Status.COASTING] = own + (255 - own) * _COASTING_LIGHTER
-    table[Status.LOST] = _LOST_RGB
-    return table.round().astype(np.uint8)[status]
+    if status == Status.LOST:
+        return _LOST_RGB
+    lighter = _COASTING_LIGHTER if status == Status.COASTING else 0.0
+    red, green, blue = (round(part + (255 - part) * lighter) for part in rgb)
+    return red, green, blue
+
+
+def status_colours(
+    status: Int[np.ndarray, " rows"], rgb: tuple[int, int, int]
+) -> UInt8[np.ndarray, "rows 3"]:
+    """(rows, 3), the colour of a drone by its status in each row; see `status_rgb`."""
+    return np.array([status_rgb(each, rgb) for each in Status], np.uint8)[status]

@@ -68,7 +68,7 @@ class ImagePlan:
 
 
 @dataclass(frozen=True)
-class CameraImagesTask:
+class EncodingTask:
     """Task of encoding the images of one video.
 
     Attributes:
@@ -92,7 +92,7 @@ class CameraImagesTask:
 
 
 @dataclass(frozen=True, repr=False)
-class CameraImages:
+class EncodedImages:
     """Encoded images of one camera.
 
     Attributes:
@@ -137,7 +137,7 @@ def plan_images(videos: Mapping[CameraKey, VideoInfo], max_bytes: float) -> Imag
     return ImagePlan(step, reduction, sum(len(range(0, each.num_frames, step)) for each in videos.values()))
 
 
-def encode_images(task: CameraImagesTask, advance: Advance) -> CameraImages:
+def encode_images(task: EncodingTask, advance: Advance) -> EncodedImages:
     """Encode the images of one video; the quality follows the size of the images so far.
 
     Raises:
@@ -174,12 +174,12 @@ def encode_images(task: CameraImagesTask, advance: Advance) -> CameraImages:
         raise OutputError(
             task.path, expected="a file that can be written", found=error.strerror or f"{error}"
         ) from error
-    return CameraImages(
+    return EncodedImages(
         task.path, np.array(frames), np.array(sizes).reshape(-1, 2), tuple(blobs), tuple(markers)
     )
 
 
-def split_images(images: CameraImages, chosen: Sequence[int]) -> list[tuple[bytes, bytes]]:
+def split_images(images: EncodedImages, chosen: Sequence[int]) -> list[tuple[bytes, bytes]]:
     """The JPEG and the PNG image of some of a camera's images."""
     ends = np.cumsum(images.sizes.sum(axis=1))
     found = []

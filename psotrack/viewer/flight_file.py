@@ -15,7 +15,7 @@ from psotrack.recordings import VideoInfo
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, map_in_processes, no_progress
 from psotrack.viewer.camera_images import (
-    CameraImagesTask,
+    EncodingTask,
     CameraKey,
     ImagePlan,
     encode_images,
@@ -149,11 +149,11 @@ def _tasks(
     plan: ImagePlan,
     folder: Path,
     max_bytes: float,
-) -> dict[CameraKey, CameraImagesTask]:
+) -> dict[CameraKey, EncodingTask]:
     silhouettes = content.silhouettes
     arrays = {} if silhouettes is None else dict(zip(silhouettes.cameras, silhouettes.arrays, strict=True))
     return {
-        camera: CameraImagesTask(
+        camera: EncodingTask(
             video=video,
             path=folder / f"{number}.images",
             step=plan.step,

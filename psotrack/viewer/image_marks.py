@@ -20,7 +20,7 @@ from psotrack.flights import (
 )
 from psotrack.geometry.rotations import rotation_matrices
 from psotrack.recordings import OnboardVideo, read_detections
-from psotrack.viewer.camera_images import CameraImages, CameraKey, split_images
+from psotrack.viewer.camera_images import EncodedImages, CameraKey, split_images
 from psotrack.viewer.entity_log import EntityLog, camera_path, drone_label, shown_rgb, tracks_path
 from psotrack.viewer.space import MARKER_RGB, pinhole
 
@@ -60,7 +60,7 @@ def log_images(
     log: EntityLog,
     flight: TrackedFlight,
     camera: CameraKey,
-    images: CameraImages,
+    images: EncodedImages,
     pixels: tuple[int, int],
 ) -> None:
     """Log the images of a camera: of the rig with silhouettes and blobs, on a drone with its path and markers.

@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Float
 
-from psotrack.flights import USUAL_SIZE_M, TrackedFlight, ellipsoids_90, status_colours
+from psotrack.flights import USUAL_SIZE_M, TrackedFlight, ellipsoids_90, status_rgb
 from psotrack.recordings import Recording
 from psotrack.support import COLOURS
 from psotrack.trajectories import Status, Trajectories
@@ -81,7 +81,7 @@ class LiveView:
             trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
             trail.append(position_m)
             number = int(name) if name.isdecimal() else len(self._trails)
-            rgb = status_colours(np.array([status]), shown_rgb(COLOURS[number % len(COLOURS)]))
+            rgb = [status_rgb(status, shown_rgb(COLOURS[number % len(COLOURS)]))]
             label = status_label(name, status)
             path = f"world/drones/{part(name)}"
             half_m = np.array(USUAL_SIZE_M) / 2

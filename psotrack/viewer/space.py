@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Float
 
-from psotrack.flights import FlightTracks, TrackedFlight, ellipsoids_90, status_colours, statuses
+from psotrack.flights import FlightTracks, TrackedFlight, ellipsoids_90, status_colours, status_rgb, statuses
 from psotrack.inside_out import MarkerMap, read_marker_table
 from psotrack.trajectories import Status, Trajectories
 from psotrack.viewer.camera_images import CameraKey
@@ -147,7 +147,7 @@ def _log_drone(
         f"{path}/path",
         rr.LineStrips3D(
             [piece_m for piece_m, _ in pieces],
-            colors=[(*status_colours(np.array(each), rgb).tolist(), _PATH_OPACITY) for _, each in pieces],
+            colors=[(*status_rgb(each, rgb), _PATH_OPACITY) for _, each in pieces],
             radii=[0.006],
         ),
     )
