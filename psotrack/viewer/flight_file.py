@@ -15,8 +15,8 @@ from psotrack.recordings import VideoInfo
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, map_in_processes, no_progress
 from psotrack.viewer.camera_images import (
-    EncodingTask,
     CameraKey,
+    EncodingTask,
     ImagePlan,
     encode_images,
     plan_images,

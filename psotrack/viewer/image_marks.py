@@ -20,7 +20,7 @@ from psotrack.flights import (
 )
 from psotrack.geometry.rotations import rotation_matrices
 from psotrack.recordings import OnboardVideo, read_detections
-from psotrack.viewer.camera_images import EncodedImages, CameraKey, split_images
+from psotrack.viewer.camera_images import CameraKey, EncodedImages, split_images
 from psotrack.viewer.entity_log import EntityLog, camera_path, drone_label, shown_rgb, tracks_path
 from psotrack.viewer.space import MARKER_RGB, pinhole
 

@@ -10,10 +10,12 @@ import rerun.blueprint as rrb
 
 from psotrack.flights import TrackedFlight
 from psotrack.viewer.camera_images import CameraKey
-from psotrack.viewer.entity_log import TIME, camera_path, drone_path
+from psotrack.viewer.entity_log import FRAME, TIME, camera_path, drone_path
 
 #: Time for which a drone's trail is shown, seconds.
 _TRAIL_S = 3.0
+#: Background of the view of space, also where the browser's page is light: colours of drones are made for it.
+_BACKGROUND = (18, 20, 24)
 #: Quantities that are plotted, and the names of their plots.
 _PLOTS = {
     "error_mm": "error against the reference (mm)",
@@ -57,7 +59,7 @@ def live_blueprint() -> rrb.Blueprint:
     """The arrangement for tracks that come while cameras film."""
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial3DView(origin="/world", name="space"),
+            rrb.Spatial3DView(origin="/world", name="space", background=_BACKGROUND),
             rrb.Vertical(
                 rrb.TimeSeriesView(origin="/plots/height_m", name="height (m)"),
                 rrb.TimeSeriesView(origin="/plots/deviation_mm", name="standard deviation (mm)"),
@@ -99,6 +101,7 @@ def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
         name="space",
         overrides=trails,
         eye_controls=_eye(flight),
+        background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0),
     )
 
@@ -146,7 +149,7 @@ def _events() -> rrb.TextLogView:
     return rrb.TextLogView(
         origin="/events",
         name="events: a click on a time jumps there",
-        columns=rrb.TextLogColumns(timeline_columns=[TIME], text_log_columns=["loglevel", "body"]),
+        columns=rrb.TextLogColumns(timeline_columns=[TIME, FRAME], text_log_columns=["loglevel", "body"]),
     )
 
 

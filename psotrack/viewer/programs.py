@@ -27,7 +27,9 @@ _START_S, _END_S = 30.0, 3.0
 _LOOK_S = 0.1
 #: Share of the memory up to which the server keeps a flight.
 _MEMORY = "75%"
-_WITHOUT_WINDOW = "--save FLIGHT.rrd writes a file, and --web shows the flight in a browser"
+_WITHOUT_WINDOW = (
+    "`psotrack view --save FLIGHT.rrd` or `--web`, and `psotrack live --view web`, need no screen"
+)
 
 
 @dataclass(frozen=True)
