@@ -60,6 +60,7 @@ ROOMS = [
     "simulation",
     "demo",
     "sweep",
+    "reports",
     "cli",
     "__main__",
 ]
