@@ -8,13 +8,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 import pytest
 from helpers import ring_rig
 from test_evaluation_shown import flights
 
 from psotrack.evaluation import evaluate, tables
+from psotrack.identity import Identities
+from psotrack.pipeline import TrackedRecording
 from psotrack.recordings import FrameTimes, Recording
+from psotrack.settings import TrackSettings
 from psotrack.support import html_paths
 from psotrack.trajectories import Status, Trajectories, summarise, summary_columns
 
@@ -114,6 +118,28 @@ def test_trajectories_show_a_table_and_the_paths() -> None:
     x_px = [float(point.split(",")[0]) for point in lines[0].attrib["points"].split()]
     assert x_px == sorted(x_px)
     assert len(x_px) == 5
+
+
+def test_a_tracked_recording_shows_sizes_seconds_and_changed_settings() -> None:
+    order, ambiguity = np.tile(np.arange(2), (5, 1)), np.zeros((5, 1))
+    settings = TrackSettings().changed({"swarm.particles": 50, "smooth": True})
+    tracked = TrackedRecording(
+        tracks(),
+        np.array([[0.4, 0.4, 0.1], [0.5, 0.5, 0.2]]),
+        Identities(order, np.array([[0, 1]]), ambiguity, ()),
+        {
+            "sequence": "<u>lab</u>",
+            "settings": msgspec.to_builtins(settings),
+            "seconds": {"track": 1.25, "total": 7.0},
+        },
+    )
+    page = Page(tracked._repr_html_())
+    sizes = page.rows[0].index("size (cm)")
+    assert [row[sizes] for row in page.rows[1:3]] == ["40 40 10", "50 50 20"]
+    assert ["settings", "smooth = True, swarm.particles = 50"] in page.rows
+    assert ["seconds", "track 1.2, total 7.0"] in page.rows
+    assert "u" not in page.tags
+    assert len(picture(tracked._repr_html_())) == 5
 
 
 def test_pictures_stay_small_and_inside_of_their_frame() -> None:

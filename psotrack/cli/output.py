@@ -117,10 +117,9 @@ def print_drones(
         columns.pop(heading, None)
     table = Table(box=box.HORIZONTALS, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
     for heading in columns:
-        is_name = heading == "drone"
-        table.add_column(
-            heading, justify="left" if is_name else "right", no_wrap=not is_name, overflow="fold"
-        )
+        # Long names are folded; numbers are on one line.
+        style = {"min_width": 5} if heading == "drone" else {"justify": "right", "no_wrap": True}
+        table.add_column(heading, overflow="fold", **style)
     for row in zip(*columns.values(), strict=True):
         table.add_row(*map(Text, row))
     Console().print(table)

@@ -12,6 +12,8 @@ from psotrack.trajectories.trajectories import Status, Trajectories
 
 #: Text of an unknown number.
 UNKNOWN = "-"
+#: Numbers from here on are shown without decimals.
+_LARGE = 10_000
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,10 @@ def _mean(values: np.ndarray) -> float:
 
 
 def _number(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if math.isfinite(value) else UNKNOWN
+    """A number; a large one has no decimals, so that columns stay narrow."""
+    if not math.isfinite(value):
+        return UNKNOWN
+    return f"{value:.{decimals if abs(value) < _LARGE else 0}f}"
 
 
 def _share(value: float) -> str:
