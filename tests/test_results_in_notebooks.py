@@ -122,7 +122,8 @@ def test_trajectories_show_a_table_and_the_paths() -> None:
 
 def test_a_tracked_recording_shows_sizes_seconds_and_changed_settings() -> None:
     order, ambiguity = np.tile(np.arange(2), (5, 1)), np.zeros((5, 1))
-    settings = TrackSettings().changed({"swarm.particles": 50, "smooth": True})
+    changed = {"swarm.particles": 50, "smooth": True, "motion.max_speed_m_s": 6.0}
+    settings = TrackSettings().changed(changed)
     tracked = TrackedRecording(
         tracks(),
         np.array([[0.4, 0.4, 0.1], [0.5, 0.5, 0.2]]),
@@ -130,6 +131,8 @@ def test_a_tracked_recording_shows_sizes_seconds_and_changed_settings() -> None:
         {
             "sequence": "<u>lab</u>",
             "settings": msgspec.to_builtins(settings),
+            # The largest speed was not given, so nobody chose it.
+            "volume": {"speed_from": "default", "bounds_from": "given"},
             "seconds": {"track": 1.25, "total": 7.0},
         },
     )

@@ -335,5 +335,6 @@ def _track_causally(
         f"{out}: {record['drones']} drones, {record['frames']} frames, {record['seconds']['total']:.1f} s, "
         f"{record['real_time_factor']:.2g} of real time",
     )
-    if not quiet:
+    # A file without rows is none of tracks.
+    if record["drones"] and not quiet:
         print_drones(quiet, json_path, read_trajectories(out))

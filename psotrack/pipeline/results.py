@@ -68,7 +68,7 @@ class TrackedRecording:
             drones_html(self.trajectories, self.size_m),
             html_lines(
                 {
-                    "settings": ", ".join(_changed_settings(self.record["settings"])),
+                    "settings": ", ".join(_changed_settings(self.record)),
                     "seconds": ", ".join(
                         f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()
                     ),
@@ -77,13 +77,16 @@ class TrackedRecording:
         )
 
 
-def _changed_settings(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Name and value of each setting of a record that is not the default."""
+def _changed_settings(record: Mapping[str, Any]) -> Iterator[str]:
+    """Name and value of each setting of a record that somebody chose and that is not the default."""
     usual = msgspec.to_builtins(TrackSettings())
+    origin = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
     for name in setting_names():
         part, dot, field = name.partition(".")
-        value, default = (each[part][field] if dot else each[part] for each in (settings, usual))
-        if value != default:
+        value, default = (each[part][field] if dot else each[part] for each in (record["settings"], usual))
+        # The record has the values that were used, also where the data gave them.
+        found = name in origin and record["volume"][origin[name]] != "given"
+        if value != default and not found:
             yield f"{name} = {value}"
 
 

@@ -92,7 +92,9 @@ def html_paths(position_m: Float[np.ndarray, "frames drones 3"]) -> str:
 
 
 def _cell(text: str, side: str, kind: str = "td") -> str:
-    return f'<{kind} style="{_CELL.format(side=side)}">{html.escape(text)}</{kind}>'
+    # Columns of numbers stay on one line; sentences, which are on the left, are folded.
+    style = _CELL.format(side=side) + ("; white-space: nowrap" if side == "right" else "")
+    return f'<{kind} style="{style}">{html.escape(text)}</{kind}>'
 
 
 def _parts(path_m: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
