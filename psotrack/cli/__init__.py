@@ -18,6 +18,7 @@ import click
 from psotrack import __version__
 from psotrack.cli.interrupts import orderly_interrupts
 from psotrack.cli.lazy import LazyCommand, LazyGroup
+from psotrack.cli.log_file import FirstOnly
 from psotrack.errors import PsotrackError, SettingsError
 
 __all__ = ["cli", "main"]
@@ -127,27 +128,15 @@ def cli(verbose: bool) -> None:
     """
     logging.addLevelName(logging.WARNING, "warning")
     handler = logging.StreamHandler(sys.stderr)
-    handler.addFilter(_FirstOnly())
+    handler.addFilter(FirstOnly())
+    level = logging.INFO if verbose else logging.WARNING
+    # A log file takes more than stderr.
+    handler.setLevel(level)
     logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING,
+        level=level,
         format="%(levelname)s %(name)s: %(message)s" if verbose else "psotrack: %(levelname)s: %(message)s",
         handlers=[handler],
     )
-
-
-class _FirstOnly(logging.Filter):
-    """Lets a warning pass once: `evaluate --offset`, for one, reads the reference twice."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._said: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is the first one with its text, or no warning."""
-        message = record.getMessage()
-        new = record.levelno < logging.WARNING or message not in self._said
-        self._said.add(message)
-        return new
 
 
 def main(started: float | None = None) -> None:
