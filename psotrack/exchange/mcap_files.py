@@ -1,7 +1,8 @@
 """MCAP files with ROS 2 messages: a topic of poses per drone, TF, and with a recording the cameras and their images.
 
     /NAME/pose                      geometry_msgs/PoseWithCovarianceStamped, in the frame `world`
-    /tf, /tf_static                 the drones at each time; the cameras, whose z looks ahead
+    /tf                             the drones at each time; the cameras, whose z looks ahead, at each whole second and
+                                    at the end, so that no player has to know that they stand still
     /CAMERA/camera_info             sensor_msgs/CameraInfo
     /CAMERA/image/compressed        sensor_msgs/CompressedImage, JPEG
 
@@ -37,13 +38,6 @@ from psotrack.trajectories import Trajectories
 WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
 _JPEG_QUALITY = 90
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
-#: Durability of /tf_static: a program that starts to listen later gets the last message, too.
-_LATCHED = (
-    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline: {sec: 9223372036, nsec: 854775807}\n"
-    "  lifespan: {sec: 9223372036, nsec: 854775807}\n  liveliness: 1\n"
-    "  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}\n  avoid_ros_namespace_conventions: false"
-)
-
 #: Time in nanoseconds, topic, type and content of a message.
 _Message = tuple[int, str, str, dict[str, Any]]
 
@@ -76,8 +70,9 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     streams: list[Iterator[_Message]] = [_drone_messages(trajectories, names)]
     total = 0
     if footage is not None:
-        heads, missing = _camera_heads(footage, cameras, camera_names)
-        streams.insert(0, iter(heads))
+        infos, missing = _camera_infos(footage, cameras, camera_names)
+        places = _camera_places(footage, cameras, camera_names, float(trajectories.time_s[-1]))
+        streams = [iter(infos), places, *streams]
         if footage.images:
             filmed = [camera for camera in cameras if camera.name in footage.recording.videos]
             total = sum(len(camera.time_s) for camera in filmed)
@@ -252,20 +247,33 @@ def _drone_messages(trajectories: Trajectories, names: list[str]) -> Iterator[_M
             yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": transforms}
 
 
-def _camera_heads(
+def _camera_infos(
     footage: Footage, cameras: list[CameraFrames], names: dict[str, str]
 ) -> tuple[list[_Message], list[str]]:
-    """Places and lenses of the cameras at time 0, and what ROS cannot hold of them."""
-    transforms, infos, missing = [], [], []
+    """Lenses of the cameras at time 0, and what ROS cannot hold of them."""
+    infos: list[_Message] = []
+    missing = []
     for camera in cameras:
-        one, name = footage.recording.rig.cameras[camera.index], names[camera.name]
-        transforms.append(ros.transform(ros.header(0, WORLD), name, *ros.camera_pose(one)))
-        info = ros.camera_message(ros.header(0, name), one)
+        name = names[camera.name]
+        info = ros.camera_message(ros.header(0, name), footage.recording.rig.cameras[camera.index])
         if info is None:
             missing.append(f"the lens of {camera.name}, for which ROS has no model")
         else:
             infos.append((0, f"/{name}/camera_info", ros.CAMERA_INFO, info))
-    return [(0, "/tf_static", ros.TRANSFORMS, {"transforms": transforms}), *infos], missing
+    return infos, missing
+
+
+def _camera_places(
+    footage: Footage, cameras: list[CameraFrames], names: dict[str, str], last_s: float
+) -> Iterator[_Message]:
+    """Places of the cameras at each whole second, and at the end."""
+    poses = [
+        (names[each.name], *ros.camera_pose(footage.recording.rig.cameras[each.index])) for each in cameras
+    ]
+    times_ns = [*range(0, round(last_s * 1e9), 10**9), round(last_s * 1e9)]
+    for time_ns in times_ns:
+        head = ros.header(time_ns, WORLD)
+        yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": [ros.transform(head, *pose) for pose in poses]}
 
 
 def _image_messages(
@@ -308,7 +316,7 @@ def _write_bag_file(
                 "name": topic,
                 "type": kind,
                 "serialization_format": "cdr",
-                "offered_qos_profiles": _LATCHED if topic == "/tf_static" else "",
+                "offered_qos_profiles": "",
             },
             "message_count": count,
         }

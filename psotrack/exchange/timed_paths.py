@@ -138,7 +138,7 @@ def _own_interval_s(paths: Sequence[TimedPath]) -> float | None:
 
 def _on_frames(
     paths: Sequence[TimedPath],
-    frames: Sequence[Int[np.ndarray, "rows"] | None],
+    frames: Sequence[Int[np.ndarray, "_"] | None],
     time_of: Callable[[Int[np.ndarray, "frames"]], Float[np.ndarray, "frames"]],
 ) -> Trajectories:
     """Trajectories in the frames that some path has."""
