@@ -577,6 +577,13 @@ def test_nothing_is_overwritten(run: Callable[..., Output], flight: Path, tmp_pa
     assert (out / "notes.md").read_text() == "mine"
 
 
+@pytest.mark.parametrize("names", [("a b", "a_b"), ("c1", "d"), ("world", "d")])
+def test_names_that_are_one_name_in_ros(tmp_path: Path, footage: Footage, names: tuple[str, str]) -> None:
+    with pytest.raises(InputError, match="differ as names of ROS"):
+        export_tracks(replace(small_tracks(), drones=names), "mcap", tmp_path / "bag", footage=footage)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

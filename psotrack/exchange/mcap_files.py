@@ -49,7 +49,7 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
         path: the file, or a new folder if the name does not end in .mcap.
         trajectories: the tracks.
         footage: the recording, and whether its images are written; None: poses alone.
-        report: shows the progress in images.
+        report: shows the progress in frames of the tracks and images.
 
     Raises:
         SettingsError: the libraries are not installed.
@@ -66,25 +66,23 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     cameras = [] if footage is None else camera_frames(footage.recording, trajectories)
     shown = [camera.name for camera in cameras]
     camera_names = dict(zip(shown, _ros_names(shown, "cam"), strict=True))
+    _check_different([WORLD, *names, *camera_names.values()])
+    filmed = []
+    if footage is not None and footage.images:
+        filmed = [camera for camera in cameras if camera.name in footage.recording.videos]
     missing: list[str] = []
-    streams: list[Iterator[_Message]] = [_drone_messages(trajectories, names)]
-    total = 0
-    if footage is not None:
-        infos, missing = _camera_infos(footage, cameras, camera_names)
-        places = _camera_places(footage, cameras, camera_names, float(trajectories.time_s[-1]))
-        streams = [iter(infos), places, *streams]
-        if footage.images:
-            filmed = [camera for camera in cameras if camera.name in footage.recording.videos]
-            total = sum(len(camera.time_s) for camera in filmed)
     counts: Counter[tuple[str, str]] = Counter()
     first_ns, last_ns = 2**63 - 1, 0
     file = path if path.suffix == ".mcap" else path / f"{path.name.lstrip('.').partition('.')[0]}_0.mcap"
     file.parent.mkdir(parents=True, exist_ok=True)
-    with report("images" if total else "messages", total) as advance, file.open("wb") as stream:
-        if footage is not None and footage.images:
-            streams += [
-                _image_messages(footage, camera, camera_names[camera.name], advance) for camera in filmed
-            ]
+    total = trajectories.num_frames + sum(len(camera.time_s) for camera in filmed)
+    with report("messages", total) as advance, file.open("wb") as stream:
+        streams: list[Iterator[_Message]] = [_drone_messages(trajectories, names, advance)]
+        if footage is not None:
+            infos, missing = _camera_infos(footage, cameras, camera_names)
+            places = _camera_places(footage, cameras, camera_names, float(trajectories.time_s[-1]))
+            images = [_image_messages(footage, each, camera_names[each.name], advance) for each in filmed]
+            streams = [iter(infos), places, *streams, *images]
         writer = writer_class(stream)
         schemas = {name: writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
         drones = dict(zip((f"/{name}/pose" for name in names), trajectories.drones, strict=True))
@@ -219,23 +217,32 @@ def _ros_names(names: Sequence[str], prefix: str) -> list[str]:
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
         found.append(plain if _NAME.match(plain) else f"{prefix}_{plain}")
-    twice = [name for name, count in Counter(found).items() if count > 1]
-    if twice:
-        raise InputError(
-            "names", expected="names that differ as names of ROS topics", found=f"{twice[0]} twice"
-        )
     return found
 
 
-def _drone_messages(trajectories: Trajectories, names: list[str]) -> Iterator[_Message]:
+def _check_different(names: Sequence[str]) -> None:
+    """Raise `InputError` for a drone and another drone, a camera or the world with one name."""
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(
+            "names", expected="drones and cameras that differ as names of ROS", found=f"{twice[0]} twice"
+        )
+
+
+def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advance) -> Iterator[_Message]:
     """A pose for each drone that is seen at a time, and one message of transforms for all."""
-    orientation, covariance = trajectories.orientation_wxyz, trajectories.covariance_m2
+    seen, orientation, covariance = (
+        trajectories.seen,
+        trajectories.orientation_wxyz,
+        trajectories.covariance_m2,
+    )
     for row, time_ns in enumerate(
         np.round(trajectories.time_s.astype(float) * 1e9).astype(np.int64).tolist()
     ):
         head = ros.header(time_ns, WORLD)
         transforms = []
-        for drone in np.flatnonzero(trajectories.seen[row]).tolist():
+        advance(1)
+        for drone in np.flatnonzero(seen[row]).tolist():
             position_m = trajectories.position_m[row, drone]
             turned = None if orientation is None else orientation[row, drone]
             message = ros.pose_message(
