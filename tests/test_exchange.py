@@ -31,6 +31,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from psotrack import cli
+from psotrack.cli.export import FORMAT_NAMES
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.evaluation import evaluate
@@ -541,6 +542,10 @@ def test_the_definitions_of_the_messages_are_those_of_ros() -> None:
 
 
 # What is said, and what is refused
+
+
+def test_the_command_and_the_tests_know_every_format() -> None:
+    assert set(FORMAT_NAMES) == set(OUTPUTS) == set(FORMATS)
 
 
 def test_export_says_what_is_lost(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:

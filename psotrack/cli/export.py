@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,8 +12,8 @@ from psotrack.cli.output import print_line, report_to
 from psotrack.errors import InputError, OutputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.exchange import Footage
-    from psotrack.recordings import Recording
+    import numpy as np
+
     from psotrack.trajectories import Trajectories
 
 FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
@@ -63,14 +63,15 @@ def export(
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mcap --out flight.mcap --images
     """
     from psotrack.datasets import open_recording
-    from psotrack.exchange import export_tracks, read_tracks
+    from psotrack.exchange import Footage, export_tracks, read_tracks
 
     _check_options(tracks, sequence, to, out, images)
     recording = None if sequence is None else open_recording(sequence)
     trajectories = read_tracks(tracks, recording=recording)
     footage = None
     if recording is not None:
-        footage = _footage(recording, trajectories, tracks, images, drone_size_m)
+        sizes_m = _sizes_m(trajectories, tracks, drone_size_m) if to == "mot" else None
+        footage = Footage(recording, sizes_m, images)
     lost = export_tracks(trajectories, to, out, footage=footage, force=force, report=report_to(quiet))
     left = f"; not in this format: {', '.join(lost)}" if lost else ""
     drones = f"{trajectories.num_drones} drone{'s' if trajectories.num_drones != 1 else ''}"
@@ -96,38 +97,34 @@ def _check_options(tracks: Path, sequence: Path | None, to: str, out: Path, imag
         )
 
 
-def _footage(
-    recording: Recording,
-    trajectories: Trajectories,
-    tracks: Path,
-    images: bool,
-    drone_size_m: tuple[float, ...] | None,
-) -> Footage:
+def _sizes_m(
+    trajectories: Trajectories, tracks: Path, drone_size_m: tuple[float, ...] | None
+) -> np.ndarray | None:
+    """(drones, 3), sizes of the drones, as the user says or from the record beside the tracks; None if unknown."""
     import numpy as np
 
-    from psotrack.exchange import Footage
-
     if drone_size_m is not None:
-        if min(drone_size_m) <= 0:
+        if not min(drone_size_m) > 0:
             raise SettingsError("--drone-size", expected="lengths above 0", found=f"{drone_size_m}")
-        return Footage(recording, np.tile(drone_size_m, (trajectories.num_drones, 1)), images)
-    sizes = _recorded_sizes(tracks.with_suffix(".json"))
-    known = all(name in sizes for name in trajectories.drones)
-    size_m = np.array([sizes[name] for name in trajectories.drones], float) if known else None
-    return Footage(recording, size_m, images)
+        return np.tile(drone_size_m, (trajectories.num_drones, 1))
+    recorded = _recorded_sizes(tracks.with_suffix(".json"))
+    sizes = [recorded.get(name, (np.nan,) * 3) for name in trajectories.drones]
+    size_m = np.array(sizes, float)
+    return size_m if np.isfinite(size_m).all() else None
 
 
-def _recorded_sizes(record: Path) -> dict[str, Any]:
-    """Sizes by the drones' names, from the record of a run; empty where there is none that has them."""
+def _recorded_sizes(record: Path) -> dict[str, list[float]]:
+    """Sizes by the drones' names, from the record of a run; empty where there is no record that has them."""
     import json
 
-    if not record.is_file():
-        return {}
     try:
-        drones = json.loads(record.read_text(encoding="utf-8")).get("drones")
-        if not isinstance(drones, list):
-            return {}
-        return {str(drone["drone"]): drone["size_m"] for drone in drones if drone.get("size_m")}
-    except (OSError, ValueError, AttributeError, KeyError, TypeError) as error:
+        content = json.loads(record.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
         found = f"{error}".partition("\n")[0]
         raise InputError(record, expected="the record of the tracks beside it", found=found) from error
+    drones = content.get("drones") if isinstance(content, dict) else None
+    # `track --causal` records the number of drones alone.
+    listed = drones if isinstance(drones, list) else []
+    return {str(each["drone"]): each["size_m"] for each in listed if each.get("size_m") and "drone" in each}
