@@ -36,6 +36,7 @@ ROOMS = [
     "trajectories",
     "recordings",
     "datasets",
+    "exchange",
     "silhouettes",
     "settings",
     "motion",

@@ -46,6 +46,7 @@ COMMANDS = {
         "Check the calibration of SEQ against the detections of its cameras, before tracking.",
     ),
     "evaluate": LazyCommand("psotrack.cli.evaluate", "Compare TRACKS with the reference of SEQ."),
+    "export": LazyCommand("psotrack.cli.export", "Write TRACKS in a format of another program."),
     "fly": LazyCommand(
         "psotrack.cli.fly", "Fly a simulated drone by hand and record the flight for a scenario."
     ),
