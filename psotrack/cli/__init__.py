@@ -77,6 +77,10 @@ COMMANDS = {
         "psotrack.cli.map_markers",
         "Write the table of a room's marker corners from SOURCE, or check such a table.",
     ),
+    "report": LazyCommand(
+        "psotrack.cli.report",
+        "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
+    ),
     "silhouettes": LazyCommand(
         "psotrack.cli.silhouettes",
         "Compute and store the silhouettes of SEQ, which `track` reads, or write them as images or as a video.",

@@ -126,15 +126,15 @@ def _of_errors(tracks: FlightTracks, truth: Trajectories) -> Iterator[Event]:
     for switched in np.flatnonzero(errors["switch"].to_numpy(bool)):
         name = f"{names[switched]}"
         text = f"{name} is followed by another track than before"
-        position_m = _position_m(truth, name, errors["frame"].iloc[switched])
-        yield _event(tracks, rows[switched], EventKind.SWITCH, (name,), text, position_m)
+        position_m = _position_m(truth, name, int(errors["frame"].iloc[switched]))
+        yield _event(tracks, int(rows[switched]), EventKind.SWITCH, (name,), text, position_m)
     for name in dict.fromkeys(names):
         own_m = np.where((names == name) & np.isfinite(error_m), error_m, -1.0)
         largest = int(own_m.argmax())
         if own_m[largest] >= 0:
             text = f"{name} has its largest error, {1e3 * own_m[largest]:.0f} mm"
-            position_m = _position_m(truth, name, errors["frame"].iloc[largest])
-            yield _event(tracks, rows[largest], EventKind.LARGEST_ERROR, (f"{name}",), text, position_m)
+            position_m = _position_m(truth, name, int(errors["frame"].iloc[largest]))
+            yield _event(tracks, int(rows[largest]), EventKind.LARGEST_ERROR, (f"{name}",), text, position_m)
 
 
 def _position_m(truth: Trajectories, drone: str, frame: int) -> Float[np.ndarray, "3"]:

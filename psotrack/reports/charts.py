@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Colour that stands for the colour of the page's text.
 _INK = "#2b313a"
+#: Colours of figures, and the colours of a page that replace them: text, faint text and lines.
+_OF_PAGE = {_INK: "currentColor", "#9aa3ad": "var(--faint)", "#e3e6ea": "var(--line)"}
 #: Largest number of points of a drawn line. A plot is about 1,100 pixels wide.
 _MOST_POINTS = 2400
 
@@ -27,22 +29,33 @@ def svg(size_inches: tuple[float, float], draw: Callable[[Figure], None]) -> Mar
         size_inches: width and height, inches.
         draw: draws into the empty figure that it is given.
     """
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
+    figure = Figure(size_inches, layout="constrained")
+    draw(figure)
+    return figure_svg(figure)
+
+
+def figure_svg(figure: Figure) -> Markup:
+    """An SVG element of a figure whose dark text and lines get the colour of the page's text."""
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    FigureCanvasSVG(figure)
+    figure.patch.set_alpha(0)
+    for axes in figure.axes:
+        axes.patch.set_alpha(0)
+    text = io.StringIO()
     # Text stays text, and the ids of elements are the same each time.
     with matplotlib.rc_context(
         {"svg.fonttype": "none", "svg.hashsalt": "psotrack", "font.family": "sans-serif"}
     ):
-        figure = Figure(size_inches, layout="constrained")
-        FigureCanvasSVG(figure)
-        figure.patch.set_alpha(0)
-        draw(figure)
-        text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     content = text.getvalue()
-    return Markup(content[content.index("<svg") :].replace(_INK, "currentColor"))
+    content = content[content.index("<svg") :]
+    for colour, of_page in _OF_PAGE.items():
+        content = content.replace(colour, of_page)
+    return Markup(content)
 
 
 def style(axes: Axes, *, x: str, y: str) -> None:

@@ -25,7 +25,7 @@ from psotrack.reports.charts import lines_over_time
 from psotrack.reports.moments import Moment, choose_events, take_pictures
 from psotrack.reports.page import check_page_path, render, write_page
 from psotrack.reports.scene import row_step, scene_of_flight
-from psotrack.reports.tables import Cell, PageTable, number, percent
+from psotrack.reports.tables import PageCell, PageTable, number, percent
 from psotrack.settings import TrackSettings
 from psotrack.support import Report, drone_colour, no_progress
 from psotrack.trajectories import Trajectories
@@ -156,7 +156,7 @@ def _drone_table(tracks: FlightTracks, colours: list[str]) -> PageTable:
         sizes_m = [row[f"size_{axis}_m"] for axis in "xyz"]
         rows.append(
             (
-                Cell(row["drone"], colour=colours[drone]),
+                PageCell(row["drone"], colour=colours[drone]),
                 percent(row["seen"]),
                 percent(row["coasting"]),
                 number(row["first_s"], 2),
@@ -165,7 +165,7 @@ def _drone_table(tracks: FlightTracks, colours: list[str]) -> PageTable:
                 number(row["num_cameras"], 1),
                 number(row["radius_90_m"], 1, factor=1e3),
                 number(row["speed_m_s"], 2),
-                Cell(" × ".join(f"{100 * size_m:.0f}" for size_m in sizes_m), float(np.prod(sizes_m))),  # noqa: RUF001
+                PageCell(" × ".join(f"{100 * size_m:.0f}" for size_m in sizes_m), float(np.prod(sizes_m))),  # noqa: RUF001
             )
         )
     headings = (
@@ -183,7 +183,7 @@ def _camera_table(tracks: FlightTracks, flight: TrackedFlight) -> PageTable:
     assert flight.recording is not None
     rows = tuple(
         (
-            Cell(row["camera"]),
+            PageCell(row["camera"]),
             percent(row["frames"], 0),
             percent(row["in_view"]),
             number(row["width_px"], 0),
@@ -200,8 +200,8 @@ def _camera_table(tracks: FlightTracks, flight: TrackedFlight) -> PageTable:
 def _error_table(evaluation: Evaluation) -> PageTable:
     rows = tuple(
         (
-            Cell(drone.drone),
-            Cell(drone.estimate or "–"),  # noqa: RUF001
+            PageCell(drone.drone),
+            PageCell(drone.estimate or "–"),  # noqa: RUF001
             number(drone.mean_error_m, 1, factor=1e3),
             number(drone.median_error_m, 1, factor=1e3),
             number(drone.p95_error_m, 1, factor=1e3),
@@ -293,5 +293,6 @@ def _changed(record: RunRecord) -> dict[str, Any]:
                 found[f"{prefix}{name}"] = value
         return found
 
-    defaults = flat(msgspec.to_builtins(TrackSettings()))
+    # A record has lists where settings have tuples.
+    defaults = flat(json.loads(msgspec.json.encode(TrackSettings())))
     return {name: value for name, value in flat(record.settings).items() if defaults.get(name, None) != value}

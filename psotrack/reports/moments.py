@@ -29,7 +29,7 @@ _SHOWN = (
 _SIZE_WH = (360, 240)
 #: Height of the part of the scene that a picture shows, metres, and the smallest part of an image, pixels.
 _HEIGHT_M, _LEAST_PX = 1.6, 60
-_JPEG_QUALITY = 78
+_JPEG_QUALITY = 85
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _part(
             continue
         x0, y0, x1, y1 = (round(float(edge)) for edge in scale * (box_px - np.tile(corner, 2)))
         bgr = tuple(int(colour[place : place + 2], 16) for place in (5, 3, 1))
-        cv2.rectangle(part, (x0, y0), (x1, y1), bgr, 1, cv2.LINE_AA)
+        cv2.rectangle(part, (x0, y0), (x1, y1), bgr, 2, cv2.LINE_AA)
         for thickness, ink in ((3, (255, 255, 255)), (1, bgr)):
             cv2.putText(part, name, (x0, y0 - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, thickness, cv2.LINE_AA)
     return part

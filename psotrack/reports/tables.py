@@ -9,7 +9,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Cell:
+class PageCell:
     """A cell of a table.
 
     Attributes:
@@ -34,22 +34,22 @@ class PageTable:
     """
 
     headings: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[PageCell, ...], ...]
     note: str = ""
 
 
-def number(value: float | None, decimals: int = 0, *, factor: float = 1.0, unit: str = "") -> Cell:
+def number(value: float | int | None, decimals: int = 0, *, factor: float = 1.0, unit: str = "") -> PageCell:
     """A cell with a number; a dash where it is not known."""
     if value is None or not np.isfinite(value):
-        return Cell("–")  # noqa: RUF001  a dash in print
-    return Cell(f"{factor * value:.{decimals}f}{unit}", float(value))
+        return PageCell("–")  # noqa: RUF001  a dash in print
+    return PageCell(f"{factor * value:.{decimals}f}{unit}", float(value))
 
 
-def percent(value: float | None, decimals: int = 1) -> Cell:
+def percent(value: float | int | None, decimals: int = 1) -> PageCell:
     """A cell with a share as a percentage."""
-    return number(value, decimals, factor=100, unit=" %")
+    return number(value, decimals, factor=100.0, unit=" %")
 
 
-def words(texts: Sequence[str]) -> tuple[Cell, ...]:
+def words(texts: Sequence[str]) -> tuple[PageCell, ...]:
     """Cells of text."""
-    return tuple(Cell(text) for text in texts)
+    return tuple(PageCell(text) for text in texts)

@@ -156,7 +156,7 @@ function psotrackScene(host, data) {
 
   for (const each of data.truth) {
     const position = decode(each.position_m);
-    const material = wide({ linewidth: 1.4, dashed: true, dashSize: extent / 90, gapSize: extent / 130 });
+    const material = wide({ linewidth: 1, transparent: true, opacity: 0.7, dashed: true, dashSize: extent / 90, gapSize: extent / 130 });
     inked.push(material);
     groupOf("truth").add(segments(pairs(position, 0, count - 1), material));
   }
@@ -213,7 +213,7 @@ function psotrackScene(host, data) {
   const middle = new THREE.Vector3(...low.map((value, axis) => (value + high[axis]) / 2));
   const home = () => {
     controls.target.copy(middle);
-    camera.position.copy(middle).add(new THREE.Vector3(-0.55, -1.0, 0.75).multiplyScalar(extent * 0.95));
+    camera.position.copy(middle).add(new THREE.Vector3(-0.55, -1.0, 0.75).multiplyScalar(extent * 1.05));
     camera.near = extent / 1000;
     camera.far = extent * 100;
     camera.updateProjectionMatrix();
@@ -297,6 +297,8 @@ function psotrackScene(host, data) {
     pause();
     show(rowAt(seconds));
   };
+
+  if (count < 2) host.querySelector(".scene-bar").classList.add("scene-still");
 
   playButton.addEventListener("click", () => (playing ? pause() : play()));
   speedChoice.addEventListener("change", () => {
