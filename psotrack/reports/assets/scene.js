@@ -212,8 +212,10 @@ function psotrackScene(host, data) {
 
   const middle = new THREE.Vector3(...low.map((value, axis) => (value + high[axis]) / 2));
   const home = () => {
+    // A narrow view needs a larger distance to show the whole width.
+    const away = extent * 1.05 * Math.max(1, 1.3 / camera.aspect);
     controls.target.copy(middle);
-    camera.position.copy(middle).add(new THREE.Vector3(-0.55, -1.0, 0.75).multiplyScalar(extent * 1.05));
+    camera.position.copy(middle).add(new THREE.Vector3(-0.55, -1.0, 0.75).multiplyScalar(away));
     camera.near = extent / 1000;
     camera.far = extent * 100;
     camera.updateProjectionMatrix();
@@ -342,8 +344,8 @@ function psotrackScene(host, data) {
   };
   new ResizeObserver(resize).observe(view);
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
-  home();
   resize();
+  home();
   recolour();
   show(0);
   host.scene = { play, pause, seek, show, row: () => row, isPlaying: () => playing };
