@@ -8,9 +8,11 @@ comma := ,
 install = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python -e '.[$(1)]'; \
 	else { test -x $(BIN)/pip || $(BIN)/python -m ensurepip >/dev/null; } \
 	  && $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(1)]'; fi
-# TrackEval, the oracle of HOTA in the tests, without its dependencies: opencv-python would overwrite the headless OpenCV.
-oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps 'trackeval>=1.3'; \
-	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'trackeval>=1.3'; fi
+# Oracles of the tests without their dependencies: opencv-python, which TrackEval wants, would overwrite the headless
+# OpenCV, and of evo (GPL, which no part of the package imports) the tests need only the readers and errors.
+oracles = 'trackeval>=1.3' 'evo>=1.38'
+oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps $(oracles); \
+	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(oracles); fi
 
 # One worker per processor; a worker that has finished takes tests of another. Bytecode is kept between runs, because
 # every worker and every command that a test starts would compile the package again.

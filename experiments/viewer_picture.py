@@ -51,14 +51,14 @@ def main() -> None:
         "--scale", type=float, default=1.0, help="size of the images per size of the dataset's"
     )
     options = parser.parse_args()
-    started = _results.Run("viewer")
+    started = _results.Run("viewer_picture")
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary)
         sequence, tracks = root / "Simulated_Data" / SCENARIO, root / "tracks.csv"
         cache = ("--cache", root / "cache")
         run("simulate", SCENARIO, "--out", root, "--frames", options.frames, "--scale", options.scale)
         run("track", sequence, "--out", tracks, *cache)
-        run("view", tracks, "--sequence", sequence, "--onboard", "--save", root / "flight.rrd", *cache)
+        run("view", tracks, "--sequence", sequence, "--save", root / "flight.rrd", *cache)
         run("overlay", tracks, sequence, "--out", root, "--mosaic")
         pictures = {
             "viewer": photograph(root / "flight.rrd", options.browser),

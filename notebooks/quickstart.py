@@ -29,6 +29,7 @@ from psotrack.demo import save_picture
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
+from psotrack.reports import view_3d
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.simulation import SimulationSettings, simulate
@@ -74,7 +75,7 @@ for name, video, centre_m in zip(
 # %%
 name = recording.rig.names[0]
 first_frame = next(read_frames(recording.videos[name]))
-figure, axes = plt.subplots(figsize=(9, 5.2), dpi=64, layout="constrained")
+figure, axes = plt.subplots(figsize=(9, 5.2), dpi=56, layout="constrained")
 axes.imshow(first_frame[:, :, ::-1])  # OpenCV has blue first
 axes.set(xlabel="x (pixels)", ylabel="y (pixels)", title=f"camera {name}, frame 0")
 plt.show()
@@ -108,7 +109,7 @@ pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
 # %%
 picture = DATA / "quickstart.png"
 save_picture(picture, recording, tracked)
-figure, axes = plt.subplots(figsize=(13, 4.6), layout="constrained")
+figure, axes = plt.subplots(figsize=(13, 4.6), dpi=68, layout="constrained")
 axes.imshow(plt.imread(picture))
 axes.set_axis_off()
 plt.show()
@@ -117,6 +118,15 @@ plt.show()
 # *What to see. Left: four of the cameras half-way through the recording; each box is the tracked position with the
 # learned size, projected into the camera, and sits on its drone. A colour is one drone in all pictures. Right: the
 # tracked paths (solid), the true paths (dashed), and the shadows of both on the floor. Axes are in metres.*
+#
+# The flight in 3D turns with the mouse and plays:
+
+# %%
+view_3d(tracked, recording)
+
+# %% [markdown]
+# *What to see: the drones with their paths of the last two seconds, the whole paths (faint), the true paths (dashed), and
+# the cameras. The slider is time. The view is in the saved notebook, too; it needs neither the recording nor a network.*
 #
 # ## How good is it?
 

@@ -49,7 +49,7 @@ SMALL = {"dpi": 80} if not TINY else {"dpi": 40}
 # The commands below are those of the environment in which this notebook runs; what they keep lies in `data`.
 os.environ["PATH"] = str(Path(sys.executable).parent) + os.pathsep + os.environ["PATH"]
 os.environ["PSOTRACK_CACHE"] = str(Path("data", "cache").resolve())
-os.environ |= {"COLUMNS": "110", "TTY_COMPATIBLE": "0"}  # plain text without progress bars
+os.environ |= {"COLUMNS": "110", "TTY_COMPATIBLE": "0", "PSOTRACK_PROGRESS": "none"}  # plain text
 plt.rcParams.update({"figure.dpi": SMALL["dpi"], "font.size": 9})
 
 # %% [markdown]

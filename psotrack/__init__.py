@@ -9,13 +9,13 @@
         print(pt.evaluate(tracked.trajectories, recording.truth).mean_error_m)
 
 Recordings and files
-    read_recording, Recording, read_c3d, read_trajectories, write_trajectories, simulate,
+    read_recording, Recording, read_c3d, read_trajectories, write_trajectories, read_tracks, export_tracks, simulate,
     SimulationSettings
 Tracking
     track, track_runs, TrackSettings and its parts (SwarmSettings, ScoreSettings, MotionSettings, DroneSettings,
     StatusSettings, IdentitySettings), TrackedRecording, Trajectories
-Judging
-    evaluate, Evaluation, find_offset
+Judging and showing
+    evaluate, Evaluation, find_offset, view_3d
 Cameras
     Rig, make_camera, make_rig, read_rig, write_rig, project, triangulate
 Inside-out

@@ -2,11 +2,13 @@ from .api import background_model, detect_markers, read_recording, track
 from .clocks import find_offset
 from .detection import Detector
 from .evaluation import Evaluation, evaluate
+from .exchange import export_tracks, read_tracks
 from .geometry import Rig, make_camera, make_rig, project, triangulate
 from .inside_out import MarkerMap, localise_video, read_marker_map
 from .methods import Method, MethodInputs
 from .pipeline import TrackedRecording, track_runs
 from .recordings import Recording, read_c3d
+from .reports import view_3d
 from .rig_files import read_rig, write_rig
 from .settings import (
     DroneSettings,
@@ -51,6 +53,7 @@ __all__ = [
     "background_model",
     "detect_markers",
     "evaluate",
+    "export_tracks",
     "find_offset",
     "localise_video",
     "make_camera",
@@ -60,12 +63,14 @@ __all__ = [
     "read_marker_map",
     "read_recording",
     "read_rig",
+    "read_tracks",
     "read_trajectories",
     "register_plugin",
     "simulate",
     "track",
     "track_runs",
     "triangulate",
+    "view_3d",
     "write_rig",
     "write_trajectories",
 ]

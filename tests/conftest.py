@@ -9,6 +9,8 @@ from pathlib import Path
 # The user's terminal and JAX settings must not decide any test. All processes of the suite (workers and commands that
 # tests start) share one folder of compiled programs, which is kept between runs. JAX reads the variables on import.
 os.environ["COLUMNS"] = "80"
+# Commands write lines about long work where there is no terminal; how long work takes must not decide any test.
+os.environ["PSOTRACK_PROGRESS"] = "none"
 # A test that opens a video with OpenCV itself would switch FFmpeg's messages on for later tests of the process.
 os.environ["OPENCV_FFMPEG_LOGLEVEL"] = "-8"
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(__file__).parents[1] / ".compiled")

@@ -176,6 +176,31 @@ def test_quiet_prints_nothing_and_bars_need_a_terminal(run: Run, sequence: Path,
 
 
 @pytest.mark.slow
+def test_a_saved_config_gives_the_same_tracks_and_a_log_says_what_was_done(
+    run: Run, sequence: Path, tmp_path: Path
+) -> None:
+    tracks, config, log = tmp_path / "tracks.csv", tmp_path / "run.toml", tmp_path / "run.log"
+    first = run(*track(sequence, tracks, "--seed", 5, "--save-config", config, "--log", log))
+    assert first.code == 0
+    lines = first.out.splitlines()
+    # The sentence, and a table with the four drones.
+    assert lines[0].startswith(f"{tracks}: 4 drones, {NUM_FRAMES} frames")
+    assert lines[1].split()[:2] == ["drone", "seen"]
+    assert [line.split()[0] for line in lines[3:]] == ["0", "1", "2", "3"]
+    assert max(map(len, lines[1:])) <= 80
+    said = log.read_text()
+    assert f" info track: {NUM_FRAMES} of {NUM_FRAMES} in " in said
+    assert said.splitlines()[-1].endswith(lines[0])
+
+    assert_one_line(run("track", "--config", config), "tracks.csv", "--force")
+    again = run("track", "--config", config, "--out", tmp_path / "again.csv", "--json", "-", "--causal")
+    assert (again.code, json.loads(again.out)["seed"]) == (0, 5)
+    assert (tmp_path / "again.csv").read_bytes() != tracks.read_bytes(), "what is typed is ignored"
+    assert run("track", "--config", config, "--out", tmp_path / "same.csv").code == 0
+    assert (tmp_path / "same.csv").read_bytes() == tracks.read_bytes()
+
+
+@pytest.mark.slow
 def test_init_from_truth_and_from_tracks(run: Run, sequence: Path, tmp_path: Path) -> None:
     assert run(*track(sequence, tmp_path / "a.csv", "--init", "truth")).code == 0
     assert run(*track(sequence, tmp_path / "b.csv", "--init", tmp_path / "a.csv", "--drones", 2)).code == 0

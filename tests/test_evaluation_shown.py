@@ -110,6 +110,17 @@ class TestTable:
         first_words = [line[:10].strip() for line in scores]
         assert first_words == ["CLEAR", "", "HOTA", "GOSPA", "RMSE", "ellipsoid", "centred"]
 
+    def test_long_names_are_folded_and_not_cut(self):
+        names = tuple(f"interceptor_of_the_left_hand_side_{number}" for number in range(3))
+        est, ref = flights(names=names)
+        est.position_m[:, 1] = np.nan
+        lines = print_table(tables.render(evaluate(est, ref)))
+        assert max(map(len, lines)) <= 80
+        assert not any("…" in line for line in lines)
+        width = lines[1].index("mean") - 2
+        shown = "".join(line[:width].replace(" ", "") for line in lines)
+        assert all(name in shown for name in names)
+
     def test_large_errors_are_shown_in_metres(self):
         est, ref = flights()
         est.position_m[:, :, 2] += 4.0

@@ -36,6 +36,7 @@ ROOMS = [
     "trajectories",
     "recordings",
     "datasets",
+    "exchange",
     "silhouettes",
     "settings",
     "motion",
@@ -62,6 +63,7 @@ ROOMS = [
     "simulation",
     "demo",
     "sweep",
+    "reports",
     "cli",
     "__main__",
 ]

@@ -18,6 +18,7 @@ import click
 from psotrack import __version__
 from psotrack.cli.interrupts import orderly_interrupts
 from psotrack.cli.lazy import LazyCommand, LazyGroup
+from psotrack.cli.log_file import FirstOnly
 from psotrack.errors import PsotrackError, SettingsError
 
 __all__ = ["cli", "main"]
@@ -45,6 +46,7 @@ COMMANDS = {
         "Check the calibration of SEQ against the detections of its cameras, before tracking.",
     ),
     "evaluate": LazyCommand("psotrack.cli.evaluate", "Compare TRACKS with the reference of SEQ."),
+    "export": LazyCommand("psotrack.cli.export", "Write TRACKS in a format of another program."),
     "fly": LazyCommand(
         "psotrack.cli.fly", "Fly a simulated drone by hand and record the flight for a scenario."
     ),
@@ -78,6 +80,10 @@ COMMANDS = {
     "overlay": LazyCommand(
         "psotrack.cli.overlay",
         "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
+    ),
+    "report": LazyCommand(
+        "psotrack.cli.report",
+        "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
     ),
     "silhouettes": LazyCommand(
         "psotrack.cli.silhouettes",
@@ -134,27 +140,15 @@ def cli(verbose: bool) -> None:
     """
     logging.addLevelName(logging.WARNING, "warning")
     handler = logging.StreamHandler(sys.stderr)
-    handler.addFilter(_FirstOnly())
+    handler.addFilter(FirstOnly())
+    level = logging.INFO if verbose else logging.WARNING
+    # A log file takes more than stderr.
+    handler.setLevel(level)
     logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING,
+        level=level,
         format="%(levelname)s %(name)s: %(message)s" if verbose else "psotrack: %(levelname)s: %(message)s",
         handlers=[handler],
     )
-
-
-class _FirstOnly(logging.Filter):
-    """Lets a warning pass once: `evaluate --offset`, for one, reads the reference twice."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._said: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is the first one with its text, or no warning."""
-        message = record.getMessage()
-        new = record.levelno < logging.WARNING or message not in self._said
-        self._said.add(message)
-        return new
 
 
 def main(started: float | None = None) -> None:

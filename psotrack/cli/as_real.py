@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
+from psotrack.cli.options import FORCE, JSON, SEQUENCE, reporting
 from psotrack.cli.output import output_json, print_line, report_to
 
 
@@ -29,7 +29,7 @@ from psotrack.cli.output import output_json, print_line, report_to
     "--seed", type=int, default=0, show_default=True, help="Seed of the noise and the gaps of the markers."
 )
 @FORCE
-@QUIET
+@reporting
 @JSON
 def as_real(
     sequence: Path,

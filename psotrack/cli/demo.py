@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, QUIET, compiled_folder
+from psotrack.cli.options import FORCE, JOBS, compiled_folder, reporting
 from psotrack.cli.output import report_to
 
 
@@ -21,7 +21,7 @@ from psotrack.cli.output import report_to
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of flights, noise and swarm.")
 @JOBS
 @FORCE
-@QUIET
+@reporting
 def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> None:
     """Simulate four drones, track them in eight videos, print the errors and save a picture.
 

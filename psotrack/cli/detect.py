@@ -16,11 +16,11 @@ from psotrack.cli.options import (
     FORCE,
     JOBS,
     JSON,
-    QUIET,
     SEQUENCE,
     cache_folder,
     filmed_recording,
     frames_option,
+    reporting,
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to
@@ -71,7 +71,7 @@ if TYPE_CHECKING:
 @CACHE
 @JOBS
 @FORCE
-@QUIET
+@reporting
 @JSON
 def detect(
     sequence: Path,

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, QUIET, dictionary_option, frames_option
+from psotrack.cli.options import (
+    FORCE,
+    JSON,
+    dictionary_option,
+    frames_option,
+    reporting,
+)
 from psotrack.cli.output import check_outputs, output_json, print_line, report_to
 from psotrack.errors import InputError, SettingsError
 
@@ -22,7 +28,7 @@ if TYPE_CHECKING:
 @dictionary_option("4x4_50")
 @frames_option
 @FORCE
-@QUIET
+@reporting
 @JSON
 def detect_markers(
     images: tuple[Path, ...],

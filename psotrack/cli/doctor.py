@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, SEQUENCE, Numbers, cache_folder
+from psotrack.cli.options import (
+    CACHE,
+    FORCE,
+    JOBS,
+    JSON,
+    SEQUENCE,
+    Numbers,
+    cache_folder,
+    reporting,
+)
 from psotrack.cli.output import finite_or_none, output_json, print_line, report_to
 
 if TYPE_CHECKING:
@@ -38,7 +47,7 @@ FOUND = 2
 )
 @CACHE
 @JOBS
-@QUIET
+@reporting
 @FORCE
 @JSON
 def doctor(

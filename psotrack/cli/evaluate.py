@@ -47,24 +47,28 @@ def evaluate(
 ) -> None:
     """Compare TRACKS with the reference of SEQ.
 
+    TRACKS is a file of `psotrack track`, or tracks of any other program: CSV, Parquet, JSON, TUM, KITTI, MOTChallenge
+    with positions, C3D or MCAP, as a file or a folder.
+
     \b
     Examples:
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --json errors.json --plot errors.png
       psotrack evaluate tracks.csv data/Real_Data/R12_D4 --offset auto
       psotrack evaluate tracks.csv flight --body cf1=M1,M2,M3,M4 --body cf2
+      psotrack evaluate folder_of_tum_files data/Simulated_Data/S02_D4_A
     """
     from rich.console import Console
 
     from psotrack.datasets import open_recording
     from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
-    from psotrack.trajectories import read_trajectories
+    from psotrack.exchange import read_tracks
 
     recording = open_recording(sequence, bodies=bodies)
     if recording.truth is None:
         raise InputError(sequence, expected="a reference to compare with", found="none")
-    estimate = read_trajectories(tracks, fps=recording.fps)
+    estimate = read_tracks(tracks, recording=recording)
     recording = _at_rate_of(estimate, recording)
     truth, offset_s = recording.truth, 0.0
     assert truth is not None

@@ -6,7 +6,13 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, JSON, QUIET, Numbers
+from psotrack.cli.options import (
+    FORCE,
+    JOBS,
+    JSON,
+    Numbers,
+    reporting,
+)
 from psotrack.cli.output import output_json, print_line, report_to
 
 
@@ -59,7 +65,7 @@ from psotrack.cli.output import output_json, print_line, report_to
 )
 @JOBS
 @FORCE
-@QUIET
+@reporting
 @JSON
 def labels(
     sequences: tuple[Path, ...],

@@ -20,6 +20,7 @@ from psotrack.cli.options import (
     FORCE,
     ITERATIONS,
     JSON,
+    LOG,
     MOST_DRONES,
     PARTICLES,
     QUIET,
@@ -30,6 +31,7 @@ from psotrack.cli.options import (
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, write_json
+from psotrack.cli.run_files import run_file_options
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
 from psotrack.support import refuse_to_overwrite
@@ -97,7 +99,9 @@ _SHOWN_S = 0.5
 @CAMERAS
 @CACHE
 @FORCE
+@run_file_options
 @QUIET
+@LOG
 @JSON
 def live(
     sequence: Path,

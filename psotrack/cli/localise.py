@@ -12,11 +12,11 @@ from psotrack.cli.options import (
     FORCE,
     FOV,
     JSON,
-    QUIET,
     SCALE_CAMERA,
     dictionary_option,
     frames_option,
     plot_option,
+    reporting,
 )
 from psotrack.cli.output import check_outputs, output_json, print_line, report_to
 from psotrack.cli.shutter import given_shutter, shutter_content, shutter_options, shutter_sentence
@@ -122,7 +122,7 @@ class _Input:
 @plot_option("the path from above, and the height over time", "beside --out, as .png")
 @frames_option
 @FORCE
-@QUIET
+@reporting
 @JSON
 def localise(
     video: str,

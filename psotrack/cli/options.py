@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 import platformdirs
 
+from psotrack.cli.log_file import LogFile
+from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import RENAMED, ErrorSettings, TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
@@ -65,6 +67,45 @@ TRACKS = click.argument("tracks", type=click.Path(path_type=Path))
 SEQUENCE = click.argument("sequence", metavar="SEQ", type=click.Path(path_type=Path))
 FORCE = click.option("--force", is_flag=True, help="Replace existing files.")
 QUIET = click.option("--quiet", "-q", is_flag=True, help="Print no progress and no results, only errors.")
+
+
+def reporting(command: Command) -> Command:
+    """Options of commands with long work: `QUIET`; `--progress`, which `report_to` obeys; and `--log`."""
+
+    def choose(context: click.Context, _: click.Parameter, chosen: str) -> str:
+        context.meta[CHOSEN_PROGRESS] = chosen
+        return chosen
+
+    progress = click.option(
+        "--progress",
+        type=click.Choice(list(PROGRESS)),
+        default="auto",
+        show_default=True,
+        envvar="PSOTRACK_PROGRESS",
+        callback=choose,
+        expose_value=False,
+        help="Progress on stderr. auto: a bar on a terminal, else lines now and then about work that takes long; bar: "
+        "a bar in any case; lines: lines, and the seconds of each stage; none: nothing.",
+    )
+    return QUIET(progress(LOG(command)))
+
+
+def _open_log(context: click.Context, _: click.Parameter, path: Path | None) -> Path | None:
+    context.meta["psotrack.log"] = path
+    if path is not None and not context.resilient_parsing:
+        # The outermost context ends after everything that the command says, its errors included.
+        context.find_root().with_resource(LogFile(path))
+    return path
+
+
+LOG = click.option(
+    "--log",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    callback=_open_log,
+    expose_value=False,
+    help="Add warnings, steps, seconds of each stage, results and errors to the end of FILE, with times.",
+)
 JSON = click.option(
     "--json",
     "json_path",

@@ -14,11 +14,24 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from psotrack.cli.log_file import said
 from psotrack.errors import SettingsError
-from psotrack.support import Report, atomic_write, no_progress, progress_bar, refuse_to_overwrite
+from psotrack.support import (
+    Report,
+    atomic_write,
+    joined,
+    no_progress,
+    progress_bar,
+    progress_lines,
+    refuse_to_overwrite,
+    terminal_bar,
+)
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.table import Table
+
+    from psotrack.trajectories import Trajectories
 
 #: Heading of a column of positions; `print_table` keeps each of its cells on one line.
 POSITION = "centre (m)"
@@ -26,9 +39,23 @@ POSITION = "centre (m)"
 _WIDE = 200
 
 
+#: Values of --progress.
+PROGRESS: dict[str, Report] = {
+    "auto": progress_bar,
+    "bar": terminal_bar,
+    "lines": progress_lines(),
+    "none": no_progress,
+}
+#: Key of the value of --progress in `click.Context.meta`.
+CHOSEN_PROGRESS = "psotrack.progress"
+
+
 def report_to(quiet: bool) -> Report:
-    """Progress display for long work: none with --quiet, else a bar on stderr."""
-    return no_progress if quiet else progress_bar
+    """Progress display for long work: none with --quiet, else as --progress says; and stages in the log of --log."""
+    context = click.get_current_context(silent=True)
+    chosen = "auto" if context is None else context.meta.get(CHOSEN_PROGRESS, "auto")
+    shown = no_progress if quiet else PROGRESS[chosen]
+    return joined(shown, progress_lines(said.info)) if said.handlers else shown
 
 
 def print_inventory(table: Table) -> None:
@@ -40,7 +67,8 @@ def print_inventory(table: Table) -> None:
 
 
 def print_line(quiet: bool, json_path: Path | None, sentence: str) -> None:
-    """Print a sentence on stdout; nothing with --quiet or if stdout takes the JSON."""
+    """Print a sentence on stdout, and log it; print nothing with --quiet or if stdout takes the JSON."""
+    said.info("%s", sentence)
     if not quiet and json_path != Path("-"):
         click.echo(sentence)
 
@@ -60,6 +88,40 @@ def print_table(
         table.add_column(heading, justify="right" if index else "left", no_wrap=heading == POSITION)
     for row in rows:
         table.add_row(*row)
+    Console().print(table)
+
+
+def print_drones(
+    quiet: bool, json_path: Path | None, tracks: Trajectories, size_m: np.ndarray | None = None
+) -> None:
+    """Print a table of the drones, at most 80 characters wide; see `print_line`.
+
+    Args:
+        quiet: --quiet.
+        json_path: --json.
+        tracks: the tracks of the drones.
+        size_m: (drones, 3), learned sizes, metres; None where they are not known.
+    """
+    if quiet or json_path == Path("-"):
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from psotrack.trajectories import summary_columns
+
+    columns = summary_columns(tracks, size_m)
+    # These two would make the table wider than 80 characters; notebooks show them.
+    for heading in ("extent (m)", "speed (m/s)"):
+        columns.pop(heading, None)
+    table = Table(box=box.HORIZONTALS, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
+    for heading in columns:
+        # Long names are folded; numbers are on one line.
+        style = {"min_width": 5} if heading == "drone" else {"justify": "right", "no_wrap": True}
+        table.add_column(heading, overflow="fold", **style)
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*map(Text, row))
     Console().print(table)
 
 

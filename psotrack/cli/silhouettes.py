@@ -13,11 +13,11 @@ from psotrack.cli.options import (
     FORCE,
     JOBS,
     JSON,
-    QUIET,
     SEQUENCE,
     cache_folder,
     filmed_recording,
     frames_option,
+    reporting,
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to
@@ -54,7 +54,7 @@ MASKS_REDUCTION = 1
 @frames_option
 @CACHE
 @JOBS
-@QUIET
+@reporting
 @FORCE
 @JSON
 def silhouettes(

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, JSON, QUIET
+from psotrack.cli.options import FORCE, JOBS, JSON, reporting
 from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.errors import SettingsError
 
@@ -60,7 +60,7 @@ from psotrack.errors import SettingsError
 )
 @JOBS
 @FORCE
-@QUIET
+@reporting
 @JSON
 def simulate(
     name: str | None,

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.options import CACHE, FORCE, JOBS, JSON, QUIET, cache_folder, compiled_folder
+from psotrack.cli.options import (
+    CACHE,
+    FORCE,
+    JOBS,
+    JSON,
+    cache_folder,
+    compiled_folder,
+    reporting,
+)
 from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.errors import SettingsError
 from psotrack.support import Device, Report, refuse_to_overwrite
@@ -53,7 +61,7 @@ if TYPE_CHECKING:
 )
 @CACHE
 @JOBS
-@QUIET
+@reporting
 @FORCE
 @JSON
 def sweep(

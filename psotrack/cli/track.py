@@ -18,7 +18,6 @@ from psotrack.cli.options import (
     JSON,
     MOST_DRONES,
     PARTICLES,
-    QUIET,
     SEQUENCE,
     TRACK,
     Numbers,
@@ -26,10 +25,12 @@ from psotrack.cli.options import (
     camera_names,
     compiled_folder,
     frames_option,
+    reporting,
     setting_name,
     silhouette_options,
 )
-from psotrack.cli.output import output_json, print_line, report_to, write_json
+from psotrack.cli.output import output_json, print_drones, print_line, report_to, write_json
+from psotrack.cli.run_files import FileOr, run_file_options
 from psotrack.errors import SettingsError
 from psotrack.settings import USUAL_SPEED_M_S, Clocks, SwarmKind, TrackSettings
 from psotrack.support import refuse_to_overwrite
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--detections",
+    type=FileOr("yolo", "blobs"),
     default=TRACK.detections,
     show_default=True,
     metavar="yolo|blobs|FOLDER",
@@ -64,6 +66,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--detector",
+    type=FileOr(suffix=".onnx"),
     metavar="MODEL.onnx|NAME",
     help="Detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a detector NAME "
     "that an installed package adds. Its detections are stored.",
@@ -105,6 +108,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--init",
+    type=FileOr("auto", "truth"),
     default=TRACK.init,
     show_default=True,
     metavar="auto|truth|FILE",
@@ -199,7 +203,8 @@ if TYPE_CHECKING:
 @CACHE
 @JOBS
 @FORCE
-@QUIET
+@run_file_options
+@reporting
 @JSON
 def track(
     sequence: Path,
@@ -231,6 +236,8 @@ def track(
       psotrack track data/Simulated_Data/S02_D4_A --out as_live.csv --causal
       psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
       psotrack track data/Real_Data/R12_D4 --out both.csv --method fused --detector drones.onnx --detector-size 1280
+      psotrack track data/Simulated_Data/S02_D4_A --out fast.csv --particles 15 --save-config fast.toml
+      psotrack track --config fast.toml --out again.csv
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
     started = click.get_current_context().obj or time.perf_counter()
@@ -288,6 +295,7 @@ def track(
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
         f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {record['real_time_factor']:.2g} of real time",
     )
+    print_drones(quiet, json_path, tracked.trajectories, tracked.size_m)
 
 
 def _track_causally(
@@ -304,7 +312,7 @@ def _track_causally(
 ) -> None:
     """Track a recording without the future, and write the rows of each frame as it is done."""
     from psotrack.pipeline import CausalRecording, with_real_time
-    from psotrack.trajectories import RowStream
+    from psotrack.trajectories import RowStream, read_trajectories
 
     start_s = time.perf_counter() - started
     run = CausalRecording(
@@ -327,3 +335,6 @@ def _track_causally(
         f"{out}: {record['drones']} drones, {record['frames']} frames, {record['seconds']['total']:.1f} s, "
         f"{record['real_time_factor']:.2g} of real time",
     )
+    # A file without rows is none of tracks.
+    if record["drones"] and not quiet:
+        print_drones(quiet, json_path, read_trajectories(out))

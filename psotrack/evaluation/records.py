@@ -126,6 +126,12 @@ class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
 
     __repr__ = short_repr
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the table of `psotrack evaluate`."""
+        from psotrack.evaluation.tables import to_html
+
+        return to_html(self)
+
     def to_dict(self) -> dict[str, Any]:
         """The figures with the contract's keys, for strict JSON; None becomes null."""
         values = asdict(self)

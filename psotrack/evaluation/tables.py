@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from psotrack.evaluation.records import DroneEvaluation, Evaluation, drone_label
+from psotrack.support import html_block, html_lines, html_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -23,11 +24,12 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
     Errors are in millimetres, or in metres if the mean error is a metre or more. A drone is named as in the reference,
     with the track that follows it.
     """
-    unit = _METRES if (evaluation.mean_error_m or 0) >= 1 else _MILLIMETRES
-    heading = f"{evaluation.frames} frames, {evaluation.drones} drones, errors in {unit.name}"
+    unit = _unit_of(evaluation)
+    heading = _heading(evaluation, unit)
+    scores = "\n".join(f"{label:<10}{line}" for label, line in _scores(evaluation, unit).items())
     table = Table(
         title=Text(f"{title}: {heading}" if title else heading, style="bold"),
-        caption=Text(_caption(evaluation, unit), style="default"),
+        caption=Text(scores, style="default"),
         box=box.HORIZONTALS,
         show_edge=False,
         pad_edge=False,
@@ -37,8 +39,8 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
         title_justify="left",
         caption_justify="left",
     )
-    # Only this column is cut where the table would be too wide; numbers are never cut.
-    table.add_column("drone", overflow="ellipsis", max_width=20)
+    # Only the names are folded where the table would be too wide; nothing is cut.
+    table.add_column("drone", overflow="fold", max_width=20)
     for name in _COLUMNS:
         table.add_column(name, justify="right", no_wrap=True)
     for drone in evaluation.per_drone:
@@ -48,6 +50,20 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
     table.add_section()
     table.add_row("all", *_cells(evaluation, unit), "", style="bold")
     return table
+
+
+def to_html(evaluation: Evaluation) -> str:
+    """The same as HTML for notebooks."""
+    unit = _unit_of(evaluation)
+    rows = [
+        [drone_label(drone.drone, drone.estimate), *_cells(drone, unit), unit.vector(drone.offset_m)]
+        for drone in evaluation.per_drone
+    ]
+    return html_block(
+        f"Evaluation: {_heading(evaluation, unit)}",
+        html_table(["drone", *_COLUMNS], [*rows, ["all", *_cells(evaluation, unit), ""]]),
+        html_lines(_scores(evaluation, unit)),
+    )
 
 
 def to_frame(evaluation: Evaluation) -> DataFrame:
@@ -90,6 +106,14 @@ _METRES = _Unit("m", 1.0, 2)
 _MILLIMETRES = _Unit("mm", 1000.0, 1)
 
 
+def _unit_of(evaluation: Evaluation) -> _Unit:
+    return _METRES if (evaluation.mean_error_m or 0) >= 1 else _MILLIMETRES
+
+
+def _heading(evaluation: Evaluation, unit: _Unit) -> str:
+    return f"{evaluation.frames} frames, {evaluation.drones} drones, errors in {unit.name}"
+
+
 def _cells(errors: Evaluation | DroneEvaluation, unit: _Unit) -> list[str]:
     values_m = (
         errors.mean_error_m,
@@ -105,9 +129,13 @@ def _cells(errors: Evaluation | DroneEvaluation, unit: _Unit) -> list[str]:
     ]
 
 
-def _caption(evaluation: Evaluation, unit: _Unit) -> str:
+def _scores(evaluation: Evaluation, unit: _Unit) -> dict[str, str]:
+    """Label and sentence of each score; the second sentence about a label has none."""
+    # These errors are always below the gate of matching, so millimetres fit.
+    matched = _MILLIMETRES.number(evaluation.matched_mean_error_m)
     lines = {
         "CLEAR": _clear(evaluation),
+        "": f"mean when matched anew in each frame {matched} mm",
         "HOTA": (
             f"{evaluation.hota:.3f}: DetA {evaluation.deta:.3f}, AssA {evaluation.assa:.3f}, "
             f"LocA {_score(evaluation.loca)}"
@@ -122,7 +150,7 @@ def _caption(evaluation: Evaluation, unit: _Unit) -> str:
             f"mean NEES {_nees(evaluation.mean_nees)} ({_nees(evaluation.offset_removed_mean_nees)})"
         )
     lines["centred"] = _centred(evaluation, unit)
-    return "\n".join(f"{label:<10}{line}" for label, line in lines.items())
+    return lines
 
 
 def _centred(evaluation: Evaluation, unit: _Unit) -> str:
@@ -135,12 +163,9 @@ def _centred(evaluation: Evaluation, unit: _Unit) -> str:
 
 
 def _clear(evaluation: Evaluation) -> str:
-    # These errors are always below the gate of matching, so millimetres fit.
-    motp, matched = map(_MILLIMETRES.number, (evaluation.motp_m, evaluation.matched_mean_error_m))
     return (
-        f"MOTA {evaluation.mota:.3f}, MOTP {motp} mm, IDF1 {evaluation.idf1:.3f}, "
-        f"identity switches {evaluation.id_switches}\n"
-        f"{'':<10}mean when matched anew in each frame {matched} mm"
+        f"MOTA {evaluation.mota:.3f}, MOTP {_MILLIMETRES.number(evaluation.motp_m)} mm, IDF1 {evaluation.idf1:.3f}, "
+        f"identity switches {evaluation.id_switches}"
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from psotrack.errors import InputError
 from psotrack.evaluation import errors_over_time
@@ -42,6 +42,7 @@ class Event:
         drones: names of the drones that take part; those of the reference for errors against the reference.
         text: a sentence that says what happened.
         tracks: label of the tracks.
+        position_m: where it happened, metres: between the drones, or where a lost drone was last; None if unknown.
     """
 
     time_s: float
@@ -50,6 +51,7 @@ class Event:
     drones: tuple[str, ...]
     text: str
     tracks: str
+    position_m: tuple[float, float, float] | None = None
 
 
 def find_events(flight: TrackedFlight) -> tuple[Event, ...]:
@@ -75,9 +77,11 @@ def _of_status(tracks: FlightTracks) -> Iterator[Event]:
             if start > 0:
                 kind = EventKind.FOUND_AGAIN if number else EventKind.BEGINS
                 verb = "is found again" if number else "is first tracked"
-                yield _event(tracks, start, kind, (name,), f"drone {name} {verb}")
+                position_m = trajectories.position_m[start, drone]
+                yield _event(tracks, start, kind, (name,), f"drone {name} {verb}", position_m)
             if stop < trajectories.num_frames:
-                yield _event(tracks, stop, EventKind.LOST, (name,), f"drone {name} is lost")
+                position_m = trajectories.position_m[stop - 1, drone]
+                yield _event(tracks, stop, EventKind.LOST, (name,), f"drone {name} is lost", position_m)
         if trajectories.status is None:
             continue
         for start, stop in intervals(seen & (trajectories.status[:, drone] == Status.COASTING)):
@@ -85,7 +89,8 @@ def _of_status(tracks: FlightTracks) -> Iterator[Event]:
             lasted_s = float(trajectories.time_s[end] - trajectories.time_s[start])
             if lasted_s >= _LONG_COASTING_S:
                 text = f"drone {name} is predicted for {lasted_s:.2f} s, without measurements"
-                yield _event(tracks, start, EventKind.COASTING, (name,), text)
+                position_m = trajectories.position_m[start, drone]
+                yield _event(tracks, start, EventKind.COASTING, (name,), text, position_m)
 
 
 def _of_record(tracks: FlightTracks) -> Iterator[Event]:
@@ -98,13 +103,15 @@ def _of_record(tracks: FlightTracks) -> Iterator[Event]:
         names = tuple(f"{drone}" for drone in met.drones)
         text = f"drones {names[0]} and {names[1]} meet at {met.distance_m:.2f} m; their labels: {met.outcome}"
         row = int(np.searchsorted(frame, met.closest_frame))
-        yield _event(tracks, row, EventKind.MET, names, text)
+        together = [drone for drone, name in enumerate(tracks.trajectories.drones) if name in names]
+        position_m = tracks.trajectories.position_m[row, together].mean(axis=0) if together else None
+        yield _event(tracks, row, EventKind.MET, names, text, position_m)
     for camera, left_out in tracks.record.left_out.items():
         for first, stop in left_out:
             # Frames of a camera; the instants are at least as many.
             row = min(int(np.searchsorted(frame, first)), len(frame) - 1)
             text = f"camera {camera} is left out in {stop - first} frames: foreground is everywhere"
-            yield _event(tracks, row, EventKind.LEFT_OUT, (), text)
+            yield _event(tracks, row, EventKind.LEFT_OUT, (), text, None)
 
 
 def _of_errors(tracks: FlightTracks, truth: Trajectories) -> Iterator[Event]:
@@ -119,19 +126,40 @@ def _of_errors(tracks: FlightTracks, truth: Trajectories) -> Iterator[Event]:
     for switched in np.flatnonzero(errors["switch"].to_numpy(bool)):
         name = f"{names[switched]}"
         text = f"{name} is followed by another track than before"
-        yield _event(tracks, int(rows[switched]), EventKind.SWITCH, (name,), text)
+        position_m = _position_m(truth, name, int(errors["frame"].iloc[switched]))
+        yield _event(tracks, int(rows[switched]), EventKind.SWITCH, (name,), text, position_m)
     for name in dict.fromkeys(names):
         own_m = np.where((names == name) & np.isfinite(error_m), error_m, -1.0)
         largest = int(own_m.argmax())
         if own_m[largest] >= 0:
             text = f"{name} has its largest error, {1e3 * own_m[largest]:.0f} mm"
-            yield _event(tracks, int(rows[largest]), EventKind.LARGEST_ERROR, (f"{name}",), text)
+            position_m = _position_m(truth, name, int(errors["frame"].iloc[largest]))
+            yield _event(tracks, int(rows[largest]), EventKind.LARGEST_ERROR, (f"{name}",), text, position_m)
 
 
-def _event(tracks: FlightTracks, row: int, kind: EventKind, drones: tuple[str, ...], text: str) -> Event:
+def _position_m(truth: Trajectories, drone: str, frame: int) -> Float[np.ndarray, "3"]:
+    """Position of a drone of the reference in a frame that the reference has."""
+    return truth.position_m[np.searchsorted(truth.frame, frame), truth.drones.index(drone)]
+
+
+def _event(
+    tracks: FlightTracks,
+    row: int,
+    kind: EventKind,
+    drones: tuple[str, ...],
+    text: str,
+    position_m: Float[np.ndarray, "3"] | None,
+) -> Event:
     trajectories = tracks.trajectories
+    known = position_m is not None and bool(np.isfinite(position_m).all())
     return Event(
-        float(trajectories.time_s[row]), int(trajectories.frame[row]), kind, drones, text, tracks.label
+        time_s=float(trajectories.time_s[row]),
+        frame=int(trajectories.frame[row]),
+        kind=kind,
+        drones=drones,
+        text=text,
+        tracks=tracks.label,
+        position_m=tuple(float(part) for part in position_m) if known else None,  # type: ignore[arg-type,union-attr]
     )
 
 

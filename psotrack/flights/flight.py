@@ -11,11 +11,12 @@ from jaxtyping import Float
 
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, SettingsError
+from psotrack.exchange import read_tracks
 from psotrack.flights.run_record import RunRecord, read_run_record
 from psotrack.recordings import Recording, VideoInfo
 from psotrack.silhouettes import check_whole
 from psotrack.support import COLOURS, short_repr
-from psotrack.trajectories import Trajectories, read_trajectories
+from psotrack.trajectories import Trajectories
 
 #: Full lengths of a drone of whose size the record says nothing, metres: an assumption, for drawing only.
 USUAL_SIZE_M = (0.3, 0.3, 0.3)
@@ -27,7 +28,7 @@ class FlightTracks:
 
     Attributes:
         label: name of the tracks, which no other tracks of the flight have.
-        path: the file.
+        path: the file, or a folder of another format; see `exchange.read_tracks`.
         trajectories: the tracks.
         record: the record of the run; None where there is none beside the file.
         size_m: (drones, 3), full lengths of the drones along the world's axes, metres: as the run learned them, else
@@ -161,7 +162,7 @@ def read_tracks_file(path: Path | str, label: str, recording: Recording | None =
     """Read one file of tracks and the record beside it.
 
     Args:
-        path: the file.
+        path: the file, or a folder of another format; see `exchange.read_tracks`.
         label: name of the tracks.
         recording: the recording, whose rate is that of tracks without times.
 
@@ -169,7 +170,7 @@ def read_tracks_file(path: Path | str, label: str, recording: Recording | None =
         InputError: the file or its record cannot be read.
     """
     path = Path(path)
-    trajectories = read_trajectories(path, fps=None if recording is None else recording.fps)
+    trajectories = read_tracks(path, recording=recording)
     record_path = path.with_suffix(".json")
     record = read_run_record(record_path) if record_path.is_file() and record_path != path else None
     return FlightTracks(label, path, trajectories, record, _sizes_m(trajectories, record))

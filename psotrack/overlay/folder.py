@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Sequence
@@ -29,13 +30,13 @@ from psotrack.recordings import FrameTimes, Recording, nearest_frames
 from psotrack.support import (
     Report,
     atomic_write,
-    digest_file,
     digest_record,
     map_in_processes,
     no_progress,
     read_text,
     refuse_to_overwrite,
 )
+from psotrack.trajectories import Trajectories
 
 #: File beside the videos that says of which inputs they are.
 INPUTS_FILE = "overlay.json"
@@ -198,9 +199,24 @@ def _digest(
             "cameras": list(cameras),
             "rig": [np.asarray(value)[index].tolist() for value in (rig.K, rig.dist, rig.T_cam_world)],
             "videos": [[str(info.path), info.num_frames, info.fps] for info in infos],
-            "tracks": [[each.label, digest_file(each.path), each.size_m.tolist()] for each in flight.tracks],
+            "tracks": [
+                [each.label, _digest_tracks(each.trajectories), each.size_m.tolist()]
+                for each in flight.tracks
+            ],
         }
     )
+
+
+def _digest_tracks(trajectories: Trajectories) -> list[str]:
+    """Digests of what is drawn of tracks; the files of some formats are folders."""
+    arrays = (
+        trajectories.time_s,
+        trajectories.position_m,
+        statuses(trajectories),
+        np.zeros(0) if trajectories.covariance_m2 is None else trajectories.covariance_m2,
+    )
+    digests = [hashlib.blake2b(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays]
+    return [*trajectories.drones, *digests]
 
 
 # What is drawn

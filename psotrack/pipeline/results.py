@@ -6,7 +6,7 @@ import logging
 import platform
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -25,9 +25,10 @@ from psotrack.methods import MethodResult
 from psotrack.pipeline.parts import Parts
 from psotrack.pipeline.preparation import PreparedRun
 from psotrack.recordings import Recording
-from psotrack.settings import MotionSettings
+from psotrack.settings import MotionSettings, TrackSettings, setting_names
 from psotrack.silhouettes import Silhouettes
-from psotrack.trajectories import DroneSizes, Trajectories
+from psotrack.support import html_block, html_lines
+from psotrack.trajectories import DroneSizes, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +59,35 @@ class TrackedRecording:
             f"TrackedRecording({self.record['sequence']}: {drones} drones, {frames} frames, "
             f"{self.trajectories.seen.mean():.1%} seen, {self.record['seconds']['total']:.1f} s)"
         )
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the drones, their paths from above, other settings than the defaults, and seconds."""
+        drones, frames = self.trajectories.num_drones, self.trajectories.num_frames
+        return html_block(
+            f"{self.record['sequence']}: {drones} drones, {frames} frames, {self.trajectories.seen.mean():.1%} seen",
+            drones_html(self.trajectories, self.size_m),
+            html_lines(
+                {
+                    "settings": ", ".join(_changed_settings(self.record)),
+                    "seconds": ", ".join(
+                        f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()
+                    ),
+                }
+            ),
+        )
+
+
+def _changed_settings(record: Mapping[str, Any]) -> Iterator[str]:
+    """Name and value of each setting of a record that somebody chose and that is not the default."""
+    usual = msgspec.to_builtins(TrackSettings())
+    origin = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
+    for name in setting_names():
+        part, dot, field = name.partition(".")
+        value, default = (each[part][field] if dot else each[part] for each in (record["settings"], usual))
+        # The record has the values that were used, also where the data gave them.
+        found = name in origin and record["volume"][origin[name]] != "given"
+        if value != default and not found:
+            yield f"{name} = {value}"
 
 
 def finish(

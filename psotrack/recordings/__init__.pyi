@@ -40,6 +40,7 @@ from .video import (
     probe,
     probe_images,
     read_frames,
+    read_frames_at,
     read_near,
 )
 
@@ -83,6 +84,7 @@ __all__ = [
     "read_c3d",
     "read_detections",
     "read_frames",
+    "read_frames_at",
     "read_grey",
     "read_image",
     "read_mask",

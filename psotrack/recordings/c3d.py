@@ -91,7 +91,10 @@ def read_c3d(path: Path | str) -> Markers:
 
 
 def write_c3d(path: Path | str, markers: Markers) -> None:
-    """Write markers in millimetres as float32, which is exact to 1 micrometre in a hall; unseen markers become zeros.
+    """Write markers in millimetres as float32, which is exact to 1 micrometre in a hall.
+
+    Unseen markers become zeros with a residual of -1, as the format demands. A marker exactly at the origin is
+    read back as unseen.
 
     Raises:
         SettingsError: there are more frames than a C3D header can hold.
@@ -110,6 +113,8 @@ def write_c3d(path: Path | str, markers: Markers) -> None:
     points = np.ones((4, num_markers, num_frames))
     points[:3] = np.nan_to_num(markers.position_m / _METRES_PER_UNIT["mm"]).transpose(2, 1, 0)
     content["data"]["points"] = points
+    seen = np.isfinite(markers.position_m).all(axis=-1)
+    content["data"]["meta_points"]["residuals"] = np.where(seen, 0.0, -1.0).T[None]
     with atomic_write(path) as temporary:
         content.write(str(temporary))
         # ezc3d reports no error when the disk is full.

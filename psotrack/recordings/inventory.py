@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from psotrack.recordings.detections import read_detections
 from psotrack.recordings.recording import Recording
+from psotrack.support import html_block, html_table
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+_HEADINGS = ("camera", "video", "frames", "fps", "size", "f (px)", "centre (m)", "detections")
 
 
 def describe_recording(recording: Recording) -> dict[str, Any]:
@@ -80,6 +84,22 @@ def inventory_table(content: dict[str, Any]) -> Table:
     from rich import box
     from rich.table import Table
 
+    table = Table(title=_heading(content), title_justify="left", box=box.HORIZONTALS, show_edge=False)
+    for name in _HEADINGS:
+        left = name in ("camera", "video")
+        table.add_column(name, justify="left" if left else "right", overflow="fold" if left else "ellipsis")
+    for row in _rows(content):
+        table.add_row(*row)
+    return table
+
+
+def inventory_html(content: dict[str, Any]) -> str:
+    """The same table as HTML for notebooks."""
+    return html_block(_heading(content), html_table(_HEADINGS, _rows(content)))
+
+
+def _heading(content: dict[str, Any]) -> str:
+    """Name, length and reference of a recording."""
     drones = content["drones"]
     reference = (
         f"reference of {', '.join(drones)} in {content['frames_with_truth']} frames"
@@ -87,17 +107,13 @@ def inventory_table(content: dict[str, Any]) -> Table:
         else "no reference"
     )
     length = f"{content['instants']} instants at {content['rate_hz']:g} Hz, " if content["rate_hz"] else ""
-    table = Table(
-        title=f"{content['name']}: {length}{reference}",
-        title_justify="left",
-        box=box.HORIZONTALS,
-        show_edge=False,
-    )
-    for name in ("camera", "video", "frames", "fps", "size", "f (px)", "centre (m)", "detections"):
-        left = name in ("camera", "video")
-        table.add_column(name, justify="left" if left else "right", overflow="fold" if left else "ellipsis")
+    return f"{content['name']}: {length}{reference}"
+
+
+def _rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Cells of each camera, and of each camera on a drone."""
     for name, camera in content["cameras"].items():
-        table.add_row(
+        yield (
             name,
             "no video" if camera["video"] is None else _name(camera["video"]),
             "" if camera["frames"] is None else f"{camera['frames']}{_begin(camera['begins_s'])}",
@@ -109,7 +125,7 @@ def inventory_table(content: dict[str, Any]) -> Table:
         )
     for name, camera in (content["onboard"] or {}).items():
         focal_length_px = camera["focal_length_px"]
-        table.add_row(
+        yield (
             f"on {name}",
             _name(camera["video"]),
             f"{camera['frames']}",
@@ -119,7 +135,6 @@ def inventory_table(content: dict[str, Any]) -> Table:
             f"{camera['frames_with_pose']} poses",
             "",
         )
-    return table
 
 
 def _name(video: str) -> str:

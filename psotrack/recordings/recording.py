@@ -96,6 +96,12 @@ class Recording:
 
     __repr__ = short_repr
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the table of `psotrack info`."""
+        from psotrack.recordings.inventory import describe_recording, inventory_html
+
+        return inventory_html(describe_recording(self))
+
     def __post_init__(self) -> None:
         times = {name: self._frame_times_of(name, video) for name, video in self.videos.items()}
         object.__setattr__(self, "frame_times", {**self.frame_times, **times})

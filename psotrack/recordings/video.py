@@ -33,6 +33,8 @@ _CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 
 _READ_IMAGES = 5
 #: To reach a frame, OpenCV decodes from the last key frame that is at least this number of frames before it.
 _SEEK_BEFORE = 17
+#: Number of frames from which on a seek is faster than decoding: the usual distance of key frames.
+_WORTH_SEEKING = 250
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,48 @@ def read_frames(
                 raise TruncatedVideoError(video, index)
             _check_size(video.path, video, frame, f" in frame {index}")
             yield frame
+    finally:
+        capture.release()
+
+
+def read_frames_at(
+    video: VideoInfo, numbers: Sequence[int]
+) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+    """Yield chosen frames of a video and their numbers: BGR, (height, width, 3), uint8.
+
+    Frames far ahead are sought, frames nearby are reached by decoding. Of a video that was not finished, which has no
+    index, all frames up to the last chosen one are decoded.
+
+    Args:
+        video: the video.
+        numbers: numbers of frames, ascending, below `video.num_frames`.
+
+    Raises:
+        InputError: the file ends or is damaged before a frame, or a frame has another size.
+    """
+    if video.images:
+        for number in numbers:
+            frame = read_image(video.images[number], video.depth_bits)
+            _check_size(video.images[number], video, frame)
+            yield number, frame
+        return
+    capture = _open(video.path)
+    following = 0
+    try:
+        for number in numbers:
+            if number - following > _WORTH_SEEKING and video.is_finished:
+                with silence_opencv():
+                    if capture.set(cv2.CAP_PROP_POS_FRAMES, number):
+                        following = round(capture.get(cv2.CAP_PROP_POS_FRAMES))
+            while following <= number:
+                if not capture.grab():
+                    raise TruncatedVideoError(video, following)
+                following += 1
+            decoded, frame = capture.retrieve()
+            if not decoded:
+                raise TruncatedVideoError(video, number)
+            _check_size(video.path, video, frame, f" in frame {number}")
+            yield number, frame
     finally:
         capture.release()
 

@@ -3,9 +3,10 @@ from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, drone_colour, save_figure
 from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
+from .html import html_block, html_lines, html_paths, html_table
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
-from .progress import Advance, Report, no_progress, progress_bar
+from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
 from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
@@ -29,7 +30,12 @@ __all__ = [
     "digest_record",
     "drone_colour",
     "drop_programs_if_many",
+    "html_block",
+    "html_lines",
+    "html_paths",
+    "html_table",
     "identify",
+    "joined",
     "keep_compiled",
     "load_ahead",
     "make_plugin",
@@ -40,6 +46,7 @@ __all__ = [
     "plugin_names",
     "processors",
     "progress_bar",
+    "progress_lines",
     "read_rows",
     "read_table",
     "read_text",
@@ -51,6 +58,7 @@ __all__ = [
     "short_repr",
     "standard_error",
     "stored_jit",
+    "terminal_bar",
     "toml_key",
     "toml_value",
     "use_device",

@@ -6,7 +6,7 @@ from .inputs import Inputs
 from .perturbations import delays_frames, perturb
 from .printing import render_table
 from .runner import SweepOutcome, run_in_process
-from .store import Store
+from .store import Store, is_results_folder
 from .tables import pivot
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "delays_frames",
     "estimate",
     "grid",
+    "is_results_folder",
     "perturb",
     "pivot",
     "read_grid",

@@ -37,6 +37,11 @@ from psotrack.sweep.older_folders import rename_columns, rename_manifest
 _LEFT_BEHIND_S = 3600.0
 
 
+def is_results_folder(path: Path | str) -> bool:
+    """Whether a path is a folder of results of a sweep."""
+    return (Path(path) / "cells").is_dir()
+
+
 class Store:
     """Results in a folder, which the first writer makes.
 

@@ -2,6 +2,8 @@ from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import read_trajectories, write_ambiguity, write_trajectories
 from .resampling import resample
 from .row_streams import RowStream
+from .showing import drones_html
+from .summaries import DroneSummary, summarise, summary_columns
 from .tracks import Arrival, DroneSizes, Tracks, unknown_value
 from .trajectories import Status, Trajectories
 
@@ -10,13 +12,17 @@ __all__ = [
     "UNASSIGNED",
     "Arrival",
     "DroneSizes",
+    "DroneSummary",
     "RowStream",
     "Status",
     "Tracks",
     "Trajectories",
+    "drones_html",
     "fixed_partner_values",
     "read_trajectories",
     "resample",
+    "summarise",
+    "summary_columns",
     "unknown_value",
     "write_ambiguity",
     "write_trajectories",

@@ -1,8 +1,9 @@
 """Trajectory files: CSV and Parquet tables with one row per frame and drone.
 
-Written files always have the columns of `COLUMNS` in this order, followed by the columns of `COVARIANCE_COLUMNS` and
-`RELATIVE_COLUMNS` if covariances are known, so that other programs can rely on them. A file to be read needs only
-`frame`, `drone` and the position; rows and columns may have any order, and further columns are ignored.
+Written files always have the columns of `COLUMNS` in this order, followed by the columns of `COVARIANCE_COLUMNS`,
+`RELATIVE_COLUMNS` and `ORIENTATION_COLUMNS` if these are known, so that other programs can rely on them.
+A file to be read needs only `frame`, `drone` and the position; rows and columns may have any order, and further columns
+are ignored.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ COLUMNS = {
 COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
 #: The same of covariances without the error that is constant for a drone, if they are known.
 RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
-_READ = COLUMNS | COVARIANCE_COLUMNS | RELATIVE_COLUMNS
+#: The unit quaternion that turns body coordinates into world coordinates, if orientations are known.
+ORIENTATION_COLUMNS = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
+_READ = COLUMNS | COVARIANCE_COLUMNS | RELATIVE_COLUMNS | ORIENTATION_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
 _UPPER = np.triu_indices(3)
@@ -65,7 +68,7 @@ def write_trajectories(path: Path | str, trajectories: Trajectories, *, force: b
 
     Args:
         path: path that ends in .csv or .parquet.
-        trajectories: the trajectories; orientations are not written.
+        trajectories: the trajectories.
         force: replace an existing file.
 
     Raises:
@@ -195,6 +198,10 @@ def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows
     ):
         if covariance_m2 is not None:
             columns |= dict(zip(names, np.moveaxis(covariance_m2[..., *_UPPER], -1, 0), strict=True))
+    if trajectories.orientation_wxyz is not None:
+        columns |= dict(
+            zip(ORIENTATION_COLUMNS, np.moveaxis(trajectories.orientation_wxyz, -1, 0), strict=True)
+        )
     return {name: column.ravel() for name, column in columns.items()}
 
 
@@ -363,6 +370,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
         drones=tuple(names),
         position_m=grid("x_m", "y_m", "z_m", missing=np.nan),
         velocity_m_s=optional("vx_m_s", "vy_m_s", "vz_m_s"),
+        orientation_wxyz=optional(*ORIENTATION_COLUMNS),
         fitness=None if fitness is None else fitness[..., 0],
         num_cameras=None if num_cameras is None else np.nan_to_num(num_cameras[..., 0]).astype(np.int64),
         status=status.reshape(len(frame), len(names)) if "status" in columns else None,
@@ -386,6 +394,14 @@ def _check_values(table: _Table) -> None:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
+    if all(name in table.columns for name in ORIENTATION_COLUMNS):
+        length = np.linalg.norm([table.columns[name] for name in ORIENTATION_COLUMNS], axis=0)
+        # Far above the rounding of a few digits, far below a mistake.
+        wrong = np.abs(length - 1) > 1e-2
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            names = ", ".join(ORIENTATION_COLUMNS)
+            raise table.error(row, expected=f"a unit quaternion in {names}", found=f"length {length[row]:g}")
 
 
 def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:

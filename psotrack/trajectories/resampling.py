@@ -24,6 +24,7 @@ def resample(
     time_s: Float[np.ndarray, "frames"],
     *,
     later_s: float = 0.0,
+    gap_s: float | None = None,
 ) -> Trajectories:
     """Positions and orientations at other times, by cubic splines; NaN outside of the trajectories and in their gaps.
 
@@ -32,14 +33,14 @@ def resample(
         frame: (frames,), numbers of the new frames.
         time_s: (frames,), times of the new frames, seconds.
         later_s: the trajectories at time t + `later_s` are the new ones at time t, seconds.
+        gap_s: longest gap between samples over which they are interpolated, seconds; None: `longest_gap_s`.
     """
     wanted_s = time_s + later_s
-    position_m = interpolated(trajectories.time_s, trajectories.position_m)(wanted_s)
+    position_m = interpolated(trajectories.time_s, trajectories.position_m, gap_s)(wanted_s)
     orientation_wxyz = None
     if trajectories.orientation_wxyz is not None:
-        rotation = interpolated(trajectories.time_s, rotation_matrices(trajectories.orientation_wxyz))(
-            wanted_s
-        )
+        matrices = rotation_matrices(trajectories.orientation_wxyz)
+        rotation = interpolated(trajectories.time_s, matrices, gap_s)(wanted_s)
         orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
         known = np.isfinite(rotation).all(axis=(-2, -1))
         if known.any():
@@ -69,13 +70,14 @@ def between_samples(
     return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
 
 
-def interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray) -> _At:
+def interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray, gap_s: float | None = None) -> _At:
     """A function that interpolates values (samples, drones, ...) by cubic splines.
 
-    It takes times (times,) and returns values (times, drones, ...), NaN outside of the samples and in long gaps.
+    It takes times (times,) and returns values (times, drones, ...), NaN outside of the samples and in gaps that are
+    longer than `gap_s`, by default `longest_gap_s`.
     """
     flat = values.reshape(*values.shape[:2], -1).astype(np.float64)
-    longest_s = longest_gap_s(time_s)
+    longest_s = longest_gap_s(time_s) if gap_s is None else gap_s
     known = [np.isfinite(flat[:, drone]).all(axis=-1) for drone in range(flat.shape[1])]
     # A spline needs two samples.
     splines = {

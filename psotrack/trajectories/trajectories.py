@@ -94,6 +94,18 @@ class Trajectories:
             if getattr(self, name) is not None:
                 _check_symmetric(name, getattr(self, name))
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a table with a row for each drone, and the paths from above."""
+        from psotrack.support import html_block
+        from psotrack.trajectories.showing import drones_html
+
+        drones, frames = self.num_drones, self.num_frames
+        return html_block(f"Trajectories: {drones} drones, {frames} frames{self._span}", drones_html(self))
+
+    @property
+    def _span(self) -> str:
+        return f", {self.time_s[0]:.2f} s to {self.time_s[-1]:.2f} s" if self.num_frames else ""
+
     @property
     def num_frames(self) -> int:
         """Number of frames."""

@@ -43,6 +43,8 @@ class CameraFigures:
         median_px: median residual of all corners found, pixels.
         own_median_px: median residual within the views, pixels: errors of the corners and of the lens alone.
         covered: share of the image in which corners were found.
+        coverage: number of corners in each part of the image, row by row.
+        image_size_wh: width and height of the images, pixels.
         focal_px: focal lengths along x and y, pixels.
         focal_std_px: their standard deviations.
         centre_m: the camera's centre in the world, metres.
@@ -59,6 +61,8 @@ class CameraFigures:
     median_px: float
     own_median_px: float
     covered: float
+    coverage: list[list[int]]
+    image_size_wh: tuple[int, int]
     focal_px: tuple[float, float]
     focal_std_px: tuple[float, float]
     centre_m: tuple[float, ...]
@@ -88,6 +92,8 @@ def figures_of(calibrated: CalibratedRig) -> dict[str, CameraFigures]:
             median_px=float(np.median(residual[found])),
             own_median_px=float(np.median(calibrated.own_residual_px[index][found])),
             covered=float(coverage(calibrated, index).astype(bool).mean()),
+            coverage=coverage(calibrated, index).astype(int).tolist(),
+            image_size_wh=(int(views.image_size_wh[index][0]), int(views.image_size_wh[index][1])),
             focal_px=(float(K[0, 0]), float(K[1, 1])),
             focal_std_px=(float(std[0]), float(std[1])),
             centre_m=tuple(np.asarray(rig.cameras.centre_world[index]).tolist()),

@@ -8,7 +8,7 @@ import click
 import numpy as np
 
 from psotrack.cli.calibrate.options import LENS, OUT, board_of, board_options
-from psotrack.cli.options import FORCE, JSON, QUIET
+from psotrack.cli.options import FORCE, JSON, reporting
 from psotrack.cli.output import output_json, print_line, print_table, report_to
 from psotrack.errors import SettingsError
 from psotrack.support import refuse_to_overwrite
@@ -25,7 +25,7 @@ _FISHEYE = ("k1", "k2", "k3", "k4")
 @click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
 @FORCE
-@QUIET
+@reporting
 @JSON
 def intrinsics(
     video: Path,

@@ -18,7 +18,7 @@ from psotrack.cli.calibrate.rig_points import (
     is_recording,
 )
 from psotrack.cli.calibrate.shown import show_cameras
-from psotrack.cli.options import FORCE, JSON, QUIET, plot_option
+from psotrack.cli.options import FORCE, JSON, plot_option, reporting
 from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table, report_to
 from psotrack.errors import SettingsError
 from psotrack.support import refuse_to_overwrite
@@ -87,7 +87,7 @@ if TYPE_CHECKING:
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
 @OUT
 @FORCE
-@QUIET
+@reporting
 @JSON
 def rig(
     sources: tuple[Path, ...],

@@ -14,11 +14,11 @@ from psotrack.cli.options import (
     FORCE,
     FOV,
     JSON,
-    QUIET,
     SCALE_CAMERA,
     Numbers,
     dictionary_option,
     frames_option,
+    reporting,
 )
 from psotrack.cli.output import check_outputs, report_to
 from psotrack.cli.shutter import given_shutter, shutter_options
@@ -94,7 +94,7 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
 )
 @frames_option
 @FORCE
-@QUIET
+@reporting
 @JSON
 def map_markers(
     sources: tuple[Path, ...],

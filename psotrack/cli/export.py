@@ -1,0 +1,130 @@
+"""`psotrack export`: tracks in the formats of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from psotrack.cli.options import FORCE, QUIET, TRACKS, Numbers
+from psotrack.cli.output import print_line, report_to
+from psotrack.errors import InputError, OutputError, SettingsError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from psotrack.trajectories import Trajectories
+
+FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
+
+
+@click.command()
+@TRACKS
+@click.argument("sequence", metavar="[SEQ]", type=click.Path(path_type=Path), required=False)
+@click.option("--to", type=click.Choice(FORMAT_NAMES), required=True, help="Format of the output.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="File of the output; a folder for tum with several drones, kitti, and mot with SEQ; either for mcap.",
+)
+@click.option("--images", is_flag=True, help="Write the images of SEQ's cameras too; only with --to mcap.")
+@click.option(
+    "--drone-size",
+    "drone_size_m",
+    type=Numbers(3),
+    metavar="X,Y,Z",
+    help="Full lengths of a drone along x, y and z, in metres, for boxes of --to mot.  [default: those that the record "
+    "beside TRACKS has]",
+)
+@FORCE
+@QUIET
+def export(
+    tracks: Path,
+    sequence: Path | None,
+    to: str,
+    out: Path,
+    images: bool,
+    drone_size_m: tuple[float, ...] | None,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Write TRACKS in a format of another program.
+
+    A line says what the format cannot hold. SEQ adds what only its cameras have: for mot the boxes in each camera, for
+    mcap the cameras and with --images their images. `psotrack evaluate OUT SEQ` reads all of these formats again.
+
+    \b
+    Examples:
+      psotrack export tracks.csv --to tum --out tum
+      psotrack export tracks.csv --to c3d --out tracks.c3d
+      psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mot --out mot
+      psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mcap --out flight.mcap --images
+    """
+    from psotrack.datasets import open_recording
+    from psotrack.exchange import Footage, export_tracks, read_tracks
+
+    _check_options(tracks, sequence, to, out, images)
+    recording = None if sequence is None else open_recording(sequence)
+    trajectories = read_tracks(tracks, recording=recording)
+    footage = None
+    if recording is not None:
+        sizes_m = _sizes_m(trajectories, tracks, drone_size_m) if to == "mot" else None
+        footage = Footage(recording, sizes_m, images)
+    lost = export_tracks(trajectories, to, out, footage=footage, force=force, report=report_to(quiet))
+    left = f"; not in this format: {', '.join(lost)}" if lost else ""
+    drones = f"{trajectories.num_drones} drone{'s' if trajectories.num_drones != 1 else ''}"
+    print_line(quiet, None, f"{out}: {to}, {drones}, {trajectories.num_frames} frames{left}")
+
+
+def _check_options(tracks: Path, sequence: Path | None, to: str, out: Path, images: bool) -> None:
+    """Raise an error for options that do not fit each other, and for an output that would replace an input."""
+    if images and (to != "mcap" or sequence is None):
+        found = f"--to {to}" if to != "mcap" else "no SEQ"
+        raise SettingsError("--images", expected="--to mcap and SEQ, whose images are written", found=found)
+    inputs = {tracks.resolve(): "TRACKS"}
+    if tracks.suffix in {".csv", ".parquet"}:
+        inputs[tracks.with_suffix(".json").resolve()] = "the place of the record of TRACKS"
+    if sequence is not None:
+        inputs[sequence.resolve()] = "SEQ"
+    if out.resolve() in inputs:
+        raise OutputError(
+            out,
+            expected="another path than those of the inputs",
+            found=inputs[out.resolve()],
+            remedy="name another one; nothing was written",
+        )
+
+
+def _sizes_m(
+    trajectories: Trajectories, tracks: Path, drone_size_m: tuple[float, ...] | None
+) -> np.ndarray | None:
+    """(drones, 3), sizes of the drones, as the user says or from the record beside the tracks; None if unknown."""
+    import numpy as np
+
+    if drone_size_m is not None:
+        if not min(drone_size_m) > 0:
+            raise SettingsError("--drone-size", expected="lengths above 0", found=f"{drone_size_m}")
+        return np.tile(drone_size_m, (trajectories.num_drones, 1))
+    recorded = _recorded_sizes(tracks.with_suffix(".json"))
+    sizes = [recorded.get(name, (np.nan,) * 3) for name in trajectories.drones]
+    size_m = np.array(sizes, float)
+    return size_m if np.isfinite(size_m).all() else None
+
+
+def _recorded_sizes(record: Path) -> dict[str, list[float]]:
+    """Sizes by the drones' names, from the record of a run; empty where there is no record that has them."""
+    import json
+
+    try:
+        content = json.loads(record.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        found = f"{error}".partition("\n")[0]
+        raise InputError(record, expected="the record of the tracks beside it", found=found) from error
+    drones = content.get("drones") if isinstance(content, dict) else None
+    # `track --causal` records the number of drones alone.
+    listed = drones if isinstance(drones, list) else []
+    return {str(each["drone"]): each["size_m"] for each in listed if each.get("size_m") and "drone" in each}

@@ -1,0 +1,5 @@
+from .export import export_tracks
+from .formats import FORMATS, Footage
+from .reading import read_tracks
+
+__all__ = ["FORMATS", "Footage", "export_tracks", "read_tracks"]

@@ -1,0 +1,109 @@
+"""Tracks as JSON that explains itself: version, units, frames, and all quantities of each drone, null where unknown."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psotrack.errors import InputError, PsotrackError
+from psotrack.support import read_text
+from psotrack.trajectories import Status, Trajectories
+
+#: Value of the key `format`, and version of the keys' meaning.
+NAME, VERSION = "psotrack tracks", 1
+#: Quantities of a drone with one value per frame: unit, and shape of a value.
+QUANTITIES: dict[str, tuple[str, tuple[int, ...]]] = {
+    "position_m": ("m", (3,)),
+    "velocity_m_s": ("m/s", (3,)),
+    "orientation_wxyz": ("unit quaternion, body to world", (4,)),
+    "fitness": ("1", ()),
+    "num_cameras": ("1", ()),
+    "status": ("tracked, coasting or lost", ()),
+    "covariance_m2": ("m2", (3, 3)),
+    "relative_covariance_m2": ("m2", (3, 3)),
+}
+_STATUS = {status.label: int(status) for status in Status}
+
+
+def write_json_tracks(path: Path, trajectories: Trajectories) -> None:
+    """Write all quantities of trajectories; numbers have all digits."""
+    known = {
+        name: getattr(trajectories, name) for name in QUANTITIES if getattr(trajectories, name) is not None
+    }
+    content = {
+        "format": NAME,
+        "version": VERSION,
+        "axes": "world of the calibration, z up",
+        "units": {"frame": "1", "time_s": "s"} | {name: QUANTITIES[name][0] for name in known},
+        "frame": trajectories.frame.tolist(),
+        "time_s": trajectories.time_s.tolist(),
+        "drones": [
+            {"name": name} | {key: _plain(key, value[:, drone]) for key, value in known.items()}
+            for drone, name in enumerate(trajectories.drones)
+        ],
+    }
+    path.write_text(json.dumps(content, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def read_json_tracks(path: Path) -> Trajectories:
+    """Read trajectories from JSON.
+
+    Raises:
+        InputError: the file is not JSON of this format and version, or a quantity does not have a value per frame.
+    """
+    try:
+        content = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(path, expected="JSON", found=f"{error}") from error
+    if not isinstance(content, dict) or content.get("format") != NAME:
+        remedy = "the record of a run has no positions: name its .csv or .parquet"
+        raise InputError(path, expected=f'tracks, with "format": "{NAME}"', found="other JSON", remedy=remedy)
+    if content.get("version") != VERSION:
+        raise InputError(path, expected=f"version {VERSION}", found=f"{content.get('version')}")
+    try:
+        frame = np.array(content["frame"], np.int64)
+        drones = content["drones"]
+        values: dict[str, Any] = {name: _stacked(name, drones, len(frame)) for name in QUANTITIES}
+        return Trajectories(
+            frame=frame,
+            time_s=np.array(content["time_s"], float),
+            drones=tuple(str(drone["name"]) for drone in drones),
+            **values,
+        )
+    except PsotrackError as error:
+        raise InputError(path, expected="consistent tracks", found=f"{error}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        found = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise InputError(
+            path, expected="frame, time_s and drones with a value per frame", found=found
+        ) from error
+
+
+def _plain(name: str, values: np.ndarray) -> list[Any]:
+    """One value per frame: a number, lists of numbers, or a word; None where any of its numbers is NaN."""
+    if name == "status":
+        return [Status(value).label for value in values.tolist()]
+    known = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    return [value if is_known else None for value, is_known in zip(values.tolist(), known, strict=True)]
+
+
+def _stacked(name: str, drones: list[dict[str, Any]], frames: int) -> np.ndarray | None:
+    """(frames, drones, ...), values of all drones; None if no drone has the quantity."""
+    shape = QUANTITIES[name][1]
+    if not any(name in drone for drone in drones):
+        if name == "position_m":
+            raise KeyError(name)
+        return None
+    whole = name in ("status", "num_cameras")
+    stacked = np.full((frames, len(drones), *shape), -1 if whole else np.nan, np.int64 if whole else float)
+    for index, drone in enumerate(drones):
+        values = drone[name]
+        if len(values) != frames:
+            raise ValueError(f"{len(values)} values of {name} for {frames} frames")
+        for row, value in enumerate(values):
+            if value is not None:
+                stacked[row, index] = _STATUS[value] if name == "status" else value
+    return stacked

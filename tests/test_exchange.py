@@ -1,0 +1,728 @@
+"""Tracks in the formats of other programs: there and back, read by the other programs' own libraries, and bad input.
+
+evo (GPL) runs in a process of its own, as TrackEval and the others are: as judges of the files. TrackEval and evo are
+installed without their dependencies (see the Makefile), so that their tests are skipped where they are missing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import ezc3d
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from helpers import LENSES, ring_rig, sphere_points
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
+
+from psotrack import cli
+from psotrack.cli.export import FORMAT_NAMES
+from psotrack.datasets import open_recording
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.evaluation import evaluate
+from psotrack.exchange import FORMATS, Footage, export_tracks, read_tracks
+from psotrack.exchange.ros_messages import DEFINITIONS, camera_message
+from psotrack.geometry import look_at, make_camera, project
+from psotrack.recordings import FrameTimes, Recording, VideoWriter
+from psotrack.rig_files import write_rig
+from psotrack.trajectories import Status, Trajectories, write_trajectories
+from psotrack.trajectories.tum import write_tum
+
+#: Names of outputs that hold all of the small tracks, per format.
+OUTPUTS = {
+    "tum": "tum",
+    "kitti": "kitti",
+    "mot": "mot.txt",
+    "c3d": "tracks.c3d",
+    "mcap": "tracks.mcap",
+    "csv": "again.csv",
+    "parquet": "again.parquet",
+    "json": "again.json",
+}
+SIZE_M = (0.5, 0.5, 0.2)
+LASTS_S = 1.0
+#: Rate, time of frame 0 and time per row of each camera. The instants are those of the fastest camera.
+CLOCKS = {"c0": (25.0, 0.0, 0.0), "c1": (50.0, 0.0, 0.0), "c2": (25.0, 0.013, 2e-5)}
+WH = (320, 240)
+
+
+def path_m(drone: int, time_s: np.ndarray) -> np.ndarray:
+    """(times, 3), a curve at about 1.5 m/s."""
+    angle = 1.5 * time_s + 2.5 * drone
+    return np.stack([np.cos(angle), np.sin(angle), 1.2 + 0.2 * time_s + 0.3 * drone], axis=-1)
+
+
+def small_tracks(num_frames: int = 50, fps: float = 50.0) -> Trajectories:
+    """Two drones with gaps, lost rows, covariances, velocities and orientations, near the paths of the reference."""
+    frame = np.arange(num_frames)
+    time_s = frame / fps
+    rng = np.random.default_rng(4)
+    position_m = np.stack([path_m(0, time_s), path_m(1, time_s)], axis=1)
+    position_m += rng.normal(0, 0.02, position_m.shape)
+    status = np.full((num_frames, 2), int(Status.TRACKED))
+    status[10:13, 0], status[13, 0], status[30:, 1] = Status.LOST, Status.COASTING, Status.LOST
+    position_m[35:, 1] = np.nan
+    return Trajectories(
+        frame=frame,
+        time_s=time_s,
+        drones=("0", "1"),
+        position_m=position_m,
+        velocity_m_s=rng.normal(0, 1, position_m.shape),
+        orientation_wxyz=Rotation.random(2 * num_frames, rng=rng)
+        .as_quat(scalar_first=True, canonical=True)
+        .reshape(num_frames, 2, 4),
+        status=status,
+        covariance_m2=np.broadcast_to(np.diag([1e-4, 2e-4, 4e-4]), (num_frames, 2, 3, 3)).copy(),
+    )
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of three cameras that differ in rate and start, the last with a rolling shutter, with a reference."""
+    folder = tmp_path_factory.mktemp("flight")
+    write_rig(folder / "rig.toml", ring_rig(3, coefficients=5, image_size_wh=WH))
+    tables = ['version = 1\ncalibration = "rig.toml"\n']
+    for name, (fps, begins_s, line_time_s) in CLOCKS.items():
+        with VideoWriter(folder / f"{name}.avi", fps, WH) as writer:
+            for index in range(int((LASTS_S - begins_s) * fps)):
+                writer.write(np.full((WH[1], WH[0], 3), 2 * index, np.uint8))
+        tables.append(
+            f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {begins_s}\nline_time_s = {line_time_s}\n'
+        )
+    time_s = np.arange(0, 1.2, 0.01)
+    reference = Trajectories(
+        np.arange(len(time_s)), time_s, ("a", "b"), np.stack([path_m(0, time_s), path_m(1, time_s)], axis=1)
+    )
+    write_tum(folder, reference)
+    tables.append('[reference]\nfiles = ["a.tum", "b.tum"]\n')
+    (folder / "recording.toml").write_text("\n".join(tables), encoding="utf-8")
+    write_trajectories(folder / "tracks.csv", small_tracks())
+    record = {"drones": [{"drone": drone, "size_m": list(SIZE_M)} for drone in range(2)]}
+    (folder / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recording(flight: Path) -> Recording:
+    return open_recording(flight)
+
+
+@pytest.fixture(scope="module")
+def footage(recording: Recording) -> Footage:
+    return Footage(recording, np.array([SIZE_M, SIZE_M]))
+
+
+@dataclass(frozen=True)
+class Output:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Output]:
+    """Runs `psotrack` with some arguments in this process."""
+
+    def call(*arguments: object) -> Output:
+        monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
+        capfd.readouterr()
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return Output(code, *capfd.readouterr())
+
+    return call
+
+
+def assert_one_line(result: Output, *words: str) -> None:
+    assert result.code == 2, result
+    assert result.out == ""
+    assert result.err.count("\n") == 1, result.err
+    for word in words:
+        assert word in result.err, result.err
+
+
+def instants(num_frames: int, fps: float = 25.0) -> Recording:
+    """A recording that has nothing but instants."""
+    rig = ring_rig(1)
+    return Recording("any", Path("any"), rig, {}, frame_times={rig.names[0]: FrameTimes(num_frames, fps)})
+
+
+# There and back
+
+
+@st.composite
+def with_gaps(draw: st.DrawFn) -> dict[str, Any]:
+    """Arguments of `Trajectories`: random positions of 1 to 3 drones in some of 40 frames; each drone is seen."""
+    drones = draw(st.integers(1, 3))
+    frame = np.array(sorted(draw(st.sets(st.integers(0, 39), min_size=2, max_size=12))))
+    # Up to 60 m, and not nearer to 0 than float32 millimetres can say: C3D takes the origin itself for a gap.
+    numbers = st.floats(1e-3, 60.0) | st.floats(-60.0, -1e-3)
+    position_m = draw(hnp.arrays(float, (len(frame), drones, 3), elements=numbers))
+    seen = draw(hnp.arrays(bool, (len(frame), drones)))
+    seen[0] = True
+    # Each frame is seen by some drone: a frame without any has no row in most formats.
+    seen[:, 0] |= ~seen.any(axis=1)
+    position_m[~seen] = np.nan
+    names = tuple(str(number + 1) for number in range(drones))
+    return {"frame": frame, "time_s": frame / 25.0, "drones": names, "position_m": position_m}
+
+
+@pytest.mark.parametrize("to", OUTPUTS)
+@given(arguments=with_gaps())
+@settings(max_examples=25)
+def test_positions_and_gaps_come_back(
+    to: str, arguments: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    out = tmp_path_factory.getbasetemp() / "there_and_back" / OUTPUTS[to]
+    written = Trajectories(**arguments)
+    export_tracks(written, to, out, force=True)
+    read = read_tracks(out, recording=instants(40))
+    assert read.drones == written.drones
+    np.testing.assert_array_equal(read.at_frames(written.frame).seen, written.seen)
+    assert read.seen.sum() == written.seen.sum(), "no position between the written ones"
+    np.testing.assert_allclose(read.time_s, read.frame / 25.0, rtol=0, atol=1e-12)
+    # C3D has float32 millimetres: half of 2^-23 times 64 m is 3.8 micrometres. The other formats have all digits.
+    np.testing.assert_allclose(
+        read.at_frames(written.frame).position_m, written.position_m, rtol=0, atol=4e-6 if to == "c3d" else 0
+    )
+
+
+def test_what_each_format_keeps(tmp_path: Path) -> None:
+    tracks = small_tracks()
+    read = {}
+    for to, name in OUTPUTS.items():
+        export_tracks(tracks, to, tmp_path / name)
+        read[to] = read_tracks(tmp_path / name, recording=instants(50, 50.0))
+    seen = tracks.seen
+    for to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
+        # A quaternion that was a matrix in between has an error of a few roundings.
+        np.testing.assert_allclose(
+            read[to].at_frames(tracks.frame).orientation_wxyz[seen], tracks.orientation_wxyz[seen], atol=1e-14
+        )
+    for to in ("mcap", "csv", "parquet", "json"):
+        np.testing.assert_array_equal(read[to].covariance_m2[seen], tracks.covariance_m2[seen])
+    for to in ("csv", "parquet", "json"):
+        np.testing.assert_array_equal(read[to].status, tracks.status)
+        np.testing.assert_array_equal(read[to].velocity_m_s, tracks.velocity_m_s)
+    for to in ("mot", "c3d"):
+        assert read[to].orientation_wxyz is None
+    units = json.loads(pq.read_schema(tmp_path / "again.parquet").metadata[b"psotrack.units"])
+    assert (units["qw"], units["cov_xy"], units["vx_m_s"]) == ("1", "m2", "m/s")
+
+
+def test_unknown_orientations_stay_unknown(tmp_path: Path) -> None:
+    for to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
+        export_tracks(replace(small_tracks(), orientation_wxyz=None), to, tmp_path / OUTPUTS[to])
+        assert read_tracks(tmp_path / OUTPUTS[to], recording=instants(50, 50.0)).orientation_wxyz is None
+
+
+@pytest.mark.parametrize(
+    ("to", "name"), [*OUTPUTS.items(), ("mot", "mot"), ("mcap", "bag")], ids=lambda value: str(value)
+)
+def test_evaluate_takes_back_what_export_wrote(
+    run: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str
+) -> None:
+    """The same figures, except those of covariances that the format does not hold."""
+    more = [flight] if name == "mot" else []
+    assert run("export", flight / "tracks.csv", *more, "--to", to, "--out", tmp_path / name).code == 0
+    expected, found = (
+        json.loads(run("evaluate", path, flight, "--json", "-").out)
+        for path in (flight / "tracks.csv", tmp_path / name)
+    )
+    assert expected["missed_rate"] > 0.1, "the gaps count"
+    for key, value in expected.items():
+        if key == "per_drone":
+            continue
+        if FORMATS[to].holds.isdisjoint({"covariances"}) and ("inside_90" in key or "nees" in key):
+            assert found[key] is None
+        elif key == "rpe_1s_rotation_rmse_deg" or value is None:
+            assert found[key] is None, "the reference has no orientations"
+        else:
+            # C3D has float32 millimetres.
+            assert found[key] == pytest.approx(value, abs=1e-6 if to == "c3d" else 1e-12), key
+
+
+def test_tracks_with_a_rate_of_their_own(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    """20 Hz, as from `track --rate 20`: the times say so, although the recording has 50 Hz."""
+    tracks = tmp_path / "slow.csv"
+    write_trajectories(tracks, small_tracks(20, 20.0))
+    expected = json.loads(run("evaluate", tracks, flight, "--json", "-").out)
+    assert expected["frames"] == 20
+    for to in ("tum", "kitti", "mcap", "json", "c3d"):
+        assert run("export", tracks, "--to", to, "--out", tmp_path / OUTPUTS[to]).code == 0
+        found = json.loads(run("evaluate", tmp_path / OUTPUTS[to], flight, "--json", "-").out)
+        assert found["mean_error_m"] == pytest.approx(expected["mean_error_m"], abs=1e-6)
+        assert found["missed_rate"] == expected["missed_rate"]
+
+
+def test_times_between_the_instants_are_interpolated_and_gaps_stay(tmp_path: Path) -> None:
+    time_s = 0.0137 + np.arange(40) / 25
+    keep = np.r_[0:15, 16:40]
+    position_m = path_m(0, time_s)[:, None]
+    own = Trajectories(np.arange(40)[keep], time_s[keep], ("drone",), position_m[keep])
+    export_tracks(own, "tum", tmp_path / "drone.tum")
+    read = read_tracks(tmp_path / "drone.tum", recording=instants(50))
+    # The missing sample is between instants 15 and 16.
+    assert np.flatnonzero(~read.seen[:, 0]).tolist() == [0, 15, 16, *range(40, 50)]
+    there = read.seen[:, 0]
+    # A cubic spline over 40 ms of a curve of 1.5 rad/s: 5/384 (1.5 x 0.04)^4 = 2e-7 m, more at the ends.
+    np.testing.assert_allclose(read.position_m[there, 0], path_m(0, read.time_s[there]), atol=3e-6)
+
+
+# Judged by the other programs
+
+EVO = """
+import sys, json
+from evo.core import metrics, sync
+from evo.tools import file_interface as files
+reference, estimate, poses = sys.argv[1:]
+pair = sync.associate_trajectories(*map(files.read_tum_trajectory_file, (reference, estimate)), max_diff=1e-4)
+ape = metrics.APE(metrics.PoseRelation.translation_part)
+ape.process_data(pair)
+kitti = files.read_kitti_poses_file(poses)
+print(json.dumps({"rmse": ape.get_statistic(metrics.StatisticsType.rmse), "poses": pair[1].num_poses,
+                  "kitti": kitti.positions_xyz.tolist(), "turns": kitti.orientations_quat_wxyz.tolist()}))
+"""
+
+
+@pytest.mark.skipif(find_spec("evo") is None, reason="evo is not installed; see the Makefile")
+def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path: Path, recording: Recording) -> None:
+    tracks, truth = small_tracks(), recording.truth
+    assert truth is not None
+    for to in ("tum", "kitti"):
+        export_tracks(tracks, to, tmp_path / to)
+    export_tracks(replace(truth, drones=("0", "1")), "tum", tmp_path / "truth")
+    paths = [tmp_path / name for name in ("truth/0.tum", "tum/0.tum", "kitti/poses/0.txt")]
+    result = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", EVO, *map(str, paths)],
+        env=os.environ | {"HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    by_evo = json.loads(result.stdout.splitlines()[-1])
+    seen = tracks.seen[:, 0]
+    assert by_evo["poses"] == seen.sum()
+    ours = next(drone for drone in evaluate(tracks, truth).to_dict()["per_drone"] if drone["estimate"] == "0")
+    assert by_evo["rmse"] == pytest.approx(ours["ate_rmse_m"], abs=1e-12)
+    np.testing.assert_array_equal(by_evo["kitti"], tracks.position_m[seen, 0])
+    np.testing.assert_allclose(np.abs(by_evo["turns"]), np.abs(tracks.orientation_wxyz[seen, 0]), atol=1e-12)
+
+
+def test_motmetrics_reads_the_3d_columns(tmp_path: Path) -> None:
+    import motmetrics
+
+    tracks = small_tracks()
+    export_tracks(tracks, "mot", tmp_path / "mot.txt")
+    with warnings.catch_warnings():
+        # motmetrics subtracts a tuple from columns, which pandas will change.
+        warnings.simplefilter("ignore")
+        table = motmetrics.io.loadtxt(tmp_path / "mot.txt", fmt="mot15-2D")
+    rows, drones = np.nonzero(tracks.seen)
+    assert table.index.tolist() == [(row + 1, drone + 1) for row, drone in zip(rows, drones, strict=True)]
+    # motmetrics calls the columns of x and y class and visibility, and drops z.
+    np.testing.assert_array_equal(table[["ClassId", "Visibility"]], tracks.position_m[rows, drones, :2])
+    whole = pd.read_csv(tmp_path / "mot.txt", header=None)
+    np.testing.assert_allclose(whole[[7, 8, 9]], tracks.position_m[rows, drones], rtol=1e-14)
+
+
+def trackeval_clear(folder: Path) -> dict[str, dict[str, float]]:
+    """CLEAR by TrackEval for each sequence in a folder that was exported."""
+    import trackeval
+
+    for name, kind in (("float", float), ("int", int), ("bool", bool)):
+        if not hasattr(np, name):  # TrackEval's code is older than NumPy 1.24.
+            setattr(np, name, kind)
+    quiet = {"PRINT_CONFIG": False, "PRINT_RESULTS": False}
+    data = trackeval.datasets.MotChallenge2DBox(
+        quiet
+        | {
+            "GT_FOLDER": str(folder / "gt"),
+            "TRACKERS_FOLDER": str(folder / "trackers"),
+            "BENCHMARK": "MOT15",
+            "SPLIT_TO_EVAL": "train",
+        }
+    )
+    metric = trackeval.metrics.CLEAR({"PRINT_CONFIG": False})
+    return {
+        name: metric.eval_sequence(
+            data.get_preprocessed_seq_data(data.get_raw_seq_data("psotrack", name), "pedestrian")
+        )
+        for name in data.seq_list
+    }
+
+
+@pytest.mark.skipif(find_spec("trackeval") is None, reason="trackeval is not installed; see the Makefile")
+def test_trackeval_reads_the_boxes_of_every_camera(
+    tmp_path: Path, recording: Recording, footage: Footage
+) -> None:
+    truth = recording.truth
+    assert truth is not None
+    perfect = replace(truth, drones=("0", "1"))
+    export_tracks(perfect, "mot", tmp_path / "perfect", footage=footage)
+    results = trackeval_clear(tmp_path / "perfect")
+    assert set(results) == {f"{recording.name}-{name}" for name in CLOCKS}
+    for name, result in results.items():
+        frames = int(LASTS_S * CLOCKS[name[-2:]][0])
+        assert result["MOTA"] == 1.0
+        assert result["MOTP"] == pytest.approx(1.0, abs=1e-3)
+        # The last camera's last frames are after the last instant.
+        assert frames < result["CLR_TP"] <= 2 * frames
+    export_tracks(small_tracks(), "mot", tmp_path / "tracks", footage=footage)
+    for result in trackeval_clear(tmp_path / "tracks").values():
+        # Drone 0 is lost in 3 of 50 instants, drone 1 in 20.
+        assert 0.6 < result["CLR_Re"] < 0.95
+        assert result["CLR_FP"] == 0
+
+
+def test_boxes_are_around_the_drones_at_the_exposure(
+    tmp_path: Path, recording: Recording, footage: Footage
+) -> None:
+    """The oracle projects points of the ellipsoids' surface, at the time of the frame or of the drone's row."""
+    truth = recording.truth
+    assert truth is not None
+    export_tracks(replace(truth, drones=("0", "1")), "mot", tmp_path / "mot", footage=footage)
+    surface_m = sphere_points(4000) * np.array(SIZE_M) / 2
+    for index, (name, (fps, begins_s, line_time_s)) in enumerate(CLOCKS.items()):
+        path = (
+            tmp_path
+            / "mot"
+            / "trackers"
+            / "MOT15-train"
+            / "psotrack"
+            / "data"
+            / f"{recording.name}-{name}.txt"
+        )
+        table = np.loadtxt(path, delimiter=",")
+        # The exposure of a rolling shutter is counted from the first row.
+        for frame, drone, left, top, width, height, *_ in table[:: max(1, len(table) // 12)]:
+            time_s = begins_s + (frame - 1) / fps + line_time_s * (top - 1 + height / 2)
+            points_m = path_m(int(drone) - 1, np.array([time_s])) + surface_m
+            pixels = project(recording.rig.cameras[index], points_m)[0] + 0.5
+            low, high = pixels.min(axis=0), pixels.max(axis=0)
+            # 4000 points miss the outermost ones by up to 0.02 px here; boxes with distortion are exact up to the
+            # square of the angular size, and float32 has a thousandth of a pixel.
+            np.testing.assert_allclose([left - 1, top - 1], low, atol=0.1)
+            np.testing.assert_allclose([left - 1 + width, top - 1 + height], high, atol=0.1)
+
+
+def test_ezc3d_reads_units_labels_rate_and_gaps(tmp_path: Path) -> None:
+    tracks = small_tracks()
+    export_tracks(tracks, "c3d", tmp_path / "tracks.c3d")
+    content = ezc3d.c3d(str(tmp_path / "tracks.c3d"))
+    point = content["parameters"]["POINT"]
+    assert (point["UNITS"]["value"], point["LABELS"]["value"]) == (["mm"], ["0", "1"])
+    assert point["RATE"]["value"] == pytest.approx([50.0])
+    seen = content["data"]["meta_points"]["residuals"][0].T >= 0
+    np.testing.assert_array_equal(seen, tracks.seen)
+    # Float32 millimetres of 2 m: half of 2^-23 times 2048 mm.
+    position_m = content["data"]["points"][:3].T / 1e3
+    np.testing.assert_allclose(position_m[seen], tracks.position_m[seen], atol=2e-7)
+
+
+def test_the_mcap_library_and_rosbags_read_the_messages(tmp_path: Path, footage: Footage) -> None:
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+    from rosbags.highlevel import AnyReader
+
+    tracks = replace(small_tracks(), orientation_wxyz=None)
+    lost = export_tracks(tracks, "mcap", tmp_path / "bag", footage=replace(footage, images=True))
+    assert lost == ("velocities", "status", "8 positions of lost drones")
+    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        by_mcap = [
+            (channel.topic, message.log_time, content)
+            for _, channel, message, content in reader.iter_decoded_messages()
+        ]
+    with AnyReader([tmp_path / "bag"]) as bag:
+        by_rosbags = [
+            (connection.topic, time_ns, bag.deserialize(raw, connection.msgtype))
+            for connection, time_ns, raw in bag.messages()
+        ]
+    for messages in (by_mcap, by_rosbags):
+        poses = [(time_ns, content) for topic, time_ns, content in messages if topic == "/drone_0/pose"]
+        seen = tracks.seen[:, 0]
+        assert [time_ns for time_ns, _ in poses] == [20_000_000 * frame for frame in tracks.frame[seen]]
+        for row, (time_ns, content) in zip(np.flatnonzero(seen), poses, strict=True):
+            place = content.pose.pose.position
+            assert [place.x, place.y, place.z] == tracks.position_m[row, 0].tolist()
+            assert content.header.frame_id == "world"
+            assert content.header.stamp.sec * 10**9 + content.header.stamp.nanosec == time_ns
+            covariance = np.asarray(content.pose.covariance).reshape(6, 6)
+            np.testing.assert_array_equal(covariance[:3, :3], tracks.covariance_m2[row, 0])
+            assert np.diag(covariance)[3:].tolist() == [1e9] * 3, "the orientation is not known"
+        transforms = [each for topic, _, content in messages if topic == "/tf" for each in content.transforms]
+        children = [each.child_frame_id for each in transforms]
+        # Cameras at 0 s and at the end, 0.98 s.
+        assert [children.count(name) for name in ("drone_0", "drone_1", "c0", "c1", "c2")] == [
+            *tracks.seen.sum(axis=0),
+            *(2, 2, 2),
+        ]
+        images = [content for topic, _, content in messages if topic == "/c1/image/compressed"]
+        assert len(images) == 50
+        picture = cv2.imdecode(np.frombuffer(bytes(images[20].data), np.uint8), cv2.IMREAD_COLOR)
+        # JPEG of a grey image is exact within a few levels.
+        assert picture.shape == (WH[1], WH[0], 3)
+        assert abs(picture.mean() - 40) < 3
+        # At 0 and with every later image.
+        assert sum(topic == "/c1/camera_info" for topic, *_ in messages) == 50
+
+
+def test_a_camera_info_and_its_transform_project_as_the_camera_does(tmp_path: Path, footage: Footage) -> None:
+    """The oracle is OpenCV, with the numbers that ROS programs get."""
+    from rosbags.highlevel import AnyReader
+
+    export_tracks(small_tracks(), "mcap", tmp_path / "bag", footage=footage)
+    with AnyReader([tmp_path / "bag"]) as bag:
+        contents = [(each.topic, bag.deserialize(raw, each.msgtype)) for each, _, raw in bag.messages()]
+    (info,) = (content for topic, content in contents if topic == "/c2/camera_info")
+    assert (info.distortion_model, len(info.d), info.width, info.height) == ("plumb_bob", 5, *WH)
+    transforms = [each for topic, content in contents if topic == "/tf" for each in content.transforms]
+    pose = next(each for each in transforms if each.child_frame_id == "c2")
+    turn, place = pose.transform.rotation, pose.transform.translation
+    R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix().T
+    t = -R @ [place.x, place.y, place.z]
+    point_m = np.array([[0.3, 0.2, 1.0]])
+    expected, _ = cv2.projectPoints(
+        point_m, cv2.Rodrigues(R)[0], t, np.array(info.k).reshape(3, 3), np.array(info.d)
+    )
+    camera = footage.recording.rig.cameras[2]
+    np.testing.assert_allclose(project(camera, point_m)[0], expected[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("dist", "fisheye", "model"),
+    [
+        ((), False, "plumb_bob"),
+        (LENSES[4], False, "plumb_bob"),
+        (LENSES[5], False, "plumb_bob"),
+        (LENSES[8], False, "rational_polynomial"),
+        ((*LENSES[5], 0.0, 0.0, 0.0), False, "plumb_bob"),
+        ((0.1, 0.01, -0.01, 0.001), True, "equidistant"),
+        ((*LENSES[8], 1e-3, 0.0, 0.0, 0.0), False, None),
+        ((*LENSES[8], 0.0, 0.0, 0.0, 0.0, 0.01, 0.0), False, None),
+    ],
+)
+def test_the_lens_models_of_ros(dist: tuple[float, ...], fisheye: bool, model: str | None) -> None:
+    R, t_m = look_at((3.0, 0.0, 2.0), (0.0, 0.0, 1.0))
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=WH, dist=dist, fisheye=fisheye)
+    message = camera_message({}, camera)
+    assert (None if message is None else message["distortion_model"]) == model
+    if message is not None:
+        size = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}[message["distortion_model"]]
+        assert message["d"] == [*dist, *[0.0] * size][:size]
+
+
+def test_the_definitions_of_the_messages_are_those_of_ros() -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        for part, fields in get_types_from_msg(text, name).items():
+            assert fields[1] == store.fielddefs[part][1], part
+
+
+# What is said, and what is refused
+
+
+def test_the_command_and_the_tests_know_every_format() -> None:
+    assert set(FORMAT_NAMES) == set(OUTPUTS) == set(FORMATS)
+
+
+def test_export_says_what_is_lost(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    result = run("export", flight / "tracks.csv", "--to", "kitti", "--out", tmp_path / "kitti")
+    assert result.out == (
+        f"{tmp_path / 'kitti'}: kitti, 2 drones, 50 frames; not in this format: covariances, velocities, status, "
+        "8 positions of lost drones\n"
+    )
+    result = run("export", flight / "tracks.csv", "--to", "json", "--out", tmp_path / "again.json")
+    assert result.out == f"{tmp_path / 'again.json'}: json, 2 drones, 50 frames\n"
+    late = replace(small_tracks(), time_s=small_tracks().time_s + 0.013)
+    assert "times" in export_tracks(late, "c3d", tmp_path / "late.c3d")
+    assert "times" not in export_tracks(late, "tum", tmp_path / "late")
+
+
+def test_nothing_is_overwritten(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    tracks = shutil.copy(flight / "tracks.csv", tmp_path / "tracks.csv")
+    record = tmp_path / "tracks.json"
+    record.write_text("{}", encoding="utf-8")
+    # Even with --force: the inputs, and the record of the run beside them.
+    assert_one_line(
+        run("export", tracks, "--to", "csv", "--out", tracks, "--force"), "TRACKS", "another path"
+    )
+    assert_one_line(run("export", tracks, "--to", "json", "--out", record, "--force"), "record of TRACKS")
+    assert record.read_text() == "{}"
+    out = tmp_path / "tum"
+    assert run("export", tracks, "--to", "tum", "--out", out).code == 0
+    assert_one_line(run("export", tracks, "--to", "tum", "--out", out), "--force")
+    assert run("export", tracks, "--to", "tum", "--out", out, "--force").code == 0
+    (out / "notes.md").write_text("mine", encoding="utf-8")
+    assert_one_line(
+        run("export", tracks, "--to", "tum", "--out", out, "--force"), "notes.md", "another folder"
+    )
+    assert (out / "notes.md").read_text() == "mine"
+
+
+@pytest.mark.parametrize("names", [("a b", "a_b"), ("c1", "d"), ("world", "d")])
+def test_names_that_are_one_name_in_ros(tmp_path: Path, footage: Footage, names: tuple[str, str]) -> None:
+    with pytest.raises(InputError, match="differ as names of ROS"):
+        export_tracks(replace(small_tracks(), drones=names), "mcap", tmp_path / "bag", footage=footage)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("psotrack.exchange.mcap_files._write_bag_file", full)
+    with pytest.raises(OutputError, match="No space left"):
+        export_tracks(small_tracks(), "mcap", tmp_path / "bag", footage=footage)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("to", "name", "words"),
+    [
+        ("tum", "one.tum", ("a TUM file holds one drone", "2")),
+        ("tum", "tum.csv", ("a folder, or a file that ends in .tum",)),
+        ("kitti", "poses.txt", ("a folder",)),
+        ("c3d", "tracks", ("ends in .c3d",)),
+        ("mot", "mot", ("a file that ends in .txt", "name SEQ")),
+        ("json", "a.csv", ("ends in .json",)),
+    ],
+)
+def test_outputs_that_do_not_fit(
+    run: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str, words: tuple[str, ...]
+) -> None:
+    assert_one_line(
+        run("export", flight / "tracks.csv", "--to", to, "--out", tmp_path / name), "--out", *words
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_images_and_sizes_need_a_recording(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    tracks = shutil.copy(flight / "tracks.csv", tmp_path / "without_record.csv")
+    out = tmp_path / "out"
+    assert_one_line(run("export", tracks, "--to", "mcap", "--out", out, "--images"), "--images", "no SEQ")
+    assert_one_line(
+        run("export", tracks, flight, "--to", "tum", "--out", out, "--images"), "--images", "--to tum"
+    )
+    assert_one_line(
+        run("export", tracks, flight, "--to", "mot", "--out", out), "--drone-size", "leave out SEQ"
+    )
+    assert run("export", tracks, flight, "--to", "mot", "--out", out, "--drone-size", "0.5,0.5,0.2").code == 0
+    assert (out / "gt" / "seqmaps" / "MOT15-train.txt").is_file()
+
+
+def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export_tracks(small_tracks(), "mcap", tmp_path / "tracks.mcap")
+    for name in ("mcap.reader", "mcap_ros2.writer"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(SettingsError, match=r"pip install 'psotrack\[ros\]'"):
+        export_tracks(small_tracks(), "mcap", tmp_path / "again.mcap")
+    with pytest.raises(SettingsError, match=r"pip install 'psotrack\[ros\]'"):
+        read_tracks(tmp_path / "tracks.mcap")
+
+
+def cut(path: Path, size: int) -> Path:
+    """The first bytes of a file, as a file of its own."""
+    short = path.with_name(f"short{path.suffix}")
+    short.write_bytes(path.read_bytes()[:size])
+    return short
+
+
+BAD = {
+    "a file of boxes alone": ("boxes.txt", "1,1,10,10,5,5,1,-1,-1,-1\n", "positions in MOT15's 3D columns"),
+    "a file of few columns": ("boxes.txt", "1,1,10,10,5,5,1\n", "positions in MOT15's 3D columns"),
+    "MOT counts from 1": ("mot.txt", "0,1,-1,-1,-1,-1,1,1,2,3\n", "whole frame numbers from 1"),
+    "MOT twice": ("mot.csv", "1,1,-1,-1,-1,-1,1,1,2,3\n" * 2, "one row per frame and identity"),
+    "KITTI of another length": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 3\n" * 3, "50 poses, one for each instant"),
+    "no rotation": ("k.txt", "1 0 0 1 0 2 0 2 0 0 1 3\n", "a rotation matrix"),
+    "KITTI with words": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 x\n", "line 1: expected 12 finite numbers"),
+    "an empty file": ("empty.txt", "", "an empty file"),
+    "comments alone": ("empty.tum", "# timestamp\n", "at least one pose"),
+    "5 numbers": ("five.txt", "1 2 3 4 5\n", "8 numbers per line (TUM), 12 (KITTI)"),
+    "an unknown ending": ("tracks.xyz", "1 2 3\n", "tracks as .csv, .parquet"),
+    "the record": ("record.json", '{"drones": []}', "the record of a run has no positions"),
+    "broken JSON": ("broken.json", '{"format": ', "expected JSON"),
+    "JSON with too few values": (
+        "few.json",
+        '{"format": "psotrack tracks", "version": 1, "frame": [0, 1], "time_s": [0, 0.1], '
+        '"drones": [{"name": "a", "position_m": [[1, 2, 3]]}]}',
+        "1 values of position_m for 2 frames",
+    ),
+    "a newer version": (
+        "new.json",
+        '{"format": "psotrack tracks", "version": 2}',
+        "expected version 1, found 2",
+    ),
+    "another clock": ("late.tum", "1.7e9 1 2 3 0 0 0 1\n", "times on the recording's clock, 0 to 0.98 s"),
+    "not MCAP": ("bad.mcap", "no", "an MCAP file"),
+    "not C3D": ("bad.c3d", "no", "a C3D file"),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "message"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_line(
+    run: Callable[..., Output], flight: Path, tmp_path: Path, name: str, text: str, message: str
+) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    assert_one_line(run("evaluate", tmp_path / name, flight), message, str(tmp_path))
+
+
+def test_files_that_are_cut_short_are_one_line(
+    run: Callable[..., Output], flight: Path, tmp_path: Path
+) -> None:
+    for to in ("mcap", "c3d"):
+        export_tracks(small_tracks(), to, tmp_path / OUTPUTS[to])
+        whole = (tmp_path / OUTPUTS[to]).stat().st_size
+        for size in (10, whole // 2, whole * 2 // 3):
+            assert_one_line(run("evaluate", cut(tmp_path / OUTPUTS[to], size), flight), "short")
+
+
+def test_folders_without_tracks(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    assert_one_line(run("evaluate", tmp_path / "nowhere", flight), "no such file or folder")
+    assert_one_line(run("evaluate", tmp_path, flight), "a folder without them")
+    export_tracks(small_tracks(), "kitti", tmp_path / "kitti")
+    times = tmp_path / "kitti" / "sequences" / "0" / "times.txt"
+    times.write_text("0.0\n0.1\n", encoding="utf-8")
+    assert_one_line(run("evaluate", tmp_path / "kitti", flight), "47 times, as many as 0.txt has poses")
+
+
+def test_tracks_without_a_rate_need_a_recording(tmp_path: Path) -> None:
+    export_tracks(small_tracks(), "mot", tmp_path / "mot.txt")
+    with pytest.raises(InputError, match="name SEQ, too"):
+        read_tracks(tmp_path / "mot.txt")
+    shutil.rmtree(tmp_path, ignore_errors=True)
+    export_tracks(small_tracks(), "kitti", tmp_path / "kitti")
+    shutil.rmtree(tmp_path / "kitti" / "sequences")
+    with pytest.raises(InputError, match="name SEQ, too"):
+        read_tracks(tmp_path / "kitti")
+    export_tracks(small_tracks(), "tum", tmp_path / "tum")
+    assert read_tracks(tmp_path / "tum").frame.tolist() == list(range(50))
+
+
+def test_quaternions_of_a_table_must_have_length_1(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.csv"
+    path.write_text("frame,drone,x_m,y_m,z_m,time_s,qw,qx,qy,qz\n0,a,1,2,3,0,1,1,0,0\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 2: expected a unit quaternion"):
+        read_tracks(path)

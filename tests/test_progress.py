@@ -1,0 +1,148 @@
+"""Progress where there is no terminal: lines now and then, and one tidy output per stage in a notebook."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import nbformat
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nbclient import NotebookClient
+
+from psotrack.support import joined, no_progress, progress_bar, progress_lines, terminal_bar
+
+
+class Clock:
+    """A clock that a test moves."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def lines_of(steps: list[tuple[float, int]], total: int, long_s: float = 0.0) -> list[str]:
+    """Lines about a stage whose steps take some seconds each."""
+    written: list[str] = []
+    clock = Clock()
+    with progress_lines(written.append, long_s=long_s, clock=clock)("track", total) as advance:
+        for seconds, count in steps:
+            clock.now_s += seconds
+            advance(count)
+    return written
+
+
+def test_lines_of_a_stage_of_two_minutes() -> None:
+    assert lines_of([(1.0, 5)] * 120, 600) == [
+        "track: 100 of 600 (17%), 20 s, about 2 min left",
+        "track: 200 of 600 (33%), 40 s, about 80 s left",
+        "track: 300 of 600 (50%), 60 s, about 60 s left",
+        "track: 400 of 600 (67%), 80 s, about 40 s left",
+        "track: 500 of 600 (83%), 2 min, about 20 s left",
+        "track: 600 of 600 in 2 min",
+    ]
+
+
+def test_long_stages_have_a_line_at_least_every_five_minutes() -> None:
+    lines = lines_of([(60.0, 1)] * 600, 600)
+    # One per five minutes of ten hours; the last of them is the end.
+    assert 100 <= len(lines) <= 125
+    assert lines[-1] == "track: 600 of 600 in 10 h 0 min"
+
+
+def test_a_stage_of_unknown_length() -> None:
+    assert lines_of([(15.0, 1)] * 4, 0) == ["track: 2, 30 s", "track: 4, 60 s", "track: 4 in 60 s"]
+
+
+@given(
+    seconds=st.lists(st.floats(0, 50), min_size=1, max_size=60),
+    long_s=st.sampled_from([0.0, 20.0]),
+)
+def test_few_lines_and_none_about_short_stages(seconds: list[float], long_s: float) -> None:
+    lines = lines_of([(each, 1) for each in seconds], len(seconds), long_s)
+    if sum(seconds) < long_s:
+        assert lines == []
+    else:
+        # Ten tenths, the first line, and one per five minutes.
+        assert 1 <= len(lines) <= 12 + sum(seconds) // 300
+        assert lines[-1].startswith(f"track: {len(seconds)} of {len(seconds)} in ")
+
+
+def test_a_stage_that_an_error_ends_says_so() -> None:
+    written: list[str] = []
+
+    def work() -> None:
+        with progress_lines(written.append, clock=Clock())("track", 10) as advance:
+            advance(4)
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        work()
+    assert written == ["track: 4 of 10, stopped after 0.0 s"]
+
+
+def test_lines_go_to_stderr_and_short_work_is_quiet(capfd: pytest.CaptureFixture[str]) -> None:
+    with progress_bar("track", 2) as advance:
+        advance(2)
+    assert capfd.readouterr() == ("", "")
+    with progress_lines()("track", 2) as advance:
+        advance(2)
+    assert capfd.readouterr() == ("", "psotrack: track: 2 of 2 in 0.0 s\n")
+
+
+def test_a_bar_in_any_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with terminal_bar("track", 7) as advance:
+        advance(7)
+    assert "7/7" in stream.getvalue()
+
+
+def test_joined_reports_count_the_same_steps() -> None:
+    first: list[str] = []
+    second: list[str] = []
+    report = joined(*(progress_lines(each.append, clock=Clock()) for each in (first, second)), no_progress)
+    with report("track", 5) as advance:
+        advance(2)
+        advance(3)
+    assert first == second == ["track: 5 of 5 in 0.0 s"]
+
+
+@pytest.mark.slow
+# The kernel of Jupyter leaves sockets to the garbage collector.
+@pytest.mark.filterwarnings("ignore")
+def test_a_saved_notebook_has_one_output_per_stage() -> None:
+    source = """
+import time
+from psotrack.support import progress_bar
+with progress_bar("silhouettes", 300) as advance:
+    for _ in range(300):
+        time.sleep(0.003)  # the bar is drawn again several times
+        advance(1)
+with progress_bar("<b>track", 0) as advance:
+    advance(7)
+try:
+    with progress_bar("fails", 4) as advance:
+        advance(1)
+        raise ValueError
+except ValueError:
+    pass
+"""
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    NotebookClient(notebook, kernel_name="python3", timeout=120).execute()
+    outputs = notebook.cells[0].outputs
+    texts = [output["data"]["text/plain"] for output in outputs]
+    assert [text.rpartition(" in ")[0] or text.rpartition(" after ")[0] for text in texts] == [
+        "silhouettes: 300 of 300",
+        "<b>track: 7",
+        "fails: 1 of 4, stopped",
+    ]
+    pages = [output["data"]["text/html"] for output in outputs]
+    assert 'value="300" max="300"' in pages[0]
+    # A bar without a value would move for ever in the saved notebook.
+    assert 'value="1" max="1"' in pages[1]
+    assert "&lt;b&gt;track" in pages[1]
+    assert all(page.count("<progress") == 1 for page in pages)

@@ -1,0 +1,406 @@
+"""Reports and 3D views: what is in the pages, and, in a real browser, that they work."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+
+import browser
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from evaluation_flights import on_x_axis
+from helpers import make_once, ring_rig
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.cli import cli
+from psotrack.datasets import open_recording
+from psotrack.errors import OutputError, SettingsError
+from psotrack.reports import PointCloud, Scene3D, scene_of_tracks
+from psotrack.reports.charts import thinned
+from psotrack.reports.page import MOST_BYTES, write_page
+from psotrack.reports.scene import MOST_ROWS
+from psotrack.rig_files import write_rig
+from psotrack.simulation import SimulationSettings, simulate
+from psotrack.sweep import Store
+from psotrack.trajectories import Status, write_trajectories
+
+FRAMES = 24
+
+
+def run(*arguments):
+    """Output of a command that succeeds."""
+    result = CliRunner().invoke(cli, [f"{argument}" for argument in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def refused(*arguments):
+    """Message of a command that is refused."""
+    result = CliRunner().invoke(cli, [f"{argument}" for argument in arguments])
+    assert result.exception is not None
+    return f"{result.exception}"
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Folder with a simulated recording `S01_D2_A`, and tracks.csv with its record: the truth with small changes."""
+
+    def make(folder):
+        settings = SimulationSettings(num_frames=FRAMES, scale=0.25, masks=False, onboard=False)
+        simulate("S01_D2_A", folder, settings, jobs=2)
+        truth = open_recording(folder / "Simulated_Data" / "S01_D2_A").truth
+        status = np.full((FRAMES, 2), Status.TRACKED)
+        status[8:12, 1] = Status.LOST
+        tracks = replace(
+            truth,
+            drones=("0", "<b>1</b>"),
+            position_m=truth.position_m + 0.02,
+            orientation_wxyz=None,
+            status=status,
+            fitness=np.full((FRAMES, 2), 0.5),
+            num_cameras=np.full((FRAMES, 2), 8),
+            covariance_m2=np.broadcast_to(4e-4 * np.eye(3), (FRAMES, 2, 3, 3)).copy(),
+        )
+        write_trajectories(folder / "tracks.csv", tracks)
+        record = {
+            "sequence": "S01_D2_A",
+            "drones": [{"drone": 0, "size_m": [0.5, 0.5, 0.2]}],
+            "settings": {"swarm": {"particles": 77}},
+            "versions": {"psotrack": "0.2"},
+            "real_time_factor": 1.5,
+        }
+        (folder / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
+
+    return make_once(tmp_path_factory, "reported_flight", make)
+
+
+@pytest.fixture(scope="module")
+def page(flight, tmp_path_factory):
+    """The report of the flight."""
+
+    def make(folder):
+        run(
+            "report",
+            flight / "tracks.csv",
+            flight / "Simulated_Data" / "S01_D2_A",
+            "--out",
+            folder / "report.html",
+        )
+
+    return make_once(tmp_path_factory, "report_page", make) / "report.html"
+
+
+@pytest.fixture
+def chromium():
+    with browser.open_browser() as opened:
+        yield opened
+
+
+def decoded(text):
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+class TestFlight:
+    def test_the_page_has_all_parts_and_needs_no_other_file(self, page):
+        text = page.read_text(encoding="utf-8")
+        for heading in (
+            "Errors against the reference",
+            "Drones",
+            "Cameras",
+            "Over time",
+            "Events",
+            "How it was made",
+        ):
+            assert f"<h2>{heading}</h2>" in text
+        assert "drone &lt;b&gt;1&lt;/b&gt; is lost" in text
+        assert "drone &lt;b&gt;1&lt;/b&gt; is found again" in text
+        assert "&#34;swarm.particles&#34;: 77" in text
+        assert "<b>1</b>" not in text
+        outside = re.findall(r"(?:src|href)=\"(?!data:|#)([^\"]*)\"", text)
+        assert outside == []
+        assert len(text) < MOST_BYTES / 4
+
+    def test_pictures_show_the_place_of_the_event(self, page):
+        """The box of the drone, in the drone's colour, is in the picture of the event in which the drone is found."""
+        import cv2
+
+        text = page.read_text(encoding="utf-8")
+        found = re.search(r'<img src="data:image/jpeg;base64,([^"]*)"[^>]*is found again', text)
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(found[1]), np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape == (240, 360, 3)
+        off = np.abs(picture.astype(int) - [0x00, 0x5E, 0xD5]).sum(axis=-1)
+        rows, columns = np.nonzero(off < 90)
+        # Where the box is: about the middle of the picture. JPEG blurs colours of thin lines.
+        assert len(rows) > 20
+        assert abs(np.median(rows) - 120) < 40
+        assert abs(np.median(columns) - 180) < 60
+
+    def test_without_a_recording(self, flight, tmp_path):
+        out = run("report", flight / "tracks.csv", "--out", tmp_path / "alone.html")
+        assert re.fullmatch(r".*alone\.html: 0\.\d MB\n", out)
+        text = (tmp_path / "alone.html").read_text(encoding="utf-8")
+        assert "<h2>Cameras</h2>" not in text
+        assert "<img" not in text
+
+    def test_two_files_of_tracks(self, flight, tmp_path):
+        other = tmp_path / "other.csv"
+        other.write_bytes((flight / "tracks.csv").read_bytes())
+        sequence = flight / "Simulated_Data" / "S01_D2_A"
+        out = tmp_path / "two.html"
+        run("report", flight / "tracks.csv", sequence, "--compare", other, "--no-pictures", "--out", out)
+        text = out.read_text(encoding="utf-8")
+        assert text.count("<h2>Drones</h2>") == 2
+        assert "There is no record of a run beside other." in text
+
+    def test_an_existing_page_is_replaced_only_by_force(self, flight, tmp_path):
+        out = tmp_path / "report.html"
+        out.write_text("mine", encoding="utf-8")
+        assert "pass --force" in refused("report", flight / "tracks.csv", "--out", out)
+        assert out.read_text(encoding="utf-8") == "mine"
+        assert "ends in .html" in refused("report", flight / "tracks.csv", "--out", tmp_path / "report.pdf")
+
+    def test_a_page_that_is_too_large_is_not_written(self, tmp_path):
+        with pytest.raises(OutputError, match=r"expected a page of at most 8 MB, found 9.0 MB"):
+            write_page(tmp_path / "large.html", "x" * 9_000_000)
+        assert list(tmp_path.iterdir()) == []
+
+
+class TestScene:
+    def test_positions_are_those_of_the_tracks(self):
+        tracks = on_x_axis([0, 1, None, 3], [5, 6, 7, 8])
+        (first, second) = scene_of_tracks(tracks, rig=ring_rig(3)).data()["drones"]
+        np.testing.assert_array_equal(decoded(first["position_m"])[::3], [0, 1, np.nan, 3])
+        np.testing.assert_array_equal(decoded(second["position_m"])[::3], [5, 6, 7, 8])
+        np.testing.assert_array_equal(decoded(first["status"]), [0, 0, 2, 0])
+
+    def test_a_world_far_from_its_origin_loses_nothing(self):
+        """In float32, 500 km are known to 3 cm."""
+        tracks = on_x_axis([0, 0.001, 0.002])
+        far = replace(tracks, position_m=tracks.position_m + np.array([500_000.0, 5_000_000.0, 120.0]))
+        data = scene_of_tracks(far).data()
+        shown = decoded(data["drones"][0]["position_m"])[::3].astype(float) + data["origin_m"][0]
+        np.testing.assert_allclose(shown - 500_000, [0, 0.001, 0.002], atol=1e-4)
+
+    def test_pyramids_of_cameras_open_along_their_view(self):
+        rig = ring_rig(3, coefficients=5)
+        for index, camera in enumerate(scene_of_tracks(on_x_axis([0, 1]), rig=rig).data()["cameras"]):
+            centre_m, corners_m = np.array(camera["centre_m"]), np.array(camera["corners_m"])
+            forward = np.asarray(rig.cameras.T_cam_world[index])[2, :3]
+            np.testing.assert_allclose(centre_m, rig.cameras.centre_world[index], atol=1e-12)
+            depth_m = (corners_m - centre_m) @ forward
+            np.testing.assert_allclose(depth_m, depth_m[0], rtol=1e-9)
+            assert depth_m[0] > 0
+
+    def test_long_flights_show_every_nth_row(self):
+        count = 3 * MOST_ROWS
+        scene = scene_of_tracks(on_x_axis(list(range(count))))
+        assert len(decoded(scene.data()["time_s"])) == MOST_ROWS
+
+    def test_clouds_must_have_the_rows_of_the_scene(self):
+        with pytest.raises(SettingsError, match="particles: expected 3 rows, found 2"):
+            Scene3D(np.arange(3.0), clouds=(PointCloud("particles", np.zeros((2, 5, 3))),))
+
+    def test_names_cannot_leave_the_script(self):
+        tracks = replace(on_x_axis([0, 1]), drones=("</script><script>alert(1)</script>",))
+        assert "</script><script>alert" not in scene_of_tracks(tracks)._repr_html_()
+
+
+class TestCharts:
+    @given(seed=st.integers(0, 2**32 - 1), count=st.integers(3000, 20_000))
+    def test_thinned_lines_keep_extremes_and_gaps(self, seed, count):
+        rng = np.random.default_rng(seed)
+        values = rng.normal(size=count)
+        values[rng.integers(count, size=5)] = [50, -50, 40, -40, 30]
+        values[count // 3 : count // 3 + count // 4] = np.nan
+        time_s, shown = thinned(np.arange(count, dtype=float), values)
+        assert len(shown) <= 2500
+        assert (np.diff(time_s) >= 0).all()
+        assert (np.nanmin(shown), np.nanmax(shown)) == (np.nanmin(values), np.nanmax(values))
+        assert np.isnan(shown).sum() > len(shown) / 5
+
+
+class TestSweep:
+    def test_cells_are_listed_with_means_over_runs(self, tmp_path):
+        folder = fake_sweep(tmp_path / "results")
+        run("report", folder, "--out", tmp_path / "sweep.html")
+        text = (tmp_path / "sweep.html").read_text(encoding="utf-8")
+        rows = re.findall(r"<tr>(<td.*?)</tr>", text)
+        cells = [re.findall(r">([^<]*)</td>", row) for row in rows]
+        assert [cell[2] for cell in cells] == ["10", "50"]
+        assert [cell[3] for cell in cells] == ["20.0", "10.0"]
+        assert [cell[-1] for cell in cells] == ["yes", "yes"]
+        assert "<svg" in text
+        assert "no further files" in refused("report", folder, tmp_path, "--out", tmp_path / "other.html")
+
+
+def fake_sweep(folder):
+    """Results of two cells with two runs each."""
+    import pandas as pd
+
+    store = Store(folder)
+    for particles, error_m, work in ((10, 0.02, 1.0), (50, 0.01, 5.0)):
+        rows = pd.DataFrame(
+            {
+                "cell": f"cell{particles}",
+                "sequence": "S01",
+                "method": "psotrack",
+                "seed": [0, 1],
+                "settings.swarm.particles": particles,
+                "settings.swarm.iterations": 20,
+                "mean_error_m": [error_m - 0.001, error_m + 0.001],
+                "p95_error_m": 2 * error_m,
+                "offset_removed_mean_error_m": error_m / 2,
+                "hota": 0.99,
+                "missed_rate": 0.0,
+                "track_ms_per_frame": work,
+            }
+        )
+        errors = pd.DataFrame(
+            {
+                "frame": [0, 1],
+                "time_s": [0.0, 0.1],
+                "drone": pd.Categorical(["d0", "d0"]),
+                "error_m": np.float32(error_m),
+                "switch": False,
+                "seed": [0, 1],
+            }
+        )
+        store.add(f"cell{particles}", rows, errors)
+    return folder
+
+
+def fake_calibration(folder):
+    """What `calibrate rig --json` writes for two cameras, and the rig."""
+    folder.mkdir(exist_ok=True)
+    write_rig(folder / "rig.toml", ring_rig(2))
+    camera = {
+        "lens": "5",
+        "views": 12,
+        "corners": 300,
+        "found": 310,
+        "rms_px": 0.31,
+        "median_px": 0.2,
+        "own_median_px": 0.15,
+        "covered": 0.6,
+        "coverage": [[0, 3, 9], [1, 0, 4]],
+        "image_size_wh": [320, 240],
+        "focal_px": [250.0, 251.0],
+        "focal_std_px": [0.5, None],
+        "centre_m": [0.0, 1.0, 2.0],
+        "centre_std_m": [0.001, 0.002, 0.002],
+        "best_partner": "c1",
+        "shared": 8,
+    }
+    record = {
+        "rig": "rig.toml",
+        "cameras": {"c0": camera, "c1": {**camera, "rms_px": 0.52}},
+        "print": [],
+        "worst_views": [{"camera": "c1", "frame": 7, "residual_px": 1.25}],
+        "advice": ["camera c1 sees little of its border"],
+        "world": "that of camera c0",
+    }
+    path = folder / "calibration.json"
+    path.write_text(json.dumps(record), encoding="utf-8")
+    return path
+
+
+class TestCalibration:
+    def test_cameras_coverage_and_advice(self, tmp_path):
+        path = fake_calibration(tmp_path)
+        run("report", path, "--out", tmp_path / "calibration.html")
+        text = (tmp_path / "calibration.html").read_text(encoding="utf-8")
+        assert "camera c1 sees little of its border" in text
+        assert "c1 frame 7: 1.25 px" in text
+        assert text.count("<title>9 corners</title>") == 2
+        assert text.count("<rect") == 2 * 4  # empty parts are not drawn
+
+    def test_a_rig_that_is_gone(self, tmp_path):
+        path = fake_calibration(tmp_path)
+        (tmp_path / "rig.toml").unlink()
+        assert "expected the rig rig.toml" in refused("report", path, "--out", tmp_path / "calibration.html")
+
+
+@pytest.mark.slow
+class TestInABrowser:
+    @pytest.mark.parametrize("dark", [False, True])
+    @pytest.mark.parametrize("width", [400, 1600])
+    def test_the_page_of_a_flight(self, chromium, page, width, dark):
+        with browser.open_page(chromium, page, width=width, dark=dark) as shown:
+            shown.wait_for_selector(".scene canvas")
+            paper = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+            assert paper == ("rgb(20, 24, 29)" if dark else "rgb(252, 252, 251)")
+            # Nothing is wider than the window: a table that is wider scrolls by itself.
+            assert shown.evaluate("document.documentElement.scrollWidth") <= width
+            shown.evaluate("document.querySelector('.scene').scene.show(3)")
+            picture = browser.screenshot(shown.locator(".scene-view")).reshape(-1, 3)
+            assert len(np.unique(picture, axis=0)) > 50
+            # Both drones' bodies are drawn in their colours, lit: the hue stays.
+            blue, green, red = picture.astype(int).T
+            assert ((blue > red + 60) & (blue > green + 20)).sum() > 20
+            assert ((red > blue + 60) & (red > green + 40)).sum() > 20
+
+    def test_play_step_jump_and_sort(self, chromium, page):
+        with browser.open_page(chromium, page) as shown:
+            shown.wait_for_selector(".scene canvas")
+            row = "document.querySelector('.scene').scene.row()"
+            assert shown.evaluate(row) == 0
+            before = browser.screenshot(shown.locator(".scene-view"))
+            shown.click(".scene-play")
+            shown.wait_for_function(f"{row} > 5")
+            shown.wait_for_function(f"{row} === {FRAMES - 1}")
+            assert shown.get_attribute(".scene-play", "aria-label") == "play"
+            assert np.abs(browser.screenshot(shown.locator(".scene-view")).astype(int) - before).max() > 50
+            shown.focus(".scene-view")
+            shown.keyboard.press("ArrowLeft")
+            assert shown.evaluate(row) == FRAMES - 2
+            shown.locator(".jump").first.click()
+            assert shown.evaluate(row) < FRAMES - 2
+            errors = shown.locator("table.sorts").first
+            heading = errors.locator("th button").nth(2)
+            heading.click()
+            shown_mm = [float(text) for text in errors.locator("tbody td:nth-child(3)").all_inner_texts()]
+            assert shown_mm == sorted(shown_mm)
+            heading.click()
+            assert errors.locator("th").nth(2).get_attribute("aria-sort") == "descending"
+
+    def test_a_lost_drone_is_not_drawn(self, chromium, page):
+        with browser.open_page(chromium, page) as shown:
+            shown.wait_for_selector(".scene canvas")
+            labels = "[...document.querySelectorAll('.scene-drone')]"
+            visible = f"{labels}.filter((label) => label.style.display !== 'none').length"
+            shown.evaluate("document.querySelector('.scene').scene.show(2)")
+            assert shown.evaluate(visible) == 2
+            shown.evaluate("document.querySelector('.scene').scene.show(9)")
+            assert shown.evaluate(visible) == 1
+
+    def test_pages_of_a_sweep_and_of_a_calibration(self, chromium, tmp_path):
+        run("report", fake_sweep(tmp_path / "results"), "--out", tmp_path / "sweep.html")
+        run("report", fake_calibration(tmp_path), "--out", tmp_path / "calibration.html")
+        with browser.open_page(chromium, tmp_path / "sweep.html", width=400) as shown:
+            assert shown.evaluate("document.documentElement.scrollWidth") <= 400
+            assert shown.locator("figure svg").count() == 2
+        with browser.open_page(chromium, tmp_path / "calibration.html", width=400) as shown:
+            shown.wait_for_selector(".scene canvas")
+            assert shown.evaluate("document.documentElement.scrollWidth") <= 400
+
+    def test_a_view_of_a_notebook(self, chromium, tmp_path):
+        cloud = PointCloud("particles", np.random.default_rng(0).normal(size=(4, 30, 3)))
+        scene = Scene3D(np.arange(4.0), clouds=(cloud,), step_name="iteration")
+        path = tmp_path / "cell.html"
+        path.write_text(f"<!doctype html><title>cell</title>{scene._repr_html_()}", encoding="utf-8")
+        with browser.open_page(chromium, path) as shown:
+            cell = shown.frame_locator("iframe")
+            cell.locator(".scene canvas").wait_for()
+            assert cell.locator(".scene-clock").inner_text() == "iteration 0"
+
+    def test_without_webgl_the_rest_of_the_page_works(self, page):
+        with browser.open_browser(["--disable-gpu", "--disable-3d-apis", "--no-sandbox"]) as blind:
+            context = blind.new_context()
+            shown = context.new_page()
+            shown.goto(page.as_uri())
+            shown.wait_for_selector(".scene-none")
+            assert "no 3D graphics" in shown.inner_text(".scene-none")
+            shown.locator(".jump").first.click()
+            assert shown.locator("table.sorts").count() == 3
