@@ -53,6 +53,7 @@ ROOMS = [
     "inside_out",
     "methods",
     "pipeline",
+    "archives",
     "live",
     "api",
     "evaluation",

@@ -75,6 +75,10 @@ COMMANDS = {
         "psotrack.cli.map_markers",
         "Write the table of a room's marker corners from SOURCE, or check such a table.",
     ),
+    "pack": LazyCommand(
+        "psotrack.cli.pack",
+        "Pack TRACKS and what is needed to compute them again from SEQ into one file.",
+    ),
     "silhouettes": LazyCommand(
         "psotrack.cli.silhouettes",
         "Compute and store the silhouettes of SEQ, which `track` reads, or write them as images or as a video.",
@@ -95,6 +99,9 @@ COMMANDS = {
     ),
     "track": LazyCommand(
         "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
+    ),
+    "unpack": LazyCommand(
+        "psotrack.cli.pack", "Unpack the archive FILE into a folder, which other commands take as SEQ."
     ),
 }
 
