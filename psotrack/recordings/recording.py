@@ -54,8 +54,6 @@ class Recording:
         folder: folder of the recording.
         rig: all cameras that are calibrated and placed.
         videos: videos by camera name; a camera without video is absent.
-        silhouettes: stored silhouettes by camera name: all that shows the drones in a camera without video; of a camera
-            with a video, they save the time of making the same silhouettes again.
         truth: the reference at the recording's instants, or None.
         detections: files of 2D detections by camera name, or None.
         onboard: videos of cameras on drones by the drones' names, or None.
@@ -63,6 +61,8 @@ class Recording:
             and has the video's rate.
         unplaced: cameras of the recording that are not in the rig, because their lens or their place is not known.
         streams: addresses of streams and numbers of devices by camera name; such a camera has no video.
+        silhouettes: stored silhouettes by camera name. They take the place of a video; of a camera that has a video, they
+            save the time of making the same silhouettes again.
         ignore: images by camera name, white where nothing counts as foreground.
         line_time_s: times from the exposure of one row to that of the next row by camera name, seconds; a camera that
             is absent has a global shutter.
@@ -81,13 +81,13 @@ class Recording:
     folder: Path
     rig: Rig
     videos: Mapping[str, VideoInfo]
-    silhouettes: Mapping[str, StoredSilhouettes] = field(default_factory=dict)
     truth: Trajectories | None = None
     detections: Mapping[str, Path] | None = None
     onboard: Mapping[str, OnboardVideo] | None = None
     frame_times: Mapping[str, FrameTimes] = field(default_factory=dict)
     unplaced: tuple[str, ...] = ()
     streams: Mapping[str, str] = field(default_factory=dict)
+    silhouettes: Mapping[str, StoredSilhouettes] = field(default_factory=dict)
     ignore: Mapping[str, Path] = field(default_factory=dict)
     line_time_s: Mapping[str, float] = field(default_factory=dict)
     bounds_m: tuple[float, float, float, float, float, float] | None = None

@@ -317,33 +317,31 @@ def compute(
     model = find_background(settings.background, scaled) if background is None else background
     tasks = _tasks(recording, scaled, cache, model)
     brought = _brought(recording, tasks)
-    for name in brought.keys() - tasks.keys():
-        _check_made_with(name, brought[name], scaled, model)
+    for name, stored in brought.items():
+        if name not in tasks:
+            _check_made_with(name, stored, scaled, model)
     try:
         seconds = _make_missing([task for name, task in tasks.items() if name not in brought], jobs, report)
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
     opened = {name: _open(task) for name, task in tasks.items() if name not in brought}
     opened |= {name: _open_brought(each, recording.rig, name) for name, each in brought.items()}
-    stored = {name: opened[name] for name in recording.rig.names if name in opened}
-    shape = (
-        max(array.shape[1] for array in stored.values()),
-        max(array.shape[2] for array in stored.values()),
-    )
+    whole = {name: opened[name] for name in recording.rig.names if name in opened}
+    shape = (max(array.shape[1] for array in whole.values()), max(array.shape[2] for array in whole.values()))
     # Without the future, whoever reads a frame decides about this frame.
     unusable = {
         name: intervals
-        for name, array in stored.items()
+        for name, array in whole.items()
         if scaled.first_look
         and (intervals := _within(left_out(array), 0, recording.frame_times[name].num_frames))
     }
-    arrays = {name: _without(array, unusable.get(name, [])) for name, array in stored.items()}
+    arrays = {name: _without(array, unusable.get(name, [])) for name, array in whole.items()}
     for name, intervals in unusable.items():
         _say_left_out(recording, name, intervals)
     nothing = np.zeros((0, *shape), np.uint8)
     return Silhouettes(
         cameras=recording.rig.names,
-        keys={name: brought[name].key if name in brought else tasks[name].key for name in stored},
+        keys={name: brought[name].key if name in brought else tasks[name].key for name in whole},
         reduction=scaled.reduction,
         num_frames=recording.num_frames,
         shape=shape,
