@@ -357,7 +357,7 @@ class TestPacking:
         dist[3, 4:] = 0
         cameras = replace(cams, T_cam_world=T, dist=dist, fisheye=fisheye)
         turned = replace(
-            recording, rig=replace(recording.rig, cameras=cameras), bounds_m=(-1, 2, 0, 1, 0, 1 / 3)
+            recording, rig=replace(recording.rig, cameras=cameras), bounds_m=(-1.0, 2.0, 0.0, 1.0, 0.0, 1 / 3)
         )
         pack_tracks(own_flight / "tracks.csv", turned, tmp_path / "a.psotrack", cache=tmp_path)
         unpack(tmp_path / "a.psotrack", tmp_path / "out")
@@ -596,7 +596,7 @@ USUAL = ["--particles", "15", "--iterations", "10", "--quiet"]
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small sequence with videos, detections and a reference."""
     root = tmp_path_factory.mktemp("data")
-    run("simulate", "S02_D4_A", "--out", root, "--scale", "0.35", "--frames", "12", "--no-onboard", "--quiet")
+    run("simulate", "S02_D4_A", "--out", root, "--scale", "0.35", "--frames", "25", "--no-onboard", "--quiet")
     return root / "Simulated_Data" / "S02_D4_A"
 
 
