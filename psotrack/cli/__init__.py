@@ -77,6 +77,10 @@ COMMANDS = {
         "psotrack.cli.map_markers",
         "Write the table of a room's marker corners from SOURCE, or check such a table.",
     ),
+    "pack": LazyCommand(
+        "psotrack.cli.pack",
+        "Pack TRACKS and what is needed to compute them again from SEQ into one file.",
+    ),
     "report": LazyCommand(
         "psotrack.cli.report",
         "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
@@ -101,6 +105,9 @@ COMMANDS = {
     ),
     "track": LazyCommand(
         "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
+    ),
+    "unpack": LazyCommand(
+        "psotrack.cli.pack", "Unpack the archive FILE into a folder, which other commands take as SEQ."
     ),
 }
 
