@@ -59,6 +59,8 @@ ROOMS = [
     "api",
     "evaluation",
     "flights",
+    "viewer",
+    "overlay",
     "simulation",
     "demo",
     "sweep",

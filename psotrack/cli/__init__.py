@@ -77,6 +77,10 @@ COMMANDS = {
         "psotrack.cli.map_markers",
         "Write the table of a room's marker corners from SOURCE, or check such a table.",
     ),
+    "overlay": LazyCommand(
+        "psotrack.cli.overlay",
+        "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
+    ),
     "pack": LazyCommand(
         "psotrack.cli.pack",
         "Pack TRACKS and what is needed to compute them again from SEQ into one file.",
@@ -108,6 +112,9 @@ COMMANDS = {
     ),
     "unpack": LazyCommand(
         "psotrack.cli.pack", "Unpack the archive FILE into a folder, which other commands take as SEQ."
+    ),
+    "view": LazyCommand(
+        "psotrack.cli.view", "Show TRACKS and their recording in space and time, in the viewer Rerun."
     ),
 }
 

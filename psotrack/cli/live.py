@@ -38,6 +38,8 @@ from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.live import LiveResult, LiveSession
+    from psotrack.recordings import Recording
+    from psotrack.viewer import LiveView
 
 #: Time between two changes of the table on the terminal, seconds.
 _SHOWN_S = 0.5
@@ -80,6 +82,15 @@ _SHOWN_S = 0.5
     metavar="FOLDER",
     help="Keep what the cameras film in FOLDER, as a recording that can be tracked again.",
 )
+@click.option(
+    "--view",
+    "viewer",
+    is_flag=False,
+    flag_value="window",
+    type=click.Choice(["window", "web"]),
+    help="Show drones in space and their values over time, in a window of Rerun or on a page for a browser.  [without "
+    "a value: window]",
+)
 @PARTICLES
 @ITERATIONS
 @click.option("--drones", type=int, metavar="N", help="Number of drones, if it is known.")
@@ -103,6 +114,7 @@ def live(
     udp: str | None,
     websocket: str | None,
     record: Path | None,
+    viewer: str | None,
     most_drones: int,
     cameras: str | None,
     cache: Path | None,
@@ -123,6 +135,7 @@ def live(
       psotrack live lab/recording.toml --udp 127.0.0.1:9000
       psotrack live lab/recording.toml --websocket 9000
       psotrack live lab/recording.toml --out tracks.csv --record flight
+      psotrack live lab/recording.toml --view
       psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
@@ -141,13 +154,15 @@ def live(
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
-    if out is None and not lines and udp is None and websocket is None:
-        expected = "--out FILE, --lines, --udp or --websocket"
+    if out is None and not lines and udp is None and websocket is None and viewer is None:
+        expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None and out.suffix not in {".csv", ".parquet"}:
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
     for path in () if out is None else (out, out.with_suffix(".json")):
         refuse_to_overwrite(path, force)
+    if viewer is not None:
+        _check_viewer(viewer)
     chosen = TrackSettings().changed({setting_name(option): value for option, value in settings.items()})
     keep_compiled(compiled_folder(cache))
     start_s = time.perf_counter() - started
@@ -181,7 +196,9 @@ def live(
             kept.begin()
             stack.callback(kept.end)
         rows = [] if out is None else [stack.enter_context(RowStream(out, force=force))]
-        table = stack.enter_context(_Table(quiet or lines))
+        shown = None if viewer is None else stack.enter_context(_open_view(viewer, recording, quiet or lines))
+        outputs += [] if shown is None else [shown]
+        table = stack.enter_context(_Table(quiet or lines, shown))
         stack.enter_context(_ended_by_ctrl_c(session))
         result = session.run([*rows, *outputs], table.show, longest_s=seconds or float("inf"))
     report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
@@ -200,6 +217,24 @@ def live(
     # Said before, while the other outputs went on.
     if result.failed_outputs:
         raise result.failed_outputs[0]
+
+
+def _check_viewer(viewer: str) -> None:
+    from psotrack.viewer import check_display, check_installed
+
+    check_installed()
+    if viewer == "window":
+        check_display()
+
+
+@contextlib.contextmanager
+def _open_view(viewer: str, recording: Recording, quiet: bool) -> Iterator[LiveView]:
+    from psotrack.viewer import LiveView
+
+    with LiveView(recording, web=viewer == "web") as view:
+        if view.page:
+            click.echo(view.page, err=quiet)
+        yield view
 
 
 def _record(result: LiveResult) -> dict[str, Any]:
@@ -227,10 +262,10 @@ def _record(result: LiveResult) -> dict[str, Any]:
 
 
 class _Table:
-    """A table on the terminal; shows nothing where stderr is no terminal."""
+    """A table on the terminal; shows nothing where stderr is no terminal. The viewer gets the delay."""
 
-    def __init__(self, hidden: bool) -> None:
-        self._hidden, self._shown_s = hidden, 0.0
+    def __init__(self, hidden: bool, view: LiveView | None) -> None:
+        self._hidden, self._shown_s, self._view = hidden, 0.0, view
 
     def __enter__(self) -> _Table:
         from rich.console import Console
@@ -249,6 +284,8 @@ class _Table:
 
     def show(self, result: LiveResult, films: list[bool]) -> None:
         """Show what the session has done so far."""
+        if self._view is not None:
+            self._view.show_delay(result.delay_s[-1])
         if self._live is None or time.monotonic() - self._shown_s < _SHOWN_S:
             return
         import numpy as np

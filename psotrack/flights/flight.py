@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,8 @@ from psotrack.datasets import open_recording
 from psotrack.errors import InputError, SettingsError
 from psotrack.exchange import read_tracks
 from psotrack.flights.run_record import RunRecord, read_run_record
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, VideoInfo
+from psotrack.silhouettes import check_whole
 from psotrack.support import COLOURS, short_repr
 from psotrack.trajectories import Trajectories
 
@@ -108,6 +109,53 @@ def read_flight(
         if recording is not None:
             _check_fits(each, recording)
     return TrackedFlight(recording.name if recording is not None else _name_of(read[0]), read, recording)
+
+
+def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
+    """The first instants of a flight: of its recording, of the cameras on drones, of the reference and of all tracks.
+
+    Args:
+        flight: the flight.
+        num_frames: number of instants of the recording; without a recording, of each file of tracks.
+
+    Raises:
+        SettingsError: the recording has fewer instants.
+        InputError: tracks begin later.
+    """
+    if flight.recording is None:
+        check_whole("frames", num_frames, lowest=1)
+        tracks = (_until(each, each.trajectories.time_s[:num_frames][-1]) for each in flight.tracks)
+        return replace(flight, tracks=tuple(tracks))
+    recording = flight.recording.usable(num_frames=num_frames, videos=False)
+    end_s = float(recording.timeline().time_s[-1]) + 0.5 / recording.fps
+    onboard = {
+        name: replace(camera, video=replace(camera.video, num_frames=_count_until(camera.video, end_s)))
+        for name, camera in (recording.onboard or {}).items()
+    }
+    recording = replace(
+        recording,
+        onboard=onboard or None,
+        truth=None if recording.truth is None else _cut(recording.truth, end_s),
+    )
+    return replace(flight, recording=recording, tracks=tuple(_until(each, end_s) for each in flight.tracks))
+
+
+def _until(tracks: FlightTracks, end_s: float) -> FlightTracks:
+    if tracks.trajectories.time_s[0] > end_s:
+        raise InputError(
+            tracks.path,
+            expected=f"times before {end_s:.2f} s",
+            found=f"{tracks.trajectories.time_s[0]:.2f} s",
+        )
+    return replace(tracks, trajectories=_cut(tracks.trajectories, end_s))
+
+
+def _cut(trajectories: Trajectories, end_s: float) -> Trajectories:
+    return trajectories.at_frames(trajectories.frame[trajectories.time_s <= end_s])
+
+
+def _count_until(video: VideoInfo, end_s: float) -> int:
+    return max(1, min(video.num_frames, int(end_s * video.fps) + 1))
 
 
 def read_tracks_file(path: Path | str, label: str, recording: Recording | None = None) -> FlightTracks:

@@ -27,6 +27,8 @@ from psotrack.trajectories import Trajectories
 
 #: Number of instants that are projected together, which bounds the memory of long flights.
 _TOGETHER = 5000
+#: Number of points on the outline of an ellipse.
+_OUTLINE_POINTS = 25
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,17 @@ def ellipses_in_images(recording: Recording, trajectories: Trajectories) -> Imag
     return ImageEllipses(
         np.where(visible[..., None], middle_px, np.nan), np.where(visible[..., None, None], shape_px2, np.nan)
     )
+
+
+def ellipse_outlines_px(
+    middle_px: Float[np.ndarray, "*ellipses 2"], shape_px2: Float[np.ndarray, "*ellipses 2 2"]
+) -> Float[np.ndarray, "*ellipses points 2"]:
+    """Points on the outlines of ellipses (x - middle)ᵀ S⁻¹ (x - middle) = 1; the last point is the first one again."""
+    square, directions = np.linalg.eigh(shape_px2)
+    half_px = np.sqrt(np.maximum(square, 0.0))
+    turn = np.linspace(0.0, 2 * np.pi, _OUTLINE_POINTS)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return middle_px[..., None, :] + np.einsum("...ij,...j,pj->...pi", directions, half_px, circle)
 
 
 def _exposure_offsets_s(

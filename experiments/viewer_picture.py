@@ -1,0 +1,140 @@
+"""Make the pictures of the viewer and of an overlay video, which README and how-to pages show, with their record.
+
+python experiments/viewer_picture.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import _results
+import cv2
+import numpy as np
+
+from psotrack.recordings import probe, read_frames
+from psotrack.viewer import viewer_program
+
+SCENARIO = "S02_D4_A"
+FRAMES = 125
+WINDOW_WH = (1600, 900)
+#: Place of the shown moment: share of the flight, and the slider's ends and height in the window, pixels.
+MOMENT, SLIDER_X_PX, SLIDER_Y_PX = 0.62, (267, 1393), 886
+#: Time in which the page must be complete, and between two looks at it, seconds.
+LONGEST_S, LOOK_S = 180.0, 3.0
+#: Least standard deviation of the page's right half with images, of 255.
+LOADED = 35.0
+#: Largest size of a picture, bytes.
+MOST_BYTES = 400_000
+#: How a browser without graphics card draws.
+ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+
+
+def main() -> None:
+    """Simulate and track a flight in a temporary folder, and keep the pictures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "pictures", help="folder of the pictures"
+    )
+    parser.add_argument(
+        "--browser", default=shutil.which("chromium"), help="Chromium; default: chromium, or Playwright's own"
+    )
+    parser.add_argument("--frames", type=int, default=FRAMES, help="number of frames of the flight")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="size of the images per size of the dataset's"
+    )
+    options = parser.parse_args()
+    started = _results.Run("viewer_picture")
+    with tempfile.TemporaryDirectory() as temporary:
+        root = Path(temporary)
+        sequence, tracks = root / "Simulated_Data" / SCENARIO, root / "tracks.csv"
+        cache = ("--cache", root / "cache")
+        run("simulate", SCENARIO, "--out", root, "--frames", options.frames, "--scale", options.scale)
+        run("track", sequence, "--out", tracks, *cache)
+        run("view", tracks, "--sequence", sequence, "--save", root / "flight.rrd", *cache)
+        run("overlay", tracks, sequence, "--out", root, "--mosaic")
+        pictures = {
+            "viewer": photograph(root / "flight.rrd", options.browser),
+            "overlay": list(read_frames(probe(root / "mosaic.mp4")))[round(MOMENT * options.frames)],
+        }
+    paths = []
+    for name, picture in pictures.items():
+        paths.append(options.out / f"{name}.png")
+        paths[-1].write_bytes(small_png(picture))
+    started.save(options.out, files=paths)
+
+
+def run(*arguments: object) -> None:
+    """Run `psotrack`."""
+    subprocess.run([sys.executable, "-m", "psotrack", *map(str, arguments), "--quiet"], check=True)
+
+
+def photograph(path: Path, browser: str | None) -> np.ndarray:
+    """The viewer's page with a flight, as soon as it does not change any more."""
+    from playwright.sync_api import sync_playwright
+
+    with viewer_program(path, web=True) as program, sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=browser, args=ARGUMENTS)
+        width, height = WINDOW_WH
+        page = chromium.new_page(viewport={"width": width, "height": height}, color_scheme="dark")
+        page.goto(program.page)
+        until_loaded(page)
+        # The viewer plays as soon as the flight is there; Space pauses.
+        page.mouse.move(width // 4, 12)
+        page.keyboard.press("Space")
+        left, right = SLIDER_X_PX
+        page.mouse.click(left + MOMENT * (right - left), SLIDER_Y_PX)
+        # Away from everything that explains itself under the mouse.
+        page.mouse.move(width // 4, 12)
+        picture = at_rest(page)
+        chromium.close()
+    return picture
+
+
+def look(page) -> np.ndarray:
+    """A picture of the page after a while."""
+    time.sleep(LOOK_S)
+    return cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+
+
+def until_loaded(page) -> None:
+    """Wait until the images of the cameras are there: until then the right half is of few colours."""
+    end_s = time.monotonic() + LONGEST_S
+    while look(page)[:, WINDOW_WH[0] * 6 // 10 :].std() < LOADED:
+        if time.monotonic() > end_s:
+            sys.exit(f"the viewer's page is not loaded after {LONGEST_S:.0f} s")
+
+
+def at_rest(page) -> np.ndarray:
+    """The picture of a page that has not changed between two looks."""
+    end_s, before = time.monotonic() + LONGEST_S, look(page)
+    while not np.array_equal(now := look(page), before):
+        if time.monotonic() > end_s:
+            sys.exit(f"the viewer's page has not come to rest in {LONGEST_S:.0f} s")
+        before = now
+    return now
+
+
+def small_png(picture: np.ndarray) -> bytes:
+    """A picture of at most `MOST_BYTES`: with fewer colours, then smaller."""
+    for width in (1600, 1400, 1200, 1000, 800):
+        scale = min(1.0, width / picture.shape[1])
+        scaled = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        for levels in (64, 32, 24):
+            step = 256 / levels
+            coarse = np.clip(np.round(scaled / step) * step, 0, 255).astype(np.uint8)
+            png = cv2.imencode(".png", coarse, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
+            if len(png) <= MOST_BYTES:
+                return png
+    sys.exit("the picture does not fit into its size")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""Codecs with which OpenCV can write MP4 files on this machine, and the writing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.errors import OutputError
+from psotrack.recordings import probe, silence_opencv
+from psotrack.support import atomic_write
+
+
+@dataclass(frozen=True)
+class Codec:
+    """A codec of MP4 files.
+
+    Attributes:
+        name: name for people.
+        fourcc: the four characters by which OpenCV knows the codec.
+    """
+
+    name: str
+    fourcc: str
+
+
+#: Codecs from the best one on. Browsers and phones play H.264; OpenCV's wheels encode it on few machines.
+_CODECS = (Codec("H.264", "avc1"), Codec("MPEG-4", "mp4v"))
+#: Size of the video with which a codec is tried, pixels.
+_TRIED_WH = (320, 240)
+
+
+def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
+    """The first of some codecs with which a video can be written and read back.
+
+    Raises:
+        OutputError: there is none.
+    """
+    for codec in codecs:
+        with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
+            path = Path(folder) / "tried.mp4"
+            with contextlib.suppress(OutputError):
+                with video_writer(path, codec, 25.0, _TRIED_WH) as write:
+                    for level in (0, 255):
+                        write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
+                return codec
+    raise OutputError(
+        "overlay", expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}", found="none"
+    )
+
+
+class _Writer:
+    """Appends frames of one size."""
+
+    def __init__(self, writer: cv2.VideoWriter) -> None:
+        self._writer, self.num_frames = writer, 0
+
+    def __call__(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
+        self._writer.write(bgr)
+        self.num_frames += 1
+
+
+@contextlib.contextmanager
+def video_writer(path: Path, codec: Codec, fps: float, size_wh: tuple[int, int]) -> Iterator[_Writer]:
+    """A function that appends BGR frames to a video, which appears under its name when it is complete.
+
+    Args:
+        path: path of the file, ending in .mp4.
+        codec: the codec.
+        fps: frames per second.
+        size_wh: width and height of the frames, even numbers.
+
+    Raises:
+        OutputError: the codec does not work here, or the file cannot be written completely.
+    """
+    with atomic_write(path) as temporary:
+        with silence_opencv():
+            writer = cv2.VideoWriter(
+                os.path.abspath(temporary),
+                cv2.CAP_FFMPEG,
+                cv2.VideoWriter.fourcc(*codec.fourcc),
+                fps,
+                size_wh,
+            )
+        if not writer.isOpened():
+            raise OutputError(path, expected=f"a video in {codec.name}", found="that OpenCV cannot encode it")
+        append = _Writer(writer)
+        try:
+            yield append
+        finally:
+            writer.release()
+        # FFmpeg reports no failed writes.
+        found = probe(temporary).num_frames if temporary.exists() and temporary.stat().st_size else 0
+        if found != append.num_frames:
+            raise OutputError(
+                path,
+                expected=f"a video of {append.num_frames} frames",
+                found=f"{found} written",
+                remedy="is the disk full?",
+            )

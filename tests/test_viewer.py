@@ -1,0 +1,337 @@
+"""`psotrack view`: what is in its files by Rerun's own reader, what is shown in a browser, and wrong input."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from flight_files import (
+    CAMERAS,
+    COASTING,
+    IMAGE_SIZE_WH,
+    LOST_FROM,
+    NUM_FRAMES,
+    REFERENCE,
+    make_sequence,
+    make_tracks,
+    make_tracks_file,
+)
+from rerun.chunk import RrdReader
+
+from psotrack import cli
+from psotrack.datasets import open_recording
+from psotrack.flights import boxes_in_images, read_flight
+from psotrack.geometry import project
+from psotrack.recordings import read_frames
+from psotrack.trajectories import read_trajectories, write_trajectories
+from psotrack.viewer import ViewContent, write_flight
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the sequence `flight` and the tracks `tracks.csv`, which no test changes."""
+    folder = tmp_path_factory.mktemp("viewer")
+    make_sequence(folder / "flight")
+    make_tracks_file(folder / "tracks.csv")
+    return folder
+
+
+@pytest.fixture
+def run(folder, monkeypatch, capfd):
+    """Runs `psotrack view` in this process: exit code, stdout and stderr."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(folder / "cache"))
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["psotrack", "view", *map(str, arguments)])
+        capfd.readouterr()
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return code, *capfd.readouterr()
+
+    return call
+
+
+def read_entities(path):
+    """Rerun's own reader: path of an entity -> component -> (times, values) of all rows; times are None for static."""
+    found = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        columns = dict(zip(batch.schema.names, batch.columns, strict=True))
+        times = columns.get("frame")
+        for name, column in columns.items():
+            if ":" not in name:
+                continue
+            rows = found.setdefault(str(chunk.entity_path), {}).setdefault(name, ([], []))
+            rows[0].extend([None] * batch.num_rows if times is None else times.to_pylist())
+            rows[1].extend(column.to_pylist())
+    return found
+
+
+@pytest.fixture(scope="module")
+def saved(folder):
+    """Entities of a file with tracks, images, silhouettes and reference."""
+    path = folder / "flight.rrd"
+    command = [sys.executable, "-m", "psotrack", "view", "tracks.csv", "--sequence", "flight", "--save", path]
+    result = subprocess.run(
+        [*command, "--silhouettes", "--cache", "cache", "--jobs", "2"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"{len(CAMERAS) * NUM_FRAMES} images (every frame, full size)" in result.stdout
+    return read_entities(path)
+
+
+def test_positions_are_those_of_the_tracks(saved):
+    tracks = make_tracks(0.01)
+    for drone in range(2):
+        frames, centres = saved[f"/world/drones/{drone}/body"]["Boxes3D:centers"]
+        assert frames == list(range(NUM_FRAMES))
+        # Rerun keeps float32.
+        np.testing.assert_allclose(np.array(centres)[:, 0], tracks.position_m[:, drone], atol=1e-6)
+        _, halves = saved[f"/world/drones/{drone}/body"]["Boxes3D:half_sizes"]
+        np.testing.assert_allclose(np.array(halves)[:, 0], [[0.15, 0.15, 0.075]] * NUM_FRAMES, atol=1e-6)
+        _, axes = saved[f"/world/drones/{drone}/ellipsoid"]["Ellipsoids3D:half_sizes"]
+        # 6.2514 is the 90 % quantile of chi-squared with three degrees of freedom; deviations are 2, 4 and 6 cm.
+        expected = np.sqrt(6.2514) * np.array([0.02, 0.04, 0.06])
+        np.testing.assert_allclose(np.array(axes)[:, 0], [expected] * NUM_FRAMES, rtol=1e-4)
+    truth = np.array(saved["/world/truth/dron1/point"]["Points3D:positions"][1])[:, 0]
+    np.testing.assert_allclose(truth, make_tracks().position_m[:, 0], atol=1e-6)
+
+
+def test_status_is_shown_by_words_and_colours(saved):
+    labels = [row[0] for row in saved["/world/drones/1/body"]["Boxes3D:labels"][1]]
+    assert labels[COASTING] == ["1 coasting"] * 2
+    assert set(labels[: COASTING.start] + labels[COASTING.stop :]) == {"1"}
+    colours = np.array(saved["/world/drones/1/body"]["Boxes3D:colors"][1])[:, 0]
+    assert len(set(colours[COASTING])) == 1
+    assert set(colours[COASTING]).isdisjoint(colours[: COASTING.start])
+    assert len(set(np.array(saved["/world/drones/0/body"]["Boxes3D:colors"][1])[:, 0])) == 2
+    frames, words = saved["/status/1"]["StateChange:state"]
+    assert list(zip(frames, [word[0] for word in words], strict=True)) == [
+        (0, "tracked"),
+        (COASTING.start, "coasting"),
+        (COASTING.stop, "tracked"),
+    ]
+    frames, texts = saved["/events/lost"]["TextLog:text"]
+    assert frames == [LOST_FROM]
+    assert texts == [["drone 0 is lost"]]
+
+
+def test_plots_have_the_values_of_the_tracks(saved):
+    score = np.array(saved["/plots/score/0"]["Scalars:scalars"][1])[:, 0]
+    np.testing.assert_allclose(score[:LOST_FROM], 0.6)
+    assert np.isnan(score[LOST_FROM:]).all()
+    deviation_mm = np.array(saved["/plots/deviation_mm/1"]["Scalars:scalars"][1])
+    np.testing.assert_allclose(deviation_mm, 1e3 * np.sqrt(0.0056), rtol=1e-6)
+    errors_mm = np.array(saved["/plots/error_mm/dron2"]["Scalars:scalars"][1])
+    np.testing.assert_allclose(errors_mm, 10.0, rtol=1e-6)
+
+
+def test_images_decode_and_are_those_of_the_videos(saved, folder):
+    recording = open_recording(folder / "flight")
+    for name in CAMERAS:
+        frames, blobs = saved[f"/world/cameras/{name}/image"]["EncodedImage:blob"]
+        assert frames == list(range(NUM_FRAMES))
+        images = [
+            cv2.imdecode(np.frombuffer(bytes(blob[0]), np.uint8), cv2.IMREAD_UNCHANGED) for blob in blobs
+        ]
+        for image, frame in zip(images, read_frames(recording.videos[name]), strict=True):
+            assert image.shape == frame.shape
+            # Noise of 30 levels loses some of them in JPEG; another frame differs by 12 on average.
+            assert np.abs(image.astype(float) - frame).mean() < 6
+        blobs = saved[f"/world/cameras/{name}/silhouettes"]["EncodedImage:blob"][1]
+        mask = cv2.imdecode(np.frombuffer(bytes(blobs[0][0]), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert mask.shape[2] == 4, "silhouettes are transparent where nothing is"
+
+
+def test_boxes_and_ellipses_are_about_the_drones(saved, folder):
+    flight = read_flight([folder / "tracks.csv"], folder / "flight")
+    tracks = flight.tracks[0]
+    expected = boxes_in_images(flight.recording, tracks.trajectories, tracks.size_m)
+    for index, name in enumerate(CAMERAS):
+        centres = saved[f"/world/cameras/{name}/boxes"]["Boxes2D:centers"][1]
+        halves = saved[f"/world/cameras/{name}/boxes"]["Boxes2D:half_sizes"][1]
+        labels = saved[f"/world/cameras/{name}/boxes"]["Boxes2D:labels"][1]
+        outlines = saved[f"/world/cameras/{name}/ellipses"]["LineStrips2D:strips"][1]
+        pixels, _ = project(flight.recording.rig.cameras[index], tracks.trajectories.position_m)
+        for frame in range(NUM_FRAMES):
+            seen = [1] if frame >= LOST_FROM else [0, 1]
+            assert labels[frame] == [str(drone) for drone in seen]
+            xyxy = np.hstack(
+                [np.subtract(centres[frame], halves[frame]), np.add(centres[frame], halves[frame])]
+            )
+            np.testing.assert_allclose(xyxy, expected[frame, seen, index], atol=1e-3)
+            for drone, outline in zip(seen, outlines[frame], strict=True):
+                # The outline is symmetric about the drone's pixel, which has its centre half a pixel further in Rerun.
+                middle = np.mean(outline[:-1], axis=0)
+                np.testing.assert_allclose(middle, pixels[frame, drone] + 0.5, atol=1e-2)
+
+
+def test_cameras_stand_where_the_rig_says(saved, folder):
+    rig = open_recording(folder / "flight").rig
+    for index, name in enumerate(CAMERAS):
+        components = saved[f"/world/cameras/{name}"]
+        times, places = components["Transform3D:translation"]
+        assert times == [None]
+        np.testing.assert_allclose(places[0][0], rig.cameras[index].centre_world, atol=1e-5)
+        K = np.reshape(components["Pinhole:image_from_camera"][1][0][0], (3, 3)).T
+        np.testing.assert_allclose(K[:2, 2], rig.cameras[index].K[:2, 2] + 0.5, atol=1e-4)
+        np.testing.assert_array_equal(components["Pinhole:resolution"][1][0][0], IMAGE_SIZE_WH)
+
+
+def test_two_files_of_tracks_are_two_colours(run, folder, tmp_path):
+    other, out = make_tracks_file(tmp_path / "other.csv", 0.05), tmp_path / "both.rrd"
+    assert run(folder / "tracks.csv", other, "--save", out, "--quiet")[0] == 0
+    entities = read_entities(out)
+    colours = {
+        (name, drone): entities[f"/world/drones/{name}/{drone}/body"]["Boxes3D:colors"][1][0][0]
+        for name in ("tracks", "other")
+        for drone in range(2)
+    }
+    assert colours["tracks", 0] == colours["tracks", 1]
+    assert colours["other", 0] == colours["other", 1]
+    assert colours["tracks", 0] != colours["other", 0]
+    assert not any(path.startswith("/world/cameras") for path in entities), "no recording is given"
+
+
+def test_a_line_says_that_silhouettes_are_not_stored(run, folder, tmp_path):
+    arguments = (folder / "tracks.csv", "--sequence", folder / "flight", "--save", tmp_path / "x.rrd")
+    code, out, _ = run(*arguments, "--cache", tmp_path / "empty")
+    assert code == 0
+    assert "--silhouettes computes them" in out
+    assert not (tmp_path / "empty").exists()
+
+
+@pytest.mark.parametrize("share", [0.8, 0.5, 0.25])
+def test_files_are_not_larger_than_demanded(folder, tmp_path, share):
+    flight = read_flight([folder / "tracks.csv"], folder / "flight")
+    full = write_flight(tmp_path / "full.rrd", flight, jobs=1)
+    bare = write_flight(tmp_path / "bare.rrd", replace(flight, recording=None), jobs=1)
+    max_bytes = bare.num_bytes + share * (full.num_bytes - bare.num_bytes)
+    small = write_flight(tmp_path / "small.rrd", flight, ViewContent(max_bytes=max_bytes), jobs=1)
+    # What a file needs beside its images, 250 kB, is a large part of this small flight's size.
+    assert 0.5 * max_bytes < small.num_bytes <= max_bytes
+    assert small.num_bytes == (tmp_path / "small.rrd").stat().st_size
+    images = read_entities(tmp_path / "small.rrd")["/world/cameras/c1/image"]["EncodedImage:blob"]
+    assert images[0] == list(range(0, NUM_FRAMES, small.plan.step))
+
+
+def test_the_first_frames_only(run, folder, tmp_path):
+    arguments = (folder / "tracks.csv", "--sequence", folder / "flight", "--frames", 5, "--cameras", "c0,c2")
+    assert run(*arguments, "--save", tmp_path / "part.rrd")[0] == 0
+    entities = read_entities(tmp_path / "part.rrd")
+    assert entities["/world/cameras/c0/image"]["EncodedImage:blob"][0] == list(range(5))
+    assert entities["/world/drones/1/body"]["Boxes3D:centers"][0] == list(range(5))
+    assert entities["/world/truth/dron1/point"]["Points3D:positions"][0] == list(range(5))
+    assert "/world/cameras/c1" not in entities
+
+
+def test_a_recording_without_tracks(run, folder, tmp_path):
+    assert run("--sequence", folder / "flight", "--save", tmp_path / "only.rrd")[0] == 0
+    entities = read_entities(tmp_path / "only.rrd")
+    assert {f"/world/truth/{name}/point" for name in REFERENCE} <= set(entities)
+    assert not any("drones" in path for path in entities)
+
+
+def assert_one_line(result, *words):
+    code, out, err = result
+    assert (code, out) == (2, ""), result
+    assert err.count("\n") == 1, err
+    for word in words:
+        assert word in err, err
+
+
+def test_wrong_input_is_one_line(run, folder, tmp_path, monkeypatch):
+    tracks, sequence = folder / "tracks.csv", folder / "flight"
+    assert_one_line(run("--save", tmp_path / "x.rrd"), "files of tracks, or a recording")
+    assert_one_line(run(tracks, "--save", tmp_path / "x.html"), "ends in .rrd")
+    assert_one_line(run(tracks, "--save", tmp_path / "x.rrd", "--web"), "both")
+    assert_one_line(
+        run(tracks, "--sequence", sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard"
+    )
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert_one_line(run(tracks), "--save", "--web", "a screen")
+    (tmp_path / "x.rrd").write_text("mine")
+    assert_one_line(run(tracks, "--save", tmp_path / "x.rrd"), "--force")
+    assert (tmp_path / "x.rrd").read_text() == "mine"
+    assert run(tracks, "--save", tmp_path / "x.rrd", "--force")[0] == 0
+    assert (tmp_path / "x.rrd").stat().st_size > 1000
+    assert [path.name for path in tmp_path.iterdir()] == ["x.rrd"]
+
+
+def test_a_window_that_cannot_open_is_one_line(run, folder, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":987")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    code, _, err = run(folder / "tracks.csv")
+    assert code == 2
+    assert err.count("\n") == 1, err
+    assert "--save" in err
+
+
+def test_without_rerun_a_line_says_how_to_install_it(run, folder, tmp_path, monkeypatch):
+    found = sys.modules["importlib.util"].find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name, *more: None if name == "rerun" else found(name, *more)
+    )
+    result = run(folder / "tracks.csv", "--save", tmp_path / "x.rrd")
+    assert_one_line(result, "pip install 'psotrack[view]'")
+
+
+@pytest.mark.slow
+def test_the_page_for_a_browser(folder):
+    """The page is served to this computer only, and Ctrl-C ends the command and its server."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "psotrack", "view", "tracks.csv", "--web"],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    page = ""
+    for line in process.stdout:
+        if line.startswith("http://"):
+            page = line.split()[0]
+            break
+    assert page.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(page, timeout=20) as answer:
+        assert b"<html" in answer.read().lower()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+    port = int(re.findall(r":(\d+)", page)[0])
+    time.sleep(0.1)
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5)
+
+
+def test_tracks_without_status_or_covariance(run, tmp_path):
+    """Tracks of other programs have positions alone."""
+    path = tmp_path / "other.csv"
+    plain = replace(
+        make_tracks(), velocity_m_s=None, fitness=None, num_cameras=None, status=None, covariance_m2=None
+    )
+    write_trajectories(path, plain)
+    assert read_trajectories(path).covariance_m2 is None
+    assert run(path, "--save", tmp_path / "other.rrd")[0] == 0
+    entities = read_entities(tmp_path / "other.rrd")
+    assert len(entities["/world/drones/0/body"]["Boxes3D:centers"][0]) == NUM_FRAMES
+    assert not any("ellipsoid" in path for path in entities)
