@@ -32,9 +32,9 @@ from psotrack import cli
 from psotrack.datasets import open_recording
 from psotrack.flights import boxes_in_images, read_flight
 from psotrack.geometry import project
-from psotrack.recordings import read_frames
+from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames
 from psotrack.trajectories import read_trajectories, write_trajectories
-from psotrack.viewer import ViewContent, write_flight
+from psotrack.viewer import LiveView, ViewContent, write_flight
 
 
 @pytest.fixture(scope="module")
@@ -335,3 +335,64 @@ def test_tracks_without_status_or_covariance(run, tmp_path):
     entities = read_entities(tmp_path / "other.rrd")
     assert len(entities["/world/drones/0/body"]["Boxes3D:centers"][0]) == NUM_FRAMES
     assert not any("ellipsoid" in path for path in entities)
+
+
+def test_cameras_on_drones_have_paths_and_markers(folder, tmp_path):
+    white = np.full((240, 320, 3), 255, np.uint8)
+    marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 96)
+    white[72:168, 100:196] = marker[..., None]
+    with VideoWriter(tmp_path / "dron1.avi", 25.0, (320, 240)) as writer:
+        for _ in range(5):
+            writer.write(white)
+    turned = np.tile([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], (5, 1))  # a quarter about z
+    position_m = np.arange(15.0).reshape(5, 3)
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    flight = read_flight([folder / "tracks.csv"], folder / "flight")
+    onboard = {"dron1": OnboardVideo(probe(tmp_path / "dron1.avi"), K, position_m, turned)}
+    flight = replace(flight, recording=replace(flight.recording, onboard=onboard))
+    write_flight(tmp_path / "x.rrd", flight, ViewContent(onboard=True, dictionary="4x4_50"), jobs=1)
+    entities = read_entities(tmp_path / "x.rrd")
+    places = np.array(entities["/world/onboard/dron1"]["Transform3D:translation"][1])[:, 0]
+    np.testing.assert_allclose(places, position_m)
+    # Rerun keeps matrices column by column: the first column is where the camera's x axis points, y.
+    columns = np.array(entities["/world/onboard/dron1"]["Transform3D:mat3x3"][1])[:, 0]
+    np.testing.assert_allclose(columns[:, :3], [[0.0, 1.0, 0.0]] * 5, atol=1e-6)
+    assert len(entities["/world/onboard/dron1/image"]["EncodedImage:blob"][0]) == 5
+    markers = entities["/world/onboard/dron1/markers"]
+    assert markers["LineStrips2D:labels"][1] == [["7"]] * 5
+    for strips in markers["LineStrips2D:strips"][1]:
+        # Edges of the marker as pixels are counted from their corners; the codec blurs them by less than half a pixel.
+        np.testing.assert_allclose(strips[0][0], [100, 72], atol=0.5)
+        np.testing.assert_allclose(strips[0][2], [196, 168], atol=0.5)
+
+
+@pytest.mark.slow
+# The program that keeps the rows is stopped while it waits for more.
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_rows_of_a_live_session_arrive_in_the_viewer(folder, tmp_path):
+    """Another program of Rerun connects to the viewer's address and keeps what it gets."""
+    recording = open_recording(folder / "flight")
+    tracks, saved = make_tracks(), tmp_path / "live.rrd"
+    with LiveView(recording, web=True) as view:
+        assert view.page.startswith("http://127.0.0.1:")
+        for frame in range(NUM_FRAMES):
+            view.write(tracks.at_frames(np.array([frame])))
+            view.show_delay(0.02)
+        address = re.findall(r"%3A(\d+)%2Fproxy", view.page)[0]
+        program = (sys.executable, "-m", "rerun_cli", "--connect", f"rerun+http://127.0.0.1:{address}/proxy")
+        keeper = subprocess.Popen(
+            [*program, "--save", str(saved), "--bind", "127.0.0.1", "--port", "auto"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        time.sleep(3)
+        os.killpg(keeper.pid, signal.SIGTERM)
+        keeper.wait(20)
+    entities = read_entities(saved)
+    centres = np.array(entities["/world/drones/1/body"]["Boxes3D:centers"][1])[:, 0]
+    np.testing.assert_allclose(centres, tracks.position_m[:, 1], atol=1e-6)
+    words = [word[0] for word in entities["/status/1"]["StateChange:state"][1]]
+    assert words == ["tracked", "coasting", "tracked"]
+    assert entities["/plots/delay_ms"]["Scalars:scalars"][1] == [[20.0]] * NUM_FRAMES
+    assert "/world/cameras/c0" in entities

@@ -10,11 +10,11 @@ from psotrack.cli.options import (
     CAMERAS,
     FORCE,
     JOBS,
-    QUIET,
     SEQUENCE,
     TRACKS,
     camera_names,
     frames_option,
+    reporting,
 )
 from psotrack.cli.output import report_to
 
@@ -41,7 +41,7 @@ from psotrack.cli.output import report_to
 @frames_option
 @JOBS
 @FORCE
-@QUIET
+@reporting
 def overlay(
     tracks: Path,
     sequence: Path,

@@ -15,11 +15,11 @@ from psotrack.cli.options import (
     CAMERAS,
     FORCE,
     JOBS,
-    QUIET,
     cache_folder,
     camera_names,
     dictionary_option,
     frames_option,
+    reporting,
 )
 from psotrack.cli.output import report_to
 from psotrack.errors import SettingsError
@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 @CACHE
 @JOBS
 @FORCE
-@QUIET
+@reporting
 def view(
     tracks: tuple[Path, ...],
     sequence: Path | None,

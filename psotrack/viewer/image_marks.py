@@ -127,13 +127,12 @@ def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
     position_m, orientation_wxyz = onboard.position_m[:count], onboard.orientation_wxyz[:count]
     known = np.isfinite(position_m).all(axis=1) & np.isfinite(orientation_wxyz).all(axis=1)
     frame, position_m = np.flatnonzero(known), position_m[known]
-    # Rerun has matrices column by column.
-    columns = np.swapaxes(rotation_matrices(orientation_wxyz[known]), 1, 2).reshape(-1, 9)
+    rotation = rotation_matrices(orientation_wxyz[known])
     log.rows(
         path,
         frame,
         frame / onboard.video.fps,
-        lambda rows: rr.Transform3D.columns(translation=position_m[rows], mat3x3=columns[rows]),
+        lambda rows: rr.Transform3D.columns(translation=position_m[rows], mat3x3=rotation[rows]),
     )
     if onboard.K is not None:
         log.static(path, pinhole(onboard.K, np.array(onboard.video.image_size_wh), _ONBOARD_DISTANCE_M))
