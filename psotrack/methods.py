@@ -190,21 +190,25 @@ def usable_for(
         settings: settings of a run.
         cameras: names of the cameras to use; None uses all.
         num_frames: number of instants to use from the start; None uses all.
-        videos: whether each camera needs a video, even if the settings do not require one.
+        videos: whether each camera needs a video, because a detector reads its frames; if not, stored silhouettes are
+            as good as a video.
 
     Raises:
         InputError: detections cannot be read, no camera can be used (see `Recording.usable`), or fewer than two
-            cameras have the videos that the method needs.
+            cameras have the videos or stored silhouettes that the method needs.
         SettingsError: a camera is unknown, or the recording has fewer instants.
     """
     if settings.reads_detections and settings.detections != YOLO:
         recording = recording.with_detections(detection_files_of(recording, settings.detections))
-    usable = recording.usable(cameras, num_frames, videos=videos or settings.needs_each_video)
-    if settings.needs_silhouettes and len(usable.videos) < min(2, len(usable.rig)):
+    usable = recording.usable(
+        cameras, num_frames, videos=videos or settings.needs_each_video, silhouettes=not videos
+    )
+    shown = [name for name in usable.rig.names if name in usable.videos or name in usable.silhouettes]
+    if settings.needs_silhouettes and len(shown) < min(2, len(usable.rig)):
         raise InputError(
             recording.folder,
             expected=f"videos of at least two cameras for --method {settings.method}",
-            found=", ".join(usable.videos) or "none",
+            found=", ".join(shown) or "none",
             remedy="--method projection-lines needs detections only",
         )
     return usable

@@ -270,3 +270,11 @@ class TestReading:
         monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: recording_of(ring_rig(2)))
         with pytest.raises(InputError, match="expected tracks of lab, found tracks of barn"):
             read_flight([path], "lab")
+
+    def test_tracks_of_a_longer_recording_of_the_same_name(self, tmp_path, monkeypatch):
+        path = write_flight(tmp_path, straight_tracks(num_frames=30), {"sequence": "lab"})
+        monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: recording_of(ring_rig(2)))
+        with pytest.raises(
+            InputError, match=r"expected times from 0.00 to 1.90 s, as in lab, found 0.00 to 2.90 s"
+        ):
+            read_flight([path], "lab")

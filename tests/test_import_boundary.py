@@ -54,6 +54,7 @@ ROOMS = [
     "inside_out",
     "methods",
     "pipeline",
+    "archives",
     "live",
     "api",
     "evaluation",

@@ -81,6 +81,10 @@ COMMANDS = {
         "psotrack.cli.overlay",
         "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
     ),
+    "pack": LazyCommand(
+        "psotrack.cli.pack",
+        "Pack TRACKS and what is needed to compute them again from SEQ into one file.",
+    ),
     "report": LazyCommand(
         "psotrack.cli.report",
         "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
@@ -105,6 +109,9 @@ COMMANDS = {
     ),
     "track": LazyCommand(
         "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
+    ),
+    "unpack": LazyCommand(
+        "psotrack.cli.pack", "Unpack the archive FILE into a folder, which other commands take as SEQ."
     ),
     "view": LazyCommand(
         "psotrack.cli.view", "Show TRACKS and their recording in space and time, in the viewer Rerun."

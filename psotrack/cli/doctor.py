@@ -90,7 +90,7 @@ def doctor(
     recording = open_recording(sequence)
     report = report_to(quiet)
     if detections == BLOBS:
-        recording = recording.usable()
+        recording = recording.usable(silhouettes=True)
         made = compute(recording, SilhouetteSettings(), cache=cache_folder(cache), jobs=jobs, report=report)
         sightings = from_silhouettes(made, report)
     else:

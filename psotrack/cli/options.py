@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -15,6 +16,7 @@ from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import RENAMED, ErrorSettings, TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
+from psotrack.support import ARCHIVE_SUFFIX
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -63,8 +65,23 @@ class Size(click.ParamType):
         return int(words[0]), int(words[1])
 
 
+class SequencePath(click.Path):
+    """Path of a sequence. An archive is unpacked, and its folder is the path until the command ends."""
+
+    name = "sequence"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path; that of a temporary folder with the content of an archive."""
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if ctx is None or ctx.resilient_parsing or path.suffix.lower() != ARCHIVE_SUFFIX or path.is_dir():
+            return path
+        from psotrack.cli.archived import opened_archive
+
+        return opened_archive(ctx, path)
+
+
 TRACKS = click.argument("tracks", type=click.Path(path_type=Path))
-SEQUENCE = click.argument("sequence", metavar="SEQ", type=click.Path(path_type=Path))
+SEQUENCE = click.argument("sequence", metavar="SEQ", type=SequencePath(path_type=Path))
 FORCE = click.option("--force", is_flag=True, help="Replace existing files.")
 QUIET = click.option("--quiet", "-q", is_flag=True, help="Print no progress and no results, only errors.")
 

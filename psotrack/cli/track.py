@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
+from psotrack.cli.archived import chosen_extent, chosen_settings, with_comparison
 from psotrack.cli.options import (
     CACHE,
     CAMERAS,
@@ -26,7 +27,6 @@ from psotrack.cli.options import (
     compiled_folder,
     frames_option,
     reporting,
-    setting_name,
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_drones, print_line, report_to, write_json
@@ -228,10 +228,14 @@ def track(
     settings, the estimates for each drone, births of tracks, encounters of drones, versions, device, input keys and
     seconds per stage. The file that ends in .ambiguity.csv says for each frame which drones may be confused.
 
+    SEQ may be an archive of `pack`. Options that are not given are then those of the archive's tracks, and a line says
+    whether the tracks are the same, or from which frame on and by how much they differ.
+
     \b
     Examples:
       psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
       psotrack track flight/recording.toml --out tracks.csv
+      psotrack track flight.psotrack --out again.csv
       psotrack track data/Simulated_Data/S02_D4_A --out smooth.csv --smooth
       psotrack track data/Simulated_Data/S02_D4_A --out as_live.csv --causal
       psotrack track data/Simulated_Data/S02_D4_A --out lines.csv --method projection-lines
@@ -253,7 +257,8 @@ def track(
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
     for path in (out, record_path) if causal else (out, record_path, ambiguity_path):
         refuse_to_overwrite(path, force)
-    chosen = TrackSettings().changed({setting_name(option): value for option, value in settings.items()})
+    chosen = chosen_settings(settings)
+    num_frames, causal, most_drones = chosen_extent(num_frames, causal, most_drones)
     parts = Parts(
         detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
     )
@@ -286,6 +291,7 @@ def track(
     identities, time_s = tracked.identities, tracked.trajectories.time_s
     write_ambiguity(ambiguity_path, time_s, identities.pairs, identities.ambiguity, force=force)
     record = with_real_time(tracked.record, time.perf_counter() - started, start_s=start_s)
+    record, sentence = with_comparison(record, out, chosen)
     write_json(record_path, record)
     output_json(json_path, record, force)
     seen = tracked.trajectories.seen.mean()
@@ -293,7 +299,7 @@ def track(
         quiet,
         json_path,
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
-        f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {record['real_time_factor']:.2g} of real time",
+        f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {record['real_time_factor']:.2g} of real time{sentence}",
     )
     print_drones(quiet, json_path, tracked.trajectories, tracked.size_m)
 
@@ -327,13 +333,14 @@ def _track_causally(
         for frame in run:
             rows.write(frame)
     record = with_real_time(run.record, time.perf_counter() - started, start_s=start_s)
+    record, sentence = with_comparison(record, out, settings)
     write_json(out.with_suffix(".json"), record)
     output_json(json_path, record, force)
     print_line(
         quiet,
         json_path,
         f"{out}: {record['drones']} drones, {record['frames']} frames, {record['seconds']['total']:.1f} s, "
-        f"{record['real_time_factor']:.2g} of real time",
+        f"{record['real_time_factor']:.2g} of real time{sentence}",
     )
     # A file without rows is none of tracks.
     if record["drones"] and not quiet:

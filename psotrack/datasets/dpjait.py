@@ -84,6 +84,7 @@ __all__ = [
     "read_onboard_calibration",
     "read_poses",
     "read_sequence",
+    "reference_files_in",
     "split_label",
     "write_calibration",
     "write_detections",
@@ -273,6 +274,13 @@ def _truth(
         except NoDronesError as error:
             _logger.warning("no reference: %s", error)
     return None
+
+
+def reference_files_in(folder: Path) -> tuple[Path, ...]:
+    """The pose files of a sequence's reference by the number of the drone, or else its .c3d file."""
+    files = sorted(folder.iterdir())
+    poses = tuple(numbered_files(files, _POSE_FILE).values())
+    return poses or tuple(path for path in files if path.suffix.lower() == ".c3d")
 
 
 def _pose_files(files: Sequence[Path], video: VideoInfo) -> dict[int, Path]:

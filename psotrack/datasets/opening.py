@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
+from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence, reference_files_in
 from psotrack.datasets.recording_files import read_recording_toml
 from psotrack.errors import InputError
 from psotrack.recordings import RECORDING_FILE, Recording, is_picture_folder, read_recording_file
+from psotrack.support import ARCHIVE_SUFFIX
 
 
 def open_recording(path: Path | str, *, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
@@ -62,8 +64,18 @@ def find_marker_corners(path: Path | str) -> Path:
     return file.parent / markers.corners
 
 
+def reference_files(recording: Recording) -> tuple[Path, ...]:
+    """The files of a recording's reference, as its `recording.toml` or the dataset names them; empty without one."""
+    if recording.truth is None:
+        return ()
+    return recording.reference_files or reference_files_in(recording.folder)
+
+
 def _no_recording(path: Path) -> InputError:
     expected = f"a {RECORDING_FILE}, a folder that holds one, or a folder of the DPJAIT dataset"
+    if path.suffix.lower() == ARCHIVE_SUFFIX and path.is_file():
+        remedy = f"`psotrack unpack {shlex.quote(f'{path}')} --out FOLDER` makes such a folder"
+        return InputError(path, expected=expected, found="an archive", remedy=remedy)
     if path.suffix.lower() == ".zip" and path.is_file():
         return InputError(path, expected=expected, found="an archive", remedy="unpack it first")
     if not path.exists():

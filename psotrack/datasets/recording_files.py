@@ -22,12 +22,14 @@ from psotrack.recordings import (
     FrameTimes,
     Recording,
     RecordingFile,
+    StoredSilhouettes,
     VideoInfo,
     check_rate,
     find_images,
     open_pictures,
     probe,
     probe_images,
+    probe_silhouettes,
     read_detections,
     read_mask,
     read_recording_file,
@@ -45,7 +47,7 @@ _UNKNOWN_HZ = 1.0
 _SLIP_SHARE = 0.05
 #: How addresses of streams begin that OpenCV reads, with FFmpeg or with GStreamer.
 _SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtp", "udp", "tcp", "srt", "gstreamer")
-_LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "tvec")
+_LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "R", "tvec")
 
 
 def read_recording_toml(path: Path | str, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
@@ -95,6 +97,7 @@ def recording_of(path: Path, content: RecordingFile) -> Recording:
         folder=folder,
         rig=make_rig(placed) if placed else _no_rig(),
         videos={name: each.video for name, each in opened.items() if each.video is not None},
+        silhouettes={name: each.silhouettes for name, each in opened.items() if each.silhouettes is not None},
         detections={name: each.detections for name, each in opened.items() if each.detections is not None}
         or None,
         frame_times=frame_times,
@@ -120,6 +123,7 @@ class _Opened:
     Attributes:
         size_wh: width and height of the images, pixels; None where only the calibration may know it.
         video: its video, or None.
+        silhouettes: its stored silhouettes, or None.
         stream: address of its stream, or "device" and number or path of its device; empty where it has none.
         times: times of its frames; None for a stream.
         ignore: image of what is ignored, or None.
@@ -128,6 +132,7 @@ class _Opened:
 
     size_wh: tuple[int, int] | None
     video: VideoInfo | None
+    silhouettes: StoredSilhouettes | None
     stream: str
     times: FrameTimes | None
     ignore: Path | None
@@ -149,7 +154,10 @@ def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
     detections = None
     if table.detections is not None:
         detections = _existing(folder, table.detections, path, f"{place}.detections")
-    times = None if stream else _times(path, name, table, video, detections)
+    silhouettes = None
+    if table.silhouettes is not None:
+        silhouettes = probe_silhouettes(_existing(folder, table.silhouettes, path, f"{place}.silhouettes"))
+    times = None if stream else _times(path, name, table, video, silhouettes, detections)
     if video is not None and times is not None and not video.is_finished:
         # The program that wrote video and times was stopped: the one that is longer is cut.
         video = replace(video, num_frames=min(video.num_frames, times.num_frames))
@@ -165,7 +173,7 @@ def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
             raise InputError(
                 ignore, expected=f"{_size_text(size_wh)} as camera {name}", found=_size_text((width, height))
             )
-    return _Opened(size_wh, video, stream, times, ignore, detections)
+    return _Opened(size_wh, video, silhouettes, stream, times, ignore, detections)
 
 
 def _check_videos(path: Path, opened: Mapping[str, _Opened]) -> None:
@@ -266,19 +274,36 @@ def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:
 
 
 def _times(
-    path: Path, name: str, table: CameraTable, video: VideoInfo | None, detections: Path | None
+    path: Path,
+    name: str,
+    table: CameraTable,
+    video: VideoInfo | None,
+    silhouettes: StoredSilhouettes | None,
+    detections: Path | None,
 ) -> FrameTimes:
-    """Times of the frames of a camera; without video it lasts until its last detection."""
+    """Times of the frames of a camera; without video it lasts as long as its silhouettes, or as `frames` says, or until
+    its last detection.
+    """
     if table.timestamps is not None:
         file = _existing(path.parent, table.timestamps, path, f"cameras.{name}.timestamps")
         times = read_timestamps(file, video.num_frames if video is not None and video.is_finished else None)
         if video is not None and not video.images:
             _check_seconds(file, times, video)
+        if video is None and silhouettes is not None:
+            if times.num_frames < silhouettes.num_frames:
+                expected = f"times of the {silhouettes.num_frames} frames of the silhouettes"
+                raise InputError(file, expected=expected, found=f"{times.num_frames}")
+            return times.cut(silhouettes.num_frames)
         return times
     offset_s = table.time_offset_s or 0.0
     if video is not None:
         return FrameTimes(video.num_frames, video.fps, offset_s)
-    num_frames = 0 if detections is None else int(read_detections(detections).frame.max(initial=-1)) + 1
+    if silhouettes is not None:
+        num_frames = silhouettes.num_frames
+    elif table.frames is not None:
+        num_frames = table.frames
+    else:
+        num_frames = 0 if detections is None else int(read_detections(detections).frame.max(initial=-1)) + 1
     assert table.fps is not None, "the schema asks for fps of a camera without video"
     return FrameTimes(num_frames, table.fps, offset_s)
 
@@ -332,6 +357,8 @@ def _camera(
         raise _error(path, f"cameras.{name}.size", expected, "none")
     own = msgspec.json.decode(msgspec.json.encode(table))
     keys = known | {key: own[key] for key in (*known, *_LENS_AND_PLACE) if own.get(key) is not None}
+    if "R" in own and own["R"] is not None:
+        keys.pop("rvec", None)
     if size_wh is None or not keys.keys() - {"size"}:
         return None
     entry = camera_of_table(path, name, {**keys, "size": list(size_wh)})

@@ -211,9 +211,13 @@ def _check_fits(tracks: FlightTracks, recording: Recording) -> None:
         )
     first_s, last_s = tracks.trajectories.time_s[[0, -1]]
     begin_s, end_s = recording.timeline().time_s[[0, -1]]
-    if first_s > end_s or last_s < begin_s:
+    # Tracks of this package have instants of their recording only; other programs may have tracked for longer.
+    apart = first_s > end_s or last_s < begin_s
+    longer = tracks.record is not None and last_s > end_s + 1 / recording.fps
+    if apart or longer:
         raise InputError(
             tracks.path,
             expected=f"times from {begin_s:.2f} to {end_s:.2f} s, as in {recording.name}",
             found=f"{first_s:.2f} to {last_s:.2f} s",
+            remedy="name the recording that was tracked",
         )

@@ -1,6 +1,6 @@
 from .causal_run import CausalRecording, CausalRun, causal_settings
 from .parts import Parts
-from .results import TrackedRecording, environment, real_time_factors, with_real_time
+from .results import TrackedRecording, changed_settings, environment, real_time_factors, with_real_time
 from .running import track_recording, track_runs
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "Parts",
     "TrackedRecording",
     "causal_settings",
+    "changed_settings",
     "environment",
     "real_time_factors",
     "track_recording",

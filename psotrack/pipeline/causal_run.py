@@ -203,6 +203,7 @@ class CausalRecording:
         self.record: dict[str, Any] = {
             "sequence": recording.name,
             "causal": True,
+            "most_drones": most_drones,
             "frames": len(self._time_s),
             "cameras": list(recording.rig.names),
             "rate_hz": timeline.rate_hz,

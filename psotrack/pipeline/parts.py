@@ -73,7 +73,7 @@ def with_background(parts: Parts, recording: Recording, settings: SilhouetteSett
     Raises:
         SettingsError: there is no background model of the settings' name.
     """
-    if parts.background is not None or not recording.videos:
+    if parts.background is not None or not (recording.videos or recording.silhouettes):
         return parts
     model = find_background(settings.background, scaled_settings(settings, recording))
     return parts if model is None or isinstance(model, Living) else replace(parts, background=model)

@@ -6,7 +6,7 @@ import logging
 import platform
 import shlex
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -35,6 +35,9 @@ logger = logging.getLogger(__name__)
 #: Where detections of different cameras meet in a smaller share of the frames, something is wrong with the cameras:
 #: rays of false detections meet by chance.
 _FEW_MET = 0.2
+#: Settings that the data give where nobody does, and the key of the record's `volume` that says which.
+_FOUND = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
+_MISSING = object()
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,9 @@ class TrackedRecording:
             drones_html(self.trajectories, self.size_m),
             html_lines(
                 {
-                    "settings": ", ".join(_changed_settings(self.record)),
+                    "settings": ", ".join(
+                        f"{name} = {value}" for name, value in changed_settings(self.record).items()
+                    ),
                     "seconds": ", ".join(
                         f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()
                     ),
@@ -77,17 +82,29 @@ class TrackedRecording:
         )
 
 
-def _changed_settings(record: Mapping[str, Any]) -> Iterator[str]:
-    """Name and value of each setting of a record that somebody chose and that is not the default."""
-    usual = msgspec.to_builtins(TrackSettings())
-    origin = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
+def changed_settings(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run that somebody chose and that are not today's defaults, by their dotted names.
+
+    Args:
+        record: record of the run; settings that it lacks, because a later version brought them, are left out.
+    """
+    # Through JSON, because a record that was read from a file has lists where settings have tuples.
+    usual, used = (
+        msgspec.json.decode(msgspec.json.encode(settings))
+        for settings in (TrackSettings(), record["settings"])
+    )
+    changed = {}
     for name in setting_names():
         part, dot, field = name.partition(".")
-        value, default = (each[part][field] if dot else each[part] for each in (record["settings"], usual))
+        value, default = (
+            each.get(part, {}).get(field, _MISSING) if dot else each.get(part, _MISSING)
+            for each in (used, usual)
+        )
         # The record has the values that were used, also where the data gave them.
-        found = name in origin and record["volume"][origin[name]] != "given"
-        if value != default and not found:
-            yield f"{name} = {value}"
+        found = name in _FOUND and record.get("volume", {}).get(_FOUND[name]) != "given"
+        if value is not _MISSING and value != default and not found:
+            changed[name] = value
+    return changed
 
 
 def finish(

@@ -67,7 +67,9 @@ def track_recording(
     """
     began = time.perf_counter()
     needs_silhouettes = settings.needs_silhouettes or parts.method is not None
-    recording = usable_for(recording, settings, videos=parts.method is not None or parts.detector is not None)
+    recording = usable_for(recording, settings, videos=parts.detector is not None)
+    if parts.method is not None:
+        recording = recording.usable(silhouettes=True)
     if len(recording.rig) < 2:
         raise InputError(
             recording.folder,

@@ -28,6 +28,7 @@ from .recording_file import (
     recording_file_text,
     write_recording_file,
 )
+from .stored_silhouettes import ARRAY_FILE, MADE_OF, StoredSilhouettes, probe_silhouettes
 from .timestamps import read_timestamps
 from .timing import REACH, FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
 from .video import (
@@ -45,7 +46,9 @@ from .video import (
 )
 
 __all__ = [
+    "ARRAY_FILE",
     "IMAGE_SUFFIXES",
+    "MADE_OF",
     "REACH",
     "RECORDING_FILE",
     "CameraTable",
@@ -58,6 +61,7 @@ __all__ = [
     "Recording",
     "RecordingFile",
     "ReferenceTable",
+    "StoredSilhouettes",
     "Timeline",
     "TruncatedVideoError",
     "VideoInfo",
@@ -81,6 +85,7 @@ __all__ = [
     "open_video",
     "probe",
     "probe_images",
+    "probe_silhouettes",
     "read_c3d",
     "read_detections",
     "read_frames",

@@ -54,9 +54,10 @@ def describe_recording(recording: Recording) -> dict[str, Any]:
 def _describe_camera(recording: Recording, name: str) -> dict[str, Any]:
     video, times = recording.videos.get(name), recording.frame_times.get(name)
     detections = (recording.detections or {}).get(name)
-    ignore = recording.ignore.get(name)
+    ignore, silhouettes = recording.ignore.get(name), recording.silhouettes.get(name)
     described: dict[str, Any] = {
         "video": str(video.path) if video else recording.streams.get(name),
+        "silhouettes": None if silhouettes is None else str(silhouettes.path),
         "frames": times.num_frames if times else None,
         "fps": times.fps if times else None,
         "begins_s": float(times.time_s[0]) if times and times.num_frames else None,
@@ -115,7 +116,7 @@ def _rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     for name, camera in content["cameras"].items():
         yield (
             name,
-            "no video" if camera["video"] is None else _name(camera["video"]),
+            _shown(camera),
             "" if camera["frames"] is None else f"{camera['frames']}{_begin(camera['begins_s'])}",
             "" if camera["fps"] is None else f"{camera['fps']:g}",
             _size(camera["image_size_wh"]),
@@ -135,6 +136,13 @@ def _rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
             f"{camera['frames_with_pose']} poses",
             "",
         )
+
+
+def _shown(camera: dict[str, Any]) -> str:
+    """What there is of a camera's images."""
+    if camera["video"] is not None:
+        return _name(camera["video"])
+    return "no video" if camera["silhouettes"] is None else "silhouettes only"
 
 
 def _name(video: str) -> str:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Rig, chosen_cameras
 from psotrack.recordings.detections import read_detections
+from psotrack.recordings.stored_silhouettes import StoredSilhouettes
 from psotrack.recordings.timing import FrameTimes, Timeline, make_timeline
 from psotrack.recordings.video import VideoInfo
 from psotrack.support import short_repr
@@ -60,6 +61,8 @@ class Recording:
             and has the video's rate.
         unplaced: cameras of the recording that are not in the rig, because their lens or their place is not known.
         streams: addresses of streams and numbers of devices by camera name; such a camera has no video.
+        silhouettes: stored silhouettes by camera name. They take the place of a video; for a camera that has a video,
+            they save the time of making the same silhouettes again.
         ignore: images by camera name, white where nothing counts as foreground.
         line_time_s: times from the exposure of one row to that of the next row by camera name, seconds; a camera that
             is absent has a global shutter.
@@ -84,6 +87,7 @@ class Recording:
     frame_times: Mapping[str, FrameTimes] = field(default_factory=dict)
     unplaced: tuple[str, ...] = ()
     streams: Mapping[str, str] = field(default_factory=dict)
+    silhouettes: Mapping[str, StoredSilhouettes] = field(default_factory=dict)
     ignore: Mapping[str, Path] = field(default_factory=dict)
     line_time_s: Mapping[str, float] = field(default_factory=dict)
     bounds_m: tuple[float, float, float, float, float, float] | None = None
@@ -192,7 +196,12 @@ class Recording:
         return line_time_s * float(self.rig.cameras.image_size_wh[self.rig.names.index(name), 1])
 
     def usable(
-        self, cameras: Sequence[str] | None = None, num_frames: int | None = None, *, videos: bool = True
+        self,
+        cameras: Sequence[str] | None = None,
+        num_frames: int | None = None,
+        *,
+        videos: bool = True,
+        silhouettes: bool = False,
     ) -> Recording:
         """This recording with the chosen cameras and frames only, checked to be consistent.
 
@@ -202,13 +211,14 @@ class Recording:
             cameras: names of the cameras to keep; None: all that can be used.
             num_frames: number of instants to keep from the start; None: all.
             videos: whether a camera needs a video; if not, detections are enough.
+            silhouettes: whether stored silhouettes are as good as a video.
 
         Raises:
             InputError: no camera can be used, a chosen camera cannot be used, or an image size differs from the
                 calibration.
             SettingsError: a camera is unknown, or the recording has fewer than `num_frames` instants.
         """
-        names = self._usable_names(cameras, videos)
+        names = self._usable_names(cameras, videos, silhouettes)
         rig = self.rig.select(names)
         for name in names:
             if name in self.videos:
@@ -217,6 +227,7 @@ class Recording:
             self,
             rig=rig,
             videos={name: self.videos[name] for name in names if name in self.videos},
+            silhouettes={name: self.silhouettes[name] for name in names if name in self.silhouettes},
             frame_times={name: self.frame_times[name] for name in names if name in self.frame_times},
             detections=None
             if self.detections is None
@@ -233,7 +244,9 @@ class Recording:
         times = dict(self.frame_times)
         for name, path in files.items():
             known = times.get(name)
-            if name not in self.videos and known is not None and known.listed_s is None:
+            if name in self.videos or name in self.silhouettes:
+                continue
+            if known is not None and known.listed_s is None:
                 times[name] = replace(known, num_frames=_frames_of(path))
         return replace(self, detections=dict(files), frame_times=times)
 
@@ -255,7 +268,7 @@ class Recording:
                 continue
             last = known.num_frames - 1
             beyond = int(np.count_nonzero(frame > last))
-            shown = self.videos[name].path.name if name in self.videos else "its timestamps"
+            shown = self.videos[name].path.name if name in self.videos else "its frames"
             if beyond == len(frame):
                 raise InputError(
                     path,
@@ -269,15 +282,18 @@ class Recording:
                 path, beyond, len(frame), name, shown, last,
             )  # fmt: skip
 
-    def _usable_names(self, cameras: Sequence[str] | None, videos: bool) -> tuple[str, ...]:
+    def _usable_names(
+        self, cameras: Sequence[str] | None, videos: bool, silhouettes: bool
+    ) -> tuple[str, ...]:
         """Names of the cameras that are to be used; the others are left out with a warning each."""
         names = (*self.rig.names, *self.unplaced) if cameras is None else self._chosen(cameras)
         self._check_files(names)
-        without = [name for name in names if self._fault(name, videos)]
+        faults = {name: self._fault(name, videos, silhouettes) for name in names}
+        without = {name: fault for name, fault in faults.items() if fault}
         if len(without) == len(names) or (without and cameras is not None):
-            raise self._nothing_usable(names, videos)
-        for name in without:
-            _logger.warning("camera %s is left out: it has no %s", name, self._fault(name, videos))
+            raise self._nothing_usable(names, tuple(without), videos)
+        for name, fault in without.items():
+            _logger.warning("camera %s is left out: it has no %s", name, fault)
         return tuple(name for name in names if name not in without)
 
     def _chosen(self, cameras: Sequence[str]) -> tuple[str, ...]:
@@ -285,11 +301,11 @@ class Recording:
         known = (*self.rig.names, *self.unplaced)
         return chosen_cameras([cameras] if isinstance(cameras, str) else cameras, known)
 
-    def _fault(self, name: str, videos: bool) -> str:
+    def _fault(self, name: str, videos: bool, silhouettes: bool) -> str:
         """What a camera lacks, in words; empty for a camera that can be used."""
         if name in self.unplaced:
             return "place in the world"
-        if videos and name not in self.videos:
+        if videos and name not in self.videos and not (silhouettes and name in self.silhouettes):
             return "video"
         return "" if name in self.frame_times else "video and no detections"
 
@@ -303,7 +319,7 @@ class Recording:
                     remedy="record it first: this command works on files",
                 )
 
-    def _nothing_usable(self, names: Sequence[str], videos: bool) -> InputError:
+    def _nothing_usable(self, names: Sequence[str], without: Sequence[str], videos: bool) -> InputError:
         wanted = "a video" if videos else "a video, or detections,"
         if set(names) <= set(self.unplaced):
             return InputError(
@@ -315,7 +331,7 @@ class Recording:
         return InputError(
             self.folder,
             expected=f"{wanted} for each of the cameras {', '.join(names)}",
-            found=f"none for {', '.join(name for name in names if self._fault(name, videos))}",
+            found=f"none for {', '.join(without)}",
         )
 
     def _first(self, num_frames: int) -> Recording:
@@ -336,6 +352,11 @@ class Recording:
             videos={
                 name: replace(video, num_frames=counts[name])
                 for name, video in self.videos.items()
+                if name in rig.names
+            },
+            silhouettes={
+                name: replace(stored, num_frames=min(counts[name], stored.num_frames))
+                for name, stored in self.silhouettes.items()
                 if name in rig.names
             },
             frame_times={name: self.frame_times[name].cut(counts[name]) for name in rig.names},

@@ -24,6 +24,15 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 Pixels = Annotated[int, msgspec.Meta(ge=1)]
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 
+#: Pairs of keys of a camera of which only one may be there.
+_EXCLUSIVE = (
+    ("video", "images"),
+    ("timestamps", "fps"),
+    ("timestamps", "time_offset_s"),
+    *((key, "frames") for key in ("video", "images", "silhouettes", "timestamps")),
+    ("rvec", "R"),
+)
+
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of the tables of the file: immutable, unknown keys are refused."""
@@ -35,9 +44,11 @@ class CameraTable(_Table, frozen=True, kw_only=True):
     Attributes:
         video: a video file, a folder of pictures, the address of a stream, or the number or path of a device.
         images: pattern of image files, which are the frames in natural order.
+        silhouettes: folder of stored silhouettes.
         ignore: image file, white where nothing counts as foreground.
         detections: file of detections, in the layout of the dataset's dl_data.
         size: width and height of the images, pixels.
+        frames: number of frames of a camera of which only detections are known.
         fps: frames per second.
         time_offset_s: time of frame 0 on the recording's clock, seconds.
         timestamps: CSV file with the columns `frame` and `time_s`.
@@ -46,14 +57,17 @@ class CameraTable(_Table, frozen=True, kw_only=True):
         model: lens model.
         distortion: coefficients in OpenCV's order.
         rvec: Rodrigues vector of the rotation from world to camera.
+        R: the same rotation as a matrix, three rows of three numbers.
         tvec: translation from world to camera, metres.
     """
 
     video: Text | int | None = None
     images: Text | None = None
+    silhouettes: Text | None = None
     ignore: Text | None = None
     detections: Text | None = None
     size: tuple[Pixels, Pixels] | None = None
+    frames: Annotated[int, msgspec.Meta(ge=1)] | None = None
     fps: Positive | None = None
     time_offset_s: float | None = None
     timestamps: Text | None = None
@@ -62,6 +76,7 @@ class CameraTable(_Table, frozen=True, kw_only=True):
     model: Literal["opencv", "fisheye"] | None = None
     distortion: tuple[float, ...] | None = None
     rvec: Vector | None = None
+    R: tuple[Vector, Vector, Vector] | None = None
     tvec: Vector | None = None
 
 
@@ -159,7 +174,7 @@ def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
         CameraTable,
         lambda field, *parts: _error(path, f"{place}.{field}" if field else place, *parts),
     )
-    for one, other in (("video", "images"), ("timestamps", "fps"), ("timestamps", "time_offset_s")):
+    for one, other in _EXCLUSIVE:
         if table.get(one) is not None and table.get(other) is not None:
             raise _error(path, place, f"{one} or {other}", "both")
     if camera.fps is not None:
@@ -173,9 +188,11 @@ def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
 
 
 def _check_place(path: Path, name: str, camera: CameraTable) -> None:
-    if (camera.rvec is None) != (camera.tvec is None):
+    turned = camera.rvec is not None or camera.R is not None
+    if turned != (camera.tvec is not None):
         missing = "tvec" if camera.tvec is None else "rvec"
-        expected = "three numbers, because a place needs rvec and tvec"
+        turn = "rvec" if camera.R is None else "R"
+        expected = f"three numbers, because a place needs {turn} and tvec"
         raise _error(path, f"cameras.{name}.{missing}", expected, "none")
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from markupsafe import Markup
 
@@ -15,18 +14,17 @@ from psotrack.errors import InputError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.flights import (
     FlightTracks,
-    RunRecord,
     TrackedFlight,
     camera_quality,
     drone_quality,
     find_events,
 )
+from psotrack.pipeline import changed_settings
 from psotrack.reports.charts import lines_over_time
 from psotrack.reports.moments import Moment, choose_events, take_pictures
 from psotrack.reports.page import check_page_path, render, write_page
 from psotrack.reports.scene import row_step, scene_of_flight
 from psotrack.reports.tables import PageCell, PageTable, number, percent
-from psotrack.settings import TrackSettings
 from psotrack.support import Report, drone_colour, no_progress
 from psotrack.trajectories import Trajectories
 
@@ -264,7 +262,7 @@ def _run(tracks: FlightTracks, flight: TrackedFlight) -> dict[str, Any]:
     record = tracks.record
     if record is None:
         return {"label": tracks.label, "again": "", "versions": (), "settings": ""}
-    changed = _changed(record)
+    changed = changed_settings(record.whole) if record.settings else {}
     lines = "".join(f"    {json.dumps(name)}: {value!r},\n" for name, value in changed.items())
     sequence = record.sequence or flight.name
     again = (
@@ -279,20 +277,3 @@ def _run(tracks: FlightTracks, flight: TrackedFlight) -> dict[str, Any]:
         "versions": tuple(versions.items()),
         "settings": json.dumps(record.settings, indent=2),
     }
-
-
-def _changed(record: RunRecord) -> dict[str, Any]:
-    """Settings of a run that differ from today's defaults, by dotted name."""
-
-    def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, value in values.items():
-            if isinstance(value, dict):
-                found |= flat(value, f"{prefix}{name}.")
-            else:
-                found[f"{prefix}{name}"] = value
-        return found
-
-    # A record has lists where settings have tuples.
-    defaults = flat(json.loads(msgspec.json.encode(TrackSettings())))
-    return {name: value for name, value in flat(record.settings).items() if defaults.get(name, None) != value}

@@ -1,5 +1,6 @@
 from .dpjait_calibration import METRES_PER_UNIT, read_calibration, read_camera_names, write_calibration
 from .entries import UNITS_M, Entry
+from .fields import lens_model
 from .formats import (
     RIG_FORMATS,
     WRITTEN_RIG_FORMATS,
@@ -18,6 +19,7 @@ __all__ = [
     "WRITTEN_RIG_FORMATS",
     "Entry",
     "camera_of_table",
+    "lens_model",
     "read_calibration",
     "read_camera_names",
     "read_entries",

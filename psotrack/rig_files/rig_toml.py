@@ -7,11 +7,11 @@
     K = [[1160.2, 0.0, 961.0], [0.0, 1160.9, 541.2], [0.0, 0.0, 1.0]]
     model = "opencv"                           # or "fisheye"
     distortion = [-0.28, 0.09, 0.0, 0.0, 0.01] # OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers; 4 of a fisheye
-    rvec = [1.2, -0.4, 0.3]                    # x_cam = R X + t, R as Rodrigues vector
+    rvec = [1.2, -0.4, 0.3]                    # x_cam = R X + t, R as Rodrigues vector; or R = [[...], [...], [...]]
     tvec = [0.1, 0.2, 5.0]                     # metres
 
-Numbers are written with all their digits: reading gives the same bits, rotations the same matrix within 1e-15. A camera
-whose place is not known has no `rvec` and `tvec`. `recording.toml` has the same keys beside its own.
+Numbers are written with all their digits: reading gives the same bits, and of `rvec` the same matrix within 1e-15. A
+camera whose place is not known has no `rvec`, `R` and `tvec`. `recording.toml` has the same keys beside its own.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ from psotrack.support import atomic_write, nearest, read_toml, toml_key, toml_va
 #: Newest version of the layout.
 VERSION = 1
 #: Keys of a camera's lens and place.
-KEYS = ("size", "K", "model", "distortion", "rvec", "tvec")
+KEYS = ("size", "K", "model", "distortion", "rvec", "R", "tvec")
 #: Keys that a camera has in addition in a recording.toml.
 RECORDING_KEYS = (
-    "video", "images", "ignore", "detections", "fps", "time_offset_s", "timestamps", "line_time_s",
+    "video", "images", "silhouettes", "ignore", "detections", "frames", "fps", "time_offset_s", "timestamps",
+    "line_time_s",
 )  # fmt: skip
 _MODELS = ("opencv", "fisheye")
 
@@ -67,11 +68,14 @@ def camera_of_table(
         raise fields.error("model", " or ".join(_MODELS), str(model))
     if table.get("distortion") is not None and not isinstance(table["distortion"], list):
         raise fields.error("distortion", "a list of numbers", str(table["distortion"]))
-    if table.get("K") is None and any(key in table for key in ("distortion", "rvec", "tvec")):
+    if table.get("K") is None and any(key in table for key in ("distortion", "rvec", "R", "tvec")):
         raise fields.error("K", "3 x 3 numbers", "none")
-    pose = [key for key in ("rvec", "tvec") if key in table]
-    if len(pose) == 1:
-        raise fields.error("tvec" if pose == ["rvec"] else "rvec", f"3 numbers, as for {pose[0]}", "none")
+    if "rvec" in table and "R" in table:
+        raise fields.error("R", "rvec or R", "both")
+    turn = [key for key in ("rvec", "R") if key in table]
+    if bool(turn) != ("tvec" in table):
+        missing, other = ("tvec", turn[0]) if turn else ("rvec", "tvec")
+        raise fields.error(missing, f"3 numbers, as for {other}", "none")
     return entry_from_fields(fields, image_size_wh)
 
 
@@ -81,7 +85,7 @@ def recognises(data: Mapping[str, Any]) -> bool:
     tables = (
         [table for table in cameras.values() if isinstance(table, dict)] if isinstance(cameras, dict) else []
     )
-    own = {"K", "model", "distortion", "rvec", "tvec"}
+    own = {"K", "model", "distortion", "rvec", "R", "tvec"}
     return any(own & table.keys() for table in tables) or (bool(tables) and "version" in data)
 
 

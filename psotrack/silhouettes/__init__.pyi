@@ -7,6 +7,7 @@ from .computation import (
     exposures_of,
     scaled_settings,
     silhouette_keys,
+    stored_silhouettes,
     tasks_of,
     usual_drone_px,
 )
@@ -15,7 +16,7 @@ from .foreground import BackgroundModel, Mog2, coverage, reduce_frame
 from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
-from .store import Task, frames_to_decode, ignored_pixels, key_of, open_stored, reduced_shape
+from .store import Task, frames_to_decode, ignored_pixels, key_of, made_of, open_stored, reduced_shape
 from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
@@ -47,6 +48,7 @@ __all__ = [
     "frames_to_decode",
     "ignored_pixels",
     "key_of",
+    "made_of",
     "masks_out",
     "moved_by",
     "open_stored",
@@ -57,6 +59,7 @@ __all__ = [
     "scaled_settings",
     "silhouette_keys",
     "stack_blobs",
+    "stored_silhouettes",
     "summed_area_table",
     "tasks_of",
     "usual_drone_px",

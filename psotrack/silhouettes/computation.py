@@ -8,34 +8,39 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import zarr
 from jaxtyping import Int, UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import Rig, looking_depths_m
-from psotrack.recordings import Recording, Timeline, TruncatedVideoError
+from psotrack.recordings import Recording, StoredSilhouettes, Timeline, TruncatedVideoError
 from psotrack.silhouettes.background_models import find_background
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.foreground import BackgroundModel
-from psotrack.silhouettes.settings import ScaledSettings, SilhouetteSettings, check_whole
+from psotrack.silhouettes.settings import MOG2, ScaledSettings, SilhouetteSettings, check_whole
 from psotrack.silhouettes.store import (
     Task,
     frames_to_decode,
-    key_of,
     left_out,
+    made_of,
     open_stored,
     reduced_shape,
     remove_stale,
     store,
 )
 from psotrack.silhouettes.usable_frames import Interval, in_words
-from psotrack.support import Report, map_in_processes, no_progress, short_repr
+from psotrack.support import Report, identify, map_in_processes, no_progress, short_repr
 
 __all__ = ["SilhouetteSettings", "Silhouettes", "compute"]
 
 logger = logging.getLogger(__name__)
+
+#: Settings that follow from the size of the images where they are left open.
+_OPEN = ("reduction", "working_reduction", "min_blob_px")
 
 #: Width of a usual drone, metres: most are wider; smaller ones have fewer pixels in the reduced images.
 _USUAL_DRONE_M = 0.3
@@ -47,14 +52,14 @@ class Silhouettes:
 
     Attributes:
         cameras: names of the cameras, in the order of the rig.
-        keys: key of each camera's silhouettes in the store, by camera name; a camera without video has none.
+        keys: key of each camera's silhouettes, by camera name; a camera without silhouettes has none.
         reduction: r; cell (i, j) covers the pixels [r * i, r * i + r) x [r * j, r * j + r). Pixels beyond the image's
             border count as background.
         num_frames: number of frames of the longest camera.
         shape: height and width of the largest silhouette, cells.
         seconds: time spent on "decode" and "foreground", summed over workers; 0 for silhouettes from the store.
         arrays: one array (frames, height, width) per camera, stored or in memory; cameras may differ in frames, height
-            and width. A camera without video has no frames.
+            and width. A camera without silhouettes has no frames.
         exposures: when the frames were exposed; None where frame i of every camera is instant i.
         left_out: frames of a camera's video in which foreground is everywhere, as intervals (first frame, frame after
             the last), by camera name; these frames show no foreground in `arrays`, and `at_instants` says that the
@@ -164,6 +169,74 @@ def _within(intervals: list[Interval], start: int, stop: int) -> list[Interval]:
     return [(first, last) for first, last in cut if first < last]
 
 
+def _brought(recording: Recording, tasks: Mapping[str, Task]) -> dict[str, StoredSilhouettes]:
+    """The stored silhouettes that a recording brings and that can be used, by camera name."""
+    return {
+        name: stored
+        for name, stored in recording.silhouettes.items()
+        if name not in tasks or stored.key == tasks[name].key
+    }
+
+
+def _check_made_with(
+    name: str, stored: StoredSilhouettes, scaled: ScaledSettings, model: BackgroundModel | None
+) -> None:
+    """Raise `SettingsError` for silhouettes without a video that were made with other settings."""
+    made_with = _made_with(stored)
+    for setting in ScaledSettings.__struct_fields__:
+        asked, made = getattr(scaled, setting), getattr(made_with, setting)
+        if asked != made:
+            raise _made_otherwise(setting, name, made, asked)
+    asked, made = None if model is None else identify(model), stored.made_of.get("background")
+    if asked != made:
+        raise _made_otherwise("background", name, *(_model_in_words(each) for each in (made, asked)))
+
+
+def _made_otherwise(setting: str, name: str, made: object, asked: object) -> SettingsError:
+    return SettingsError(
+        f"silhouettes.{setting}",
+        expected=f"{made}, with which the stored silhouettes of camera {name} were made",
+        found=f"{asked}",
+        remedy="other silhouettes need the camera's video",
+    )
+
+
+def _model_in_words(identity: Mapping[str, Any] | None) -> str:
+    """Name of a background model, from its identity."""
+    if identity is None:
+        return MOG2
+    key = f" {identity['key']}" if identity.get("key") else ""
+    return f"{identity['class'].rpartition('.')[2]}{key}"
+
+
+def _made_with(stored: StoredSilhouettes) -> ScaledSettings:
+    """The settings with which stored silhouettes were made.
+
+    Raises:
+        InputError: this version does not know these settings.
+    """
+    try:
+        return msgspec.convert(stored.made_of["settings"], ScaledSettings)
+    except msgspec.ValidationError as error:
+        expected = "silhouettes that were made with settings of this version"
+        raise InputError(stored.path, expected=expected, found=f"{error}") from error
+
+
+def _open_brought(stored: StoredSilhouettes, rig: Rig, name: str) -> zarr.Array:
+    """Open the silhouettes that a recording brings."""
+    width, height = _size_wh(rig, name)
+    reduction, num_frames = _made_with(stored).reduction, stored.made_of["num_frames"]
+    shape = (-(-height // reduction), -(-width // reduction))
+    array = open_stored(stored.path, num_frames, shape)
+    if array is None:
+        raise InputError(
+            stored.path,
+            expected=f"silhouettes of camera {name}: {num_frames} frames of {shape[1]} x {shape[0]} values",
+            found="none, damaged ones, or those of another camera",
+        )
+    return array
+
+
 def exposures_of(timeline: Timeline) -> Exposures:
     """When the frames that a timeline's instants show were exposed, in float32."""
     of_cameras = np.zeros(len(timeline.cameras)) if timeline.line_time_s is None else timeline.line_time_s
@@ -211,56 +284,64 @@ def compute(
 ) -> Silhouettes:
     """Silhouettes of a sequence, read from the store; missing silhouettes are computed and stored.
 
+    Stored silhouettes that the recording brings are used where a camera has no video, or where they are made of the
+    same video in the same way.
+
     Each camera's silhouettes are stored when they are finished, under a key made of the video's content, the number of
     frames and all settings. After an interruption, the next call computes only the missing cameras.
 
     Args:
-        recording: a recording with a video for each camera.
-        settings: settings of the silhouettes.
+        recording: a recording with a video or stored silhouettes for each camera.
+        settings: settings of the silhouettes; a value that is left open (None) is that of the silhouettes which the
+            recording brings instead of videos.
         cache: folder of the store; made if it does not exist.
         jobs: largest number of processes; None is one per processor.
         background: a background model of the caller's instead of the one that the settings name.
-        all_videos: whether each camera needs a video; if not, a camera without video has no silhouettes, and
-            `Silhouettes.at_instants` says that it sees nothing.
+        all_videos: whether each camera needs a video or stored silhouettes; if not, a camera without both has no
+            silhouettes, and `Silhouettes.at_instants` says that it sees nothing.
         report: progress bar for the frames of all cameras, including the frames from which the background is learned.
 
     Raises:
         InputError: a video is missing, unreadable, ends early, or has another size than its camera.
-        SettingsError: `jobs` is below 1, there is no background model of the settings' name, or the background model
-            yields masks of a wrong number, type or shape.
+        SettingsError: `jobs` is below 1, there is no background model of the settings' name, the background model
+            yields masks of a wrong number, type or shape, or silhouettes without a video were made with other settings.
         OutputError: the store cannot be written; the cameras that were finished stay in the store.
     """
     cache = Path(cache)
     jobs = jobs if jobs is not None else os.cpu_count() or 1
     check_whole("jobs", jobs, lowest=1)
-    recording = recording.usable(recording.rig.names, videos=all_videos)
-    cameras = tuple(name for name in recording.rig.names if name in recording.videos)
-    if not cameras:
+    recording = recording.usable(recording.rig.names, videos=all_videos, silhouettes=True)
+    if not recording.videos and not recording.silhouettes:
         raise InputError(recording.folder, expected="at least one video", found="none")
-    tasks = tasks_of(recording, settings, cache, background)
-    scaled = tasks[cameras[0]].settings
+    scaled = scaled_settings(settings, recording)
+    model = find_background(settings.background, scaled) if background is None else background
+    tasks = _tasks(recording, scaled, cache, model)
+    brought = _brought(recording, tasks)
+    for name, stored in brought.items():
+        if name not in tasks:
+            _check_made_with(name, stored, scaled, model)
     try:
-        seconds = _make_missing(list(tasks.values()), jobs, report)
+        seconds = _make_missing([task for name, task in tasks.items() if name not in brought], jobs, report)
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
-    heights, widths = zip(
-        *(reduced_shape(task.video, scaled.reduction) for task in tasks.values()), strict=True
-    )
-    shape = (max(heights), max(widths))
-    stored = {name: _open(task) for name, task in tasks.items()}
+    opened = {name: _open(task) for name, task in tasks.items() if name not in brought}
+    opened |= {name: _open_brought(each, recording.rig, name) for name, each in brought.items()}
+    whole = {name: opened[name] for name in recording.rig.names if name in opened}
+    shape = (max(array.shape[1] for array in whole.values()), max(array.shape[2] for array in whole.values()))
     # Without the future, whoever reads a frame decides about this frame.
     unusable = {
         name: intervals
-        for name, array in stored.items()
-        if (intervals := left_out(array)) and scaled.first_look
+        for name, array in whole.items()
+        if scaled.first_look
+        and (intervals := _within(left_out(array), 0, recording.frame_times[name].num_frames))
     }
-    arrays = {name: _without(array, unusable.get(name, [])) for name, array in stored.items()}
+    arrays = {name: _without(array, unusable.get(name, [])) for name, array in whole.items()}
     for name, intervals in unusable.items():
-        _say_left_out(name, tasks[name], intervals)
+        _say_left_out(recording, name, intervals)
     nothing = np.zeros((0, *shape), np.uint8)
     return Silhouettes(
         cameras=recording.rig.names,
-        keys={name: task.key for name, task in tasks.items()},
+        keys={name: brought[name].key if name in brought else tasks[name].key for name in whole},
         reduction=scaled.reduction,
         num_frames=recording.num_frames,
         shape=shape,
@@ -280,16 +361,17 @@ def _without(array: zarr.Array, intervals: list[Interval]) -> zarr.Array | Frame
     return FramesOfInstants(array, frame)
 
 
-def _say_left_out(name: str, task: Task, intervals: list[Interval]) -> None:
+def _say_left_out(recording: Recording, name: str, intervals: list[Interval]) -> None:
     """Warn that frames of a camera are left out."""
     count = sum(stop - start for start, stop in intervals)
-    second = max(1, round(task.video.fps))
+    times = recording.frame_times[name]
+    second = max(1, round(times.fps))
     logger.warning(
         "camera %s: %d of %d frames are left out, because foreground is everywhere in the image: frames %s; "
         "a camera that moved, or light that the background model does not follow?",
         name,
         count,
-        task.video.num_frames,
+        times.num_frames,
         in_words(intervals, gap_frames=second),
     )
 
@@ -309,24 +391,59 @@ def tasks_of(
         InputError: a video cannot be read.
         SettingsError: there is no background model of the settings' name.
     """
-    videos = {name: recording.videos[name] for name in recording.rig.names if name in recording.videos}
-    if not videos:
+    if not recording.videos:
         return {}
     scaled = scaled_settings(settings, recording)
     model = find_background(settings.background, scaled) if background is None else background
+    return _tasks(recording, scaled, cache, model)
+
+
+def _tasks(
+    recording: Recording, scaled: ScaledSettings, cache: Path, model: BackgroundModel | None
+) -> dict[str, Task]:
+    videos = {name: recording.videos[name] for name in recording.rig.names if name in recording.videos}
     ignored = {name: recording.ignore.get(name) for name in videos}
     with ThreadPoolExecutor() as threads:
-        keys = threads.map(lambda name: key_of(videos[name], scaled, model, ignored[name]), videos)
+        parts = threads.map(lambda name: made_of(videos[name], scaled, model, ignored[name]), videos)
     return {
-        name: Task(video, scaled, cache, key, model, ignored[name])
-        for (name, video), key in zip(videos.items(), keys, strict=True)
+        name: Task(video, scaled, cache, of_video, model, ignored[name])
+        for (name, video), of_video in zip(videos.items(), parts, strict=True)
     }
 
 
 def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> ScaledSettings:
-    """The settings of silhouettes for the images and the rig of a recording with videos."""
+    """The settings of silhouettes for the images and the rig of a recording with videos or stored silhouettes.
+
+    Where the settings leave a value open, cameras that have stored silhouettes and no video decide.
+
+    Raises:
+        SettingsError: a value differs from the one with which these silhouettes were made.
+    """
     sizes_wh = [video.image_size_wh for video in recording.videos.values()]
+    alone = [name for name in recording.rig.names if name in recording.silhouettes.keys() - recording.videos]
+    if alone:
+        sizes_wh += [_size_wh(recording.rig, name) for name in alone]
+        settings = _with_open_values(settings, alone[0], recording.silhouettes[alone[0]])
     return settings.scaled(sizes_wh, usual_drone_px(recording.rig))
+
+
+def _with_open_values(
+    settings: SilhouetteSettings, name: str, stored: StoredSilhouettes
+) -> SilhouetteSettings:
+    """The settings with the values of stored silhouettes, where they are left open."""
+    if settings.drone_px is not None:
+        return settings
+    made_with = _made_with(stored)
+    given = {setting: getattr(settings, setting) for setting in _OPEN}
+    for setting, value in given.items():
+        if value is not None and value != getattr(made_with, setting):
+            raise _made_otherwise(setting, name, getattr(made_with, setting), value)
+    return msgspec.structs.replace(settings, **{setting: getattr(made_with, setting) for setting in _OPEN})
+
+
+def _size_wh(rig: Rig, name: str) -> tuple[int, int]:
+    width, height = rig.cameras.image_size_wh[rig.names.index(name)].astype(int).tolist()
+    return width, height
 
 
 def usual_drone_px(rig: Rig) -> float | None:
@@ -340,20 +457,35 @@ def usual_drone_px(rig: Rig) -> float | None:
     return float((_USUAL_DRONE_M * rig.cameras.K[:, 0, 0] / depth_m).min())
 
 
-def silhouette_keys(recording: Recording, settings: SilhouetteSettings) -> dict[str, str]:
-    """Key of the silhouettes of each camera that has a video, by name; nothing is computed.
+def stored_silhouettes(
+    recording: Recording, settings: SilhouetteSettings, cache: Path
+) -> dict[str, StoredSilhouettes]:
+    """Place and key of the silhouettes of each camera that `compute` reads, by name; nothing is computed.
+
+    Args:
+        recording, settings, cache: as for `compute`.
 
     Raises:
         InputError: a video cannot be read.
         SettingsError: there is no background model of the settings' name.
     """
-    return {name: task.key for name, task in tasks_of(recording, settings, Path()).items()}
+    tasks = tasks_of(recording, settings, cache)
+    places = {
+        name: StoredSilhouettes(cache / task.key, task.video.num_frames, task.made_of)
+        for name, task in tasks.items()
+    } | _brought(recording, tasks)
+    return {name: places[name] for name in recording.rig.names if name in places}
+
+
+def silhouette_keys(recording: Recording, settings: SilhouetteSettings) -> dict[str, str]:
+    """Key of the silhouettes of each camera that has a video or stored silhouettes, by name (`stored_silhouettes`)."""
+    return {name: each.key for name, each in stored_silhouettes(recording, settings, Path()).items()}
 
 
 def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> TruncatedVideoError:
     """The same error with the number of instants before the missing frame: `--frames` counts instants."""
     timeline = recording.timeline()
-    frame = timeline.frame[:, [recording.videos[name] == error.video for name in timeline.cameras]]
+    frame = timeline.frame[:, [recording.videos.get(name) == error.video for name in timeline.cameras]]
     missing = (frame >= error.num_readable).any(axis=-1)
     num_instants = int(missing.argmax()) if missing.any() else timeline.num_instants
     return TruncatedVideoError(error.video, error.num_readable, num_instants)

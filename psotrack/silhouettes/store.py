@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from jaxtyping import Bool, UInt8
 from zarr.codecs import ZstdCodec
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import VideoInfo, digest_video, read_frames, read_mask
+from psotrack.recordings import MADE_OF, VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.first_look import look_first
 from psotrack.silhouettes.foreground import (
     BackgroundModel,
@@ -67,7 +67,7 @@ class Task:
         video: the video.
         settings: settings of the silhouettes.
         cache: folder of the store.
-        key: name of the silhouettes' folder.
+        made_of: what the silhouettes are made of (see `made_of`); its digest is their key.
         background: background model; None is MOG2.
         ignore: image of the video's size, white where nothing counts as foreground; None for no such image.
     """
@@ -75,9 +75,39 @@ class Task:
     video: VideoInfo
     settings: ScaledSettings
     cache: Path
-    key: str
+    made_of: Mapping[str, Any]
     background: BackgroundModel | None = None
     ignore: Path | None = None
+
+    @property
+    def key(self) -> str:
+        """Name of the silhouettes' folder."""
+        return digest_record(self.made_of)
+
+
+def made_of(
+    video: VideoInfo,
+    settings: ScaledSettings,
+    background: BackgroundModel | None = None,
+    ignore: Path | None = None,
+) -> dict[str, Any]:
+    """Everything that silhouettes depend on: digest of the video, frames, settings, background model, ignored part.
+
+    Raises:
+        InputError: the video cannot be read.
+        SettingsError: the key of the background model is no plain data.
+    """
+    parts: dict[str, Any] = {
+        "schema": SCHEMA,
+        "content": digest_video(video),
+        "num_frames": video.num_frames,
+        "settings": msgspec.to_builtins(settings),
+    }
+    if background is not None:
+        parts["background"] = identify(background)
+    if ignore is not None:
+        parts["ignore"] = digest_file(ignore, expected="a readable image")
+    return parts
 
 
 def key_of(
@@ -86,23 +116,8 @@ def key_of(
     background: BackgroundModel | None = None,
     ignore: Path | None = None,
 ) -> str:
-    """Digest of a video's content, number of frames, settings, background model and ignored part, in 40 digits.
-
-    Raises:
-        InputError: the video cannot be read.
-        SettingsError: the key of the background model is no plain data.
-    """
-    made_of: dict[str, Any] = {
-        "schema": SCHEMA,
-        "content": digest_video(video),
-        "num_frames": video.num_frames,
-        "settings": msgspec.to_builtins(settings),
-    }
-    if background is not None:
-        made_of["background"] = identify(background)
-    if ignore is not None:
-        made_of["ignore"] = digest_file(ignore, expected="a readable image")
-    return digest_record(made_of)
+    """Digest of what silhouettes are made of, in 40 digits; arguments and errors as of `made_of`."""
+    return digest_record(made_of(video, settings, background, ignore))
 
 
 def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:
@@ -188,7 +203,7 @@ def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -
         chunks=(CHUNK_FRAMES, *shape),
         dtype=np.uint8,
         compressors=ZstdCodec(level=3, checksum=True),
-        attributes={"video": video.path.name, "schema": SCHEMA, "settings": msgspec.to_builtins(settings)},
+        attributes={"video": video.path.name, MADE_OF: dict(task.made_of)},
         # Chunks of zeros are written too, so that a missing chunk is always a damage.
         config={"write_empty_chunks": True},
         overwrite=True,

@@ -2,7 +2,15 @@ from .compiled import drop_programs_if_many, keep_compiled
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, drone_colour, save_figure
-from .files import atomic_write, digest_file, digest_record, read_text, refuse_to_overwrite, user_cache
+from .files import (
+    ARCHIVE_SUFFIX,
+    atomic_write,
+    digest_file,
+    digest_record,
+    read_text,
+    refuse_to_overwrite,
+    user_cache,
+)
 from .html import html_block, html_lines, html_paths, html_table
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
@@ -13,6 +21,7 @@ from .standard_errors import standard_error
 from .stored_programs import load_ahead, stored_jit
 
 __all__ = [
+    "ARCHIVE_SUFFIX",
     "COLOURS",
     "Advance",
     "Column",

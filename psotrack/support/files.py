@@ -20,6 +20,9 @@ import platformdirs
 
 from psotrack.errors import InputError, OutputError
 
+#: Ending of the names of archives (`psotrack.archives`).
+ARCHIVE_SUFFIX = ".psotrack"
+
 #: Hash functions of `digest_file`: BLAKE2b with 512 and with 160 bits, and SHA-256.
 Algorithm = Literal["blake2b", "blake2b-160", "sha256"]
 

@@ -215,7 +215,7 @@ def _make_silhouettes(camera: str, cell: Cell, job: _Job) -> None:
     """A task: store the silhouettes of one camera."""
     # The cells that need the silhouettes report the error.
     with contextlib.suppress(PsotrackError):
-        recording = _inputs(job).recording_of(cell).usable([camera])
+        recording = _inputs(job).recording_of(cell).usable([camera], silhouettes=True)
         compute(recording, cell.settings.silhouettes, cache=job.cache, jobs=1)
 
 

@@ -1,0 +1,92 @@
+"""Stored silhouettes of a camera, which a recording may have instead of a video.
+
+The room `silhouettes` makes and reads the arrays. Here only their description is read: a recording needs to know how
+many frames there are, and from what the silhouettes were made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from psotrack.errors import InputError
+from psotrack.support import digest_record
+
+#: Name of the description in the folder of a zarr array.
+ARRAY_FILE = "zarr.json"
+#: Attribute of the array: everything that the silhouettes depend on.
+MADE_OF = "made_of"
+
+
+@dataclass(frozen=True)
+class StoredSilhouettes:
+    """Silhouettes of one camera in a folder.
+
+    Attributes:
+        path: folder of the zarr array.
+        num_frames: number of frames to use, at most the number of frames that are stored.
+        made_of: what the silhouettes were made of: "schema", "content" (digest of the video), "num_frames" and
+            "settings"; "background" and "ignore" where the silhouettes depend on them.
+    """
+
+    path: Path
+    num_frames: int
+    made_of: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """Digest of what the silhouettes were made of, in 40 digits; of the first frames only, another digest."""
+        if self.num_frames == self.made_of["num_frames"]:
+            return digest_record(self.made_of)
+        return digest_record({**self.made_of, "first_frames": self.num_frames})
+
+
+class _MadeOf(msgspec.Struct, frozen=True):
+    schema: int
+    content: str
+    num_frames: int
+    settings: dict[str, Any]
+
+
+class _Attributes(msgspec.Struct, frozen=True):
+    made_of: _MadeOf
+
+
+class _Array(msgspec.Struct, frozen=True):
+    shape: tuple[int, int, int]
+    attributes: _Attributes
+
+
+def probe_silhouettes(path: Path | str) -> StoredSilhouettes:
+    """Read the description of stored silhouettes; their frames are not read.
+
+    Args:
+        path: folder of the silhouettes of one camera, as the store of silhouettes and archives have it.
+
+    Raises:
+        InputError: the folder holds no silhouettes, or they do not say what they were made of.
+    """
+    path = Path(path)
+    try:
+        text = (path / ARRAY_FILE).read_bytes()
+        described, array = msgspec.json.decode(text), msgspec.json.decode(text, type=_Array)
+    except OSError as error:
+        found = f"no {ARRAY_FILE}: {(error.strerror or str(error)).lower()}"
+        raise InputError(path, expected="a folder with stored silhouettes", found=found) from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise InputError(
+            path / ARRAY_FILE,
+            expected="the description of silhouettes that say what they were made of",
+            found=f"{error}",
+            remedy="silhouettes of an archive, and those that this version stores, say it",
+        ) from error
+    made_of = described["attributes"][MADE_OF]
+    if array.shape[0] != made_of["num_frames"]:
+        raise InputError(
+            path / ARRAY_FILE, expected=f"{made_of['num_frames']} frames", found=f"{array.shape[0]}"
+        )
+    return StoredSilhouettes(path, array.shape[0], made_of)
