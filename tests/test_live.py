@@ -334,7 +334,7 @@ def test_a_camera_of_another_size_is_left_out_and_none_ends_the_command(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--replay"], "--out: expected --out FILE, --lines, --udp or --websocket"),
+        (["--replay"], "--out: expected --out FILE, --lines, --udp, --websocket or --view"),
         (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
         (["--replay", "--out", "tracks.txt"], "ends in .csv or .parquet"),
         (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
