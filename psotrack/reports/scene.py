@@ -143,7 +143,7 @@ class Scene3D:
         }
 
     def _bounds_m(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Lowest and highest coordinates of all that is shown; drones are shown with the floor, z = 0, if it is near."""
+        """Lowest and highest coordinates of all that is shown; with drones also the floor, z = 0, if it is near."""
         parts = [each.trajectories.position_m[each.trajectories.seen] for each in self.drones]
         parts += [cloud.position_m.reshape(-1, 3) for cloud in self.clouds]
         if self.truth is not None:
