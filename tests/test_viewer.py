@@ -285,13 +285,39 @@ def test_a_window_that_cannot_open_is_one_line(run, folder, monkeypatch):
     assert "--save" in err
 
 
-def test_without_rerun_a_line_says_how_to_install_it(run, folder, tmp_path, monkeypatch):
-    found = sys.modules["importlib.util"].find_spec
-    monkeypatch.setattr(
-        "importlib.util.find_spec", lambda name, *more: None if name == "rerun" else found(name, *more)
+def in_a_process(code, folder, *arguments):
+    """Run `psotrack view` in a new interpreter after some code."""
+    whole = f"{code}\nfrom psotrack.__main__ import main\nmain()"
+    return subprocess.run(
+        [sys.executable, "-c", whole, "view", *map(str, arguments)],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])},
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    result = run(folder / "tracks.csv", "--save", tmp_path / "x.rrd")
-    assert_one_line(result, "pip install 'psotrack[view]'")
+
+
+HIDDEN = """
+import sys
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("rerun", "rerun_cli", "rerun_bindings"):
+            raise ModuleNotFoundError(f"No module named {name!r}")
+sys.meta_path.insert(0, Hidden())
+"""
+LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))"
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [(HIDDEN, ["pip install 'psotrack[view]'"]), (LIMITED, ["x.rrd", "the whole file", "disk"])],
+    ids=["without Rerun", "on a full disk"],
+)
+def test_what_the_machine_lacks_is_one_line(folder, tmp_path, code, words):
+    result = in_a_process(code, folder, "tracks.csv", "--save", tmp_path / "x.rrd")
+    assert_one_line((result.returncode, result.stdout, result.stderr), *words)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

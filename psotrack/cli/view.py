@@ -23,7 +23,7 @@ from psotrack.cli.options import (
 )
 from psotrack.cli.output import report_to
 from psotrack.errors import SettingsError
-from psotrack.support import atomic_write, refuse_to_overwrite
+from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.flights import TrackedFlight
@@ -96,13 +96,11 @@ def view(
     """
     from psotrack.flights import first_instants, read_flight
     from psotrack.viewer import (
-        ViewContent,
         check_display,
         check_installed,
         find_silhouettes,
         show_in_browser,
         show_window,
-        write_flight,
     )
 
     if save is not None and web:
@@ -110,6 +108,9 @@ def view(
     if save is not None and save.suffix != ".rrd":
         raise SettingsError("--save", expected="a file that ends in .rrd", found=save.name)
     check_installed()
+    # These names need Rerun.
+    from psotrack.viewer import ViewContent, write_flight
+
     if save is not None:
         refuse_to_overwrite(save, force)
     elif not web:
@@ -133,8 +134,7 @@ def view(
             click.echo(_sentence(name, flight, content.silhouettes is not None, written))
 
     if save is not None:
-        with atomic_write(save) as temporary:
-            write(temporary, str(save))
+        write(save, str(save))
         return
     with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
         path = Path(folder) / "flight.rrd"

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import rerun as rr
 
+from psotrack.errors import OutputError
 from psotrack.flights import TrackedFlight
 from psotrack.recordings import VideoInfo
 from psotrack.silhouettes import Silhouettes
-from psotrack.support import Report, map_in_processes, no_progress
+from psotrack.support import Report, atomic_write, map_in_processes, no_progress
 from psotrack.viewer.camera_images import (
     CameraKey,
     EncodingTask,
@@ -31,6 +32,8 @@ from psotrack.viewer.space import log_drones, log_world
 _BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
 #: Share of the rest of the size that images take, and bytes of the list of contents at the end of the file.
 _IMAGES_SHARE, _CONTENTS_BYTES = 0.96, 250e3
+#: End of a complete file.
+_END = b"RRF2FOOT\x01\x00\x00\x00"
 #: Name of the program in Rerun; arrangements that a user changes are kept under it.
 APPLICATION = "psotrack"
 
@@ -73,7 +76,7 @@ def write_flight(
     jobs: int | None = None,
     report: Report = no_progress,
 ) -> WrittenFlight:
-    """Write a flight as a file of Rerun.
+    """Write a flight as a file of Rerun, which appears under its name when it is complete.
 
     Images are made as small, and as many frames are left out, as `max_bytes` demands.
 
@@ -86,7 +89,24 @@ def write_flight(
 
     Raises:
         InputError: a video cannot be read.
+        OutputError: the file cannot be written completely.
     """
+    with atomic_write(path) as temporary:
+        try:
+            plan = _write(temporary, flight, content, jobs or os.cpu_count() or 1, report)
+            _check_end(temporary)
+        except _FileError as error:
+            expected, found = "to write the whole file", "that Rerun could not"
+            raise OutputError(path, expected=expected, found=found, remedy="is the disk full?") from error
+        num_bytes = temporary.stat().st_size
+    return WrittenFlight(num_bytes, plan)
+
+
+class _FileError(Exception):
+    """Rerun could not write the file."""
+
+
+def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, report: Report) -> ImagePlan:
     stream = rr.RecordingStream(APPLICATION, recording_id=flight.name, send_properties=False)
     stream.save(path)
     try:
@@ -97,24 +117,37 @@ def write_flight(
         log_world(log, flight)
         log_drones(log, flight)
         log_plots(log, flight)
-        stream.flush()
+        _flush(stream)
         most = _max_bytes(flight, content)
         plan = plan_images(videos, _left_bytes(path, most))
         log_marks(log, flight, plan.step)
-        stream.flush()
+        _flush(stream)
         with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
             tasks = _tasks(content, videos, plan, Path(folder), _left_bytes(path, most))
-            processes = jobs or os.cpu_count() or 1
             with report("images", plan.num_images) as advance:
-                encoded = map_in_processes(
-                    encode_images, list(tasks.values()), jobs=processes, advance=advance
-                )
+                encoded = map_in_processes(encode_images, list(tasks.values()), jobs=jobs, advance=advance)
             for camera, images in zip(tasks, encoded, strict=True):
                 task = tasks[camera]
                 log_images(log, flight, camera, images, (task.reduction, task.cell_px))
     finally:
         stream.disconnect()
-    return WrittenFlight(path.stat().st_size, plan)
+    return plan
+
+
+def _check_end(path: Path) -> None:
+    """Raise `_FileError` for a file without its end."""
+    with path.open("rb") as file:
+        file.seek(-min(len(_END), path.stat().st_size), os.SEEK_END)
+        if file.read() != _END:
+            raise _FileError
+
+
+def _flush(stream: rr.RecordingStream) -> None:
+    """Wait until the file has everything that was logged."""
+    try:
+        stream.flush()
+    except RuntimeError as error:
+        raise _FileError from error
 
 
 def _left_bytes(path: Path, max_bytes: float) -> float:

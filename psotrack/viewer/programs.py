@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
+import importlib
 import os
 import signal
 import socket
@@ -50,14 +50,21 @@ class ViewerProgram:
 
 
 def check_installed() -> None:
-    """Raise `SettingsError` where Rerun is not installed."""
-    if importlib.util.find_spec("rerun") is None or importlib.util.find_spec("rerun_cli") is None:
+    """Raise `SettingsError` where Rerun is not installed; call before anything else of this room.
+
+    Rerun writes no lines of its own about errors from then on, unless the user has set the level of its log.
+    """
+    os.environ.setdefault("RUST_LOG", "off")
+    try:
+        for name in ("rerun", "rerun_cli"):
+            importlib.import_module(name)
+    except ModuleNotFoundError as error:
         raise SettingsError(
             "the viewer",
             expected="the package rerun-sdk",
             found="that it is not installed",
             remedy="pip install 'psotrack[view]'",
-        )
+        ) from error
 
 
 def check_display() -> None:
