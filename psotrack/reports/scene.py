@@ -143,7 +143,7 @@ class Scene3D:
         }
 
     def _bounds_m(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Lowest and highest coordinates of all that is shown; the floor z = 0 is shown where it is near."""
+        """Lowest and highest coordinates of all that is shown; with drones also the floor, z = 0, if it is near."""
         parts = [each.trajectories.position_m[each.trajectories.seen] for each in self.drones]
         parts += [cloud.position_m.reshape(-1, 3) for cloud in self.clouds]
         if self.truth is not None:
@@ -158,7 +158,7 @@ class Scene3D:
         extent_m = max(float((high_m - low_m).max()), 0.1)
         middle_m = (low_m + high_m) / 2
         low_m, high_m = np.minimum(low_m, middle_m - 0.05), np.maximum(high_m, middle_m + 0.05)
-        if 0 < low_m[2] < extent_m:
+        if (self.drones or self.rig is not None) and 0 < low_m[2] < extent_m:
             low_m[2] = 0.0
         return low_m, high_m
 
