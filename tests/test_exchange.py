@@ -235,7 +235,9 @@ def test_unknown_orientations_stay_unknown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("to", "name"), [*OUTPUTS.items(), ("mot", "mot"), ("mcap", "bag")], ids=lambda value: str(value)
+    ("to", "name"),
+    [*OUTPUTS.items(), pytest.param("mot", "mot", marks=pytest.mark.slow), ("mcap", "bag")],
+    ids=lambda value: str(value),
 )
 def test_evaluate_takes_back_what_export_wrote(
     run: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str

@@ -141,6 +141,7 @@ def test_the_mosaic_has_all_cameras_and_a_map(run, folder, tmp_path):
     assert seen[LOST_FROM - 1, 1][1] < seen[0, 1][1], "drones fly towards larger y"
 
 
+@pytest.mark.slow
 def test_finished_videos_are_kept_and_others_are_made(run, folder, tmp_path):
     command = (folder / "tracks.csv", folder / "flight", "--out", tmp_path, "--scale", 0.5)
     assert run(*command, "--cameras", "c1")[0] == 0

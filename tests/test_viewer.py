@@ -309,6 +309,7 @@ sys.meta_path.insert(0, Hidden())
 LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "words"),
     [(HIDDEN, ["pip install 'psotrack[view]'"]), (LIMITED, ["x.rrd", "the whole file", "disk"])],
