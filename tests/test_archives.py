@@ -596,7 +596,7 @@ USUAL = ["--particles", "15", "--iterations", "10", "--quiet"]
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small sequence with videos, detections and a reference."""
     root = tmp_path_factory.mktemp("data")
-    run("simulate", "S02_D4_A", "--out", root, "--scale", "0.35", "--frames", "25", "--no-onboard", "--quiet")
+    run("simulate", "S02_D4_A", "--out", root, "--scale", "0.35", "--frames", "45", "--no-onboard", "--quiet")
     return root / "Simulated_Data" / "S02_D4_A"
 
 

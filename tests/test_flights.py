@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from psotrack.errors import InputError, SettingsError
+from psotrack.exchange import export_tracks
 from psotrack.flights import (
     EventKind,
     boxes_in_images,
@@ -278,3 +279,9 @@ class TestReading:
             InputError, match=r"expected times from 0.00 to 1.90 s, as in lab, found 0.00 to 2.90 s"
         ):
             read_flight([path], "lab")
+
+    def test_exported_tracks_beside_a_file_are_no_record(self, tmp_path):
+        path = write_flight(tmp_path, straight_tracks())
+        export_tracks(straight_tracks(), "json", path.with_suffix(".json"))
+        (tracks,) = read_flight([path]).tracks
+        assert tracks.record is None

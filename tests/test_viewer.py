@@ -339,10 +339,10 @@ def test_the_page_for_a_browser(folder):
             page = line.split()[0]
             break
     assert page.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(page, timeout=20) as answer:
+    with urllib.request.urlopen(page, timeout=60) as answer:
         assert b"<html" in answer.read().lower()
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
     port = int(re.findall(r":(\d+)", page)[0])
     time.sleep(0.1)

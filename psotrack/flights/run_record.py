@@ -69,8 +69,8 @@ class RunRecord(msgspec.Struct, frozen=True):
     whole: dict[str, Any] = {}
 
 
-def read_run_record(path: Path | str) -> RunRecord:
-    """Read the record of a run.
+def read_run_record(path: Path | str) -> RunRecord | None:
+    """Read the record of a run; None for JSON that says of itself that it has another format, such as exported tracks.
 
     Raises:
         InputError: the file cannot be read, or is no record of a run.
@@ -82,6 +82,8 @@ def read_run_record(path: Path | str) -> RunRecord:
         raise InputError(path, expected="JSON, as `psotrack track` writes it", found=f"{error}") from error
     if not isinstance(content, dict):
         raise InputError(path, expected="the record of a run", found=f"JSON with a {type(content).__name__}")
+    if "format" in content:
+        return None
 
     def wrong(field: str, expected: str, found: str, remedy: str) -> InputError:
         return InputError(f"{path}, {field}", expected=expected, found=found, remedy=remedy)
