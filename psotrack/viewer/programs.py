@@ -187,9 +187,8 @@ def _failed(found: str) -> OutputError:
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """End a program and the program that it has started."""
+    # The second signal also ends the program that the first, ended one has started; mostly nothing is left by then.
     for number in (signal.SIGTERM, None):
-        if process.poll() is not None and number is None:
-            return
         with contextlib.suppress(OSError):
             if not hasattr(os, "killpg"):
                 process.kill()
