@@ -61,8 +61,8 @@ class Recording:
             and has the video's rate.
         unplaced: cameras of the recording that are not in the rig, because their lens or their place is not known.
         streams: addresses of streams and numbers of devices by camera name; such a camera has no video.
-        silhouettes: stored silhouettes by camera name. They take the place of a video; of a camera that has a video, they
-            save the time of making the same silhouettes again.
+        silhouettes: stored silhouettes by camera name. They take the place of a video; of a camera that has a video,
+            they save the time of making the same silhouettes again.
         ignore: images by camera name, white where nothing counts as foreground.
         line_time_s: times from the exposure of one row to that of the next row by camera name, seconds; a camera that
             is absent has a global shutter.
