@@ -332,6 +332,7 @@ class Recording:
             self.folder,
             expected=f"{wanted} for each of the cameras {', '.join(names)}",
             found=f"none for {', '.join(without)}",
+            remedy="stored silhouettes do not show the images" if self.silhouettes.keys() & without else "",
         )
 
     def _first(self, num_frames: int) -> Recording:

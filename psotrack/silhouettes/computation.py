@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -189,7 +188,10 @@ def _check_made_with(
             raise _made_otherwise(setting, name, made, asked)
     asked, made = None if model is None else identify(model), stored.made_of.get("background")
     if asked != made:
-        raise _made_otherwise("background", name, *(_model_in_words(each) for each in (made, asked)))
+        kinds = [MOG2 if each is None else each["class"].rpartition(".")[2] for each in (made, asked)]
+        # Two models of one kind differ in their keys.
+        words = kinds if kinds[0] != kinds[1] else [f"{made}", f"{asked}"]
+        raise _made_otherwise("background", name, *words)
 
 
 def _made_otherwise(setting: str, name: str, made: object, asked: object) -> SettingsError:
@@ -199,14 +201,6 @@ def _made_otherwise(setting: str, name: str, made: object, asked: object) -> Set
         found=f"{asked}",
         remedy="other silhouettes need the camera's video",
     )
-
-
-def _model_in_words(identity: Mapping[str, Any] | None) -> str:
-    """Name of a background model, from its identity."""
-    if identity is None:
-        return MOG2
-    key = f" {identity['key']}" if identity.get("key") else ""
-    return f"{identity['class'].rpartition('.')[2]}{key}"
 
 
 def _made_with(stored: StoredSilhouettes) -> ScaledSettings:
