@@ -108,6 +108,17 @@ def own_flight(flight: Path, tmp_path: Path) -> Path:
 
 
 class TestOldArchives:
+    def test_commands_that_show_and_hand_on_take_an_archive_as_sequence(
+        self, flight: Path, tmp_path: Path
+    ) -> None:
+        tracks = flight / "tracks.csv"
+        run("report", tracks, OLD, "--out", tmp_path / "r.html")
+        assert "<h2>Cameras</h2>" in (tmp_path / "r.html").read_text(encoding="utf-8")
+        run("export", tracks, OLD, "--to", "mot", "--out", tmp_path / "mot")
+        assert list((tmp_path / "mot").rglob("*cam8*"))
+        run("view", tracks, "--sequence", OLD, "--save", tmp_path / "f.rrd")
+        assert (tmp_path / "f.rrd").stat().st_size > 10_000
+
     def test_the_old_archive_has_what_was_packed(self, flight: Path) -> None:
         manifest, recording = read_manifest(flight), open_recording(flight)
         assert (manifest.version, manifest.sequence, manifest.frames) == (1, "S02_D4_A", 10)

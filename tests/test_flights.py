@@ -202,6 +202,14 @@ class TestEvents:
             (6, "drones 0 and 1 meet at 0.31 m; their labels: swapped"),
         ]
 
+    def test_left_out_frames_of_a_late_slow_camera_are_shown_at_their_times(self, tmp_path, monkeypatch):
+        """Frames 4 and 5 of a camera of 5 Hz that begins 0.2 s late are exposed from 1.0 s on: instant 10 of 10 Hz."""
+        path = write_flight(tmp_path, straight_tracks(), {"sequence": "lab", "left_out": {"c1": [[4, 6]]}})
+        slow = recording_of(ring_rig(2), frame_times={"c1": FrameTimes(9, 5.0, time_offset_s=0.2)})
+        monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: slow)
+        (event,) = find_events(read_flight([path], "lab"))
+        assert (event.frame, event.kind) == (10, EventKind.LEFT_OUT)
+
 
 class TestQuality:
     def test_drones(self, tmp_path):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.options import FORCE, QUIET, TRACKS, Numbers
+from psotrack.cli.options import FORCE, QUIET, TRACKS, Numbers, SequencePath
 from psotrack.cli.output import print_line, report_to
 from psotrack.errors import InputError, OutputError, SettingsError
 
@@ -21,7 +21,7 @@ FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
 
 @click.command()
 @TRACKS
-@click.argument("sequence", metavar="[SEQ]", type=click.Path(path_type=Path), required=False)
+@click.argument("sequence", metavar="[SEQ]", type=SequencePath(path_type=Path), required=False)
 @click.option("--to", type=click.Choice(FORMAT_NAMES), required=True, help="Format of the output.")
 @click.option(
     "--out",

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, reporting
+from psotrack.cli.options import FORCE, JOBS, SequencePath, reporting
 from psotrack.cli.output import print_line, report_to
 from psotrack.errors import SettingsError
 
 
 @click.command()
 @click.argument("source", metavar="SOURCE", type=click.Path(path_type=Path))
-@click.argument("sequence", metavar="[SEQ]", type=click.Path(path_type=Path), required=False)
+@click.argument("sequence", metavar="[SEQ]", type=SequencePath(path_type=Path), required=False)
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Page to write; it ends in .html."
 )
@@ -62,10 +62,8 @@ def report(
     )
     from psotrack.sweep import is_results_folder
 
-    is_sweep, is_calibration = (
-        is_results_folder(source),
-        source.suffix == ".json" and is_calibration_record(source),
-    )
+    is_sweep = is_results_folder(source)
+    is_calibration = source.suffix == ".json" and is_calibration_record(source)
     if (is_sweep or is_calibration) and (sequence is not None or compare):
         what = "the results of a sweep" if is_sweep else "a calibration"
         found = f"{sequence}" if sequence is not None else f"--compare {compare[0]}"

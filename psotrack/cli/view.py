@@ -15,6 +15,7 @@ from psotrack.cli.options import (
     CAMERAS,
     FORCE,
     JOBS,
+    SequencePath,
     cache_folder,
     camera_names,
     dictionary_option,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 @click.option(
     "--sequence",
     metavar="SEQ",
-    type=click.Path(path_type=Path),
+    type=SequencePath(path_type=Path),
     help="The recording: its cameras with their images, and its reference.",
 )
 @click.option(

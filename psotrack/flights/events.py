@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from psotrack.errors import InputError
 from psotrack.evaluation import errors_over_time
 from psotrack.flights.flight import FlightTracks, TrackedFlight
+from psotrack.recordings import Recording
 from psotrack.trajectories import Status, Trajectories
 
 #: Shortest time of coasting that is an event, seconds: shorter gaps are usual where drones cover each other.
@@ -63,7 +64,7 @@ def find_events(flight: TrackedFlight) -> tuple[Event, ...]:
     found: list[Event] = []
     for tracks in flight.tracks:
         found += _of_status(tracks)
-        found += _of_record(tracks)
+        found += _of_record(tracks, flight.recording)
         if flight.truth is not None:
             found += _of_errors(tracks, flight.truth)
     return tuple(sorted(found, key=lambda event: (event.time_s, event.tracks, event.kind, event.drones)))
@@ -93,7 +94,7 @@ def _of_status(tracks: FlightTracks) -> Iterator[Event]:
                 yield _event(tracks, start, EventKind.COASTING, (name,), text, position_m)
 
 
-def _of_record(tracks: FlightTracks) -> Iterator[Event]:
+def _of_record(tracks: FlightTracks, recording: Recording | None) -> Iterator[Event]:
     if tracks.record is None:
         return
     frame = tracks.trajectories.frame
@@ -108,10 +109,18 @@ def _of_record(tracks: FlightTracks) -> Iterator[Event]:
         yield _event(tracks, row, EventKind.MET, names, text, position_m)
     for camera, left_out in tracks.record.left_out.items():
         for first, stop in left_out:
-            # Frames of a camera; the instants are at least as many.
-            row = min(int(np.searchsorted(frame, first)), len(frame) - 1)
+            row = min(_row_of_frame(tracks, recording, camera, first), len(frame) - 1)
             text = f"camera {camera} is left out in {stop - first} frames: foreground is everywhere"
             yield _event(tracks, row, EventKind.LEFT_OUT, (), text, None)
+
+
+def _row_of_frame(tracks: FlightTracks, recording: Recording | None, camera: str, number: int) -> int:
+    """Row of the tracks at the time of a camera's frame; without the recording, frames count as instants."""
+    if recording is None or camera not in recording.exposed or not recording.exposed[camera].num_frames:
+        return int(np.searchsorted(tracks.trajectories.frame, number))
+    time_s = recording.exposed[camera].time_s
+    at_s = time_s[min(number, len(time_s) - 1)]
+    return int(np.searchsorted(tracks.trajectories.time_s, at_s - 1e-6))
 
 
 def _of_errors(tracks: FlightTracks, truth: Trajectories) -> Iterator[Event]:

@@ -27,8 +27,9 @@ _SHOWN = (
 )
 #: Width and height of a picture, pixels.
 _SIZE_WH = (360, 240)
-#: Height of the part of the scene that a picture shows, metres, and the smallest part of an image, pixels.
-_HEIGHT_M, _LEAST_PX = 1.6, 60
+#: Height of the part of the scene that a picture shows, in lengths of the largest drone, and the smallest part of an
+#: image, pixels.
+_LENGTHS, _LEAST_PX = 4.0, 60
 _JPEG_QUALITY = 85
 
 
@@ -107,6 +108,7 @@ def take_pictures(
     """
     boxes_px = boxes_in_images(recording, tracks.trajectories, tracks.size_m)
     shown = shown_frames(recording, tracks.trajectories)
+    length_m = float(tracks.size_m.max())
     by_camera: dict[int, list[_Picture]] = {}
     for number, event in enumerate(events):
         row = int(np.searchsorted(tracks.trajectories.frame, event.frame))
@@ -116,7 +118,7 @@ def take_pictures(
         per_m[shown.frame[row] < 0] = 0.0
         camera = int(per_m.argmax())
         if per_m[camera] > 0:
-            height_px = max(_HEIGHT_M * float(per_m[camera]), _LEAST_PX)
+            height_px = max(_LENGTHS * length_m * float(per_m[camera]), _LEAST_PX)
             by_camera.setdefault(camera, []).append(
                 _Picture(
                     number,
