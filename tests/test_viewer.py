@@ -321,28 +321,40 @@ def test_what_the_machine_lacks_is_one_line(folder, tmp_path, code, words):
     assert list(tmp_path.iterdir()) == []
 
 
+#: The program with Ctrl-C as at a terminal: a shell starts programs in the background with Ctrl-C ignored.
+HEARS_CTRL_C = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from psotrack.__main__ import main
+main()
+"""
+
+
 @pytest.mark.slow
 def test_the_page_for_a_browser(folder):
     """The page is served to this computer only, and Ctrl-C ends the command and its server."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "psotrack", "view", "tracks.csv", "--web"],
+        [sys.executable, "-c", HEARS_CTRL_C, "view", "tracks.csv", "--web"],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
-    page = ""
-    for line in process.stdout:
-        if line.startswith("http://"):
-            page = line.split()[0]
-            break
-    assert page.startswith("http://127.0.0.1:")
-    with urllib.request.urlopen(page, timeout=60) as answer:
-        assert b"<html" in answer.read().lower()
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    try:
+        assert process.stdout is not None
+        page = ""
+        for line in process.stdout:
+            if line.startswith("http://"):
+                page = line.split()[0]
+                break
+        assert page.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(page, timeout=60) as answer:
+            assert b"<html" in answer.read().lower()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.terminate()
     assert (process.returncode, err) == (0, "")
     port = int(re.findall(r":(\d+)", page)[0])
     time.sleep(0.1)
