@@ -3,7 +3,8 @@
 import importlib
 import os
 import pkgutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # The user's terminal and JAX settings must not decide any test. All processes of the suite (workers and commands that
@@ -32,6 +33,8 @@ from hypothesis import HealthCheck, settings
 # runs without them: a function that only slow tests call is not checked.
 if os.environ.get("PSOTRACK_TYPE_CHECKS") != "off":
     lazy_checks.install("psotrack")
+
+from helpers import Output
 
 # Conversions such as int32 to float32 must be explicit: an implicit promotion loses bits of exact sums.
 # Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
@@ -63,6 +66,24 @@ def optimised() -> Iterator[None]:
     yield
     jax.config.update("jax_disable_most_optimizations", True)
     jax.clear_caches()
+
+
+@pytest.fixture
+def run_psotrack(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Output]:
+    """Runs `psotrack` with some arguments in this process."""
+    from psotrack import cli
+
+    def call(*arguments: object) -> Output:
+        monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
+        capfd.readouterr()
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        return Output(code, *capfd.readouterr())
+
+    return call
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

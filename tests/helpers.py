@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,14 @@ def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
 def make_unnamed_rig(*cameras):
     """Rig of the given cameras, which are named "0", "1" and so on."""
     return make_rig({str(i): camera for i, camera in enumerate(cameras)})
+
+
+class Output(NamedTuple):
+    """What a command gave: exit code, stdout and stderr."""
+
+    code: int
+    out: str
+    err: str
 
 
 def environment_without_jax_settings() -> dict[str, str]:

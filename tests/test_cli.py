@@ -9,13 +9,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import environment_without_jax_settings
+from helpers import Output, environment_without_jax_settings
 
 from psotrack import cli
 from psotrack.recordings import VideoWriter, probe, read_frames
@@ -41,15 +40,6 @@ NUM_FRAMES = 12
 CAMERAS = ",".join(f"cam{i}" for i in range(1, 8))
 
 
-@dataclass(frozen=True)
-class Output:
-    """Exit code, stdout and stderr of a command."""
-
-    code: int
-    out: str
-    err: str
-
-
 Run = Callable[..., Output]
 
 
@@ -70,21 +60,10 @@ def sequence(data: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(data: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """Runs `psotrack` with some arguments in this process; silhouettes are shared by the tests of this file."""
+def run(data: Path, monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+    """Runs `psotrack` with some arguments; silhouettes are shared by the tests of this file."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(data / "cache"))
-
-    def call(*arguments: object) -> Output:
-        monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
-        capfd.readouterr()
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return Output(code, *capfd.readouterr())
-
-    return call
+    return run_psotrack
 
 
 def track(sequence: Path, out: Path, *more: object) -> list[object]:

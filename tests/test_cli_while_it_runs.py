@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ import click
 import cv2
 import numpy as np
 import pytest
+from helpers import Output
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -28,25 +28,14 @@ from psotrack.trajectories import Status, Trajectories
 #: A line of a log: local time with its offset, level, and what was said.
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (info|warning|error) (.*)")
 
-Run = Callable[..., tuple[int, str, str]]
+Run = Callable[..., Output]
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """Runs `psotrack` with some arguments in this process; gives exit code, stdout and stderr."""
+def run(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+    """Runs `psotrack` with some arguments, with the progress that users see."""
     monkeypatch.delenv("PSOTRACK_PROGRESS", raising=False)
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
-        capfd.readouterr()
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return code, *capfd.readouterr()
-
-    return call
+    return run_psotrack
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,12 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from helpers import LENSES, ring_rig, sphere_points
+from helpers import LENSES, Output, ring_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
-from psotrack import cli
 from psotrack.cli.export import FORMAT_NAMES
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, OutputError, SettingsError
@@ -127,30 +126,6 @@ def footage(recording: Recording) -> Footage:
     return Footage(recording, np.array([SIZE_M, SIZE_M]))
 
 
-@dataclass(frozen=True)
-class Output:
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Output]:
-    """Runs `psotrack` with some arguments in this process."""
-
-    def call(*arguments: object) -> Output:
-        monkeypatch.setattr(sys, "argv", ["psotrack", *map(str, arguments)])
-        capfd.readouterr()
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return Output(code, *capfd.readouterr())
-
-    return call
-
-
 def assert_one_line(result: Output, *words: str) -> None:
     assert result.code == 2, result
     assert result.out == ""
@@ -240,13 +215,15 @@ def test_unknown_orientations_stay_unknown(tmp_path: Path) -> None:
     ids=lambda value: str(value),
 )
 def test_evaluate_takes_back_what_export_wrote(
-    run: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str
+    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str
 ) -> None:
     """The same figures, except those of covariances that the format does not hold."""
     more = [flight] if name == "mot" else []
-    assert run("export", flight / "tracks.csv", *more, "--to", to, "--out", tmp_path / name).code == 0
+    assert (
+        run_psotrack("export", flight / "tracks.csv", *more, "--to", to, "--out", tmp_path / name).code == 0
+    )
     expected, found = (
-        json.loads(run("evaluate", path, flight, "--json", "-").out)
+        json.loads(run_psotrack("evaluate", path, flight, "--json", "-").out)
         for path in (flight / "tracks.csv", tmp_path / name)
     )
     assert expected["missed_rate"] > 0.1, "the gaps count"
@@ -262,15 +239,17 @@ def test_evaluate_takes_back_what_export_wrote(
             assert found[key] == pytest.approx(value, abs=1e-6 if to == "c3d" else 1e-12), key
 
 
-def test_tracks_with_a_rate_of_their_own(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+def test_tracks_with_a_rate_of_their_own(
+    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
+) -> None:
     """20 Hz, as from `track --rate 20`: the times say so, although the recording has 50 Hz."""
     tracks = tmp_path / "slow.csv"
     write_trajectories(tracks, small_tracks(20, 20.0))
-    expected = json.loads(run("evaluate", tracks, flight, "--json", "-").out)
+    expected = json.loads(run_psotrack("evaluate", tracks, flight, "--json", "-").out)
     assert expected["frames"] == 20
     for to in ("tum", "kitti", "mcap", "json", "c3d"):
-        assert run("export", tracks, "--to", to, "--out", tmp_path / OUTPUTS[to]).code == 0
-        found = json.loads(run("evaluate", tmp_path / OUTPUTS[to], flight, "--json", "-").out)
+        assert run_psotrack("export", tracks, "--to", to, "--out", tmp_path / OUTPUTS[to]).code == 0
+        found = json.loads(run_psotrack("evaluate", tmp_path / OUTPUTS[to], flight, "--json", "-").out)
         assert found["mean_error_m"] == pytest.approx(expected["mean_error_m"], abs=1e-6)
         assert found["missed_rate"] == expected["missed_rate"]
 
@@ -550,36 +529,38 @@ def test_the_command_and_the_tests_know_every_format() -> None:
     assert set(FORMAT_NAMES) == set(OUTPUTS) == set(FORMATS)
 
 
-def test_export_says_what_is_lost(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
-    result = run("export", flight / "tracks.csv", "--to", "kitti", "--out", tmp_path / "kitti")
+def test_export_says_what_is_lost(run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    result = run_psotrack("export", flight / "tracks.csv", "--to", "kitti", "--out", tmp_path / "kitti")
     assert result.out == (
         f"{tmp_path / 'kitti'}: kitti, 2 drones, 50 frames; not in this format: covariances, velocities, status, "
         "8 positions of lost drones\n"
     )
-    result = run("export", flight / "tracks.csv", "--to", "json", "--out", tmp_path / "again.json")
+    result = run_psotrack("export", flight / "tracks.csv", "--to", "json", "--out", tmp_path / "again.json")
     assert result.out == f"{tmp_path / 'again.json'}: json, 2 drones, 50 frames\n"
     late = replace(small_tracks(), time_s=small_tracks().time_s + 0.013)
     assert "times" in export_tracks(late, "c3d", tmp_path / "late.c3d")
     assert "times" not in export_tracks(late, "tum", tmp_path / "late")
 
 
-def test_nothing_is_overwritten(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+def test_nothing_is_overwritten(run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
     tracks = shutil.copy(flight / "tracks.csv", tmp_path / "tracks.csv")
     record = tmp_path / "tracks.json"
     record.write_text("{}", encoding="utf-8")
     # Even with --force: the inputs, and the record of the run beside them.
     assert_one_line(
-        run("export", tracks, "--to", "csv", "--out", tracks, "--force"), "TRACKS", "another path"
+        run_psotrack("export", tracks, "--to", "csv", "--out", tracks, "--force"), "TRACKS", "another path"
     )
-    assert_one_line(run("export", tracks, "--to", "json", "--out", record, "--force"), "record of TRACKS")
+    assert_one_line(
+        run_psotrack("export", tracks, "--to", "json", "--out", record, "--force"), "record of TRACKS"
+    )
     assert record.read_text() == "{}"
     out = tmp_path / "tum"
-    assert run("export", tracks, "--to", "tum", "--out", out).code == 0
-    assert_one_line(run("export", tracks, "--to", "tum", "--out", out), "--force")
-    assert run("export", tracks, "--to", "tum", "--out", out, "--force").code == 0
+    assert run_psotrack("export", tracks, "--to", "tum", "--out", out).code == 0
+    assert_one_line(run_psotrack("export", tracks, "--to", "tum", "--out", out), "--force")
+    assert run_psotrack("export", tracks, "--to", "tum", "--out", out, "--force").code == 0
     (out / "notes.md").write_text("mine", encoding="utf-8")
     assert_one_line(
-        run("export", tracks, "--to", "tum", "--out", out, "--force"), "notes.md", "another folder"
+        run_psotrack("export", tracks, "--to", "tum", "--out", out, "--force"), "notes.md", "another folder"
     )
     assert (out / "notes.md").read_text() == "mine"
 
@@ -613,25 +594,41 @@ def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch:
     ],
 )
 def test_outputs_that_do_not_fit(
-    run: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str, words: tuple[str, ...]
+    run_psotrack: Callable[..., Output],
+    flight: Path,
+    tmp_path: Path,
+    to: str,
+    name: str,
+    words: tuple[str, ...],
 ) -> None:
     assert_one_line(
-        run("export", flight / "tracks.csv", "--to", to, "--out", tmp_path / name), "--out", *words
+        run_psotrack("export", flight / "tracks.csv", "--to", to, "--out", tmp_path / name), "--out", *words
     )
     assert not list(tmp_path.iterdir())
 
 
-def test_images_and_sizes_need_a_recording(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+def test_images_and_sizes_need_a_recording(
+    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
+) -> None:
     tracks = shutil.copy(flight / "tracks.csv", tmp_path / "without_record.csv")
     out = tmp_path / "out"
-    assert_one_line(run("export", tracks, "--to", "mcap", "--out", out, "--images"), "--images", "no SEQ")
     assert_one_line(
-        run("export", tracks, flight, "--to", "tum", "--out", out, "--images"), "--images", "--to tum"
+        run_psotrack("export", tracks, "--to", "mcap", "--out", out, "--images"), "--images", "no SEQ"
     )
     assert_one_line(
-        run("export", tracks, flight, "--to", "mot", "--out", out), "--drone-size", "leave out SEQ"
+        run_psotrack("export", tracks, flight, "--to", "tum", "--out", out, "--images"),
+        "--images",
+        "--to tum",
     )
-    assert run("export", tracks, flight, "--to", "mot", "--out", out, "--drone-size", "0.5,0.5,0.2").code == 0
+    assert_one_line(
+        run_psotrack("export", tracks, flight, "--to", "mot", "--out", out), "--drone-size", "leave out SEQ"
+    )
+    assert (
+        run_psotrack(
+            "export", tracks, flight, "--to", "mot", "--out", out, "--drone-size", "0.5,0.5,0.2"
+        ).code
+        == 0
+    )
     assert (out / "gt" / "seqmaps" / "MOT15-train.txt").is_file()
 
 
@@ -685,29 +682,31 @@ BAD = {
 
 @pytest.mark.parametrize(("name", "text", "message"), BAD.values(), ids=BAD)
 def test_bad_input_is_one_line(
-    run: Callable[..., Output], flight: Path, tmp_path: Path, name: str, text: str, message: str
+    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path, name: str, text: str, message: str
 ) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
-    assert_one_line(run("evaluate", tmp_path / name, flight), message, str(tmp_path))
+    assert_one_line(run_psotrack("evaluate", tmp_path / name, flight), message, str(tmp_path))
 
 
 def test_files_that_are_cut_short_are_one_line(
-    run: Callable[..., Output], flight: Path, tmp_path: Path
+    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
 ) -> None:
     for to in ("mcap", "c3d"):
         export_tracks(small_tracks(), to, tmp_path / OUTPUTS[to])
         whole = (tmp_path / OUTPUTS[to]).stat().st_size
         for size in (10, whole // 2, whole * 2 // 3):
-            assert_one_line(run("evaluate", cut(tmp_path / OUTPUTS[to], size), flight), "short")
+            assert_one_line(run_psotrack("evaluate", cut(tmp_path / OUTPUTS[to], size), flight), "short")
 
 
-def test_folders_without_tracks(run: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
-    assert_one_line(run("evaluate", tmp_path / "nowhere", flight), "no such file or folder")
-    assert_one_line(run("evaluate", tmp_path, flight), "a folder without them")
+def test_folders_without_tracks(run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+    assert_one_line(run_psotrack("evaluate", tmp_path / "nowhere", flight), "no such file or folder")
+    assert_one_line(run_psotrack("evaluate", tmp_path, flight), "a folder without them")
     export_tracks(small_tracks(), "kitti", tmp_path / "kitti")
     times = tmp_path / "kitti" / "sequences" / "0" / "times.txt"
     times.write_text("0.0\n0.1\n", encoding="utf-8")
-    assert_one_line(run("evaluate", tmp_path / "kitti", flight), "47 times, as many as 0.txt has poses")
+    assert_one_line(
+        run_psotrack("evaluate", tmp_path / "kitti", flight), "47 times, as many as 0.txt has poses"
+    )
 
 
 def test_tracks_without_a_rate_need_a_recording(tmp_path: Path) -> None:

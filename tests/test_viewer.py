@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.request
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -47,21 +48,10 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def run(folder, monkeypatch, capfd):
-    """Runs `psotrack view` in this process: exit code, stdout and stderr."""
+def run(folder, monkeypatch, run_psotrack):
+    """Runs `psotrack view`: exit code, stdout and stderr."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(folder / "cache"))
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["psotrack", "view", *map(str, arguments)])
-        capfd.readouterr()
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return code, *capfd.readouterr()
-
-    return call
+    return partial(run_psotrack, "view")
 
 
 def read_entities(path):
