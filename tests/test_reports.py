@@ -3,9 +3,11 @@
 import base64
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import browser
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -98,6 +100,13 @@ def chromium():
         yield opened
 
 
+def pictures_in(page, caption=""):
+    """Pictures of the events whose caption contains a text, BGR."""
+    found = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)"([^>]*)', page.read_text(encoding="utf-8"))
+    coded = [np.frombuffer(base64.b64decode(data), np.uint8) for data, words in found if caption in words]
+    return [cv2.imdecode(one, cv2.IMREAD_COLOR) for one in coded]
+
+
 def decoded(text):
     return np.frombuffer(base64.b64decode(text), "<f4")
 
@@ -124,18 +133,29 @@ class TestFlight:
 
     def test_pictures_show_the_place_of_the_event(self, page):
         """The box of the drone, in the drone's colour, is in the picture of the event in which the drone is found."""
-        import cv2
-
-        text = page.read_text(encoding="utf-8")
-        found = re.search(r'<img src="data:image/jpeg;base64,([^"]*)"[^>]*is found again', text)
-        picture = cv2.imdecode(np.frombuffer(base64.b64decode(found[1]), np.uint8), cv2.IMREAD_COLOR)
+        (picture,) = pictures_in(page, "is found again")
         assert picture.shape == (240, 360, 3)
         off = np.abs(picture.astype(int) - [0x00, 0x5E, 0xD5]).sum(axis=-1)
         rows, columns = np.nonzero(off < 90)
-        # Where the box is: about the middle of the picture. JPEG blurs colours of thin lines.
+        # The whole box, with its name, a quarter as high as the picture. JPEG blurs colours of thin lines.
         assert len(rows) > 20
-        assert abs(np.median(rows) - 120) < 40
-        assert abs(np.median(columns) - 180) < 60
+        assert 0 < rows.min() < rows.max() < 239
+        assert 0 < columns.min() < columns.max() < 359
+        assert np.ptp(columns) < 120
+
+    def test_pictures_of_large_objects_stay_inside_the_frame(self, flight, tmp_path):
+        """People fill the frame: their pictures show the whole height, and little grey around a frame of 4:3."""
+        shutil.copy(flight / "tracks.csv", tmp_path / "tracks.csv")
+        record = {"drones": [{"drone": drone, "size_m": [0.6, 0.6, 1.8]} for drone in range(2)]}
+        (tmp_path / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
+        sequence = flight / "Simulated_Data" / "S01_D2_A"
+        run("report", tmp_path / "tracks.csv", sequence, "--out", tmp_path / "people.html")
+        pictures = pictures_in(tmp_path / "people.html")
+        assert pictures
+        for picture in pictures:
+            grey = (np.abs(picture.astype(int) - 90) < 3).all(axis=-1)
+            # Of 240 rows, the frame has all; of 360 columns, a frame of 16:9 has all too.
+            assert grey.mean() < 0.02
 
     def test_without_a_recording(self, flight, tmp_path):
         out = run("report", flight / "tracks.csv", "--out", tmp_path / "alone.html")

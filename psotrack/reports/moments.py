@@ -56,7 +56,7 @@ class _Picture:
         number: number of the event.
         frame: number of the camera's frame.
         middle_px: (2,), where the event is in the frame.
-        height_px: height of the part of the frame that is shown.
+        height_px: height of the part of the frame that is shown, at most the frame's own.
         boxes_px: (drones, 4), boxes to draw; NaN for none.
         colours: a colour per drone, as #rrggbb.
         names: a name per drone.
@@ -176,9 +176,12 @@ def _take(task: _Task, advance: Advance) -> list[tuple[int, str]]:
 def _part(
     image: UInt8[np.ndarray, "height width 3"], picture: _Picture
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """The part of a frame around an event, with the boxes of the drones and their names."""
-    scale = _SIZE_WH[1] / picture.height_px
-    corner = picture.middle_px + 0.5 - np.array(_SIZE_WH) / (2 * scale)
+    """The part of a frame around an event, as far as possible inside the frame, with boxes and names of the drones."""
+    size_wh = np.array(image.shape[1::-1])
+    scale = _SIZE_WH[1] / min(picture.height_px, image.shape[0])
+    margin_px = size_wh - np.array(_SIZE_WH) / scale
+    wanted = picture.middle_px + 0.5 - np.array(_SIZE_WH) / (2 * scale)
+    corner = np.where(margin_px < 0, margin_px / 2, np.clip(wanted, 0, np.maximum(margin_px, 0)))
     # A pixel's centre is at a whole number for OpenCV, and half a pixel further for boxes.
     to_part = np.array([[scale, 0, 0], [0, scale, 0]], np.float64)
     to_part[:, 2] = -scale * corner + 0.5 * (scale - 1)
