@@ -99,9 +99,27 @@ def test_positions_are_those_of_the_tracks(saved):
         _, axes = saved[f"/world/drones/{drone}/ellipsoid"]["Ellipsoids3D:half_sizes"]
         # 6.2514 is the 90 % quantile of chi-squared with three degrees of freedom; deviations are 2, 4 and 6 cm.
         expected = np.sqrt(6.2514) * np.array([0.02, 0.04, 0.06])
-        np.testing.assert_allclose(np.array(axes)[:, 0], [expected] * NUM_FRAMES, rtol=1e-4)
+        # A lost drone has none: its ellipsoid would grow to the size of the room.
+        shown = NUM_FRAMES if drone else LOST_FROM
+        np.testing.assert_allclose(np.array(axes[:shown])[:, 0], [expected] * shown, rtol=1e-4)
+        assert axes[shown:] == [[]] * (not drone)
     truth = np.array(saved["/world/truth/dron1/point"]["Points3D:positions"][1])[:, 0]
     np.testing.assert_allclose(truth, make_tracks().position_m[:, 0], atol=1e-6)
+
+
+def test_in_a_gap_a_drone_is_not_shown(tmp_path):
+    tracks = make_tracks()
+    position_m = tracks.position_m.copy()
+    position_m[[3, 4], 0] = np.nan
+    write_trajectories(tmp_path / "gaps.csv", replace(tracks, position_m=position_m, velocity_m_s=None))
+    write_flight(tmp_path / "gaps.rrd", read_flight([tmp_path / "gaps.csv"]))
+    entities = read_entities(tmp_path / "gaps.rrd")
+    for path, component in (("body", "Boxes3D:centers"), ("trail", "LineStrips3D:strips")):
+        frames, values = entities[f"/world/drones/0/{path}"][component]
+        shown = dict(zip(frames, values, strict=True))
+        assert shown[3] == []
+        assert 4 not in shown
+        assert len(shown[6]) == 1
 
 
 def test_status_is_shown_by_words_and_colours(saved):

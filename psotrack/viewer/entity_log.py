@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.flights import FlightTracks, TrackedFlight, colour_rgb
 from psotrack.viewer.camera_images import CameraKey
@@ -69,6 +69,32 @@ class EntityLog:
                 rr.TimeColumn(FRAME, sequence=np.asarray(frame[rows], np.int64)),
             ]
             rr.send_columns(path, times, columns(rows), recording=self._stream, strict=True)
+
+    def rows_where(
+        self,
+        path: str,
+        frame: Int[np.ndarray, " rows"],
+        time_s: Float[np.ndarray, " rows"],
+        there: Bool[np.ndarray, " rows"],
+        columns: Callable[[Int[np.ndarray, " some"]], Any],
+    ) -> None:
+        """Log one value per row that has a value; at the first row without, the value before goes away.
+
+        Args:
+            path: path of the entity.
+            frame, time_s: see `rows`.
+            there: (rows,), whether a row has a value.
+            columns: makes the columns of rows with these numbers, all of which have a value.
+        """
+        ends = np.diff(there.astype(int), prepend=0) < 0
+        logged, values = np.flatnonzero(there | ends), np.flatnonzero(there)
+        counts = there[logged].astype(int)
+        self.rows(
+            path,
+            frame[logged],
+            time_s[logged],
+            lambda rows: columns(values[_part(counts, rows)]).partition(counts[rows]),
+        )
 
     def boxes(
         self,

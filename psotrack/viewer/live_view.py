@@ -19,7 +19,7 @@ from psotrack.viewer.flight_file import APPLICATION
 from psotrack.viewer.layout import live_blueprint
 from psotrack.viewer.plots import log_status_words
 from psotrack.viewer.programs import viewer_program
-from psotrack.viewer.space import log_world, quaternions_xyzw, status_label
+from psotrack.viewer.space import ELLIPSOID_FILL, log_world, quaternions_xyzw, status_label
 
 #: Number of positions in a drone's trail: three seconds at 25 per second.
 _TRAIL_ROWS = 75
@@ -76,14 +76,15 @@ class LiveView:
                 self._log(f"status/{part(name)}", rr.StateChange(state=Status(status).label))
                 self._status[name] = status
             position_m = rows.position_m[0, index].astype(np.float64)
+            path = f"world/drones/{part(name)}"
             if not np.isfinite(position_m).all():
+                self._log(path, rr.Clear(recursive=True))
                 continue
             trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
             trail.append(position_m)
             number = int(name) if name.isdecimal() else len(self._trails)
             rgb = [status_rgb(status, shown_rgb(COLOURS[number % len(COLOURS)]))]
             label = status_label(name, status)
-            path = f"world/drones/{part(name)}"
             half_m = np.array(USUAL_SIZE_M) / 2
             self._log(
                 f"{path}/body",
@@ -91,7 +92,9 @@ class LiveView:
             )
             self._log(f"{path}/trail", rr.LineStrips3D([np.stack(trail)], colors=rgb))
             self._log(f"plots/height_m/{part(name)}", rr.Scalars(position_m[2]))
-            if rows.covariance_m2 is not None and np.isfinite(rows.covariance_m2[0, index]).all():
+            if status == Status.LOST:
+                self._log(f"{path}/ellipsoid", rr.Clear(recursive=False))
+            elif rows.covariance_m2 is not None and np.isfinite(rows.covariance_m2[0, index]).all():
                 covariance_m2 = rows.covariance_m2[0, index].astype(np.float64)
                 ellipsoid = ellipsoids_90(covariance_m2)
                 self._log(
@@ -101,6 +104,7 @@ class LiveView:
                         half_sizes=[ellipsoid.half_axes_m],
                         quaternions=quaternions_xyzw(ellipsoid.rotation[None]),
                         colors=rgb,
+                        fill_mode=ELLIPSOID_FILL,
                     ),
                 )
                 deviation_mm = 1e3 * float(np.sqrt(np.trace(covariance_m2)))

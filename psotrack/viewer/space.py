@@ -20,6 +20,8 @@ _GREY_RGB = (110, 110, 110)
 _TRUTH_RGBA = (255, 255, 255, 130)
 #: Opacity of the whole path of a drone, 0 to 255: the trail is in front of it.
 _PATH_OPACITY = 110
+#: How ellipsoids are drawn: a large one must not hide what is behind.
+ELLIPSOID_FILL = rr.components.FillMode.TransparentFillMajorWireframe
 #: Distance of the images from the cameras, metres.
 _IMAGE_DISTANCE_M = 1.0
 
@@ -101,45 +103,47 @@ def _log_drone(
 ) -> None:
     trajectories, name = tracks.trajectories, tracks.trajectories.drones[drone]
     path = drone_path("world/drones", flight, tracks, name)
-    known = np.flatnonzero(np.isfinite(trajectories.position_m[:, drone]).all(axis=-1))
-    position_m = trajectories.position_m[known, drone]
-    status = statuses(trajectories)[known, drone]
+    position_m, status = trajectories.position_m[:, drone], statuses(trajectories)[:, drone]
+    known = np.isfinite(position_m).all(axis=-1)
     colours = status_colours(status, rgb)
     label = drone_label(flight, tracks, name)
-    labels = [status_label(label, int(each)) for each in status]
-    half_m = np.broadcast_to(tracks.size_m[drone] / 2, position_m.shape)
-    at = (trajectories.frame[known], trajectories.time_s[known])
-    log.rows(
+    half_m = tracks.size_m[drone] / 2
+    at = (trajectories.frame, trajectories.time_s)
+    log.rows_where(
         f"{path}/body",
         *at,
+        known,
         lambda rows: rr.Boxes3D.columns(
-            centers=position_m[rows], half_sizes=half_m[rows], colors=colours[rows], labels=labels[rows]
+            centers=position_m[rows],
+            half_sizes=np.broadcast_to(half_m, (len(rows), 3)),
+            colors=colours[rows],
+            labels=[status_label(label, int(each)) for each in status[rows]],
         ),
     )
     # From the row before to this one; nothing over a gap.
-    follows = np.diff(known, prepend=-2) == 1
-    before_m = np.where(follows[:, None], np.roll(position_m, 1, axis=0), position_m)
-    steps_m = np.stack([before_m, position_m], axis=1)
-    log.rows(
+    before_m = np.roll(position_m, 1, axis=0)
+    log.rows_where(
         f"{path}/trail",
         *at,
-        lambda rows: rr.LineStrips3D.columns(strips=steps_m[rows], colors=colours[rows]),
+        known & np.roll(known, 1) & (np.arange(len(known)) > 0),
+        lambda rows: rr.LineStrips3D.columns(
+            strips=np.stack([before_m[rows], position_m[rows]], axis=1), colors=colours[rows]
+        ),
     )
     if trajectories.covariance_m2 is not None:
-        ellipsoids = ellipsoids_90(trajectories.covariance_m2[known, drone])
-        there = np.isfinite(ellipsoids.half_axes_m).all(axis=-1)
-        middles_m, axes_m = position_m[there], ellipsoids.half_axes_m[there]
-        xyzw, own_colours = quaternions_xyzw(ellipsoids.rotation[there]), colours[there]
-        log.static(f"{path}/ellipsoid", rr.Ellipsoids3D.from_fields(fill_mode="solid"))
-        log.rows(
+        ellipsoids = ellipsoids_90(trajectories.covariance_m2[:, drone])
+        stated = np.isfinite(ellipsoids.half_axes_m).all(axis=-1)
+        # The ellipsoid of a lost drone grows to the size of the room.
+        log.static(f"{path}/ellipsoid", rr.Ellipsoids3D.from_fields(fill_mode=ELLIPSOID_FILL))
+        log.rows_where(
             f"{path}/ellipsoid",
-            at[0][there],
-            at[1][there],
+            *at,
+            known & stated & (status != Status.LOST),
             lambda rows: rr.Ellipsoids3D.columns(
-                centers=middles_m[rows],
-                half_sizes=axes_m[rows],
-                quaternions=xyzw[rows],
-                colors=own_colours[rows],
+                centers=position_m[rows],
+                half_sizes=ellipsoids.half_axes_m[rows],
+                quaternions=quaternions_xyzw(ellipsoids.rotation[rows]),
+                colors=colours[rows],
             ),
         )
     pieces = _pieces(trajectories, drone)
@@ -154,17 +158,18 @@ def _log_drone(
 
 
 def _log_truth(log: EntityLog, truth: Trajectories, drone: int, name: str) -> None:
-    known = np.flatnonzero(np.isfinite(truth.position_m[:, drone]).all(axis=-1))
-    position_m = truth.position_m[known, drone]
+    position_m = truth.position_m[:, drone]
+    known = np.isfinite(position_m).all(axis=-1)
     path = f"world/truth/{part(name)}"
     log.static(f"{path}/point", rr.Points3D.from_fields(colors=[_TRUTH_RGBA], radii=[0.03]))
-    log.rows(
+    log.rows_where(
         f"{path}/point",
-        truth.frame[known],
-        truth.time_s[known],
+        truth.frame,
+        truth.time_s,
+        known,
         lambda rows: rr.Points3D.columns(positions=position_m[rows]),
     )
-    log.static(f"{path}/path", rr.LineStrips3D([position_m], colors=[_TRUTH_RGBA], radii=[0.004]))
+    log.static(f"{path}/path", rr.LineStrips3D([position_m[known]], colors=[_TRUTH_RGBA], radii=[0.004]))
 
 
 def _pieces(trajectories: Trajectories, drone: int) -> list[tuple[Float[np.ndarray, "points 3"], int]]:
