@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
+import signal
 import time
+
+from psotrack.interrupts import Terminated, end, orderly_interrupts
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it with one line and exit code 2."""
+    """Run the command line; Ctrl-C and SIGTERM end it with one line, and exit codes 130 and 143."""
     started = time.perf_counter()
     try:
-        # Imported here, so that Ctrl-C is answered during the import too.
-        from psotrack.cli import main as run
+        with orderly_interrupts():
+            # Imported here, so that signals are answered during the import too.
+            from psotrack.cli import main as run
 
-        run(started)
+            run(started)
+    except Terminated:
+        end(signal.SIGTERM)
     except KeyboardInterrupt:
-        sys.stderr.write(
-            "psotrack: interrupted; earlier results are unchanged; run the command again to finish\n"
-        )
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError):
-                stream.flush()
-        # The usual end of the interpreter would wait for a computation of JAX, which cannot be interrupted: all blocks
-        # have ended, temporary files are removed, and worker processes have stopped.
-        os._exit(2)
+        end(signal.SIGINT)
 
 
 if __name__ == "__main__":

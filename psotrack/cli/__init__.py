@@ -16,7 +16,6 @@ import sys
 import click
 
 from psotrack import __version__
-from psotrack.cli.interrupts import orderly_interrupts
 from psotrack.cli.lazy import LazyCommand, LazyGroup
 from psotrack.cli.log_file import FirstOnly
 from psotrack.errors import PsotrackError, SettingsError
@@ -170,7 +169,7 @@ def main(started: float | None = None) -> None:
     try:
         _complete()
         # `cli.main` would answer Ctrl-C itself.
-        with orderly_interrupts(), cli.make_context("psotrack", sys.argv[1:], obj=started) as context:
+        with cli.make_context("psotrack", sys.argv[1:], obj=started) as context:
             cli.invoke(context)
     except click.exceptions.Exit as done:
         sys.exit(done.exit_code)
