@@ -123,11 +123,19 @@ LOG = click.option(
     expose_value=False,
     help="Add warnings, steps, seconds of each stage, results and errors to the end of FILE, with times.",
 )
+
+
+def _stdout_as_dash(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+    """/dev/stdout is stdout, which then gets nothing but the JSON."""
+    return Path("-") if path == Path("/dev/stdout") else path
+
+
 JSON = click.option(
     "--json",
     "json_path",
     type=click.Path(path_type=Path),
     metavar="OUT",
+    callback=_stdout_as_dash,
     help="Write the results as JSON to OUT; - is stdout.",
 )
 JOBS = click.option(

@@ -33,7 +33,7 @@ from psotrack.cli.output import output_json, print_drones, print_line, report_to
 from psotrack.cli.run_files import FileOr, run_file_options
 from psotrack.errors import SettingsError
 from psotrack.settings import USUAL_SPEED_M_S, Clocks, SwarmKind, TrackSettings
-from psotrack.support import refuse_to_overwrite
+from psotrack.support import atomic_write_all, refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -287,12 +287,13 @@ def track(
         parts=parts,
         report=report_to(quiet),
     )
-    write_trajectories(out, tracked.trajectories, force=force)
     identities, time_s = tracked.identities, tracked.trajectories.time_s
-    write_ambiguity(ambiguity_path, time_s, identities.pairs, identities.ambiguity, force=force)
     record = with_real_time(tracked.record, time.perf_counter() - started, start_s=start_s)
-    record, sentence = with_comparison(record, out, chosen)
-    write_json(record_path, record)
+    with atomic_write_all(record_path, ambiguity_path, out) as (record_file, ambiguity_file, tracks_file):
+        write_trajectories(tracks_file, tracked.trajectories)
+        write_ambiguity(ambiguity_file, time_s, identities.pairs, identities.ambiguity)
+        record, sentence = with_comparison(record, tracks_file, chosen)
+        write_json(record_file, record)
     output_json(json_path, record, force)
     seen = tracked.trajectories.seen.mean()
     print_line(

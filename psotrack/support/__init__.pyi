@@ -5,6 +5,7 @@ from .figures import COLOURS, drone_colour, save_figure
 from .files import (
     ARCHIVE_SUFFIX,
     atomic_write,
+    atomic_write_all,
     digest_file,
     digest_record,
     read_text,
@@ -32,6 +33,7 @@ __all__ = [
     "TextRow",
     "assign",
     "atomic_write",
+    "atomic_write_all",
     "check_interface",
     "check_types",
     "convert",

@@ -1,7 +1,8 @@
 """Safe reading and writing of files, and digests of their content.
 
 A file is first written under a temporary name beside its path and then renamed, so that an interrupted write never
-damages an older file.
+damages an older file. A link is followed: the file that the link leads to is replaced. What is no regular file, such as
+/dev/null or a pipe, is never replaced, and gets the finished bytes.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import secrets
 import shutil
+import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -26,11 +30,14 @@ ARCHIVE_SUFFIX = ".psotrack"
 #: Hash functions of `digest_file`: BLAKE2b with 512 and with 160 bits, and SHA-256.
 Algorithm = Literal["blake2b", "blake2b-160", "sha256"]
 
+#: Names that `atomic_write` gives.
+_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}\.partial")
+
 
 def refuse_to_overwrite(path: Path | str, force: bool) -> None:
-    """Raise `OutputError` if `path` exists and `force` is not set."""
+    """Raise `OutputError` if `path` is an existing file or folder and `force` is not set."""
     path = Path(path)
-    if path.exists() and not force:
+    if path.exists() and not force and not _takes_bytes(path):
         found = "an existing folder" if path.is_dir() else "an existing file"
         raise OutputError(
             path, expected="a path that does not exist yet", found=found, remedy="pass --force to replace it"
@@ -44,26 +51,85 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     If the block raises (Ctrl-C included), the temporary file or folder is removed and `path` is unchanged. The
     temporary name has the suffix of `path`, because writers of videos and images choose their format by the suffix.
 
+    A link at `path` stays, and what it leads to is replaced. A device or a pipe at `path` stays too, and gets the bytes
+    of the file at the end of the block. A path that another `atomic_write` yielded is yielded again.
+
     Raises:
-        OutputError: the folder cannot be written, the disk is full, or `path` is a folder and a file was written.
+        OutputError: the folder cannot be written, the disk is full, `path` is a folder and a file was written, or
+            `path` is a link that leads to itself.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
+    if _TEMPORARY.match(path.name):
+        yield path
+        return
+    if _takes_bytes(path):
+        with _errors_of(path, path), tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
+            temporary = Path(folder) / f"output{path.suffix}"
+            yield temporary
+            with temporary.open("rb") as content, path.open("ab") as taker:
+                shutil.copyfileobj(content, taker)
+        return
+    target = _end_of_links(path)
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        if path.is_dir() and not temporary.is_dir():
-            # Even with `force`: a user who names a folder by mistake must not lose the folder's content.
-            remedy = "name a file; the content of the folder is unchanged"
-            raise OutputError(path, expected="the path of a file", found="a folder", remedy=remedy)
-        _replace(temporary, path)
+        with _errors_of(path, temporary):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            if target.is_dir() and not temporary.is_dir():
+                # Even with `force`: a user who names a folder by mistake must not lose the folder's content.
+                remedy = "name a file; the content of the folder is unchanged"
+                raise OutputError(path, expected="the path of a file", found="a folder", remedy=remedy)
+            _replace(temporary, target)
+    finally:
+        _remove(temporary)
+
+
+@contextlib.contextmanager
+def atomic_write_all(*paths: Path | str) -> Iterator[tuple[Path, ...]]:
+    """`atomic_write` of files that belong together: after an error in the block, all of them are unchanged."""
+    with contextlib.ExitStack() as stack:
+        yield tuple(stack.enter_context(atomic_write(path)) for path in paths)
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path, temporary: Path) -> Iterator[None]:
+    """Errors of the system within the block become an `OutputError` of `path`."""
+    try:
+        yield
     except OSError as error:
-        reason = f"{error.strerror or error} ({temporary.name})"
+        place = "" if temporary == path else f" ({temporary.name})"
+        reason = f"{error.strerror or error}{place}"
         raise OutputError(
             path, expected="a path that can be written", found=reason, remedy="earlier results are unchanged"
         ) from error
-    finally:
-        _remove(temporary)
+
+
+def _takes_bytes(path: Path) -> bool:
+    """Whether a path is something other than a file or folder: a device, a pipe or a socket, also through links.
+
+    /dev/stdout is one too where stdout is a file: the file belongs to the shell.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) or path.as_posix().startswith(
+        ("/dev/std", "/dev/fd/")
+    )
+
+
+def _end_of_links(path: Path) -> Path:
+    """What a link leads to, whether it exists or not; a path that is no link as it is."""
+    if not path.is_symlink():
+        return path
+    # Python 3.13 no longer raises where links go round in a circle.
+    with contextlib.suppress(RuntimeError, OSError):
+        end = path.resolve()
+        if not end.is_symlink():
+            return end
+    raise OutputError(
+        path, expected="a link that leads to a file", found="a link that leads to itself", remedy="remove it"
+    )
 
 
 def read_text(path: Path | str) -> str:
