@@ -24,7 +24,7 @@ from typing import NoReturn
 #: Time after which a signal that came at a bad moment is repeated, seconds.
 _AGAIN_S = 0.02
 #: Time that the program has to end in order, seconds. Removing temporary files takes a part of it.
-_IN_ORDER_S = 1.2
+_IN_ORDER_S = 0.8
 
 
 class Terminated(KeyboardInterrupt):
@@ -62,7 +62,9 @@ def orderly_interrupts() -> Iterator[None]:
             hook(unraisable)
 
     # `nohup` and `&` in scripts start commands with Ctrl-C ignored.
-    answered = [number for number, old in zip((signal.SIGINT, signal.SIGTERM), before, strict=True) if _is_usual(old)]
+    answered = [
+        number for number, old in zip((signal.SIGINT, signal.SIGTERM), before, strict=True) if _is_usual(old)
+    ]
     for number in answered:
         signal.signal(number, _interrupt)
     sys.unraisablehook = dropped
@@ -82,7 +84,7 @@ def orderly_interrupts() -> Iterator[None]:
 
 @contextlib.contextmanager
 def unhurried_end() -> Iterator[None]:
-    """Within the block, a program that gets a first signal may take its time to end: it has results to write."""
+    """Within the block, a program that gets a signal may take its time to end: it has results to write."""
     before, _State.unhurried = _State.unhurried, True
     try:
         yield
@@ -100,7 +102,10 @@ def end(number: int) -> NoReturn:
     before = "\r\x1b[K\x1b[?25h" if sys.stderr.isatty() else ""
     for stream, text in (
         (sys.stdout, ""),
-        (sys.stderr, f"{before}psotrack: {word}; earlier results are unchanged; run the command again to finish\n"),
+        (
+            sys.stderr,
+            f"{before}psotrack: {word}; earlier results are unchanged; run the command again to finish\n",
+        ),
     ):
         with contextlib.suppress(OSError, ValueError):
             stream.write(text)
@@ -133,7 +138,7 @@ def _imports_jax(frame: FrameType | None) -> bool:
 def _repeat(number: int) -> None:
     def send() -> None:
         _State.repeats += 1
-        _thread.interrupt_main(number)
+        _thread.interrupt_main(signal.Signals(number))
 
     again = threading.Timer(_AGAIN_S, send)
     again.daemon = True
@@ -154,25 +159,24 @@ def _watched() -> Iterator[None]:
         yield
     finally:
         # After an interruption the thread still watches that the end does not take too long.
-        if sys.exc_info()[0] is None or not issubclass(sys.exc_info()[0], KeyboardInterrupt):
+        if not isinstance(sys.exception(), KeyboardInterrupt):
             signal.set_wakeup_fd(before)
             os.close(theirs)
 
 
 def _watch(pipe: int) -> None:
     """End the program where it does not end by itself; returns when the other end of the pipe is closed."""
-    first_s = 0.0
+    is_second = False
     while numbers := os.read(pipe, 1):
         number = numbers[0]
-        # Commands with handlers of their own, such as `live`, end as they say.
-        if signal.getsignal(number) is not _interrupt:
-            continue
         if _State.repeats:
             _State.repeats -= 1
             continue
-        if first_s:
+        if _State.unhurried:
+            continue
+        if is_second:
             _end_now(number)
-        first_s = time.monotonic()
+        is_second = True
         threading.Thread(target=_end_later, args=(number,), daemon=True).start()
     os.close(pipe)
 

@@ -613,7 +613,8 @@ def test_ctrl_c_in_a_callback_of_the_garbage_collector_ends_the_command(
         text=True,
         check=False,
     )
-    assert_one_line(Output(done.returncode, done.stdout, done.stderr), "interrupted")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert re.fullmatch(r"psotrack: interrupted; .*\n", done.stderr)
 
 
 def test_ctrl_c_leaves_earlier_results(sequence: Path, tmp_path: Path) -> None:
@@ -626,5 +627,6 @@ def test_ctrl_c_leaves_earlier_results(sequence: Path, tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert_one_line(Output(done.returncode, done.stdout, done.stderr), "interrupted")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert re.fullmatch(r"psotrack: interrupted; .*\n", done.stderr)
     assert tracks.read_text() == "earlier"

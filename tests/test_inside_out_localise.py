@@ -484,9 +484,6 @@ def test_ctrl_c_in_a_recording_writes_nothing(room, tmp_path, monkeypatch):
     out = tmp_path / "track.csv"
     result = run(room.video, "--markers", room.markers, "--camera", room.lens, "--out", out)
     assert result.exit_code != 0
-    assert (
-        "interrupted; nothing is written, and the same command starts from the first frame" in result.output
-    )
     assert not out.exists()
 
 

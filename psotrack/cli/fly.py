@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import FORCE, QUIET, Numbers
+from psotrack.interrupts import unhurried_end
 from psotrack.support import refuse_to_overwrite
 
 
@@ -88,12 +89,14 @@ def fly(
     space = flight_space(hall)
     start = np.array(start_m)
     piloting.check(start, space, rate_hz)
-    with devices.open_device(device, space) as opened:
-        samples = piloting.until(opened.samples(), max_seconds)
-        flown = piloting.fly(samples, start, space, rate_hz=rate_hz, watch=opened.watch)
-    recorded = flown.recorded
-    write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
-    piloting.write_sticks(sticks_path, flown.samples)
+    # Ctrl-C ends the flight, which is then written.
+    with unhurried_end():
+        with devices.open_device(device, space) as opened:
+            samples = piloting.until(opened.samples(), max_seconds)
+            flown = piloting.fly(samples, start, space, rate_hz=rate_hz, watch=opened.watch)
+        recorded = flown.recorded
+        write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+        piloting.write_sticks(sticks_path, flown.samples)
     if not quiet:
         click.echo(f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s")
         click.echo(f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}')

@@ -33,6 +33,7 @@ from psotrack.cli.options import (
 from psotrack.cli.output import output_json, print_line, write_json
 from psotrack.cli.run_files import run_file_options
 from psotrack.errors import SettingsError
+from psotrack.interrupts import unhurried_end
 from psotrack.settings import TrackSettings
 from psotrack.support import refuse_to_overwrite
 
@@ -200,7 +201,13 @@ def live(
         outputs += [] if shown is None else [shown]
         table = stack.enter_context(_Table(quiet or lines, shown))
         stack.enter_context(_ended_by_ctrl_c(session))
-        result = session.run([*rows, *outputs], table.show, longest_s=seconds or float("inf"))
+
+        def show(result: LiveResult, films: list[bool]) -> None:
+            if result.instants == 1:
+                stack.enter_context(unhurried_end())
+            table.show(result, films)
+
+        result = session.run([*rows, *outputs], show, longest_s=seconds or float("inf"))
     report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}
@@ -309,10 +316,14 @@ class _Table:
 
 @contextlib.contextmanager
 def _ended_by_ctrl_c(session: LiveSession) -> Iterator[None]:
-    """Ctrl-C ends the session, instead of the program."""
+    """Ctrl-C and SIGTERM end the session, instead of the program, as soon as there is a first result."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        session.stop()
+        earlier = before[signal.Signals(number)]
+        if session.result.instants or not callable(earlier):
+            session.stop()
+        else:
+            earlier(number, frame)
 
     before = {each: signal.signal(each, end) for each in (signal.SIGINT, signal.SIGTERM)}
     try:

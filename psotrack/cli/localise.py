@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from psotrack.cli.options import (
 from psotrack.cli.output import check_outputs, output_json, print_line, report_to
 from psotrack.cli.shutter import given_shutter, shutter_content, shutter_options, shutter_sentence
 from psotrack.errors import InputError, SettingsError
+from psotrack.interrupts import unhurried_end
 
 if TYPE_CHECKING:
     from psotrack.geometry import Camera
@@ -223,21 +225,15 @@ def localise(
         filter=PoseFilterParams() if filtered else None,
         shutter=shutter,
     ).within(source.num_frames)
-    try:
+    # What a stream has shown is kept: no one can show the stream again.
+    with unhurried_end() if source.stream else contextlib.nullcontext():
         found = localise_camera(
             source, marker_map, lens, settings, report_to(quiet or json_path == Path("-")), side_m=side_m
         )
         if smoothed:
             found = replace(found, path=smooth(found.raw, settings.filter))
-    except KeyboardInterrupt as stop:
-        again = (
-            "a stream cannot be read again"
-            if source.stream
-            else "the same command starts from the first frame"
-        )
-        raise click.ClickException(f"interrupted; nothing is written, and {again}") from stop
-    drone_name = name or given.name
-    write_camera_path(out, found.path, drone_name, force=force)
+        drone_name = name or given.name
+        write_camera_path(out, found.path, drone_name, force=force)
     if picture is not None:
         save_flight(
             picture, found.path, found.marker_map, caption=f"{drone_name}: {given.source.name}", force=force

@@ -8,8 +8,11 @@ damages an older file. A link is followed: the file that the link leads to is re
 from __future__ import annotations
 
 import contextlib
+import functools
+import glob
 import hashlib
 import os
+import platform
 import re
 import secrets
 import shutil
@@ -30,8 +33,10 @@ ARCHIVE_SUFFIX = ".psotrack"
 #: Hash functions of `digest_file`: BLAKE2b with 512 and with 160 bits, and SHA-256.
 Algorithm = Literal["blake2b", "blake2b-160", "sha256"]
 
-#: Names that `atomic_write` gives.
-_TEMPORARY = re.compile(r"\..*\.[0-9a-f]{8}\.partial")
+#: Names that `atomic_write` gives: machine and process that write, and a random part.
+_TEMPORARY = re.compile(r"\..*\.([0-9a-f]{4})-([0-9]+)-[0-9a-f]{8}\.partial")
+#: Temporary files that this process writes just now.
+_OPEN: set[Path] = set()
 
 
 def refuse_to_overwrite(path: Path | str, force: bool) -> None:
@@ -70,10 +75,13 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
                 shutil.copyfileobj(content, taker)
         return
     target = _end_of_links(path)
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{path.suffix}")
+    name = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.stem}.{name}.partial{path.suffix}")
+    _OPEN.add(temporary)
     try:
         with _errors_of(path, temporary):
             target.parent.mkdir(parents=True, exist_ok=True)
+            _remove_left_over(target)
             yield temporary
             if target.is_dir() and not temporary.is_dir():
                 # Even with `force`: a user who names a folder by mistake must not lose the folder's content.
@@ -82,6 +90,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
             _replace(temporary, target)
     finally:
         _remove(temporary)
+        _OPEN.discard(temporary)
 
 
 @contextlib.contextmanager
@@ -89,6 +98,40 @@ def atomic_write_all(*paths: Path | str) -> Iterator[tuple[Path, ...]]:
     """`atomic_write` of files that belong together: after an error in the block, all of them are unchanged."""
     with contextlib.ExitStack() as stack:
         yield tuple(stack.enter_context(atomic_write(path)) for path in paths)
+
+
+def remove_temporary_files() -> None:
+    """Remove what `atomic_write` of this process is writing: for a program that ends without its clean-up."""
+    for path in list(_OPEN):
+        _remove(path)
+
+
+def _remove_left_over(target: Path) -> None:
+    """Remove temporary files of a path that killed processes of this machine have left."""
+    with contextlib.suppress(OSError):
+        for path in target.parent.glob(f".{glob.escape(target.stem)}.*.partial*"):
+            found = _TEMPORARY.match(path.name)
+            if found and found[1] == _machine() and not _is_running(int(found[2])):
+                _remove(path)
+
+
+def _is_running(process: int) -> bool:
+    """Whether a process of this machine runs; where this is not known, it may."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+@functools.cache
+def _machine() -> str:
+    """Four hexadecimal digits of the machine's name: on a network file system, other machines have other processes."""
+    return hashlib.blake2b(platform.node().encode(), digest_size=2).hexdigest()
 
 
 @contextlib.contextmanager

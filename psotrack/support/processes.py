@@ -24,7 +24,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
 #: Time that the workers have to notice that the pipe is broken, seconds. `SystemExit` is raised in them after it.
-GRACE_S = 1.0
+GRACE_S = 0.3
 #: Time between two messages of progress, seconds.
 _PROGRESS_S = 0.1
 #: Time that they have after that to remove their temporary files before they are killed, seconds.

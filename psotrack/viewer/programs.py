@@ -17,12 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from psotrack.errors import OutputError, SettingsError
+from psotrack.interrupts import unhurried_end
 
 _HOST = "127.0.0.1"
 #: `python -m rerun_cli` ends with exit code 0 after an error.
 _START = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 #: Time that a program of Rerun has to start, and to end, seconds.
-_START_S, _END_S = 30.0, 3.0
+_START_S, _END_S = 30.0, 0.5
 #: Time between two looks whether a program has ended, seconds.
 _LOOK_S = 0.1
 #: Share of the memory up to which the server keeps a flight.
@@ -141,7 +142,9 @@ def viewer_program(path: Path | None = None, *, web: bool = False) -> Iterator[V
             _until_listening(program, [port, page_port] if web else [port])
             yield program
         finally:
-            _end(process)
+            # The other program must not outlive this one.
+            with unhurried_end():
+                _end(process)
 
 
 def _free_port() -> int:
