@@ -24,6 +24,7 @@ from jaxtyping import Bool
 from psotrack.datasets._archives import stored_entry
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key, chosen_camera
+from psotrack.recordings import image_of
 
 MASKS = "drone_masks.zip"
 
@@ -114,10 +115,7 @@ class Masks:
             data = self._archive.read(name) if self._archive else (self._path / name).read_bytes()
         except (OSError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{self._path}: {name}", expected="an image", found=str(error)) from error
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
-        if image is None:
-            raise InputError(f"{self._path}: {name}", expected="an image", found="none that can be decoded")
-        return image > 0
+        return image_of(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE, f"{self._path}: {name}") > 0
 
     def __enter__(self) -> Masks:
         return self

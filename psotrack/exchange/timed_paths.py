@@ -126,6 +126,8 @@ def _own_interval_s(paths: Sequence[TimedPath]) -> float | None:
     if not np.isfinite(shortest_s) or longest.time_s[0] < -_SAME * shortest_s:
         return None
     span_s = float(longest.time_s[-1])
+    if not np.isfinite(span_s / shortest_s):
+        return None
     # Over a long span, the number of intervals gives the interval better than two rounded times do.
     interval_s = span_s / max(round(span_s / shortest_s), 1)
     for path in paths:

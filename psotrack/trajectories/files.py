@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import atomic_write, refuse_to_overwrite
+from psotrack.support import LARGEST, atomic_write, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Status, Trajectories
 
 if TYPE_CHECKING:
@@ -390,7 +390,7 @@ def _check_values(table: _Table) -> None:
         elif name == "num_cameras":
             wrong, expected = ~(_whole(values) | np.isnan(values)), "a whole number from 0, or nothing"
         else:
-            wrong, expected = np.isinf(values), "a finite number, or nothing"
+            wrong, expected = np.abs(values) > LARGEST, f"a number of at most {LARGEST:g} in size, or nothing"
         if wrong.any():
             row = int(np.argmax(wrong))
             raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))

@@ -18,9 +18,9 @@ import pandas as pd
 import test_archives
 import test_dpjait
 import test_rig_formats as rigs
-from fuzz.mutations import Change, columns, members
 from helpers import ring_rig
 
+from fuzz.mutations import Change, columns, members
 from psotrack import archives, calibration, datasets, exchange, flights, inside_out, recordings, simulation
 from psotrack.datasets.dpjait import (
     pose_file,
@@ -522,7 +522,9 @@ def _results(folder: Path) -> None:
                 **dict.fromkeys(_FIGURES, [0.5, 0.25]),
             }
         )
-        store.add(key, rows, pd.DataFrame({"seed": [0, 1], "frame": 0, "drone": "dron1", "error_m": [0.01, 0.02]}))
+        store.add(
+            key, rows, pd.DataFrame({"seed": [0, 1], "frame": 0, "drone": "dron1", "error_m": [0.01, 0.02]})
+        )
     store.add_failure("c" * 40, "no file", {"sequence": "S03", "method": "swarm"})
     store.change_manifest(lambda manifest: manifest["inputs"].update(a="b"))
 

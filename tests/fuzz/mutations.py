@@ -116,7 +116,7 @@ def members(change: Callable[[bytes], bytes] = bytes) -> Change:
             del entries[index]
         elif kind < 0.9:
             renamed = random.choice(_OF_TEXT)(random, name.encode()).decode("utf-8", "replace")
-            entries[index] = renamed.replace("\x00", "0"), data
+            entries[index] = renamed.replace("\x00", "0") or "0", data
         else:
             entries.append((name.upper(), data))
         out = io.BytesIO()

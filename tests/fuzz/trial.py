@@ -23,7 +23,6 @@ from random import Random
 
 from fuzz.formats import FORMATS, make_all
 from fuzz.mutations import mutate
-
 from psotrack import cli
 from psotrack.errors import PsotrackError
 
