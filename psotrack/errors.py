@@ -24,8 +24,8 @@ class PsotrackError(Exception):
         found: noun phrase for what is there instead.
         remedy: what the user can do; the end of the message.
 
-    A message is one line: what cannot be printed is written as an escape sequence, and the longest part is cut where the
-    message would be longer than `LONGEST_MESSAGE`.
+    A message is one line: what cannot be printed is written as an escape sequence, and the longest part is cut where
+    the message would be longer than `LONGEST_MESSAGE`.
     """
 
     def __init__(self, where: object, *, expected: str, found: str, remedy: str = "") -> None:
@@ -79,11 +79,14 @@ def _unpickled(kind: type[PsotrackError], message: str) -> PsotrackError:
 
 @contextlib.contextmanager
 def errors_name(path: object) -> Iterator[None]:
-    """Errors of the block that do not name a file, because they are about its content, begin with its name."""
+    """Errors of the block that do not name a file, because they are about its content, begin with its name.
+
+    An error of an output is about another file.
+    """
     try:
         yield
     except PsotrackError as error:
-        if str(path) in str(error):
+        if isinstance(error, OutputError) or str(path) in str(error):
             raise
         raise error.within(path) from error
 

@@ -31,6 +31,8 @@ from psotrack.trajectories.association import align, fixed_identity
 #: The folder of TrackEval: with the benchmark MOT15, TrackEval leaves nothing out.
 BENCHMARK, SPLIT, TRACKER = "MOT15", "train", "psotrack"
 WORLD, TRACKS, REFERENCE, INFO = "3d", "tracks.txt", "reference.txt", "seqinfo.ini"
+#: Largest number of a frame or an identity.
+_LARGEST = 2**31
 _COLUMNS = "frame, id, left, top, width, height, confidence, x, y, z"
 
 
@@ -101,7 +103,8 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
         InputError: the file cannot be read, has boxes only, has a drone twice in a frame, or there is no rate.
     """
     table = read_numbers(path, 7, f"at least 7 numbers: {_COLUMNS}", more=True)
-    wrong = (table[:, 0] < 1) | (table[:, :2] != np.floor(table[:, :2])).any(axis=1)
+    numbers = table[:, :2]
+    wrong = (table[:, 0] < 1) | ((numbers != np.floor(numbers)) | (np.abs(numbers) > _LARGEST)).any(axis=1)
     if wrong.any():
         first = int(np.argmax(wrong))
         raise InputError(

@@ -110,7 +110,11 @@ def _read(path: Path) -> CalibrationRecord:
 
     if not content.get("cameras"):
         raise InputError(path, expected="the record of a calibration by a board", found="no cameras")
-    return convert(content, CalibrationRecord, wrong)
+    record = convert(content, CalibrationRecord, wrong)
+    for name, camera in record.cameras.items():
+        if len({len(line) for line in camera.coverage}) > 1:
+            raise wrong(f"cameras.{name}.coverage", "lines of equal length", "different ones", "")
+    return record
 
 
 def _rig_path(record_path: Path, rig: str) -> Path:

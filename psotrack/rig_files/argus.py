@@ -40,7 +40,7 @@ def read(source: Source) -> FileRig:
     entries = []
     for row in table.values:
         values = dict(zip(_NAMES, row.tolist(), strict=True))
-        name = f"cam{values['camera']:.0f}"
+        name = f"cam{values['camera']:.9g}"
         fields = CameraFields(source.path, name, {"size": [values["w"], values["h"]]})
         if not (values["fx"] > 0 and values["AR"] > 0 and (np.abs(row) <= LARGEST).all()):
             raise fields.error(

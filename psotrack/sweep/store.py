@@ -181,13 +181,17 @@ class Store:
             seeds: seeds of the wanted runs.
 
         Raises:
-            InputError: there is no file of the cell's errors.
+            InputError: there is no file of the cell's errors, or it has no errors of these runs.
         """
         path = _present(self._errors_path(key))
         if not path.exists():
             raise InputError(path, expected="errors of a finished cell", found="no file")
-        errors = _read_table(path)
-        return errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
+        errors = _read_table(path, ("seed", "frame", "drone", "error_m"))
+        wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
+        if wanted.empty:
+            expected = f"errors of seeds {', '.join(map(str, seeds))}"
+            raise InputError(path, expected=expected, found="none", remedy=_REMEDY)
+        return wanted
 
     def status(self) -> dict[str, Any]:
         """Numbers of finished, failed and locked cells, the errors, and the processes at work.
@@ -284,8 +288,8 @@ def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
     return parts
 
 
-def _read_table(path: Path) -> pd.DataFrame:
-    """A table of runs or of their errors.
+def _read_table(path: Path, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
+    """A table of runs or of their errors, which must have some columns: names in `drone`, numbers in the others.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -301,10 +305,10 @@ def _read_table(path: Path) -> pd.DataFrame:
     # pandas raises more than Arrow's errors for a file whose metadata are damaged.
     except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(path, expected=expected, found=f"{error}", remedy=_REMEDY) from error
-    if "seed" not in table or not pd.api.types.is_integer_dtype(table["seed"]):
-        raise InputError(
-            path, expected=f"{expected}, with whole numbers in seed", found="others", remedy=_REMEDY
-        )
+    for name in columns:
+        if name not in table or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name])):
+            found = "others" if name in table else "none"
+            raise InputError(path, expected=f"values in the column {name}", found=found, remedy=_REMEDY)
     return table
 
 

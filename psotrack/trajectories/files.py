@@ -128,7 +128,8 @@ def read_trajectories(path: Path | str, *, fps: float | None = None) -> Trajecto
 
     Raises:
         InputError: the file does not exist, a line is broken, a column is missing, a frame number is not a whole
-            number, a frame and drone have two rows, a frame has two times, or there is neither a time nor `fps`. The
+            number, a frame and drone have two rows, a frame has two times, times do not increase, or
+            there is neither a time nor `fps`. The
             message names file and line.
     """
     path = Path(path)
@@ -300,7 +301,8 @@ def _read_parquet(path: Path) -> _Table:
 
     try:
         table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
+    # A damaged file is also found by errors of Python in the library.
+    except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
     _check_columns(path, table.column_names)
     columns = {name: _parquet_column(path, table, name) for name in _READ if name in table.column_names}
@@ -423,6 +425,12 @@ def _times(
         row = int(known[np.argmax(differs)])
         expected = f"{time_s[frame_index[row]]:g} s as in another row of this frame"
         raise table.error(row, expected=expected, found=f"{given_s[row]:g} s")
+    back = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(back):
+        after = back[0] + 1
+        row = int(np.argmax(frame_index == after))
+        expected = f"a time after {time_s[back[0]]:g} s, that of frame {frame[back[0]]}"
+        raise table.error(row, expected=expected, found=f"{time_s[after]:g} s")
     if np.isnan(time_s).any():
         row = int(np.argmax(np.isnan(time_s)[frame_index]))
         raise table.error(row, expected="a time_s, or a frame rate to compute it", found="neither")

@@ -12,6 +12,8 @@ import threading
 import time
 from pathlib import Path
 
+import click
+
 from fuzz.formats import FORMATS
 from fuzz.worker import Worker
 
@@ -66,7 +68,7 @@ def main() -> None:
             path = options.finds / f"{name}-{options.seed}-{number}{Path(FORMATS[name].file).suffix}"
             path.write_bytes(content)
             kept = f" ({path})"
-        print(f"FAILED try {number}, {name}, {call}: {fault}{kept}", flush=True)
+        click.echo(f"FAILED try {number}, {name}, {call}: {fault}{kept}")
 
     root = Path(tempfile.mkdtemp(prefix="psotrack-fuzz-"))
     try:
@@ -77,7 +79,7 @@ def main() -> None:
             thread.join()
     finally:
         shutil.rmtree(root, ignore_errors=True)
-    print(
+    click.echo(
         f"{sum(done.values())} tries of {len(names)} formats with seed {options.seed}, from try {options.first} on, in "
         f"{time.monotonic() - began_s:.0f} s: {sum(refused.values())} files refused, {sum(finds.values())} failures"
     )

@@ -30,6 +30,7 @@ from psotrack.datasets.dpjait import (
     write_poses,
 )
 from psotrack.detection import DetectorSettings, OnnxDetector
+from psotrack.errors import errors_name
 from psotrack.reports import write_calibration_report
 from psotrack.rig_files import read_lenses, read_rig, write_rig
 from psotrack.sweep import Store, read_grid
@@ -229,7 +230,7 @@ def _recording(folder: Path) -> None:
     (folder / "times.csv").write_text(f"frame,time_s\n{times}")
     labels = tuple(f"{body}:{body}{i}" for body in ("dronA", "dronB") for i in range(4))
     cross_m = np.array([[0.1, 0, 0], [0, 0.12, 0], [-0.15, 0, 0], [0, -0.1, 0.05]])
-    position_m = np.concatenate([cross_m + [x, 0, 1.2] for x in (-0.6, 0.6)])
+    position_m = np.concatenate([cross_m + np.array([x, 0, 1.2]) for x in (-0.6, 0.6)])
     moved_m = position_m + 0.01 * np.arange(20)[:, None, None]
     recordings.write_c3d(folder / "mocap.c3d", recordings.Markers(labels, moved_m, 50.0))
     write_marker_corners(folder / "corners.csv", _corners())
@@ -244,7 +245,7 @@ def _recording(folder: Path) -> None:
 
 def _corners() -> Mapping[int, np.ndarray]:
     square = np.array([[0, 2, 1.2], [0.2, 2, 1.2], [0.2, 2, 1.0], [0, 2, 1.0]])
-    return {marker: square + [marker, 0, 0] for marker in (0, 1, 7)}
+    return {marker: square + np.array([marker, 0, 0]) for marker in (0, 1, 7)}
 
 
 def _csv_recording(folder: Path) -> None:
@@ -461,7 +462,8 @@ _TABLES = {
 
 def _loaded(path: Path) -> object:
     # The world is built small; a scenario that is read but cannot be built must say so too.
-    return simulation.build(simulation.load(path), scale=0.05)
+    with errors_name(path):
+        return simulation.build(simulation.load(path), scale=0.05)
 
 
 _OBJ = "".join(f"v {x} {y} {z}\n" for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.1, 0.1)) + (
@@ -478,7 +480,8 @@ def _mesh(folder: Path) -> None:
 def _mesh_of(path: Path) -> object:
     recipe = simulation.load(path.parent / "scenario.toml")
     model = {"file": str(path), "scale": 1.0}
-    return simulation.build(simulation.change_scenario(recipe, {"drones[0].model": model}), scale=0.05)
+    with errors_name(path):
+        return simulation.build(simulation.change_scenario(recipe, {"drones[0].model": model}), scale=0.05)
 
 
 _GRID = """sequences = ["S01_D2_A", "S02_D4_A"]
@@ -519,7 +522,7 @@ def _results(folder: Path) -> None:
                 "seed": [0, 1],
                 "mean_error_m": [0.01, 0.02],
                 "settings.swarm.particles": [8, 8],
-                **dict.fromkeys(_FIGURES, [0.5, 0.25]),
+                **{figure: [0.5, 0.25] for figure in _FIGURES},
             }
         )
         store.add(
@@ -588,7 +591,7 @@ _OTHERS = {
         _text("run.toml", _CONFIG),
         "run.toml",
         (),
-        "track --config {file} --out {out}/tracks.csv",
+        "track {folder}/nowhere --config {file} --out {out}/tracks.csv",
         is_refused=True,
     ),
     "sweep-rows": _stored(f"cells/{'a' * 40}.parquet", "table {folder}", columns),

@@ -1,9 +1,10 @@
 """One try: a changed file is given to a public function or a command, and what happens is judged.
 
-The property: the call succeeds, or raises a `PsotrackError` of one line with at most `LONGEST` characters that names the
-file or a file beside it; a command then has exit code 2, that line as last line on stderr, and nothing else there but
-warnings of one line. Nothing is written or changed beside the input; after an error nothing is written at all. No library
-writes to stderr. Processor time and memory are at most twice those of the sound file, plus `SECONDS` and `MEBIBYTES`.
+The property: the call succeeds, or raises a `PsotrackError` of one line with at most `LONGEST` characters that names
+the file or a file beside it; a command then has exit code 2, that line as last line on stderr, and nothing else there
+but warnings of one line. Nothing is written or changed beside the input; after an error nothing is written at all. No
+library writes to stderr. Processor time and memory are at most twice those of the sound file, plus `SECONDS`
+and `MEBIBYTES`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from fuzz.mutations import mutate
 from psotrack import cli
 from psotrack.errors import PsotrackError
 
-#: Longest message, characters.
+#: Longest message, characters; the folders of the tries do not count.
 LONGEST = 300
 #: What a try may take beside twice what the sound file takes.
 SECONDS, MEBIBYTES = 2.0, 256
@@ -71,7 +72,6 @@ class Judge:
     """
 
     def __init__(self, folder: Path, seed: int, names: tuple[str, ...] = tuple(FORMATS)) -> None:
-        # The longest paths are not part of the messages' length that psotrack can choose.
         self._folder, self._seed, self._names = folder, seed, names
         self._seeds, self._out = folder / "in", folder / "out"
         make_all(self._seeds, names)

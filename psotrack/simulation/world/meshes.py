@@ -75,7 +75,8 @@ def _read(path: Path) -> Triangles:
         # Names of parts and comments may be in any encoding; they are not used.
         file = io.StringIO(content.decode(errors="replace")) if suffix == ".obj" else io.BytesIO(content)
         read = trimesh.load_mesh(file, file_type=suffix[1:], process=False, skip_materials=True)
-        vertices, faces = np.asarray(read.vertices, float), np.asarray(read.faces, int)
+        vertices = np.asarray(read.vertices, float).reshape(-1, 3)
+        faces = np.asarray(read.faces, int).reshape(-1, 3)
     # Each parser of trimesh has different errors.
     except Exception as error:
         raise InputError(
