@@ -441,5 +441,12 @@ def test_rows_of_a_live_session_arrive_in_the_viewer(folder, tmp_path):
     np.testing.assert_allclose(centres, tracks.position_m[:, 1], atol=1e-6)
     words = [word[0] for word in entities["/status/1"]["StateChange:state"][1]]
     assert words == ["tracked", "coasting", "tracked"]
+    # Lines have the colours of the drones.
+    for drone in "01":
+        line = entities[f"/plots/height_m/{drone}"]["SeriesLines:colors"][1]
+        assert line[0] == entities[f"/world/drones/{drone}/body"]["Boxes3D:colors"][1][0]
+    # A lost drone has no ellipsoid.
+    last_frame = max(entities["/world/drones/0/ellipsoid"]["Ellipsoids3D:half_sizes"][0])
+    assert last_frame == LOST_FROM - 1
     assert entities["/plots/delay_ms"]["Scalars:scalars"][1] == [[20.0]] * NUM_FRAMES
     assert "/world/cameras/c0" in entities

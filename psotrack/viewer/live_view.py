@@ -45,6 +45,7 @@ class LiveView:
         self._recording, self._web = recording, web
         self._trails: dict[str, deque[Float[np.ndarray, "3"]]] = {}
         self._status: dict[str, int] = {}
+        self._colours: dict[str, tuple[int, int, int]] = {}
         self._ends = contextlib.ExitStack()
         self.page = ""
 
@@ -70,8 +71,8 @@ class LiveView:
             del self._trails[name]
         for index, name in enumerate(rows.drones):
             status = int(rows.status[0, index]) if rows.status is not None else int(Status.TRACKED)
-            if name not in self._status:
-                log_status_words(self._entities, f"status/{part(name)}")
+            if name not in self._colours:
+                self._begin(name)
             if status != self._status.get(name):
                 self._log(f"status/{part(name)}", rr.StateChange(state=Status(status).label))
                 self._status[name] = status
@@ -82,8 +83,7 @@ class LiveView:
                 continue
             trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
             trail.append(position_m)
-            number = int(name) if name.isdecimal() else len(self._trails)
-            rgb = [status_rgb(status, shown_rgb(COLOURS[number % len(COLOURS)]))]
+            rgb = [status_rgb(status, self._colours[name])]
             label = status_label(name, status)
             half_m = np.array(USUAL_SIZE_M) / 2
             self._log(
@@ -109,6 +109,15 @@ class LiveView:
                 )
                 deviation_mm = 1e3 * float(np.sqrt(np.trace(covariance_m2)))
                 self._log(f"plots/deviation_mm/{part(name)}", rr.Scalars(deviation_mm))
+
+    def _begin(self, name: str) -> None:
+        """Choose the colour of a drone that is seen for the first time, and log how its status and its lines look."""
+        number = int(name) if name.isdecimal() else len(self._colours)
+        self._colours[name] = shown_rgb(COLOURS[number % len(COLOURS)])
+        log_status_words(self._entities, f"status/{part(name)}")
+        for quantity in ("height_m", "deviation_mm"):
+            line = rr.SeriesLines(colors=[self._colours[name]], names=[name], widths=[1.5])
+            self._entities.static(f"plots/{quantity}/{part(name)}", line)
 
     def show_delay(self, delay_s: float) -> None:
         """Show the delay of the instant whose rows were written last, seconds."""
