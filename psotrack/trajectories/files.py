@@ -301,11 +301,12 @@ def _read_parquet(path: Path) -> _Table:
 
     try:
         table = pq.read_table(path)
+        names = table.column_names
     # A damaged file is also found by errors of Python in the library.
     except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
-    _check_columns(path, table.column_names)
-    columns = {name: _parquet_column(path, table, name) for name in _READ if name in table.column_names}
+    _check_columns(path, names)
+    columns = {name: _parquet_column(path, table, name) for name in _READ if name in names}
     return _Table(path, columns, lambda row: f"row {row + 1}")
 
 
@@ -317,7 +318,7 @@ def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray
         if name not in _WORDS:
             return column.cast(pa.float64()).to_numpy().astype(float)
         words = column.cast(pa.string()).to_pylist()
-    except pa.ArrowException:
+    except (pa.ArrowException, ValueError):
         expected = f"{'words' if name in _WORDS else 'numbers'} in {name}"
         raise InputError(path, expected=expected, found=f"{column.type}") from None
     return np.array([word or "" for word in words], object)

@@ -622,11 +622,12 @@ _OTHERS = {
         "a.onnx",
         (_detected,),
         "detect {folder}/pictures --detector {file} --size 64 --out {out}/boxes",
+        is_slow=True,
     ),
 }
 
 #: The formats by name.
-FORMATS: Mapping[str, Format] = {
+FORMATS: dict[str, Format] = {
     **_CALIBRATIONS,
     **_TRACKS,
     **_RECORDINGS,

@@ -35,6 +35,10 @@ SECONDS, MEBIBYTES = 2.0, 256
 COMMANDS = 0.05
 
 
+#: Streams of Python to the file descriptors, whatever else pytest has made of `sys.stdout`.
+_STREAMS = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+
+
 @dataclass(frozen=True)
 class Trial:
     """What a try is made of, and what happened.
@@ -214,23 +218,30 @@ def _captured() -> Iterator[Callable[[], str]]:
     """Take what the process writes to stdout and stderr; the function gives the text of stderr."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = os.dup(1), os.dup(2)
+    kept, streams = (os.dup(1), os.dup(2)), (sys.stdout, sys.stderr)
     text = ""
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err, warnings.catch_warnings():
+    with (
+        tempfile.TemporaryFile() as out,
+        tempfile.TemporaryFile() as err,
+        warnings.catch_warnings(record=True) as warned,
+    ):
         warnings.simplefilter("always")
         os.dup2(out.fileno(), 1)
         os.dup2(err.fileno(), 2)
+        sys.stdout, sys.stderr = _STREAMS
         try:
             yield lambda: text
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
+            sys.stdout, sys.stderr = streams
             os.dup2(kept[0], 1)
             os.dup2(kept[1], 2)
             os.close(kept[0])
             os.close(kept[1])
             err.seek(0)
-            text = err.read().decode("utf-8", "replace")
+            shown = [f"{each.filename}:{each.lineno}: {each.message}\n" for each in warned]
+            text = "".join(shown) + err.read().decode("utf-8", "replace")
 
 
 def _begin_memory() -> float:

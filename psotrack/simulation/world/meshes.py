@@ -12,6 +12,7 @@ from psotrack.errors import InputError
 from psotrack.simulation.scenarios import Mesh
 from psotrack.simulation.world.models import DroneModel
 from psotrack.simulation.world.shapes import Triangles
+from psotrack.support import LARGEST
 
 _SUFFIXES = (".obj", ".ply")
 #: Smallest and largest extent of a drone. A mesh outside this range is in other units.
@@ -35,10 +36,9 @@ def load(mesh: Mesh) -> DroneModel:
     """
     path = Path(mesh.file)
     triangles = mesh.scale * _read(path) - np.array(mesh.origin_m)
-    if not np.isfinite(triangles).all():
-        raise InputError(
-            path, expected="numbers as vertices", found="NaN or infinity", remedy="export it again"
-        )
+    if not (np.abs(triangles) <= LARGEST).all():
+        found = "NaN, infinity or huge numbers"
+        raise InputError(path, expected="numbers as vertices", found=found, remedy="export it again")
     kept = triangles[_area_m2(triangles) > _NO_AREA_M2]
     if not len(kept):
         found = f"{len(triangles)} without" if len(triangles) else "no faces"
