@@ -10,9 +10,10 @@ import contextlib
 import os
 from collections.abc import Iterator
 
-#: Longest message, characters. What follows a long place has `_SHORTEST` characters all the same.
-LONGEST_MESSAGE = 300
-_SHORTEST = 200
+#: Longest message, characters: 300 with `psotrack: ` before the message. The folder of the place does not count, wherever
+#: it stands in the message. What follows a long name has `_SHORTEST` characters all the same.
+LONGEST_MESSAGE = 290
+_SHORTEST = 150
 
 
 class PsotrackError(Exception):
@@ -30,8 +31,12 @@ class PsotrackError(Exception):
 
     def __init__(self, where: object, *, expected: str, found: str, remedy: str = "") -> None:
         place = _on_one_line(os.fspath(where) if isinstance(where, os.PathLike) else str(where))
-        room = max(LONGEST_MESSAGE - len(f"{place}: expected , found ; "), _SHORTEST)
-        expected, found, remedy = _shortened([_on_one_line(part) for part in (expected, found, remedy)], room)
+        parts = [_on_one_line(part) for part in (expected, found, remedy)]
+        folder = os.path.dirname(place)
+        room = max(LONGEST_MESSAGE - len(f"{place[len(folder) :]}: expected , found ; "), _SHORTEST)
+        if folder:
+            room += len(folder) * sum(part.count(folder) for part in parts)
+        expected, found, remedy = _shortened(parts, room)
         message = f"{place}: expected {expected}, found {found}"
         super().__init__(f"{message}; {remedy}" if remedy else message)
 

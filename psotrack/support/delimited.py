@@ -18,6 +18,8 @@ from psotrack.support.numbers import MODERATE, is_moderate
 
 #: Largest number of characters of a cell, so that no search in a cell takes long.
 _LONGEST_CELL = 1000
+#: Largest whole number: NumPy's integers of any size hold it.
+_LARGEST_COUNT = 2**31 - 1
 #: A column's name and, in brackets, its unit: `pos_x[m]`.
 _HEADER = re.compile(r"(?P<name>[^\[]*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 
@@ -84,6 +86,10 @@ class TextRow:
         value = self.number(column)
         if value < 0 or value != int(value):
             raise self.error(column, "a whole number, 0 or more", repr(self.cells[column.index]))
+        if value > _LARGEST_COUNT:
+            raise self.error(
+                column, f"a whole number of at most {_LARGEST_COUNT}", repr(self.cells[column.index])
+            )
         return int(value)
 
     def error(self, column: Column, expected: str, found: str, remedy: str = "") -> InputError:

@@ -393,7 +393,9 @@ def _check_values(table: _Table) -> None:
         elif name == "num_cameras":
             wrong, expected = ~(_whole(values) | np.isnan(values)), "a whole number from 0, or nothing"
         else:
-            wrong, expected = np.abs(values) > LARGEST, f"a number of at most {LARGEST:g} in size, or nothing"
+            # Covariances are squares.
+            most = LARGEST**2 if name in COVARIANCE_COLUMNS | RELATIVE_COLUMNS else LARGEST
+            wrong, expected = np.abs(values) > most, "a finite number, or nothing"
         if wrong.any():
             row = int(np.argmax(wrong))
             raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))

@@ -125,7 +125,7 @@ class Judge:
         text = said()
         allowed = read is None
         if not fault and message is not None:
-            fault = _wrong_message(message, self._seeds / name)
+            fault = _wrong_message(message, path, self._seeds / name)
         lines = text.splitlines()
         if not fault and allowed and message is not None:
             lines = lines[:-1]
@@ -192,11 +192,11 @@ def _trace(error: BaseException) -> str:
     return f"{type(error).__name__} at {place}: {str(error)[:200]}"
 
 
-def _wrong_message(message: str, folder: Path) -> str:
+def _wrong_message(message: str, path: Path, folder: Path) -> str:
     if "\n" in message or "\r" in message or not message.isprintable():
         return f"a message that is not one printable line: {message[:300]!r}"
     # The folders of the try are no part of the message that psotrack chooses.
-    shown = message.replace(str(folder), "")
+    shown = message.replace(str(path.parent), "").replace(str(folder), "")
     if len(shown) > LONGEST:
         return f"a message of {len(shown)} characters: {shown[:300]!r}"
     if str(folder) not in message:
