@@ -10,8 +10,8 @@ import contextlib
 import os
 from collections.abc import Iterator
 
-#: Longest message, characters: 300 with `psotrack: ` before the message. The folder of the place does not count, wherever
-#: it stands in the message. What follows a long name has `_SHORTEST` characters all the same.
+#: Longest message, characters: 300 with `psotrack: ` before the message. The folder of the place does not count,
+#: wherever it stands in the message. What follows a long name has `_SHORTEST` characters all the same.
 LONGEST_MESSAGE = 290
 _SHORTEST = 150
 
