@@ -18,7 +18,7 @@ oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python 
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow lint format bench bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
+.PHONY: help demo test test-slow fuzz lint format bench bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -41,6 +41,9 @@ test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/test_vid
 
 test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and experiments at small sizes
 	@PSOTRACK_TYPE_CHECKS=off $(pytest) -m slow $(NAMES)
+
+fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINUTES=60 for more, SEED=7 for others
+	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
 
 lint: $(VENV)/.installed  ## ruff, its format check, mypy
 	@$(BIN)/ruff check .

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 from helpers import ring_rig
 
-from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError, check_positive
+from psotrack.errors import (
+    LONGEST_MESSAGE,
+    InputError,
+    OutputError,
+    PsotrackError,
+    SettingsError,
+    check_positive,
+    errors_name,
+)
 from psotrack.recordings import (
     Detections,
     Markers,
@@ -43,6 +51,31 @@ def test_a_message_has_four_parts():
         str(SettingsError("drones", expected="at least 1", found="0"))
         == "drones: expected at least 1, found 0"
     )
+
+
+def test_a_message_is_one_short_line(tmp_path):
+    """What cannot be printed is escaped, the longest part is cut, and a remedy that fits stays whole."""
+    command = f"psotrack init {tmp_path}/videos"
+    error = InputError(tmp_path / "a\nb.csv", expected="text", found="\x00\x1b[31m\n" * 100, remedy=command)
+    message = str(error)
+    assert message.startswith(f"{tmp_path}/a b.csv: expected text, found \\x00\\x1b[31m \\x00")
+    assert message.endswith(f" ...; {command}")
+    assert message.isprintable()
+    assert len(message.replace(str(tmp_path), "")) == LONGEST_MESSAGE
+
+
+def test_errors_of_a_file_name_it(tmp_path):
+    with pytest.raises(SettingsError, match=r"^tracks\.csv, frame: expected this, found that$"):
+        fail_within("tracks.csv", SettingsError("frame", expected="this", found="that"))
+    with pytest.raises(InputError, match=r"^tracks\.csv: expected this, found that$"):
+        fail_within("tracks.csv", InputError("tracks.csv", expected="this", found="that"))
+    with pytest.raises(OutputError, match=r"^out: expected this, found that$"):
+        fail_within("tracks.csv", OutputError("out", expected="this", found="that"))
+
+
+def fail_within(path, error):
+    with errors_name(path):
+        raise error
 
 
 @pytest.mark.parametrize("error_class", [InputError, SettingsError, OutputError])

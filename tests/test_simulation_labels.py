@@ -409,7 +409,8 @@ def test_broken_archives_and_images_are_named(tmp_path):
     with read_masks(tmp_path / "masks.zip") as masks:
         for frame in (0, 1):
             with pytest.raises(
-                InputError, match=rf"masks\.zip: cam1i/dron1/{frame}\.png: expected an image, found none"
+                InputError,
+                match=rf"masks\.zip: cam1i/dron1/{frame}\.png: expected an image, found a file that",
             ):
                 masks.mask("cam1", 1, frame)
 

@@ -32,8 +32,10 @@ def rows(*seeds: int, error_m: float = 0.01) -> pd.DataFrame:
 
 def add(store: Store, key: str, new: pd.DataFrame) -> None:
     """Add rows, and the errors of two frames for each row."""
-    frames = pd.concat([new.assign(frame=frame, error_m=new["mean_error_m"]) for frame in (0, 1)])
-    store.add(key, new, frames[["seed", "frame", "error_m"]])
+    frames = pd.concat(
+        [new.assign(frame=frame, drone="dron1", error_m=new["mean_error_m"]) for frame in (0, 1)]
+    )
+    store.add(key, new, frames[["seed", "frame", "drone", "error_m"]])
 
 
 def lock_path(store: Store) -> Path:

@@ -118,7 +118,7 @@ def manifest_of(content: bytes, where: Path) -> Manifest:
                 remedy="install a newer psotrack",
             )
         return msgspec.convert(data, Manifest)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(where, expected=f"a whole {MANIFEST_FILE}", found=f"{error}") from error
 
 

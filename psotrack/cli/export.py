@@ -9,7 +9,7 @@ import click
 
 from psotrack.cli.options import FORCE, QUIET, TRACKS, Numbers, SequencePath
 from psotrack.cli.output import print_line, report_to
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -115,16 +115,11 @@ def _sizes_m(
 
 def _recorded_sizes(record: Path) -> dict[str, list[float]]:
     """Sizes by the drones' names, from the record of a run; empty where there is no record that has them."""
-    import json
+    from psotrack.support import read_json
 
-    try:
-        content = json.loads(record.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not record.exists():
         return {}
-    except (OSError, ValueError) as error:
-        found = f"{error}".partition("\n")[0]
-        raise InputError(record, expected="the record of the tracks beside it", found=found) from error
-    drones = content.get("drones") if isinstance(content, dict) else None
+    drones = read_json(record, "the record of the tracks beside it").get("drones")
     # `track --causal` records the number of drones alone.
     listed = drones if isinstance(drones, list) else []
     return {str(each["drone"]): each["size_m"] for each in listed if each.get("size_m") and "drone" in each}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tomllib
 from pathlib import Path
@@ -11,7 +12,7 @@ import click
 
 from psotrack.cli.options import FORCE, JOBS, JSON, reporting
 from psotrack.cli.output import output_json, print_line, report_to
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, errors_name
 
 
 @click.command()
@@ -152,14 +153,15 @@ def simulate(
         output_json(json_path, {"preview": str(page)}, force)
         print_line(quiet, json_path, f"{page}")
         return
-    folder = (simulate_own_cameras if own_cameras else make)(
-        recipe,
-        out,
-        SimulationSettings(num_frames, scale, seed, masks, onboard),
-        force=force,
-        jobs=jobs,
-        report=report_to(quiet),
-    )
+    with errors_name(scenario_file) if scenario_file else contextlib.nullcontext():
+        folder = (simulate_own_cameras if own_cameras else make)(
+            recipe,
+            out,
+            SimulationSettings(num_frames, scale, seed, masks, onboard),
+            force=force,
+            jobs=jobs,
+            report=report_to(quiet),
+        )
     output_json(json_path, {"sequence": str(folder)}, force)
     print_line(quiet, json_path, f"{folder}")
 

@@ -24,8 +24,13 @@ from jaxtyping import Bool
 from psotrack.datasets._archives import stored_entry
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key, chosen_camera
+from psotrack.recordings import image_of
 
 MASKS = "drone_masks.zip"
+#: What `zipfile` raises for archives that are damaged, encrypted, or compressed in a way that it does not know.
+_ZIP_ERRORS = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error, ValueError),
+)
 
 Mask = Bool[np.ndarray, "height width"]
 
@@ -112,12 +117,10 @@ class Masks:
             )
         try:
             data = self._archive.read(name) if self._archive else (self._path / name).read_bytes()
-        except (OSError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{self._path}: {name}", expected="an image", found=str(error)) from error
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
-        if image is None:
-            raise InputError(f"{self._path}: {name}", expected="an image", found="none that can be decoded")
-        return image > 0
+        except (OSError, *_ZIP_ERRORS) as error:
+            found = str(error) or type(error).__name__
+            raise InputError(f"{self._path}: {name}", expected="an image", found=found) from error
+        return image_of(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE, f"{self._path}: {name}") > 0
 
     def __enter__(self) -> Masks:
         return self
@@ -145,7 +148,7 @@ def read_masks(path: Path | str) -> Masks:
         return Masks(path, _index_images(path, files), None)
     try:
         archive = zipfile.ZipFile(path)
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, *_ZIP_ERRORS) as error:
         found = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InputError(path, expected="a ZIP archive or a folder of masks", found=found.lower()) from error
     return Masks(path, _index_images(path, archive.namelist()), archive)

@@ -25,6 +25,8 @@ Orientations = Float[np.ndarray, "frames 4"]
 
 _QUATERNION = re.compile(r"(?P<stem>[a-z_ .]*q[a-z_ .]*?)[_ .]?(?P<axis>[wxyz])")
 #: Largest deviation of a quaternion's norm from 1: the effect of rounding to two decimals.
+#: Largest frame number, whatever the number of rows, and per row: the poses of all frames take memory.
+_FRAMES, _FRAMES_PER_ROW = 1_000_000, 100
 _NORM_TOLERANCE = 0.02
 
 
@@ -43,6 +45,10 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
     metres = np.array([table.factor(column, METRES_PER_UNIT) for column in position])
     quaternion = _quaternion_columns(table)
     rows = _by_frame(table, id_column)
+    last, most = max(rows), max(_FRAMES, _FRAMES_PER_ROW * len(rows))
+    if last > most:
+        expected = f"a frame number of at most {most} in a file of {len(rows)} rows"
+        raise rows[last].error(id_column, expected, f"{last}")
     position_m = np.full((max(rows) + 1, 3), np.nan)
     orientation_wxyz = np.full((max(rows) + 1, 4), np.nan)
     for frame, row in rows.items():

@@ -13,6 +13,9 @@ All boxes are in pixels of the input. Objects of all classes count as drones: us
 from __future__ import annotations
 
 import contextlib
+import functools
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,7 +102,7 @@ class OnnxDetector:
         settings: settings of the detection.
 
     Raises:
-        InputError: the file does not exist, or OpenCV cannot read it.
+        InputError: the file does not exist, or OpenCV cannot read it, or would end the process.
     """
 
     def __init__(self, model: Path | str, settings: DetectorSettings) -> None:
@@ -108,6 +111,7 @@ class OnnxDetector:
             raise InputError(model, expected="an ONNX model", found="no such file")
         self.model = model
         self.settings = settings
+        _check_survives(model, settings.size)
         with self._opencv_errors("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
 
@@ -194,6 +198,31 @@ class OnnxDetector:
             raise InputError(self.model, expected=expected, found=found, remedy=remedy) from error
         finally:
             cv2.utils.logging.setLogLevel(level)
+
+
+#: Reads a network and runs it on a black image. Errors of OpenCV are no concern here.
+_RUN_ONCE = """
+import sys, cv2, numpy
+side = int(sys.argv[2])
+network = cv2.dnn.readNetFromONNX(sys.argv[1])
+network.setInput(cv2.dnn.blobFromImage(numpy.zeros((side, side, 3), numpy.uint8)))
+network.forward()
+"""
+
+
+def _check_survives(model: Path, size: int) -> None:
+    """Raise `InputError` if a network ends the process that runs it, as OpenCV does for some damaged files."""
+    code = _exit_code(str(model.resolve()), model.stat().st_mtime_ns, size)
+    # An error of Python has the exit code 1.
+    if code not in (0, 1):
+        found = f"one that ends the process that runs it (exit code {code})"
+        raise InputError(model, expected="an ONNX model that OpenCV can run", found=found)
+
+
+@functools.lru_cache(maxsize=16)
+def _exit_code(model: str, _modified_ns: int, size: int) -> int:
+    command = [sys.executable, "-c", _RUN_ONCE, model, str(size)]
+    return subprocess.run(command, capture_output=True, check=False).returncode
 
 
 def find_detector(name: str, settings: DetectorSettings) -> Detector:

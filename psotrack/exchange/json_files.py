@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.support import read_text
+from psotrack.support import read_json
 from psotrack.trajectories import Status, Trajectories
 
 #: Value of the key `format`, and version of the keys' meaning.
@@ -54,11 +54,8 @@ def read_json_tracks(path: Path) -> Trajectories:
     Raises:
         InputError: the file is not JSON of this format and version, or a quantity does not have a value per frame.
     """
-    try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(path, expected="JSON", found=f"{error}") from error
-    if not isinstance(content, dict) or content.get("format") != NAME:
+    content = read_json(path, "JSON with tracks")
+    if content.get("format") != NAME:
         remedy = "the record of a run has no positions: name its .csv or .parquet"
         raise InputError(path, expected=f'tracks, with "format": "{NAME}"', found="other JSON", remedy=remedy)
     if content.get("version") != VERSION:

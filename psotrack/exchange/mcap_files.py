@@ -13,7 +13,9 @@ mcap and mcap-ros2-support are an extra: `pip install 'psotrack[ros]'`.
 
 from __future__ import annotations
 
+import contextlib
 import heapq
+import io
 import json
 import re
 from collections import Counter
@@ -117,7 +119,8 @@ def read_mcap(path: Path) -> list[TimedPath]:
     rows: dict[str, _Rows] = {}
     names: dict[str, str] = {}
     try:
-        with path.open("rb") as stream:
+        # The library also prints what it finds in a damaged file.
+        with path.open("rb") as stream, contextlib.redirect_stderr(io.StringIO()):
             reader = make_reader(stream, decoder_factories=[decoder])
             summary = reader.get_summary()
             if summary is None:

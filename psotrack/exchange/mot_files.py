@@ -31,6 +31,10 @@ from psotrack.trajectories.association import align, fixed_identity
 #: The folder of TrackEval: with the benchmark MOT15, TrackEval leaves nothing out.
 BENCHMARK, SPLIT, TRACKER = "MOT15", "train", "psotrack"
 WORLD, TRACKS, REFERENCE, INFO = "3d", "tracks.txt", "reference.txt", "seqinfo.ini"
+#: Largest number of a frame or an identity.
+_LARGEST = 2**31
+#: A lower rate is none; times would overflow.
+_SLOWEST_HZ = 1e-6
 _COLUMNS = "frame, id, left, top, width, height, confidence, x, y, z"
 
 
@@ -101,7 +105,8 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
         InputError: the file cannot be read, has boxes only, has a drone twice in a frame, or there is no rate.
     """
     table = read_numbers(path, 7, f"at least 7 numbers: {_COLUMNS}", more=True)
-    wrong = (table[:, 0] < 1) | (table[:, :2] != np.floor(table[:, :2])).any(axis=1)
+    numbers = table[:, :2]
+    wrong = (table[:, 0] < 1) | ((numbers != np.floor(numbers)) | (np.abs(numbers) > _LARGEST)).any(axis=1)
     if wrong.any():
         first = int(np.argmax(wrong))
         raise InputError(
@@ -156,8 +161,8 @@ def _times(
             fps = float(parser["Sequence"]["frameRate"])
         except (configparser.Error, KeyError, ValueError) as error:
             raise InputError(info, expected="a frameRate", found=f"{error}".partition("\n")[0]) from error
-        if not 0 < fps < np.inf:
-            raise InputError(info, expected="a frameRate above 0", found=f"{fps:g}")
+        if not _SLOWEST_HZ < fps < np.inf:
+            raise InputError(info, expected=f"a frameRate above {_SLOWEST_HZ:g}", found=f"{fps:g}")
     if recording is not None and (fps is None or abs(fps / recording.fps - 1) < 1e-3):
         time_s = recording.timeline().time_s
         return np.where(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.support import read_text
+from psotrack.support import is_moderate, read_text
 
 _SEPARATOR = re.compile(r"\s*,\s*|\s+")
 
@@ -54,7 +54,7 @@ def read_numbers(
             values = [float(word) for word in words[:columns]]
         except ValueError:
             raise InputError(place, expected=expected, found=repr(line.strip()[:80])) from None
-        if len(words) < columns or (len(words) > columns and not more) or not np.isfinite(values).all():
+        if len(words) < columns or (len(words) > columns and not more) or not all(map(is_moderate, values)):
             raise InputError(place, expected=expected, found=repr(line.strip()[:80]))
         rows.append(values)
     if not rows:

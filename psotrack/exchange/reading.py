@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, errors_name
 from psotrack.exchange.c3d_files import read_c3d_tracks
 from psotrack.exchange.json_files import read_json_tracks
 from psotrack.exchange.kitti_files import POSES, read_kitti
@@ -48,9 +48,9 @@ def read_tracks(path: Path | str, *, recording: Recording | None = None) -> Traj
     if not path.exists():
         raise InputError(path, expected="a file or folder of tracks", found="no such file or folder")
     instant_s = None if recording is None else recording.timeline().time_s.astype(np.float64)
-    return (
-        _read_folder(path, recording, instant_s) if path.is_dir() else _read_file(path, recording, instant_s)
-    )
+    with errors_name(path):
+        read = _read_folder if path.is_dir() else _read_file
+        return read(path, recording, instant_s)
 
 
 def _read_folder(

@@ -14,6 +14,8 @@ from psotrack.trajectories import Trajectories, resample
 
 #: Largest distance of a time from an instant whose frame number it gets, in intervals. Times that are rounded to
 #: milliseconds are within the limit up to 40 frames per second. In 2 % of an interval of 40 ms, a drone at 2 m/s flies
+#: Largest number of a frame.
+_LARGEST_FRAME = 2**31
 #: 1.6 mm. All other times are brought to the instants by interpolation.
 _SAME = 0.02
 #: Longest gap between two samples over which positions are interpolated, in intervals between samples: one missing
@@ -126,12 +128,15 @@ def _own_interval_s(paths: Sequence[TimedPath]) -> float | None:
     if not np.isfinite(shortest_s) or longest.time_s[0] < -_SAME * shortest_s:
         return None
     span_s = float(longest.time_s[-1])
+    if not np.isfinite(span_s / shortest_s):
+        return None
     # Over a long span, the number of intervals gives the interval better than two rounded times do.
     interval_s = span_s / max(round(span_s / shortest_s), 1)
     for path in paths:
         count = path.time_s / interval_s
         number = np.round(count)
-        if (np.abs(count - number) > _SAME).any() or (number < 0).any() or (np.diff(number) <= 0).any():
+        is_wrong = (np.abs(count - number) > _SAME) | (number < 0) | (number > _LARGEST_FRAME)
+        if is_wrong.any() or (np.diff(number) <= 0).any():
             return None
     return interval_s
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from psotrack.errors import InputError
-from psotrack.support import convert, read_text
+from psotrack.support import convert, read_json
 
 
 class LearnedDrone(msgspec.Struct, frozen=True):
@@ -76,12 +75,7 @@ def read_run_record(path: Path | str) -> RunRecord | None:
         InputError: the file cannot be read, or is no record of a run.
     """
     path = Path(path)
-    try:
-        content = json.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(path, expected="JSON, as `psotrack track` writes it", found=f"{error}") from error
-    if not isinstance(content, dict):
-        raise InputError(path, expected="the record of a run", found=f"JSON with a {type(content).__name__}")
+    content = read_json(path, "the record of a run, as `psotrack track` writes it")
     if "format" in content:
         return None
 

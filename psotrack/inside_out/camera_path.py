@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, errors_name
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, short_repr, write_rows
@@ -222,8 +222,8 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
     covariance[:, *_UPPER] = _numbers(table, *(f"cov_{axes}" for axes in _COVARIANCE))
     covariance += np.triu(covariance, 1).swapaxes(-1, -2)
     velocity_m_s = _numbers(table, *_VELOCITY)
-    return (
-        CameraPath(
+    with errors_name(path):
+        camera_path = CameraPath(
             frame=_counts(table, "frame"),
             time_s=_numbers(table, "time_s")[:, 0],
             position_m=_numbers(table, *_POSITION),
@@ -235,9 +235,8 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
             status=np.array([_status(row, table) for row in table.rows]),
             flags=np.array([_flags(row, table) for row in table.rows]),
             velocity_m_s=velocity_m_s if np.isfinite(velocity_m_s).any() else None,
-        ),
-        names.pop(),
-    )
+        )
+    return camera_path, names.pop()
 
 
 def _split(names: tuple[str, ...] | list[str], values: Float[np.ndarray, "frames columns"]) -> Mapping:

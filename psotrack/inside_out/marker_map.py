@@ -171,7 +171,7 @@ def _check_square(marker: int, row: MarkerRow) -> None:
     edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     diagonals = np.linalg.norm(corners[2:] - corners[:2], axis=1)
     # Corners in an order such as 1, 2, 4, 3 have a square's six distances, but two diagonals as short as its sides.
-    six = np.sort([*edges, *diagonals]) / edges.min()
+    six = np.sort([*edges, *diagonals]) / max(edges.min(), 1e-300)
     square = np.allclose(six, [1, 1, 1, 1, np.sqrt(2), np.sqrt(2)], atol=SQUARE_TOLERANCE)
     if square and diagonals.min() < 0.9 * edges.max():
         expected = "corners one after the other around the marker"

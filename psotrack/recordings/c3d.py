@@ -32,6 +32,8 @@ _WORDS = {
 _WORD_START = 3
 #: Largest number of frames that 16 bits can hold; a larger number is written elsewhere, and here this number.
 _MAX_FRAMES = 2**16 - 1
+#: Farthest position of a marker: a larger one is from damaged bytes.
+_FARTHEST_M = 1e5
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,7 +69,8 @@ def read_c3d(path: Path | str) -> Markers:
     stated is the millimetre, with a warning.
 
     Raises:
-        InputError: the file cannot be read, is cut short, has no markers, or its length unit is unknown.
+        InputError: the file cannot be read, is cut short, has no markers, has a position far away from everything that
+            motion capture can see, or its length unit is unknown.
     """
     path = Path(path)
     try:
@@ -84,6 +87,12 @@ def read_c3d(path: Path | str) -> Markers:
     data = _find_points(path, content, processor, header, parameters)
     position, seen = data.read(content)
     position_m = np.where(seen[..., None], position * _metres_per_unit(path, parameters), np.nan)
+    with np.errstate(invalid="ignore"):
+        far = np.argwhere((np.abs(position_m) > _FARTHEST_M).any(axis=-1))
+    if len(far):
+        frame, marker = far[0].tolist()
+        found = f"{np.abs(position_m[frame, marker]).max():.3g} m for marker {marker + 1} in frame {frame}"
+        raise InputError(path, expected=f"positions of at most {_FARTHEST_M:g} m", found=found)
     rate_hz = parameters.number("POINT:RATE") or header.rate_hz
     if not 0 < rate_hz < np.inf:
         raise InputError(path, expected="a rate above 0 Hz", found=f"{rate_hz:g}")

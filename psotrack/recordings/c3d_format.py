@@ -39,12 +39,15 @@ class Processor(IntEnum):
     def reals(self, data: bytes | memoryview) -> Float[np.ndarray, "values"]:
         """Numbers from 32-bit reals; a whole number of them."""
         if self is not Processor.DEC:
-            return np.frombuffer(data, f"{self.order}f4").astype(float)
+            # A number that is a signalling NaN makes NumPy warn.
+            with np.errstate(invalid="ignore"):
+                return np.frombuffer(data, f"{self.order}f4").astype(float)
         # A VAX real has its 16-bit words in the other order, and an exponent that is larger by 2.
         words = np.frombuffer(data, "<u2").reshape(-1, 2).astype(np.uint32)
         bits = words[:, 0] << 16 | words[:, 1]
         # A VAX real with the exponent 0 is zero, where IEEE's would be a very small number.
-        return np.where(bits & 0x7F800000, bits.view(np.float32).astype(float) / 4, 0.0)
+        with np.errstate(invalid="ignore"):
+            return np.where(bits & 0x7F800000, bits.view(np.float32).astype(float) / 4, 0.0)
 
 
 @dataclass(frozen=True)

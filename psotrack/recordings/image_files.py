@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from psotrack.errors import InputError
-from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.opencv_messages import decode_image
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -113,13 +113,26 @@ def _decode(path: Path, flags: int) -> Shaped[np.ndarray, "..."]:
         coded = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(path, expected="an image", found=(error.strerror or str(error)).lower()) from error
+    return image_of(coded, flags, path)
+
+
+def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> Shaped[np.ndarray, "..."]:
+    """Decode the content of an image file.
+
+    Args:
+        coded: the content.
+        flags: flags of `cv2.imdecode`.
+        where: the file, for messages.
+
+    Raises:
+        InputError: the content is no image.
+    """
     if coded[: len(_PNG)].tobytes() == _PNG and not _is_whole_png(coded):
-        raise InputError(path, expected="an image", found="a PNG that is cut short or damaged")
-    with silence_opencv():
-        image = cv2.imdecode(coded, flags) if len(coded) else None
+        raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
+    image = decode_image(coded, flags, where)
     if image is None:
-        raise InputError(path, expected="an image", found="a file that OpenCV cannot decode")
-    return np.asarray(image)
+        raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
+    return image
 
 
 def _is_whole_png(coded: UInt8[np.ndarray, " bytes"]) -> bool:

@@ -26,8 +26,8 @@ _LARGEST_M = 1.5
 _FEWEST, _MOST = 3, 20
 #: Number of frames in which distances are looked at.
 _FRAMES = 2000
-#: Number of labels that a message shows of one body.
-_SHOWN = 6
+#: Number of labels that a message shows of one body, and of each of several bodies.
+_SHOWN, _SHOWN_OF_MANY = 6, 2
 
 
 class NoDronesError(InputError):
@@ -69,17 +69,18 @@ def drone_markers(
     rigid = {name: columns for name, columns in bodies.items() if not faults[name]}
     others = [name for name, fault in faults.items() if fault and len(bodies[name]) >= _FEWEST]
     if not rigid or others:
+        most = _SHOWN if len(bodies) == 1 else _SHOWN_OF_MANY
         raise NoDronesError(
             where,
-            expected=f"markers of drones, which are rigid bodies of {_FEWEST} to {_MOST} markers",
+            expected=f"drones, rigid bodies of {_FEWEST} to {_MOST} markers",
             found="; ".join(
-                f"{name}, {faults[name] or 'rigid'} ({_shown(markers, columns)})"
+                f"{name}, {faults[name] or 'rigid'} ({_shown(markers, columns, most)})"
                 for name, columns in bodies.items()
             )
             if any(bodies.values())
             else f"unidentified markers only ({_shown(markers, range(len(markers.labels)))})",
-            remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies], or leave the "
-            "file out of the recording",
+            remedy="say which markers are a drone's with --body NAME=LABEL,LABEL or [reference.bodies], or leave "
+            "the file out",
         )
     _logger.warning(
         "%s: no body is called %s...; taken for drones, because their markers are rigid: %s",
@@ -150,9 +151,9 @@ def _fault(markers: Markers, columns: Sequence[int]) -> str:
     return f"{median_m.max():.1f} m large" if median_m.max() > _LARGEST_M else ""
 
 
-def _shown(markers: Markers, columns: Sequence[int]) -> str:
+def _shown(markers: Markers, columns: Sequence[int], most: int = _SHOWN) -> str:
     labels = [markers.labels[column] for column in columns]
-    return ", ".join(labels[:_SHOWN]) + (f" and {len(labels) - _SHOWN} more" if len(labels) > _SHOWN else "")
+    return ", ".join(labels[:most]) + (f" and {len(labels) - most} more" if len(labels) > most else "")
 
 
 def _sorted(bodies: Mapping[str, list[int]]) -> dict[str, list[int]]:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
+import tempfile
 import threading
 from collections.abc import Iterator
 
 import cv2
+import numpy as np
+from jaxtyping import Shaped, UInt8
+
+logger = logging.getLogger(__name__)
 
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
@@ -19,7 +25,8 @@ _opening = threading.Lock()
 def silence_opencv() -> Iterator[None]:
     """Suppress the messages of OpenCV and FFmpeg about a file that is opened or decoded in this block.
 
-    Errors replace them. Libraries that write to the terminal themselves, such as libpng, are not silenced.
+    Errors replace them. Libraries that write to the terminal themselves, such as libpng, are not silenced: see
+    `decode_image`.
     FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user has set is
     kept.
     """
@@ -34,3 +41,42 @@ def silence_opencv() -> Iterator[None]:
             cv2.utils.logging.setLogLevel(level)
             if not chosen:
                 del os.environ[_FFMPEG_LOG_LEVEL]
+
+
+def decode_image(
+    coded: UInt8[np.ndarray, " bytes"], flags: int, where: object
+) -> Shaped[np.ndarray, "..."] | None:
+    """Decode an image; None if OpenCV cannot.
+
+    libjpeg and libpng write about damaged images straight to stderr. What they write becomes a warning with the name of
+    the image.
+
+    Args:
+        coded: content of an image file.
+        flags: flags of `cv2.imdecode`.
+        where: the file, for the warning.
+    """
+    if not len(coded):
+        return None
+    with silence_opencv(), tempfile.TemporaryFile() as taken:
+        stderr = os.dup(2)
+        try:
+            os.dup2(taken.fileno(), 2)
+            image = cv2.imdecode(coded, flags)
+        except cv2.error:
+            image = None
+        finally:
+            os.dup2(stderr, 2)
+            taken.seek(0)
+            written = taken.read()
+            # A progress bar of another thread, which moves the cursor, is no message about the image.
+            if b"\x1b" in written:
+                os.write(stderr, written)
+                written = b""
+            os.close(stderr)
+    if image is None:
+        return None
+    if written:
+        said = written.decode(errors="replace").splitlines()[0].strip()
+        logger.warning("%s is damaged (%s)", where, said)
+    return np.asarray(image)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from psotrack.reports.page import check_page_path, render, write_page
 from psotrack.reports.scene import Scene3D
 from psotrack.reports.tables import PageCell, PageTable, number, percent
 from psotrack.rig_files import read_rig
-from psotrack.support import convert, read_text
+from psotrack.support import convert, read_json
 
 
 class CalibratedCamera(msgspec.Struct, frozen=True):
@@ -59,10 +58,10 @@ class CalibrationRecord(msgspec.Struct, frozen=True):
 def is_calibration_record(path: Path | str) -> bool:
     """Whether a JSON file is what `calibrate rig --json` writes."""
     try:
-        content = json.loads(read_text(path))
-    except (ValueError, PsotrackError):
+        content = read_json(path)
+    except PsotrackError:
         return False
-    return isinstance(content, dict) and {"rig", "cameras"} <= set(content)
+    return {"rig", "cameras"} <= set(content)
 
 
 def write_calibration_report(path: Path | str, record_path: Path | str, *, force: bool = False) -> None:
@@ -104,19 +103,18 @@ def write_calibration_report(path: Path | str, record_path: Path | str, *, force
 
 
 def _read(path: Path) -> CalibrationRecord:
-    try:
-        content = json.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(
-            path, expected="JSON, as `calibrate rig --json` writes it", found=f"{error}"
-        ) from error
+    content = read_json(path, "JSON, as `calibrate rig --json` writes it")
 
     def wrong(field: str, expected: str, found: str, remedy: str) -> InputError:
         return InputError(f"{path}, {field}", expected=expected, found=found, remedy=remedy)
 
-    if not isinstance(content, dict) or not content.get("cameras"):
+    if not content.get("cameras"):
         raise InputError(path, expected="the record of a calibration by a board", found="no cameras")
-    return convert(content, CalibrationRecord, wrong)
+    record = convert(content, CalibrationRecord, wrong)
+    for name, camera in record.cameras.items():
+        if len({len(line) for line in camera.coverage}) > 1:
+            raise wrong(f"cameras.{name}.coverage", "lines of equal length", "different ones", "")
+    return record
 
 
 def _rig_path(record_path: Path, rig: str) -> Path:

@@ -18,6 +18,7 @@ from psotrack.geometry import make_camera
 from psotrack.rig_files.entries import Entry, FileRig, Source, collect
 from psotrack.rig_files.fields import CameraFields, image_size
 from psotrack.rig_files.number_table import parse_numbers
+from psotrack.support import LARGEST
 
 _NAMES = ("camera", "fx", "w", "h", "cx", "cy", "AR", "k1", "k2", "t1", "t2", "k3")
 
@@ -39,9 +40,9 @@ def read(source: Source) -> FileRig:
     entries = []
     for row in table.values:
         values = dict(zip(_NAMES, row.tolist(), strict=True))
-        name = f"cam{values['camera']:.0f}"
+        name = f"cam{values['camera']:.9g}"
         fields = CameraFields(source.path, name, {"size": [values["w"], values["h"]]})
-        if not (values["fx"] > 0 and values["AR"] > 0 and np.isfinite(row).all()):
+        if not (values["fx"] > 0 and values["AR"] > 0 and (np.abs(row) <= LARGEST).all()):
             raise fields.error(
                 "fx", "finite numbers, fx and AR above 0", f"{values['fx']:g}, {values['AR']:g}"
             )

@@ -55,7 +55,7 @@ def read_anipose(source: Source) -> FileRig:
     """Read a file of anipose; the unit is the one in `[metadata]`, if there is one."""
     metadata = read_toml(source.path).get("metadata")
     unit = metadata.get("unit") if isinstance(metadata, dict) else None
-    if unit is not None and unit not in UNITS_M:
+    if unit is not None and unit not in list(UNITS_M):
         raise InputError(
             f"{source.path}, metadata.unit", expected=f"one of {', '.join(UNITS_M)}", found=f"{unit}"
         )

@@ -30,6 +30,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Camera, make_camera
 from psotrack.rig_files.entries import Entry, FileRig, Source
 from psotrack.rig_files.number_table import NumberTable, parse_numbers
+from psotrack.support import LARGEST
 
 _COEFFICIENTS = 11
 
@@ -50,7 +51,7 @@ def read(source: Source) -> FileRig:
         raise source.missing_size()
     names, columns = _columns(table)
     for name, column in zip(names, columns, strict=True):
-        if not np.isfinite(column).all():
+        if not (np.abs(column) <= LARGEST).all():
             raise InputError(
                 f"{source.path}, camera {name}", expected="finite numbers", found="NaN or infinity"
             )

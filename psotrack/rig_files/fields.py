@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, Camera, make_camera
 from psotrack.rig_files.entries import Entry
+from psotrack.support import LARGEST
 
 #: Largest element of |R Rᵀ - I| in a rotation matrix that is taken for rounded and made orthogonal: matrices written
 #: with four decimals pass.
@@ -76,7 +77,7 @@ class CameraFields:
             if squeezed.ndim == len(shape) and all(
                 want in (-1, have) for want, have in zip(shape, squeezed.shape, strict=True)
             ):
-                if not np.isfinite(squeezed).all():
+                if not (np.abs(squeezed) <= LARGEST).all():
                     raise self.error(name, "finite numbers", quoted(self.values[name]))
                 return squeezed
         raise self.error(name, expected, " x ".join(map(str, array.shape)) or quoted(self.values[name]))

@@ -52,7 +52,7 @@ def read(source: Source) -> FileRig:
     """Read a file of OpenCV; the unit is the file's `unit`, if there is one."""
     content = parse(source)
     unit = content.get("unit")
-    if unit is not None and unit not in UNITS_M:
+    if unit is not None and unit not in list(UNITS_M):
         raise InputError(f"{source.path}, unit", expected=f"one of {', '.join(UNITS_M)}", found=f"{unit}")
     entries = collect(source.path, _entries(source, content))
     return FileRig(entries, metres_per_unit=None if unit is None else UNITS_M[unit])

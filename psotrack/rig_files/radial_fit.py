@@ -59,7 +59,7 @@ def _polynomial(
 ) -> Float[np.ndarray, "5"]:
     """k1, k2, p1, p2, k3."""
     design = np.concatenate([_columns(points, axis) for axis in (0, 1)])
-    return np.linalg.lstsq(design, (distorted - points).T.ravel(), rcond=None)[0]
+    return _solved(design, (distorted - points).T.ravel())
 
 
 def _rational(
@@ -74,7 +74,17 @@ def _rational(
             for axis in (0, 1)
         ]
     )  # fmt: skip
-    return np.linalg.lstsq(design, (distorted - points).T.ravel(), rcond=None)[0]
+    return _solved(design, (distorted - points).T.ravel())
+
+
+def _solved(
+    design: Float[np.ndarray, "rows columns"], values: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " columns"]:
+    """The least-squares solution; no distortion where there is none, and the error of the fit is then large."""
+    try:
+        return np.linalg.lstsq(design, values, rcond=None)[0]
+    except np.linalg.LinAlgError:
+        return np.zeros(design.shape[1])
 
 
 def _columns(points: Float[np.ndarray, "n 2"], axis: int) -> Float[np.ndarray, "n 5"]:

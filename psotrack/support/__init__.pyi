@@ -13,17 +13,20 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_paths, html_table
+from .numbers import LARGEST, MODERATE, is_moderate
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
 from .representation import short_repr
-from .schema import assign, check_types, convert, nearest, plain, read_toml, toml_key, toml_value
+from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
 from .stored_programs import load_ahead, stored_jit
 
 __all__ = [
     "ARCHIVE_SUFFIX",
     "COLOURS",
+    "LARGEST",
+    "MODERATE",
     "Advance",
     "Column",
     "Device",
@@ -46,6 +49,7 @@ __all__ = [
     "html_paths",
     "html_table",
     "identify",
+    "is_moderate",
     "joined",
     "keep_compiled",
     "load_ahead",
@@ -58,6 +62,7 @@ __all__ = [
     "processors",
     "progress_bar",
     "progress_lines",
+    "read_json",
     "read_rows",
     "read_table",
     "read_text",

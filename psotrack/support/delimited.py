@@ -14,7 +14,12 @@ from pathlib import Path
 
 from psotrack.errors import InputError
 from psotrack.support.files import atomic_write, read_text
+from psotrack.support.numbers import MODERATE, is_moderate
 
+#: Largest number of characters of a cell, so that no search in a cell takes long.
+_LONGEST_CELL = 1000
+#: Largest whole number: NumPy's integers of any size hold it.
+_LARGEST_COUNT = 2**31 - 1
 #: A column's name and, in brackets, its unit: `pos_x[m]`.
 _HEADER = re.compile(r"(?P<name>[^\[]*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 
@@ -72,6 +77,8 @@ class TextRow:
             raise self.error(column, "a number", repr(cell), remedy) from None
         if not math.isfinite(value):
             raise self.error(column, "a finite number", repr(cell))
+        if not is_moderate(value):
+            raise self.error(column, MODERATE, repr(cell))
         return value
 
     def count(self, column: Column) -> int:
@@ -79,6 +86,10 @@ class TextRow:
         value = self.number(column)
         if value < 0 or value != int(value):
             raise self.error(column, "a whole number, 0 or more", repr(self.cells[column.index]))
+        if value > _LARGEST_COUNT:
+            raise self.error(
+                column, f"a whole number of at most {_LARGEST_COUNT}", repr(self.cells[column.index])
+            )
         return int(value)
 
     def error(self, column: Column, expected: str, found: str, remedy: str = "") -> InputError:
@@ -128,12 +139,15 @@ def read_rows(path: Path | str, separator: str) -> list[TextRow]:
     """Read the lines of a text file that are not blank, split at the separator.
 
     Raises:
-        InputError: the file cannot be read or is not text.
+        InputError: the file cannot be read, is not text, or has a cell of more than 1000 characters.
     """
     path = Path(path)
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         cells = tuple(cell.strip() for cell in line.split(separator))
+        if max(map(len, cells)) > _LONGEST_CELL:
+            expected = f"cells of at most {_LONGEST_CELL} characters, separated by {separator!r}"
+            raise InputError(f"{path}, line {number}", expected=expected, found="a longer one")
         if any(cells):
             # A separator at the end of a line ends the last cell; no empty cell follows.
             rows.append(TextRow(path, number, cells[:-1] if len(cells) > 1 and not cells[-1] else cells))

@@ -21,6 +21,7 @@ from msgspec import inspect
 
 from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.support.files import read_text
+from psotrack.support.numbers import MODERATE, is_moderate
 
 #: Function that makes an exception from the field, what was expected, what was found, and the remedy.
 MakeError = Callable[[str, str, str, str], PsotrackError]
@@ -52,6 +53,8 @@ def convert(data: dict[str, Any], kind: type[Record], error: MakeError) -> Recor
     for path, value in _floats(data, ""):
         if not math.isfinite(value):
             raise error(path, "a finite number", f"{value}", "")
+        if not is_moderate(value):
+            raise error(path, MODERATE, f"{value}", "")
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as fault:
@@ -99,6 +102,34 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         where = f"{path}, {place.partition(',')[0]}" if place else path
         found = f"an error ({reason[:1].lower()}{reason[1:]})"
         raise InputError(where, expected="valid TOML", found=found) from error
+    except RecursionError as error:
+        raise InputError(path, expected="valid TOML", found="brackets in hundreds of brackets") from error
+
+
+def read_json(path: Path | str, expected: str = "a JSON object", remedy: str = "") -> dict[str, Any]:
+    """Read the object of a JSON file.
+
+    Args:
+        path: path of the file.
+        expected: noun phrase for the content, for messages.
+        remedy: what the user can do about another content, for messages.
+
+    Raises:
+        InputError: the file cannot be read, is not valid JSON, or has another value than an object.
+    """
+    try:
+        content = json.loads(read_text(path))
+    # A ValueError is also an integer with thousands of digits.
+    except (ValueError, RecursionError) as error:
+        found = (
+            f"an error ({error})" if isinstance(error, ValueError) else "brackets in thousands of brackets"
+        )
+        raise InputError(path, expected=expected, found=found, remedy=remedy) from error
+    if not isinstance(content, dict):
+        raise InputError(
+            path, expected=expected, found=f"JSON with a {type(content).__name__}", remedy=remedy
+        )
+    return content
 
 
 def toml_key(name: str) -> str:
@@ -218,6 +249,14 @@ def _translate(message: str, data: Any, kind: type) -> tuple[str, str, str, str]
         return f"{path}.{name}" if path else name, "a value", "none", ""
     found = data
     for token in _tokens(path):
+        if not _can_hold(found, token) or (isinstance(found, dict) and token not in found):
+            # msgspec does not say which key of a mapping is meant.
+            return (
+                path,
+                _expected_words(fault),
+                _words_of(fault.partition(", got ")[2]) or "another value",
+                "",
+            )
         found = found[token]
     if fault.startswith("Invalid value"):
         tags = [struct.tag for struct in _structs_at(data, kind, path.rpartition(".")[0])]
@@ -242,6 +281,11 @@ def _on_one_line(name: str) -> str:
     return name if name.isprintable() else _quoted(name)
 
 
+def _words_of(types: str) -> str:
+    """Words for users instead of msgspec's names of types."""
+    return re.sub(r"`(\w+)`", lambda match: _TYPE_WORDS.get(match[1], match[1]), types)
+
+
 def _expected_words(fault: str) -> str:
     """Words for users: `Expected `array` of length 3, got 2` -> `a list of length 3`."""
     words = fault.removeprefix("Expected ").partition(", got ")[0]
@@ -250,8 +294,7 @@ def _expected_words(fault: str) -> str:
         return "a value in the allowed range"
     if "matching regex" in words:
         return "a name of letters, digits, dots, dashes and underscores, the first a letter or digit"
-    words = re.sub(r" ?\| null", "", words).replace(" | ", "` or `")
-    words = re.sub(r"`(\w+)`", lambda match: _TYPE_WORDS.get(match[1], match[1]), words)
+    words = _words_of(re.sub(r" ?\| null", "", words).replace(" | ", "` or `"))
     words = re.sub(r"(\d)\.0\b", r"\1", words)
     for sign, word in ((">=", "of at least"), ("<=", "of at most"), (">", "above"), ("<", "below")):
         words = words.replace(f" {sign} ", f" {word} ")

@@ -26,15 +26,43 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import atomic_write
+from psotrack.support import atomic_write, convert, read_json
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.older_folders import rename_columns, rename_manifest
 
 #: A temporary file that is older was left by a runner that was killed, seconds.
 _LEFT_BEHIND_S = 3600.0
+#: What helps against a damaged file.
+_REMEDY = "remove it, and run the sweep again"
+
+
+class _Failure(msgspec.Struct, frozen=True):
+    """What must be in the record of a failed cell."""
+
+    sequence: str
+    method: str
+    error: str
+
+
+class _Grid(msgspec.Struct, frozen=True):
+    settings: dict[str, Any]
+    methods: dict[str, dict[str, Any]]
+    axes: dict[str, Any]
+
+
+class _Run(msgspec.Struct, frozen=True):
+    grid: _Grid
+
+
+class _Manifest(msgspec.Struct, frozen=True):
+    """What must be in the manifest."""
+
+    runs: list[_Run]
+    inputs: dict[str, Any]
 
 
 def is_results_folder(path: Path | str) -> bool:
@@ -56,7 +84,7 @@ class Store:
     def finished_seeds(self, key: str) -> set[int]:
         """Seeds of a cell's finished runs."""
         try:
-            return set(pd.read_parquet(self._rows_path(key), columns=["seed"])["seed"].tolist())
+            return set(_read_table(self._rows_path(key))["seed"].tolist())
         except FileNotFoundError:
             return set()
 
@@ -75,8 +103,8 @@ class Store:
         """
         older_rows, older_errors = self._rows_path(older_key), _present(self._errors_path(older_key))
         if older_rows.exists() and older_errors.exists():
-            rows = rename_columns(pd.read_parquet(older_rows)).assign(cell=key)
-            self.add(key, rows, pd.read_parquet(older_errors))
+            rows = rename_columns(_read_table(older_rows)).assign(cell=key)
+            self.add(key, rows, _read_table(older_errors))
             older_rows.unlink()
         older_errors.unlink(missing_ok=True)
 
@@ -104,7 +132,7 @@ class Store:
         for path, new in ((self._errors_path(key), errors), (self._rows_path(key), rows)):
             before_path = _present(path)
             if before_path.exists():
-                before = pd.read_parquet(before_path)
+                before = _read_table(before_path)
                 new = pd.concat([before[~before["seed"].isin(rows["seed"])], new], ignore_index=True)
             with atomic_write(path) as temporary:
                 new.sort_values("seed", kind="stable").to_parquet(temporary, index=False)
@@ -124,7 +152,7 @@ class Store:
 
     def failure(self, name: str) -> str | None:
         """Why a cell failed at the last attempt; None if it did not fail."""
-        content = _read_if_present(self._failure_path(name))
+        content = _read_if_present(self._failure_path(name), _Failure)
         return None if content is None else str(content["error"])
 
     def rows(self, seeds: Mapping[str, Collection[int]] | None = None) -> pd.DataFrame:
@@ -153,13 +181,17 @@ class Store:
             seeds: seeds of the wanted runs.
 
         Raises:
-            InputError: there is no file of the cell's errors.
+            InputError: there is no file of the cell's errors, or it has no errors of these runs.
         """
         path = _present(self._errors_path(key))
         if not path.exists():
             raise InputError(path, expected="errors of a finished cell", found="no file")
-        errors = pd.read_parquet(path)
-        return errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
+        errors = _read_table(path, ("seed", "frame", "drone", "error_m"))
+        wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
+        if wanted.empty:
+            expected = f"errors of seeds {', '.join(map(str, seeds))}"
+            raise InputError(path, expected=expected, found="none", remedy=_REMEDY)
+        return wanted
 
     def status(self) -> dict[str, Any]:
         """Numbers of finished, failed and locked cells, the errors, and the processes at work.
@@ -169,7 +201,11 @@ class Store:
         """
         if not (self.folder / "cells").is_dir():
             raise InputError(self.folder, expected="results of a sweep", found="none")
-        failures = [failure for path in self._cell_files("error.json") if (failure := _read_if_present(path))]
+        failures = [
+            failure
+            for path in self._cell_files("error.json")
+            if (failure := _read_if_present(path, _Failure))
+        ]
         locks = sorted((self.folder / "cells").glob(".*.lock"))
         at_work = [holder for path in locks if (holder := self._locks.holder(path))]
         return {
@@ -184,7 +220,7 @@ class Store:
 
     def manifest(self) -> dict[str, Any]:
         """Content of the manifest: runs and inputs; both are empty before the first run."""
-        content = _read_if_present(self.folder / "_manifest.json")
+        content = _read_if_present(self.folder / "_manifest.json", _Manifest)
         return rename_manifest(content) if content else {"runs": [], "inputs": {}}
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
@@ -248,13 +284,47 @@ def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
     for path in paths:
         # Another process may remove the file of a cell that version 0.1 stored (see `Store.adopt`).
         with contextlib.suppress(FileNotFoundError):
-            parts.append(rename_columns(pd.read_parquet(path)))
+            parts.append(rename_columns(_read_table(path)))
     return parts
 
 
-def _read_if_present(path: Path) -> dict[str, Any] | None:
+def _read_table(path: Path, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
+    """A table of runs or of their errors, which must have some columns: names in `drone`, numbers in the others.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        InputError: the file is damaged, or is another table.
+    """
+    import pyarrow as pa
+
+    expected = "a table of results of a sweep"
     try:
-        content: dict[str, Any] = json.loads(_present(path).read_text(encoding="utf-8"))
-        return content
+        table = pd.read_parquet(path)
     except FileNotFoundError:
+        raise
+    # pandas raises more than Arrow's errors for a file whose metadata are damaged.
+    except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(path, expected=expected, found=f"{error}", remedy=_REMEDY) from error
+    for name in columns:
+        if name not in table or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name])):
+            found = "others" if name in table else "none"
+            raise InputError(path, expected=f"values in the column {name}", found=found, remedy=_REMEDY)
+    return table
+
+
+def _read_if_present(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any] | None:
+    """The JSON object in a file, which is checked to be like `kind`; None if the file does not exist.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = _present(path)
+    if not path.exists():
         return None
+    content = read_json(path, "JSON that a sweep wrote", _REMEDY)
+
+    def wrong(field: str, expected: str, found: str, remedy: str) -> InputError:
+        return InputError(f"{path}, {field}", expected=expected, found=found, remedy=remedy or _REMEDY)
+
+    convert(content, kind, wrong)
+    return content

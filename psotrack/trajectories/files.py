@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import atomic_write, refuse_to_overwrite
+from psotrack.support import LARGEST, atomic_write, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Status, Trajectories
 
 if TYPE_CHECKING:
@@ -128,7 +128,8 @@ def read_trajectories(path: Path | str, *, fps: float | None = None) -> Trajecto
 
     Raises:
         InputError: the file does not exist, a line is broken, a column is missing, a frame number is not a whole
-            number, a frame and drone have two rows, a frame has two times, or there is neither a time nor `fps`. The
+            number, a frame and drone have two rows, a frame has two times, times do not increase, or
+            there is neither a time nor `fps`. The
             message names file and line.
     """
     path = Path(path)
@@ -300,10 +301,12 @@ def _read_parquet(path: Path) -> _Table:
 
     try:
         table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
+        names = table.column_names
+    # A damaged file is also found by errors of Python in the library.
+    except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
-    _check_columns(path, table.column_names)
-    columns = {name: _parquet_column(path, table, name) for name in _READ if name in table.column_names}
+    _check_columns(path, names)
+    columns = {name: _parquet_column(path, table, name) for name in _READ if name in names}
     return _Table(path, columns, lambda row: f"row {row + 1}")
 
 
@@ -315,7 +318,7 @@ def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray
         if name not in _WORDS:
             return column.cast(pa.float64()).to_numpy().astype(float)
         words = column.cast(pa.string()).to_pylist()
-    except pa.ArrowException:
+    except (pa.ArrowException, ValueError):
         expected = f"{'words' if name in _WORDS else 'numbers'} in {name}"
         raise InputError(path, expected=expected, found=f"{column.type}") from None
     return np.array([word or "" for word in words], object)
@@ -390,7 +393,9 @@ def _check_values(table: _Table) -> None:
         elif name == "num_cameras":
             wrong, expected = ~(_whole(values) | np.isnan(values)), "a whole number from 0, or nothing"
         else:
-            wrong, expected = np.isinf(values), "a finite number, or nothing"
+            # Curves through positions have no larger numbers.
+            most = LARGEST if name in ("time_s", "x_m", "y_m", "z_m") else np.finfo(float).max
+            wrong, expected = np.abs(values) > most, "a finite number, or nothing"
         if wrong.any():
             row = int(np.argmax(wrong))
             raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
@@ -423,6 +428,12 @@ def _times(
         row = int(known[np.argmax(differs)])
         expected = f"{time_s[frame_index[row]]:g} s as in another row of this frame"
         raise table.error(row, expected=expected, found=f"{given_s[row]:g} s")
+    back = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(back):
+        after = back[0] + 1
+        row = int(np.argmax(frame_index == after))
+        expected = f"a time after {time_s[back[0]]:g} s, that of frame {frame[back[0]]}"
+        raise table.error(row, expected=expected, found=f"{time_s[after]:g} s")
     if np.isnan(time_s).any():
         row = int(np.argmax(np.isnan(time_s)[frame_index]))
         raise table.error(row, expected="a time_s, or a frame rate to compute it", found="neither")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import atomic_write, refuse_to_overwrite
+from psotrack.support import atomic_write, is_moderate, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Trajectories
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
@@ -167,7 +167,7 @@ def _numbers(place: str, line: str) -> list[float]:
         values = [float(word) for word in line.split()]
     except ValueError as error:
         raise InputError(place, expected=expected, found=f"{error}") from None
-    if len(values) != 8 or not np.isfinite(values).all():
+    if len(values) != 8 or not all(map(is_moderate, values)):
         raise InputError(place, expected=expected, found=repr(line.strip()))
     if not any(values[4:]):
         raise InputError(place, expected="a quaternion", found="0 0 0 0")

@@ -23,6 +23,7 @@ from psotrack.recordings import (
     make_timeline,
     probe,
     read_frames,
+    read_mask,
 )
 
 _PATTERN = re.compile(r"[*?\[]")
@@ -80,16 +81,14 @@ class CameraImages:
         return self.frames[::step]
 
     def _read_file(self, file: Path) -> UInt8[np.ndarray, "height width"]:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            raise InputError(file, expected="an image", found="a file that cannot be read as one")
+        image = read_mask(file)
         if image.shape[::-1] != self.image_size_wh:
             raise InputError(
                 file,
                 expected=f"{self.image_size_wh[0]} x {self.image_size_wh[1]} pixels as in {self.files[0].name}",
                 found=f"{image.shape[1]} x {image.shape[0]}",
             )
-        return np.asarray(image, np.uint8)
+        return image
 
 
 def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None) -> tuple[CameraImages, ...]:
@@ -225,9 +224,7 @@ def _open(name: str, path: Path) -> CameraImages:
             )
         numbered[number] = file
     ordered = dict(sorted(numbered.items()))
-    first = cv2.imread(str(files[0]), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if first is None:
-        raise InputError(files[0], expected="an image", found="a file that cannot be read as one")
+    first = read_mask(files[0])
     return CameraImages(
         name, path, (first.shape[1], first.shape[0]), np.array(list(ordered)), None, tuple(ordered.values())
     )

@@ -23,6 +23,8 @@ _SEPARATOR = ","
 _LONGEST_GAP = 2.5
 #: Shares of an interval below this are rounding.
 _SAME = 1e-6
+#: Largest number of a frame.
+_LARGEST_FRAME = 2**31
 
 
 def read_point_views(path: Path | str) -> PointViews:
@@ -45,8 +47,8 @@ def read_point_views(path: Path | str) -> PointViews:
         cameras[name] = None
         end = row.text(named) if named is not None else ""
         number = row.number(frame)
-        if number != int(number):
-            raise row.error(frame, "a whole number", f"{number:g}")
+        if number != int(number) or abs(number) > _LARGEST_FRAME:
+            raise row.error(frame, f"a whole number of at most {_LARGEST_FRAME} in size", f"{number:g}")
         of_frame = seen.setdefault((int(number), end), {})
         if name in of_frame:
             raise row.error(frame, "each point once per camera and frame", f"{int(number)} of {name} again")

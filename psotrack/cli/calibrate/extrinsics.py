@@ -12,7 +12,7 @@ from psotrack.cli.calibrate.located import locate_cameras
 from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
 from psotrack.cli.calibrate.shown import show_cameras
 from psotrack.cli.options import FORCE, FOV, JSON, QUIET, Numbers, dictionary_option
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, errors_name
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
@@ -91,7 +91,8 @@ def extrinsics(
     refuse_to_overwrite(out, force)
     marks = read_image_points(pairs, points) if pairs else _find_markers(Path(str(markers)), dictionary)
     lenses = _lenses(list(marks), **lens)
-    rig, rows = locate_cameras(marks, lenses, noise_px)
+    with errors_name(pairs or markers):
+        rig, rows = locate_cameras(marks, lenses, noise_px)
     write_rig(out, rig, force=force)
     show_cameras(rows, out, quiet, json_path, force)
 

@@ -12,6 +12,7 @@ from psotrack.errors import InputError
 from psotrack.simulation.scenarios import Mesh
 from psotrack.simulation.world.models import DroneModel
 from psotrack.simulation.world.shapes import Triangles
+from psotrack.support import LARGEST
 
 _SUFFIXES = (".obj", ".ply")
 #: Smallest and largest extent of a drone. A mesh outside this range is in other units.
@@ -35,10 +36,9 @@ def load(mesh: Mesh) -> DroneModel:
     """
     path = Path(mesh.file)
     triangles = mesh.scale * _read(path) - np.array(mesh.origin_m)
-    if not np.isfinite(triangles).all():
-        raise InputError(
-            path, expected="numbers as vertices", found="NaN or infinity", remedy="export it again"
-        )
+    if not (np.abs(triangles) <= LARGEST).all():
+        found = "NaN, infinity or huge numbers"
+        raise InputError(path, expected="numbers as vertices", found=found, remedy="export it again")
     kept = triangles[_area_m2(triangles) > _NO_AREA_M2]
     if not len(kept):
         found = f"{len(triangles)} without" if len(triangles) else "no faces"
@@ -75,7 +75,8 @@ def _read(path: Path) -> Triangles:
         # Names of parts and comments may be in any encoding; they are not used.
         file = io.StringIO(content.decode(errors="replace")) if suffix == ".obj" else io.BytesIO(content)
         read = trimesh.load_mesh(file, file_type=suffix[1:], process=False, skip_materials=True)
-        vertices, faces = np.asarray(read.vertices, float), np.asarray(read.faces, int)
+        vertices = np.asarray(read.vertices, float).reshape(-1, 3)
+        faces = np.asarray(read.faces, int).reshape(-1, 3)
     # Each parser of trimesh has different errors.
     except Exception as error:
         raise InputError(
