@@ -7,7 +7,7 @@ from fuzz.formats import FORMATS
 from fuzz.trial import Judge
 
 #: Number of tries per format; `make fuzz` makes many thousands.
-TRIES, SLOW_TRIES = 12, 1
+TRIES, SLOW_TRIES = 5, 1
 #: Files that a reader once treated wrongly, in folders with the names of their formats.
 FINDS = sorted(path for path in (Path(__file__).parent / "data" / "fuzz").rglob("*") if path.is_file())
 #: Finds that are long and regular.
