@@ -52,7 +52,10 @@ def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
                         write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
                 return codec
     raise OutputError(
-        "overlay", expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}", found="none"
+        "overlay",
+        expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}",
+        found="none",
+        remedy=f"is the disk of {tempfile.gettempdir()} full? videos were tried there",
     )
 
 

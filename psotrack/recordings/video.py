@@ -413,8 +413,8 @@ def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
     """
     # The header may count frames that are missing: count the frames themselves.
     found = _count_packets(temporary) if num_frames else 0
-    is_avi = path.suffix.lower() == ".avi"
-    if found != num_frames or found == 0 or (is_avi and not _has_its_end(temporary)):
+    has_its_end = _mp4_has_its_end if path.suffix.lower() == ".mp4" else _has_its_end
+    if found != num_frames or found == 0 or not has_its_end(temporary):
         raise OutputError(
             path,
             expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
@@ -435,6 +435,23 @@ def _has_its_end(path: Path) -> bool:
             if name != b"RIFF":
                 return False
             position += 8 + int.from_bytes(length, "little")
+    return position == size
+
+
+def _mp4_has_its_end(path: Path) -> bool:
+    """Whether an MP4 file has the length that its boxes state."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            length = int.from_bytes(file.read(4), "big")
+            if length == 1:
+                # A box above 4 GB states its length after its name.
+                file.seek(position + 8)
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            position += length
     return position == size
 
 

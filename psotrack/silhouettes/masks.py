@@ -58,7 +58,8 @@ def write_masks(task: MaskTask, advance: Advance) -> int:
         for count, mask in enumerate(masks, 1):
             there, coded = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
             assert there, "PNG takes every mask"
-            coded.tofile(temporary / f"{count - 1:06d}.png")
+            # Not `coded.tofile`, which reports no error where the last bytes are not written.
+            (temporary / f"{count - 1:06d}.png").write_bytes(coded.tobytes())
     return count
 
 

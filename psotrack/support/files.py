@@ -176,6 +176,13 @@ def _errors_of(outputs: Sequence[_Output]) -> Iterator[None]:
             found=reason,
             remedy="earlier results are unchanged",
         ) from error
+    except OutputError as error:
+        # Writers name the temporary file, which is gone when users read the message.
+        message = str(error)
+        for output in outputs:
+            message = message.replace(str(output.temporary), str(output.path))
+        error.args = (message,)
+        raise
 
 
 def _takes_bytes(path: Path) -> bool:
