@@ -7,6 +7,7 @@ fast.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal, get_args
 
@@ -258,6 +259,9 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
             _check_least("drones.count", self.count, 1)
         for length_m in self.size_m or ():
             check_positive("drones.size_m", length_m)
+        if not all(map(math.isfinite, self.body_offset_m)):
+            found = ",".join(f"{length_m:g}" for length_m in self.body_offset_m)
+            raise SettingsError("drones.body_offset_m", expected="finite numbers", found=found)
 
 
 class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

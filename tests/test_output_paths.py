@@ -4,9 +4,10 @@ import json
 import os
 import stat
 import threading
+from pathlib import Path
 
 import pytest
-from flight_files import make_sequence
+from flight_files import make_sequence, make_tracks_file
 from helpers import make_once
 
 from psotrack.errors import OutputError
@@ -132,3 +133,94 @@ def test_files_that_belong_together_are_replaced_together(tmp_path):
         for path in temporary:
             path.write_text("newer", encoding="utf-8")
     assert {path.read_text(encoding="utf-8") for path in paths} == {"newer"}
+
+
+def test_a_file_is_replaced_after_those_without_which_it_must_not_be(tmp_path):
+    """The second path is a folder: the first must not be replaced either, because the two belong together."""
+    tracks, record = tmp_path / "tracks.csv", tmp_path / "tracks.json"
+    tracks.write_text("older", encoding="utf-8")
+    record.mkdir()
+
+    def write():
+        with atomic_write_all(tracks, record) as temporary:
+            for path in temporary:
+                path.write_text("newer", encoding="utf-8")
+
+    with pytest.raises(OutputError, match=r"tracks\.json: expected the path of a file, found a folder"):
+        write()
+    assert tracks.read_text(encoding="utf-8") == "older"
+
+
+def test_the_file_of_a_set_that_fails_is_named(tmp_path):
+    def write():
+        with (
+            atomic_write_all(tmp_path / "a.json", tmp_path / "b.csv") as (first, _),
+            atomic_write(first) as file,
+        ):
+            file.mkdir()
+            file.write_text("a folder takes no text", encoding="utf-8")
+
+    with pytest.raises(OutputError, match=r"[\\/]a\.json: expected a path that can be written"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["tracks.csv", "tracks.json", "tracks.ambiguity.csv"])
+def test_track_refuses_a_folder_before_it_tracks(run_psotrack, flight, tmp_path, name):
+    (tmp_path / name).mkdir()
+    result = run_psotrack(
+        "track", flight, "--out", tmp_path / "tracks.csv", "--force", "--cache", tmp_path / "c"
+    )
+    assert result.code == 2
+    assert result.err.count("\n") == 1
+    assert f"{name}: expected the path of a file, found a folder" in result.err
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("offset", ["inf,0,0", "0,-inf,0", "0,0,nan"])
+def test_an_offset_that_is_no_number_of_metres_is_refused_before_tracking(
+    run_psotrack, flight, tmp_path, offset
+):
+    result = run_psotrack("track", flight, "--out", tmp_path / "tracks.csv", "--body-offset", offset)
+    assert result.code == 2
+    assert result.err.count("\n") == 1
+    assert "finite numbers" in result.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["calibrate", "convert", "{flight}/rig.toml", "-"],
+        ["init", "{flight}", "--out", "-"],
+        ["simulate", "S02_D4_A", "--frames", "2", "--log", "-"],
+    ],
+)
+def test_a_dash_makes_no_file_of_this_name(run_psotrack, flight, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    result = run_psotrack(*(word.format(flight=flight) for word in words))
+    assert result.code == 2
+    assert result.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words", [["silhouettes", "{flight}", "--masks"], ["overlay", "{tracks}", "{flight}", "--out"]]
+)
+def test_a_link_to_a_folder_is_followed(run_psotrack, flight, tmp_path, words):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    tracks = make_tracks_file(tmp_path / "tracks.csv")
+    words = [word.format(flight=flight, tracks=tracks) for word in words]
+    result = run_psotrack(*words, tmp_path / "link", "--force", "--jobs", 1)
+    assert result.code == 0, result.err
+    assert (tmp_path / "link").is_symlink()
+    assert {path.name.partition(".")[0] for path in (tmp_path / "elsewhere").iterdir()} >= {"c0", "c1", "c2"}
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_the_work(tmp_path, monkeypatch):
+    # Rights do not bind root, who may run the tests.
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path)
+    with pytest.raises(OutputError, match=r"tracks\.csv: expected a path in a folder that can be written"):
+        refuse_to_overwrite(tmp_path / "new" / "tracks.csv", force=True)
+    assert list(tmp_path.iterdir()) == []

@@ -49,6 +49,8 @@ class LogFile:
     """
 
     def __init__(self, path: Path) -> None:
+        if path == Path("-"):
+            raise OutputError(path, expected="the path of a log file", found="-; stderr is /dev/stderr")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_file() and not _begins_like_a_log(path):

@@ -33,7 +33,7 @@ from psotrack.cli.output import output_json, print_drones, print_line, report_to
 from psotrack.cli.run_files import FileOr, run_file_options
 from psotrack.errors import SettingsError
 from psotrack.settings import USUAL_SPEED_M_S, Clocks, SwarmKind, TrackSettings
-from psotrack.support import atomic_write_all, refuse_to_overwrite
+from psotrack.support import atomic_write_all, refuse_files
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -255,8 +255,7 @@ def track(
     if out.suffix not in {".csv", ".parquet"}:
         raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
-    for path in (out, record_path) if causal else (out, record_path, ambiguity_path):
-        refuse_to_overwrite(path, force)
+    refuse_files(out, record_path, *([] if causal else [ambiguity_path]), force=force)
     chosen = chosen_settings(settings)
     num_frames, causal, most_drones = chosen_extent(num_frames, causal, most_drones)
     parts = Parts(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import OutputError
-from psotrack.recordings import probe, silence_opencv
+from psotrack.recordings import check_video_written, silence_opencv
 from psotrack.support import atomic_write
 
 
@@ -52,7 +52,10 @@ def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
                         write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
                 return codec
     raise OutputError(
-        "overlay", expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}", found="none"
+        "overlay",
+        expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}",
+        found="none",
+        remedy=f"is the disk of {tempfile.gettempdir()} full? videos were tried there",
     )
 
 
@@ -96,12 +99,4 @@ def video_writer(path: Path, codec: Codec, fps: float, size_wh: tuple[int, int])
             yield append
         finally:
             writer.release()
-        # FFmpeg reports no failed writes.
-        found = probe(temporary).num_frames if temporary.exists() and temporary.stat().st_size else 0
-        if found != append.num_frames:
-            raise OutputError(
-                path,
-                expected=f"a video of {append.num_frames} frames",
-                found=f"{found} written",
-                remedy="is the disk full?",
-            )
+        check_video_written(path, temporary, append.num_frames)

@@ -127,9 +127,16 @@ def write_c3d(path: Path | str, markers: Markers) -> None:
     with atomic_write(path) as temporary:
         content.write(str(temporary))
         # ezc3d reports no error when the disk is full.
-        expected_bytes = num_frames * num_markers * 4 * 4
-        if not temporary.is_file() or temporary.stat().st_size < expected_bytes:
+        if not _is_complete(temporary, markers):
             raise OutputError(path, expected="a path that can be written", found="an incomplete file")
+
+
+def _is_complete(path: Path, markers: Markers) -> bool:
+    try:
+        written = read_c3d(path)
+    except InputError:
+        return False
+    return written.position_m.shape == markers.position_m.shape
 
 
 @dataclass(frozen=True)

@@ -353,7 +353,7 @@ class VideoWriter:
             self._writer.release()
             if error is not None:
                 raise error
-            _check_written(self._path, self._temporary, self._num_frames)
+            check_video_written(self._path, self._temporary, self._num_frames)
 
 
 def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
@@ -384,7 +384,7 @@ def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
                 _copy_packets(video, writer)
         finally:
             writer.release()
-        _check_written(path, temporary, sum(video.num_frames for video in videos))
+        check_video_written(path, temporary, sum(video.num_frames for video in videos))
 
 
 def _writer(
@@ -400,10 +400,21 @@ def _writer(
     return writer
 
 
-def _check_written(path: Path, temporary: Path, num_frames: int) -> None:
-    # FFmpeg reports no failed writes, and the header may count frames that are missing: count the frames themselves.
+def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
+    """Check a finished video before it gets its name: FFmpeg reports no failed writes.
+
+    Args:
+        path: the video's final path, for the message.
+        temporary: the video.
+        num_frames: number of frames that were written.
+
+    Raises:
+        OutputError: a frame or the index of frames is missing, or there is no frame.
+    """
+    # The header may count frames that are missing: count the frames themselves.
     found = _count_packets(temporary) if num_frames else 0
-    if found != num_frames or found == 0 or not _has_its_end(temporary):
+    has_its_end = _mp4_has_its_end if path.suffix.lower() == ".mp4" else _has_its_end
+    if found != num_frames or found == 0 or not has_its_end(temporary):
         raise OutputError(
             path,
             expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
@@ -424,6 +435,23 @@ def _has_its_end(path: Path) -> bool:
             if name != b"RIFF":
                 return False
             position += 8 + int.from_bytes(length, "little")
+    return position == size
+
+
+def _mp4_has_its_end(path: Path) -> bool:
+    """Whether an MP4 file has the length that its boxes state."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            length = int.from_bytes(file.read(4), "big")
+            if length == 1:
+                # A box above 4 GB states its length after its name.
+                file.seek(position + 8)
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            position += length
     return position == size
 
 

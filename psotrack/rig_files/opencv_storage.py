@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from psotrack.errors import InputError, OutputError
+from psotrack.errors import InputError
 from psotrack.geometry import Rig
 from psotrack.rig_files.entries import UNITS_M, Entry, FileRig, Source, collect
 from psotrack.rig_files.fields import (
@@ -92,11 +92,10 @@ def with_partner(source: Source, content: Mapping[str, Any]) -> dict[str, Any]:
 def write(path: Path, rig: Rig) -> None:
     """Write a sequence of cameras as YAML, in metres."""
     with atomic_write(path) as temporary:
-        storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_FORMAT_YAML)
-        if not storage.isOpened():
-            raise OutputError(
-                path, expected="a path that can be written", found="a folder that cannot be written"
-            )
+        # To memory, because OpenCV reports no failed writes.
+        storage = cv2.FileStorage(
+            "", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
+        )
         storage.write("unit", "m")
         storage.startWriteStruct("cameras", cv2.FILE_NODE_SEQ)
         for index, name in enumerate(rig.names):
@@ -120,7 +119,7 @@ def write(path: Path, rig: Rig) -> None:
                     storage.write(key, np.ascontiguousarray(array))
             storage.endWriteStruct()
         storage.endWriteStruct()
-        storage.release()
+        temporary.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
 def _entries(source: Source, content: dict[str, Any]) -> Iterator[tuple[str, str, Entry]]:

@@ -7,8 +7,6 @@ A mask is what the background model yields, before it is reduced to the stored s
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import VideoInfo, silence_opencv
+from psotrack.recordings import VideoInfo, check_video_written, silence_opencv
 from psotrack.silhouettes.store import Task, foreground_of
 from psotrack.support import Advance, atomic_write
 
@@ -54,23 +52,14 @@ def write_masks(task: MaskTask, advance: Advance) -> int:
     masks = _at_size(task.foreground, advance)
     if task.out.suffix.lower() in CODECS:
         return _write_video(task.out, video, masks)
-    temporary = task.out.with_name(f".{task.out.name}.{secrets.token_hex(4)}.partial")
-    try:
-        temporary.mkdir(parents=True)
-        count = 0
+    count = 0
+    with atomic_write(task.out) as temporary:
+        temporary.mkdir()
         for count, mask in enumerate(masks, 1):
             there, coded = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
             assert there, "PNG takes every mask"
-            coded.tofile(temporary / f"{count - 1:06d}.png")
-        if task.out.exists():
-            shutil.rmtree(task.out)
-        os.rename(temporary, task.out)
-    except OSError as error:
-        raise OutputError(
-            task.out, expected="a folder to write to", found=error.strerror or f"{error}"
-        ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+            # Not `coded.tofile`, which reports no error where the last bytes are not written.
+            (temporary / f"{count - 1:06d}.png").write_bytes(coded.tobytes())
     return count
 
 
@@ -105,10 +94,7 @@ def _write_video(path: Path, video: VideoInfo, masks: Iterator[UInt8[np.ndarray,
                 count += 1
         finally:
             writer.release()
-        if not temporary.is_file() or not temporary.stat().st_size:
-            raise OutputError(
-                path, expected="a video of masks", found="an empty file", remedy="is the disk full?"
-            )
+        check_video_written(path, temporary, count)
     return count
 
 

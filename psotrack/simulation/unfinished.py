@@ -14,7 +14,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from psotrack.errors import OutputError
-from psotrack.support import refuse_to_overwrite
+from psotrack.support import end_of_links, refuse_to_overwrite
 
 #: File that says how the sequence was made. Its name is hidden until everything else is there.
 RECORD = "simulation.json"
@@ -79,6 +79,7 @@ def unfinished(target: Path, record: bytes, force: bool) -> Iterator[Unfinished]
         OutputError: the sequence exists and `force` is not set, another call is making it, or the folder cannot be
             written.
     """
+    target = end_of_links(target)
     folder = target.with_name(f".{target.name}.unfinished")
     segments = folder / _SEGMENTS.format(hashlib.sha256(record).hexdigest()[:16])
     with _locked(folder, target):

@@ -18,7 +18,8 @@ import secrets
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,18 +41,50 @@ _OPEN: set[Path] = set()
 
 
 def refuse_to_overwrite(path: Path | str, force: bool) -> None:
-    """Raise `OutputError` if `path` is an existing file or folder and `force` is not set."""
+    """Refuse an output before the work for it begins.
+
+    Raises:
+        OutputError: `path` is an existing file or folder and `force` is not set, `path` is `-` or a link that leads to
+            itself, or its folder cannot be written.
+    """
     path = Path(path)
-    if path.exists() and not force and not _takes_bytes(path):
+    if path == Path("-"):
+        # A file of this name would surprise users who mean stdout.
+        raise OutputError(
+            path, expected="the path of a file or folder", found="-, which is stdout for --json only"
+        )
+    if _takes_bytes(path):
+        return
+    if path.exists() and not force:
         found = "an existing folder" if path.is_dir() else "an existing file"
         raise OutputError(
             path, expected="a path that does not exist yet", found=found, remedy="pass --force to replace it"
         )
+    folder = end_of_links(path).parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        found = f"{folder}, which cannot be written" if folder.is_dir() else f"{folder}, which is no folder"
+        raise OutputError(path, expected="a path in a folder that can be written", found=found)
+
+
+def refuse_files(*paths: Path | str, force: bool) -> None:
+    """`refuse_to_overwrite` for files: a folder is refused also with `force`."""
+    for path in paths:
+        refuse_to_overwrite(path, force)
+        _refuse_folder(Path(path))
+
+
+def _refuse_folder(path: Path) -> None:
+    # Even with `force`: a user who names a folder by mistake must not lose the folder's content.
+    if path.is_dir():
+        remedy = "name a file; the content of the folder is unchanged"
+        raise OutputError(path, expected="the path of a file", found="a folder", remedy=remedy)
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; at the end of the block, rename the file or folder written there to `path`.
+    """Yield a temporary path next to `path`; at the end of the block what was written there replaces `path`.
 
     If the block raises (Ctrl-C included), the temporary file or folder is removed and `path` is unchanged. The
     temporary name has the suffix of `path`, because writers of videos and images choose their format by the suffix.
@@ -64,40 +97,77 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
             `path` is a link that leads to itself.
     """
     path = Path(path)
-    if _TEMPORARY.match(path.name):
-        yield path
-        return
-    if _takes_bytes(path):
-        with _errors_of(path, path), tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
-            temporary = Path(folder) / f"output{path.suffix}"
+    if not _TEMPORARY.match(path.name):
+        with atomic_write_all(path) as (temporary,):
             yield temporary
-            with temporary.open("rb") as content, path.open("ab") as taker:
-                shutil.copyfileobj(content, taker)
         return
-    target = _end_of_links(path)
-    name = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = target.with_name(f".{target.stem}.{name}.partial{path.suffix}")
-    _OPEN.add(temporary)
     try:
-        with _errors_of(path, temporary):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            _remove_left_over(target)
-            yield temporary
-            if target.is_dir() and not temporary.is_dir():
-                # Even with `force`: a user who names a folder by mistake must not lose the folder's content.
-                remedy = "name a file; the content of the folder is unchanged"
-                raise OutputError(path, expected="the path of a file", found="a folder", remedy=remedy)
-            _replace(temporary, target)
-    finally:
-        _remove(temporary)
-        _OPEN.discard(temporary)
+        yield path
+    except OSError as error:
+        # The outer `atomic_write_all` names the file of the set by it.
+        error.filename = str(path)
+        raise
 
 
 @contextlib.contextmanager
 def atomic_write_all(*paths: Path | str) -> Iterator[tuple[Path, ...]]:
-    """`atomic_write` of files that belong together: after an error in the block, all of them are unchanged."""
-    with contextlib.ExitStack() as stack:
-        yield tuple(stack.enter_context(atomic_write(path)) for path in paths)
+    """`atomic_write` of files that belong together.
+
+    After an error in the block, and where one of the paths cannot be replaced, all of them are unchanged. Files are
+    replaced in the order of `paths`: name a file after those without which it must not be.
+    """
+    outputs: list[_Output] = []
+    try:
+        for path in map(Path, paths):
+            with _errors_of([_Output(path, path, path)]):
+                outputs.append(_prepare(path))
+                _OPEN.add(outputs[-1].temporary)
+        with _errors_of(outputs):
+            yield tuple(output.temporary for output in outputs)
+        for output in outputs:
+            if not output.temporary.is_dir():
+                _refuse_folder(output.path)
+        for output in outputs:
+            with _errors_of([output]):
+                output.publish()
+    finally:
+        for output in outputs:
+            _remove(output.temporary)
+            _OPEN.discard(output.temporary)
+
+
+@dataclass(frozen=True)
+class _Output:
+    """A file or folder that is being written.
+
+    Attributes:
+        path: the path as the caller names it.
+        target: what is replaced, at the end of the links; a device or a pipe gets the bytes.
+        temporary: what is written first.
+    """
+
+    path: Path
+    target: Path
+    temporary: Path
+
+    def publish(self) -> None:
+        if not _takes_bytes(self.target):
+            _replace(self.temporary, self.target)
+            return
+        with self.temporary.open("rb") as content, self.target.open("ab") as taker:
+            shutil.copyfileobj(content, taker)
+
+
+def _prepare(path: Path) -> _Output:
+    random = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    name = f".{path.stem}.{random}.partial{path.suffix}"
+    if _takes_bytes(path):
+        return _Output(path, path, Path(tempfile.gettempdir()) / name)
+    target = end_of_links(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    output = _Output(path, target, target.with_name(name))
+    _remove_left_over(output)
+    return output
 
 
 def remove_temporary_files() -> None:
@@ -106,10 +176,10 @@ def remove_temporary_files() -> None:
         _remove(path)
 
 
-def _remove_left_over(target: Path) -> None:
-    """Remove temporary files of a path that killed processes of this machine have left."""
+def _remove_left_over(output: _Output) -> None:
+    """Remove temporary files of an output that killed processes of this machine have left."""
     with contextlib.suppress(OSError):
-        for path in target.parent.glob(f".{glob.escape(target.stem)}.*.partial*"):
+        for path in output.target.parent.glob(f".{glob.escape(output.path.stem)}.*.partial*"):
             found = _TEMPORARY.match(path.name)
             if found and found[1] == _machine() and not _is_running(int(found[2])):
                 _remove(path)
@@ -135,16 +205,28 @@ def _machine() -> str:
 
 
 @contextlib.contextmanager
-def _errors_of(path: Path, temporary: Path) -> Iterator[None]:
-    """Errors of the system within the block become an `OutputError` of `path`."""
+def _errors_of(outputs: Sequence[_Output]) -> Iterator[None]:
+    """Errors of the system within the block become an `OutputError` of the output that they name, or of the last."""
     try:
         yield
     except OSError as error:
-        place = "" if temporary == path else f" ({temporary.name})"
+        named = [output for output in outputs if str(error.filename) == str(output.temporary)]
+        output = (named or outputs)[-1]
+        place = "" if output.temporary == output.path else f" ({output.temporary.name})"
         reason = f"{error.strerror or error}{place}"
         raise OutputError(
-            path, expected="a path that can be written", found=reason, remedy="earlier results are unchanged"
+            output.path,
+            expected="a path that can be written",
+            found=reason,
+            remedy="earlier results are unchanged",
         ) from error
+    except OutputError as error:
+        # Writers name the temporary file, which is gone when users read the message.
+        message = str(error)
+        for output in outputs:
+            message = message.replace(str(output.temporary), str(output.path))
+        error.args = (message,)
+        raise
 
 
 def _takes_bytes(path: Path) -> bool:
@@ -161,8 +243,12 @@ def _takes_bytes(path: Path) -> bool:
     )
 
 
-def _end_of_links(path: Path) -> Path:
-    """What a link leads to, whether it exists or not; a path that is no link as it is."""
+def end_of_links(path: Path) -> Path:
+    """What a link leads to, whether it exists or not; a path that is no link as it is.
+
+    Raises:
+        OutputError: the link leads to itself.
+    """
     if not path.is_symlink():
         return path
     # Python 3.13 no longer raises where links go round in a circle.
