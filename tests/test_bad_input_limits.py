@@ -1,26 +1,34 @@
 """Numbers in files and options that would take gigabytes or hours, or mean nothing, are refused in one line."""
 
+import contextlib
 import resource
 import struct
+import tempfile
 import zipfile
 import zlib
 from pathlib import Path
 
 import flight_files
 import numpy as np
+import onnx_models
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import test_dpjait
 from helpers import make_once
+from hypothesis import given
+from hypothesis import strategies as st
 
 from psotrack.datasets import open_recording
 from psotrack.datasets.dpjait import read_marker_corners, read_masks, read_mocap_markers, read_poses
 from psotrack.detection import DetectorSettings, OnnxDetector
+from psotrack.detection.onnx_files import check_values_beside
 from psotrack.errors import InputError, SettingsError
 from psotrack.exchange import read_tracks
 from psotrack.recordings import read_image
 from psotrack.settings import DroneSettings, SwarmSettings, TrackSettings
+from psotrack.sweep import Store
 from psotrack.trajectories import read_trajectories
 
 simulated_folder = test_dpjait.simulated_folder
@@ -303,6 +311,44 @@ def test_numbers_of_thousands_of_digits_in_names_of_masks(tmp_path):
         read_masks(path)
 
 
+# Results of sweeps
+
+
+@pytest.fixture
+def sweep_folder(tmp_path):
+    """Results of one cell."""
+    rows = pd.DataFrame({"seed": [0], "mean_error_m": [0.01]})
+    store = Store(tmp_path / "results")
+    store.add("a" * 40, rows, rows.assign(frame=0, drone="a", error_m=0.01))
+    store.change_manifest(lambda manifest: manifest["inputs"].update(a="b"))
+    return store.folder
+
+
+JUNK = [b"", b"junk", b"PAR1" + bytes(40) + b"PAR1", b"[1, 2]", b'{"runs": 3}', b"\xff\xfe\x00"]
+
+
+@pytest.mark.parametrize("junk", JUNK)
+@pytest.mark.parametrize("command", ["table", "report"])
+def test_junk_in_a_cell_of_a_sweep(command, junk, sweep_folder, run_psotrack, tmp_path):
+    path = sweep_folder / "cells" / f"{'a' * 40}.parquet"
+    path.write_bytes(junk)
+    out = ("--out", tmp_path / "page.html") if command == "report" else ()
+    check_line(run_psotrack(command, sweep_folder, *out), path)
+    assert path.read_bytes() == junk
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize("junk", JUNK)
+def test_junk_in_the_manifest_of_a_sweep(junk, sweep_folder):
+    path = sweep_folder / "_manifest.json"
+    path.write_bytes(junk)
+    with pytest.raises(InputError, match=r"_manifest\.json"):
+        Store(sweep_folder).manifest()
+    with pytest.raises(InputError, match=r"_manifest\.json"):
+        Store(sweep_folder).change_manifest(lambda manifest: manifest.update(runs=[]))
+    assert path.read_bytes() == junk
+
+
 # Networks
 
 
@@ -319,3 +365,54 @@ def test_what_is_no_network(write_network, tmp_path):
     write_network(path)
     with pytest.raises(InputError, match=r"net\.onnx: expected an ONNX model"):
         OnnxDetector(path, DetectorSettings(size=64))
+
+
+def network_with_outside_bias(monkeypatch, location: str) -> bytes:
+    """A network whose bias lies in another file: fields 13 (keys and values) and 14 of a tensor in onnx.proto."""
+    inside, message = onnx_models._tensor, onnx_models._message
+
+    def tensor(name: str, values: np.ndarray) -> bytes:
+        entry = message((1, "location"), (2, location))
+        return (
+            message((1, 1), (2, 1), (8, name), (13, entry), (14, 1))
+            if name == "bias"
+            else inside(name, values)
+        )
+
+    with monkeypatch.context() as context:
+        context.setattr(onnx_models, "_tensor", tensor)
+        return onnx_models.bright_squares("v8", 64)
+
+
+@pytest.mark.parametrize("place", ["../secret.bin", "{folder}/secret.bin", "a/../../secret.bin", "link.bin"])
+def test_a_network_that_reads_a_file_elsewhere(place, tmp_path, monkeypatch):
+    """OpenCV would read the values of ../secret.bin as weights."""
+    (tmp_path / "secret.bin").write_bytes(struct.pack("<f", -30.0))
+    nets = tmp_path / "nets"
+    nets.mkdir()
+    (nets / "link.bin").symlink_to(tmp_path / "secret.bin")
+    path = nets / "net.onnx"
+    path.write_bytes(network_with_outside_bias(monkeypatch, place.format(folder=tmp_path)))
+    with pytest.raises(
+        InputError, match=r"net\.onnx: expected an ONNX model that reads only files beside it"
+    ):
+        OnnxDetector(path, DetectorSettings(size=64))
+
+
+def test_a_network_that_reads_a_file_beside_it(tmp_path, monkeypatch):
+    """New exporters write the weights of a network beside it."""
+    (tmp_path / "net.onnx.data").write_bytes(struct.pack("<f", -30.0))
+    path = tmp_path / "net.onnx"
+    path.write_bytes(network_with_outside_bias(monkeypatch, "net.onnx.data"))
+    boxes, _ = OnnxDetector(path, DetectorSettings(size=64)).boxes(np.full((64, 64, 3), 255, np.uint8))
+    assert len(boxes)
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_at_the_end_of_a_network(tail):
+    """The search for names ends, for every content of the file; what it cannot follow is no network."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "net.onnx"
+        path.write_bytes(onnx_models.bright_squares("v8", 64) + tail)
+        with contextlib.suppress(InputError):
+            check_values_beside(path)

@@ -105,7 +105,7 @@ def _renamed(recording: Recording, name: str) -> Recording:
 
 
 def test_names_of_cameras_in_overlays(evil_recording, tmp_path):
-    flight = TrackedFlight(flight_files.make_tracks(), evil_recording)
+    flight = TrackedFlight("flight", (), evil_recording)
     with pytest.raises(InputError, match=r"found '\.\./evil'"):
         write_overlays(tmp_path / "in" / "out", flight, OverlayOptions())
     assert not list(tmp_path.rglob("*evil*"))

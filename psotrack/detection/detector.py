@@ -26,6 +26,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from psotrack.detection.onnx_files import check_values_beside
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Detections, VideoInfo, read_frames
 from psotrack.support import Report, digest_file, make_plugin, no_progress
@@ -102,7 +103,8 @@ class OnnxDetector:
         settings: settings of the detection.
 
     Raises:
-        InputError: the file does not exist, or OpenCV cannot read it, or would end the process.
+        InputError: the file does not exist, or OpenCV cannot read it, or would end the process, or the network reads
+            files outside of its folder.
     """
 
     def __init__(self, model: Path | str, settings: DetectorSettings) -> None:
@@ -111,6 +113,7 @@ class OnnxDetector:
             raise InputError(model, expected="an ONNX model", found="no such file")
         self.model = model
         self.settings = settings
+        check_values_beside(model)
         _check_survives(model, settings.size)
         with self._opencv_errors("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
