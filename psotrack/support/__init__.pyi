@@ -6,6 +6,8 @@ from .files import (
     ARCHIVE_SUFFIX,
     atomic_write,
     atomic_write_all,
+    check_file_name,
+    check_no_nul,
     digest_file,
     digest_record,
     end_of_links,
@@ -15,7 +17,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_paths, html_table
-from .numbers import LARGEST, MODERATE, is_moderate
+from .numbers import LARGEST, MODERATE, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
@@ -39,7 +41,9 @@ __all__ = [
     "assign",
     "atomic_write",
     "atomic_write_all",
+    "check_file_name",
     "check_interface",
+    "check_no_nul",
     "check_types",
     "convert",
     "digest_file",
@@ -83,6 +87,7 @@ __all__ = [
     "toml_value",
     "use_device",
     "user_cache",
+    "whole_number",
     "with_traceback",
     "worker_processes",
     "write_rows",

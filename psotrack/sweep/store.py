@@ -304,7 +304,9 @@ def _read_table(path: Path, columns: Collection[str] = ("seed",)) -> pd.DataFram
         raise
     # pandas raises more than Arrow's errors for a file whose metadata are damaged.
     except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
-        raise InputError(path, expected=expected, found=f"{error}", remedy=_REMEDY) from error
+        # The libraries' own messages repeat the path.
+        found = "a damaged file, or one of another format"
+        raise InputError(path, expected=expected, found=found, remedy=_REMEDY) from error
     for name in columns:
         if name not in table or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name])):
             found = "others" if name in table else "none"
