@@ -15,6 +15,7 @@ from .exposures import Exposures, moved_by
 from .foreground import BackgroundModel, Mog2, coverage, reduce_frame
 from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
+from .seals import SEAL_FILE, is_whole, removable
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, frames_to_decode, ignored_pixels, key_of, made_of, open_stored, reduced_shape
 from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
@@ -22,6 +23,7 @@ from .usable_frames import foreground_is_everywhere
 
 __all__ = [
     "LEAST_RADIUS_CELLS",
+    "SEAL_FILE",
     "BackgroundModel",
     "Exposures",
     "ForegroundSettings",
@@ -47,6 +49,7 @@ __all__ = [
     "foreground_is_everywhere",
     "frames_to_decode",
     "ignored_pixels",
+    "is_whole",
     "key_of",
     "made_of",
     "masks_out",
@@ -56,6 +59,7 @@ __all__ = [
     "packed_box_sums",
     "reduce_frame",
     "reduced_shape",
+    "removable",
     "scaled_settings",
     "silhouette_keys",
     "stack_blobs",
