@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
@@ -29,12 +30,18 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import atomic_write
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.older_folders import rename_columns, rename_manifest
+from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
+
+logger = logging.getLogger(__name__)
 
 #: A temporary file that is older was left by a runner that was killed, seconds.
 _LEFT_BEHIND_S = 3600.0
+
+
+#: Remedy for a damaged file that a sweep makes anew.
+_RUN_AGAIN = "run the same `psotrack sweep` again"
 
 
 def is_results_folder(path: Path | str) -> bool:
@@ -54,11 +61,9 @@ class Store:
         self._locks = Locks()
 
     def finished_seeds(self, key: str) -> set[int]:
-        """Seeds of a cell's finished runs."""
-        try:
-            return set(pd.read_parquet(self._rows_path(key), columns=["seed"])["seed"].tolist())
-        except FileNotFoundError:
-            return set()
+        """Seeds of a cell's finished runs; none, and a warning, if the cell's file is damaged."""
+        rows = self._rows_if_whole(key)
+        return set() if rows is None else set(rows["seed"].tolist())
 
     def adopt(self, older_key: str, key: str) -> None:
         """Move the results of a cell, if version 0.1 stored any, to the cell's key and names of today.
@@ -75,8 +80,8 @@ class Store:
         """
         older_rows, older_errors = self._rows_path(older_key), _present(self._errors_path(older_key))
         if older_rows.exists() and older_errors.exists():
-            rows = rename_columns(pd.read_parquet(older_rows)).assign(cell=key)
-            self.add(key, rows, pd.read_parquet(older_errors))
+            rows = rename_columns(read_parquet(older_rows, _remove(older_rows))).assign(cell=key)
+            self.add(key, rows, read_parquet(older_errors, _remove(older_rows, older_errors)))
             older_rows.unlink()
         older_errors.unlink(missing_ok=True)
 
@@ -98,16 +103,20 @@ class Store:
             errors: one row per frame and drone of every run, with a column `seed`.
 
         Raises:
+            DamagedError: the errors of other seeds are damaged, whose rows are whole.
             OutputError: the files cannot be written.
         """
+        # A cell whose rows are damaged is run again as a whole.
+        before_rows = self._rows_if_whole(key)
+        before_errors = None if before_rows is None else self._errors_if_present(key)
         # The rows come last, because a cell with rows counts as finished.
-        for path, new in ((self._errors_path(key), errors), (self._rows_path(key), rows)):
-            before_path = _present(path)
-            if before_path.exists():
-                before = pd.read_parquet(before_path)
+        for path, before, new in (
+            (self._errors_path(key), before_errors, errors),
+            (self._rows_path(key), before_rows, rows),
+        ):
+            if before is not None:
                 new = pd.concat([before[~before["seed"].isin(rows["seed"])], new], ignore_index=True)
-            with atomic_write(path) as temporary:
-                new.sort_values("seed", kind="stable").to_parquet(temporary, index=False)
+            write_parquet(path, new.sort_values("seed", kind="stable"))
 
     def add_failure(self, name: str, error: str, cell: Mapping[str, Any]) -> None:
         """Store why a cell failed, and a description of the cell.
@@ -115,8 +124,7 @@ class Store:
         Raises:
             OutputError: the file cannot be written.
         """
-        with atomic_write(self._failure_path(name)) as temporary:
-            temporary.write_text(json.dumps({"error": error, **cell}, indent=2) + "\n", encoding="utf-8")
+        write_json(self._failure_path(name), {"error": error, **cell})
 
     def remove_failure(self, name: str) -> None:
         """Remove the record of a cell's earlier failure, because the cell is finished."""
@@ -124,7 +132,7 @@ class Store:
 
     def failure(self, name: str) -> str | None:
         """Why a cell failed at the last attempt; None if it did not fail."""
-        content = _read_if_present(self._failure_path(name))
+        content = _read_if_present(self._failure_path(name), "error")
         return None if content is None else str(content["error"])
 
     def rows(self, seeds: Mapping[str, Collection[int]] | None = None) -> pd.DataFrame:
@@ -155,10 +163,9 @@ class Store:
         Raises:
             InputError: there is no file of the cell's errors.
         """
-        path = _present(self._errors_path(key))
-        if not path.exists():
-            raise InputError(path, expected="errors of a finished cell", found="no file")
-        errors = pd.read_parquet(path)
+        errors = self._errors_if_present(key)
+        if errors is None:
+            raise InputError(self._errors_path(key), expected="errors of a finished cell", found="no file")
         return errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
 
     def status(self) -> dict[str, Any]:
@@ -169,7 +176,10 @@ class Store:
         """
         if not (self.folder / "cells").is_dir():
             raise InputError(self.folder, expected="results of a sweep", found="none")
-        failures = [failure for path in self._cell_files("error.json") if (failure := _read_if_present(path))]
+        read = (
+            _read_if_present(path, "error", "sequence", "method") for path in self._cell_files("error.json")
+        )
+        failures = [failure for failure in read if failure is not None]
         locks = sorted((self.folder / "cells").glob(".*.lock"))
         at_work = [holder for path in locks if (holder := self._locks.holder(path))]
         return {
@@ -184,8 +194,10 @@ class Store:
 
     def manifest(self) -> dict[str, Any]:
         """Content of the manifest: runs and inputs; both are empty before the first run."""
-        content = _read_if_present(self.folder / "_manifest.json")
-        return rename_manifest(content) if content else {"runs": [], "inputs": {}}
+        content = _read_if_present(self.folder / "_manifest.json", "runs", "inputs")
+        if content is None:
+            return {"runs": [], "inputs": {}}
+        return rename_manifest(content)
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
         """Change the manifest while no other runner does.
@@ -202,8 +214,7 @@ class Store:
             before = json.dumps(manifest)
             change(manifest)
             if json.dumps(manifest) != before:
-                with atomic_write(path) as temporary:
-                    temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+                write_json(path, manifest)
 
     def tidy(self) -> None:
         """Remove half-written files of runners that were killed, and rename files that an older version wrote."""
@@ -218,6 +229,24 @@ class Store:
             for path in (self.folder / name for name in names):
                 if _present(path) != path:
                     _present(path).rename(path)
+
+    def _rows_if_whole(self, key: str) -> pd.DataFrame | None:
+        """Rows of a cell as they are stored; None without such a file, and with a warning for a damaged file."""
+        path = self._rows_path(key)
+        try:
+            return read_parquet(path, "")
+        except FileNotFoundError:
+            return None
+        except DamagedError:
+            logger.warning("%s: damaged rows of a cell; a sweep runs the cell again", path)
+            return None
+
+    def _errors_if_present(self, key: str) -> pd.DataFrame | None:
+        path = _present(self._errors_path(key))
+        try:
+            return read_parquet(path, _remove(self._rows_path(key), path))
+        except FileNotFoundError:
+            return None
 
     def _rows_path(self, key: str) -> Path:
         return self.folder / "cells" / f"{key}.parquet"
@@ -248,13 +277,23 @@ def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
     for path in paths:
         # Another process may remove the file of a cell that version 0.1 stored (see `Store.adopt`).
         with contextlib.suppress(FileNotFoundError):
-            parts.append(rename_columns(pd.read_parquet(path)))
+            parts.append(rename_columns(read_parquet(path, _RUN_AGAIN)))
     return parts
 
 
-def _read_if_present(path: Path) -> dict[str, Any] | None:
+def _read_if_present(path: Path, *keys: str) -> dict[str, Any] | None:
+    """Content of a JSON file, which must have some keys; None if the file does not exist."""
+    path = _present(path)
     try:
-        content: dict[str, Any] = json.loads(_present(path).read_text(encoding="utf-8"))
-        return content
+        content = read_json(path, _remove(path))
     except FileNotFoundError:
         return None
+    if not set(keys) <= content.keys():
+        found = f"the keys {', '.join(content)}" if content else "no keys"
+        raise DamagedError(path, expected=f"the keys {', '.join(keys)}", found=found, remedy=_remove(path))
+    return content
+
+
+def _remove(*paths: Path) -> str:
+    """Remedy for damaged files that a sweep does not make anew as long as they are there."""
+    return f"{_RUN_AGAIN} after `rm {' '.join(map(str, paths))}`"
