@@ -1,6 +1,7 @@
 from .background_models import find_background
 from .blob_boxes import blob_detections
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stack_blobs
+from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
 from .computation import (
     Silhouettes,
     compute,
@@ -25,6 +26,7 @@ __all__ = [
     "LEAST_RADIUS_CELLS",
     "SEAL_FILE",
     "BackgroundModel",
+    "CacheEntry",
     "Exposures",
     "ForegroundSettings",
     "Living",
@@ -41,6 +43,7 @@ __all__ = [
     "border_cells",
     "box_sum",
     "check_whole",
+    "choose_to_prune",
     "compute",
     "coverage",
     "exposures_of",
@@ -49,8 +52,10 @@ __all__ = [
     "foreground_is_everywhere",
     "frames_to_decode",
     "ignored_pixels",
+    "is_damaged",
     "is_whole",
     "key_of",
+    "list_entries",
     "made_of",
     "masks_out",
     "moved_by",
@@ -60,6 +65,7 @@ __all__ = [
     "reduce_frame",
     "reduced_shape",
     "removable",
+    "remove_entry",
     "scaled_settings",
     "silhouette_keys",
     "stack_blobs",

@@ -21,7 +21,7 @@ from psotrack.support import digest_file, digest_record
 SEAL_FILE = "seal"
 
 #: Folder of the chunks of a zarr array.
-_CHUNKS = "c"
+CHUNKS = "c"
 
 
 def write_seal(folder: Path) -> None:
@@ -92,5 +92,5 @@ def _lock(file: IO[bytes], *, shared: bool) -> bool:
 
 
 def _seal_of(folder: Path) -> str:
-    files = [folder / ARRAY_FILE, *(path for path in (folder / _CHUNKS).rglob("*") if path.is_file())]
+    files = [folder / ARRAY_FILE, *(path for path in (folder / CHUNKS).rglob("*") if path.is_file())]
     return digest_record({path.relative_to(folder).as_posix(): digest_file(path) for path in files})
