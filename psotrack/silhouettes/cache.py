@@ -58,8 +58,8 @@ def list_entries(cache: Path) -> list[CacheEntry]:
         found = (error.strerror or f"{error}").lower()
         raise InputError(cache, expected="a cache folder", found=found) from error
     programs = [path for path in (cache / _COMPILED).glob("*") if _is_program(path)]
-    found = [_entry(path) for path in (*folders, *programs)]
-    return sorted((entry for entry in found if entry is not None), key=lambda entry: entry.used_s)
+    entries = [_entry(path) for path in (*folders, *programs)]
+    return sorted((entry for entry in entries if entry is not None), key=lambda entry: entry.used_s)
 
 
 def is_damaged(entry: CacheEntry) -> bool:
