@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import itertools
 import os
 import shutil
@@ -21,6 +22,8 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
@@ -30,6 +33,8 @@ from psotrack.silhouettes import (
     Silhouettes,
     SilhouetteSettings,
     compute,
+    is_whole,
+    removable,
     silhouette_keys,
     usual_drone_px,
 )
@@ -375,6 +380,62 @@ def test_damaged_silhouettes_are_computed_again(folder: Path, tmp_path: Path, da
         (stored / "zarr.json").write_text(text.replace("41", "40"))
     again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     np.testing.assert_array_equal(_read_all(again), _expected(recording))
+
+
+@pytest.fixture(scope="module")
+def whole_cache(video_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    cache = tmp_path_factory.mktemp("whole")
+    compute(_make_recording(video_folder), SETTINGS, cache=cache, jobs=1)
+    return cache
+
+
+@settings(max_examples=30)
+@given(data=st.data())
+def test_no_changed_bit_and_no_truncation_goes_unnoticed(whole_cache: Path, data: st.DataObject) -> None:
+    """Whole folders pass, and a folder with one changed bit or a file cut short does not."""
+    folder = min(path for path in whole_cache.iterdir() if not path.name.startswith("."))
+    assert is_whole(folder)
+    file = data.draw(st.sampled_from(sorted(path for path in folder.rglob("*") if path.is_file())))
+    content = file.read_bytes()
+    damaged = bytearray(content)
+    if data.draw(st.booleans()):
+        damaged[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    else:
+        del damaged[data.draw(st.integers(0, len(content) - 1)) :]
+    try:
+        file.write_bytes(damaged)
+        assert not is_whole(folder)
+    finally:
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize("file", ["c/0/0/0", "zarr.json", "seal"])
+def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
+    folder: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    recording = _make_recording(folder)
+    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    damaged = tmp_path / "cache" / first.keys["cam2"]
+    content = bytearray((damaged / file).read_bytes())
+    content[len(content) // 2] ^= 1
+    (damaged / file).write_bytes(content)
+    caplog.clear()
+    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    lines = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert lines == [f"{damaged}: damaged silhouettes in the cache; they are made anew"]
+    assert is_whole(damaged)
+    np.testing.assert_array_equal(_read_all(again), _expected(recording))
+
+
+def test_a_folder_that_is_read_is_not_removable(folder: Path, tmp_path: Path) -> None:
+    silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    path = tmp_path / "cache" / silhouettes.keys["cam2"]
+    with removable(path) as free:
+        assert not free
+    del silhouettes
+    gc.collect()
+    with removable(path) as free:
+        assert free
 
 
 def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
 """Sweeps as tasks of a Dask cluster: when a worker is killed, its cell runs again, and the results are complete."""
 
 import json
+import shutil
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
-from sweeps import all_rows, grid_file, psotrack, small_sequence
+from sweeps import all_rows, environment, grid_file, psotrack, small_sequence
 
-from psotrack.errors import SettingsError
-from psotrack.sweep import read_grid, run_on_cluster
+from psotrack.errors import InputError, SettingsError
+from psotrack.sweep import Cluster, read_grid, run_on_cluster
 
 pytest.importorskip("distributed")
 
@@ -55,3 +59,106 @@ def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
         SettingsError, match=r"expected Dask, found .*; install it with `pip install 'psotrack\[dask\]'`"
     ):
         run_on_cluster(read_grid(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)
+
+
+#: Starts the local cluster of a sweep, and prints the addresses at which its processes listen.
+LISTENING = """
+import json
+import distributed
+import psutil
+from psotrack.sweep import cluster
+
+if __name__ == "__main__":
+    with cluster._client(distributed, "local", 2):
+        me = psutil.Process()
+        found = [
+            connection.laddr.ip
+            for process in (me, *me.children(recursive=True))
+            for connection in process.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        ]
+        print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_a_local_cluster_listens_on_the_loopback_only(tmp_path):
+    script = tmp_path / "listening.py"
+    script.write_text(LISTENING)
+    result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    addresses = json.loads(result.stdout)
+    assert len(addresses) >= 3, "the scheduler, its dashboard and the workers"
+    assert set(addresses) <= {"127.0.0.1", "::1"}
+
+
+@pytest.mark.parametrize(
+    ("address", "warned"),
+    [
+        ("tcp://10.0.0.5:8786", True),
+        ("10.0.0.5:8786", True),
+        ("tcp://scheduler.lab:8786", True),
+        ("tcp://127.0.0.1:8786", False),
+        ("localhost:8786", False),
+        ("tcp://[::1]:8786", False),
+        ("tls://10.0.0.5:8786", False),
+    ],
+)
+def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
+    tmp_path, monkeypatch, caplog, address, warned
+):
+    def refuse(*_):
+        raise OSError("nobody listens")
+
+    monkeypatch.setattr("distributed.Client", refuse)
+    (tmp_path / "Simulated_Data" / "S01_D2_A").mkdir(parents=True)
+    grid, cluster = read_grid(grid_file(tmp_path, [2])), Cluster(address)
+    monkeypatch.setattr("psotrack.sweep.cluster._result_without_worker", lambda *_: None)
+    with pytest.raises(InputError, match="nobody listens"):
+        run_on_cluster(grid, tmp_path / "out", data=tmp_path, cache=tmp_path, cluster=cluster)
+    lines = [record.getMessage() for record in caplog.records if "TLS" in record.getMessage()]
+    assert len(lines) == warned
+    assert all(line.startswith(f"--cluster {address}: ") for line in lines)
+
+
+def _certificates(folder: Path) -> dict[str, str]:
+    """A certificate that signs itself, and Dask's settings with it."""
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=test"]
+    key, certificate = folder / "key.pem", folder / "certificate.pem"
+    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    settings = {"CA_FILE": certificate}
+    for role in ("SCHEDULER", "WORKER", "CLIENT"):
+        settings |= {f"{role}__KEY": key, f"{role}__CERT": certificate}
+    return {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(path) for name, path in settings.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
+def test_a_sweep_on_a_cluster_with_tls(tmp_path_factory, tmp_path):
+    """The commands of the page about clusters: a scheduler and a worker with TLS, and a sweep."""
+    root, tls = small_sequence(tmp_path_factory), _certificates(tmp_path)
+    file = tmp_path / "scheduler.json"
+    program = [sys.executable, "-m"]
+    listening = ["--protocol", "tls", "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file]
+    scheduler = [*program, "distributed.cli.dask_scheduler", "--port", "0", *listening]
+    worker = [*program, "distributed.cli.dask_worker", "--nthreads", "1", *listening]
+    processes = []
+    try:
+        processes.append(subprocess.Popen(scheduler, env=environment(root) | tls))
+        deadline = time.monotonic() + 60
+        while not file.exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        address = json.loads(file.read_text())["address"]
+        assert address.startswith("tls://127.0.0.1:")
+        processes.append(subprocess.Popen(worker, env=environment(root) | tls))
+        words = ("sweep", grid_file(tmp_path, [2]), "--data", root, "--cluster", address, "--json", "-")
+        done = psotrack(root, *words, "--out", tmp_path / "results", **tls)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout) == {"finished": 1, "failed": 0, "left": 0}
+        stranger = psotrack(root, *words, "--out", tmp_path / "other")
+        assert stranger.returncode == 2
+        assert stranger.stderr.startswith("psotrack: --cluster: expected a Dask scheduler"), stranger.stderr
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.wait(30)

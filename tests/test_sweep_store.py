@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from psotrack.errors import InputError
 from psotrack.sweep import Store, locks
@@ -305,3 +307,74 @@ def test_missing_results_are_one_clear_line(tmp_path: Path) -> None:
         Store(tmp_path).errors(KEY, [0])
     # The manifest of no run is empty.
     assert json.dumps(Store(tmp_path).manifest()) == '{"runs": [], "inputs": {}}'
+
+
+@pytest.fixture(scope="module")
+def one_cell(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """A folder with a finished cell, a failed cell and a manifest."""
+    store = Store(tmp_path_factory.mktemp("one_cell"))
+    add(store, KEY, rows(0, 1, 2))
+    store.add_failure("f" * 40, "no such video", {"sequence": "S01", "method": "default"})
+    store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
+    return store
+
+
+def _content(store: Store) -> tuple[str, str, object, object]:
+    """Everything that a folder says."""
+    errors = store.errors(KEY, range(3))
+    manifest = {name: store.manifest()[name] for name in ("runs", "inputs")}
+    return store.rows().to_csv(), errors.to_csv(), manifest, store.status()["errors"]
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_damage_is_an_error_that_names_the_file_and_never_another_result(
+    one_cell: Store, data: st.DataObject
+) -> None:
+    """One changed bit, or a file cut short: the same content as before, or an error of one line."""
+    whole = _content(one_cell)
+    files = [path for path in one_cell.folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    file = data.draw(st.sampled_from(sorted(files)))
+    content = file.read_bytes()
+    damaged, cut = bytearray(content), data.draw(st.booleans())
+    place = data.draw(st.integers(0, len(content) - 1))
+    if cut:
+        del damaged[place:]
+    else:
+        damaged[place] ^= 1 << data.draw(st.integers(0, 7))
+    found: object = None
+    try:
+        file.write_bytes(damaged)
+        found = _content(one_cell)
+    except InputError as error:
+        found = error
+    finally:
+        file.write_bytes(content)
+    if isinstance(found, InputError):
+        assert f"{found}".startswith(f"{file}: expected ")
+        assert "run the same `psotrack sweep` again" in f"{found}"
+    else:
+        # A bit of the digest's own key, or the newline at the end of a JSON file.
+        assert found == whole
+
+
+def test_a_damaged_cell_is_run_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store, path = Store(tmp_path), tmp_path / "cells" / f"{KEY}.parquet"
+    add(store, KEY, rows(0, 1))
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="run the same `psotrack sweep` again"):
+        store.rows()
+    assert store.finished_seeds(KEY) == set()
+    assert f"{path}: damaged rows of a cell" in caplog.text
+    add(store, KEY, rows(0, 1))
+    pd.testing.assert_frame_equal(store.rows(), rows(0, 1))
+
+
+def test_other_programs_read_the_files_and_older_files_are_read(tmp_path: Path) -> None:
+    store, path = Store(tmp_path), tmp_path / "cells" / f"{KEY}.parquet"
+    add(store, KEY, rows(0, 1))
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), rows(0, 1))
+    rows(4).to_parquet(path, index=False)
+    assert store.finished_seeds(KEY) == {4}

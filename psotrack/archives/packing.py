@@ -37,7 +37,7 @@ from psotrack.recordings import (
 )
 from psotrack.rig_files import lens_model
 from psotrack.settings import YOLO, TrackSettings
-from psotrack.silhouettes import compute, stored_silhouettes
+from psotrack.silhouettes import SEAL_FILE, compute, stored_silhouettes
 from psotrack.support import Report, digest_file, no_progress, refuse_to_overwrite
 from psotrack.trajectories import read_trajectories
 
@@ -381,7 +381,8 @@ def _array_files(path: str, stored: StoredSilhouettes) -> Iterator[tuple[str, So
         folders.sort()
         for name in sorted(names):
             file = Path(folder, name)
-            if file != stored.path / ARRAY_FILE:
+            # The description that is packed may differ, and the archive has digests of its own.
+            if file not in (stored.path / ARRAY_FILE, stored.path / SEAL_FILE):
                 yield f"{path}/{file.relative_to(stored.path).as_posix()}", file
 
 

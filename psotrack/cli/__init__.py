@@ -29,6 +29,9 @@ COMMANDS = {
     "as-real": LazyCommand(
         "psotrack.cli.as_real", "Write the simulated sequence SEQ in the form of the dataset's real half."
     ),
+    "cache": LazyCommand(
+        "psotrack.cli.cache", "List, check, prune and empty the cache of silhouettes and compiled programs."
+    ),
     "calibrate": LazyCommand("psotrack.cli.calibrate", "Calibrate cameras, and convert calibration files."),
     "demo": LazyCommand(
         "psotrack.cli.demo",

@@ -89,7 +89,7 @@ def sweep(
     Examples:
       psotrack sweep grid.toml --dry-run
       psotrack sweep grid.toml --data data --out results
-      psotrack sweep grid.toml --data data --out results --cluster tcp://10.0.0.5:8786
+      psotrack sweep grid.toml --data data --out results --cluster tls://10.0.0.5:8786
       psotrack sweep --status results
       psotrack table results --rows particles --columns iterations --value mean_error_m
     """

@@ -1,6 +1,7 @@
 from .background_models import find_background
 from .blob_boxes import blob_detections
 from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stack_blobs
+from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
 from .computation import (
     Silhouettes,
     compute,
@@ -15,6 +16,7 @@ from .exposures import Exposures, moved_by
 from .foreground import BackgroundModel, Mog2, coverage, reduce_frame
 from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
+from .seals import SEAL_FILE, is_whole, removable
 from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, frames_to_decode, ignored_pixels, key_of, made_of, open_stored, reduced_shape
 from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
@@ -22,7 +24,9 @@ from .usable_frames import foreground_is_everywhere
 
 __all__ = [
     "LEAST_RADIUS_CELLS",
+    "SEAL_FILE",
     "BackgroundModel",
+    "CacheEntry",
     "Exposures",
     "ForegroundSettings",
     "Living",
@@ -39,6 +43,7 @@ __all__ = [
     "border_cells",
     "box_sum",
     "check_whole",
+    "choose_to_prune",
     "compute",
     "coverage",
     "exposures_of",
@@ -47,7 +52,10 @@ __all__ = [
     "foreground_is_everywhere",
     "frames_to_decode",
     "ignored_pixels",
+    "is_damaged",
+    "is_whole",
     "key_of",
+    "list_entries",
     "made_of",
     "masks_out",
     "moved_by",
@@ -56,6 +64,8 @@ __all__ = [
     "packed_box_sums",
     "reduce_frame",
     "reduced_shape",
+    "removable",
+    "remove_entry",
     "scaled_settings",
     "silhouette_keys",
     "stack_blobs",

@@ -20,6 +20,7 @@ from psotrack.recordings import Recording, StoredSilhouettes, Timeline, Truncate
 from psotrack.silhouettes.background_models import find_background
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.foreground import BackgroundModel
+from psotrack.silhouettes.seals import SEAL_FILE
 from psotrack.silhouettes.settings import MOG2, ScaledSettings, SilhouetteSettings, check_whole
 from psotrack.silhouettes.store import (
     Task,
@@ -27,6 +28,7 @@ from psotrack.silhouettes.store import (
     left_out,
     made_of,
     open_stored,
+    open_whole,
     reduced_shape,
     remove_stale,
     store,
@@ -103,10 +105,10 @@ class Silhouettes:
                 frames[:count, index, :height, :width] = read
             except (OSError, ValueError, RuntimeError) as error:
                 raise InputError(
-                    f"silhouettes {self.keys[self.cameras[index]]}",
+                    _folder_of(array),
                     expected="readable silhouettes",
-                    found=f"{error}",
-                    remedy="remove this folder from the cache; the next run makes it again",
+                    found=f"damage after they were opened ({error})",
+                    remedy="the same command, run again, makes the silhouettes of a cache anew",
                 ) from error
         return frames
 
@@ -160,6 +162,13 @@ class Silhouettes:
         return replace(
             self, num_frames=timeline.num_instants, arrays=arrays, exposures=exposures_of(timeline)
         )
+
+
+def _folder_of(array: object) -> object:
+    """The folder of an array that is stored, for messages."""
+    while isinstance(array, FramesOfInstants):
+        array = array.array
+    return array.store.root if isinstance(array, zarr.Array) else "silhouettes"  # type: ignore[attr-defined]
 
 
 def _within(intervals: list[Interval], start: int, stop: int) -> list[Interval]:
@@ -314,11 +323,14 @@ def compute(
     for name, stored in brought.items():
         if name not in tasks:
             _check_made_with(name, stored, scaled, model)
+    own = {name: task for name, task in tasks.items() if name not in brought}
+    opened = {name: array for name, task in own.items() if (array := _stored(task)) is not None}
+    missing = {name: task for name, task in own.items() if name not in opened}
     try:
-        seconds = _make_missing([task for name, task in tasks.items() if name not in brought], jobs, report)
+        seconds = _make_missing(list(missing.values()), jobs, report)
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
-    opened = {name: _open(task) for name, task in tasks.items() if name not in brought}
+    opened |= {name: _open(task) for name, task in missing.items()}
     opened |= {name: _open_brought(each, recording.rig, name) for name, each in brought.items()}
     whole = {name: opened[name] for name in recording.rig.names if name in opened}
     shape = (max(array.shape[1] for array in whole.values()), max(array.shape[2] for array in whole.values()))
@@ -486,13 +498,15 @@ def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> Tr
 
 
 def _make_missing(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
-    """Make and store missing silhouettes; returns the seconds of each stage, summed over the workers."""
+    """Make and store silhouettes; returns the seconds of each stage, summed over the workers."""
     # Two cameras with the same content have the same key, so their silhouettes are made once.
-    missing = list({task.key: task for task in tasks if _stored(task) is None}.values())
+    missing = list({task.key: task for task in tasks}.values())
+    for task in missing:
+        _say_damaged(task)
     seconds = {"decode": 0.0, "foreground": 0.0}
     if not missing:
         return seconds
-    logger.info("silhouettes: computing %d of %d videos", len(missing), len(tasks))
+    logger.info("silhouettes: computing those of %d videos", len(missing))
     cache = missing[0].cache
     try:
         cache.mkdir(parents=True, exist_ok=True)
@@ -509,7 +523,16 @@ def _make_missing(tasks: list[Task], jobs: int, report: Report) -> dict[str, flo
 
 def _stored(task: Task) -> zarr.Array | None:
     shape = reduced_shape(task.video, task.settings.reduction)
-    return open_stored(task.cache / task.key, task.video.num_frames, shape)
+    return open_whole(task.cache / task.key, task.video.num_frames, shape)
+
+
+def _say_damaged(task: Task) -> None:
+    """Warn that silhouettes in the cache are made anew; those of an older version, which wrote no seal, log a line."""
+    path = task.cache / task.key
+    if (path / SEAL_FILE).exists():
+        logger.warning("%s: damaged silhouettes in the cache; they are made anew", path)
+    elif path.exists():
+        logger.info("%s: silhouettes without a digest, of an older version; they are made anew", path)
 
 
 def _open(task: Task) -> zarr.Array:

@@ -10,6 +10,7 @@ import os
 import secrets
 import shutil
 import time
+import weakref
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from psotrack.silhouettes.foreground import (
     reduce_frame,
 )
 from psotrack.silhouettes.living_background import Living
+from psotrack.silhouettes.seals import hold, is_whole, write_seal
 from psotrack.silhouettes.settings import ScaledSettings
 from psotrack.silhouettes.usable_frames import (
     LEAST_FRAMES,
@@ -124,12 +126,28 @@ def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Arr
     """Open stored silhouettes (frames, height, width); None if they do not exist or are damaged."""
     try:
         array = zarr.open_array(path, mode="r", zarr_format=3)
-    except (OSError, ValueError, KeyError, TypeError):
+    except Exception:  # zarr raises whatever a damaged description leads to
         return None
     # zarr reads a missing chunk as zeros, which would look like frames without foreground.
     whole = array.shape == (num_frames, *shape) and array.nchunks_initialized == array.nchunks
     whole &= _LEFT_OUT in array.attrs
     return array if whole else None
+
+
+def open_whole(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:
+    """As `open_stored`, but every byte is compared with the folder's seal first.
+
+    As long as the array is in memory, other processes do not remove the folder from the cache.
+    """
+    held = hold(path)
+    if held is None:
+        return None
+    array = open_stored(path, num_frames, shape) if is_whole(path) else None
+    if array is None:
+        held.close()
+    else:
+        weakref.finalize(array, held.close)
+    return array
 
 
 def left_out(array: zarr.Array) -> list[Interval]:
@@ -168,6 +186,7 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
     try:
         temporary.mkdir(parents=True)
         seconds = _write(temporary, shape, task, advance)
+        write_seal(temporary)
         if open_stored(temporary, task.video.num_frames, shape) is None:
             raise OSError("another program changed the folder")
         _publish(temporary, path, task.video.num_frames, shape)
@@ -331,7 +350,7 @@ def _publish(temporary: Path, path: Path, num_frames: int, shape: tuple[int, int
     except OSError:
         if not path.exists():
             raise
-    if open_stored(path, num_frames, shape) is not None:
+    if open_whole(path, num_frames, shape) is not None:
         return
     damaged = temporary.with_name(f"{temporary.stem}.damaged{temporary.suffix}")
     os.rename(path, damaged)

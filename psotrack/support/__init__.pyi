@@ -24,7 +24,7 @@ from .progress import Advance, Report, joined, no_progress, progress_bar, progre
 from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
-from .stored_programs import load_ahead, stored_jit
+from .stored_programs import is_whole_program, load_ahead, stored_jit
 
 __all__ = [
     "ARCHIVE_SUFFIX",
@@ -57,6 +57,7 @@ __all__ = [
     "html_table",
     "identify",
     "is_moderate",
+    "is_whole_program",
     "joined",
     "keep_compiled",
     "load_ahead",

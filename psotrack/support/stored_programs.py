@@ -166,7 +166,7 @@ def _load(path: Path, device: jax.Device) -> Callable[..., Any] | None:
         logger.warning("%s: %s; the program is compiled again", path, error.strerror or error)
         return None
     start = len(_MAGIC) + _DIGEST_BYTES
-    if data[:start] != _MAGIC + hashlib.sha256(data[start:]).digest():
+    if not _agrees(data):
         logger.warning("%s is damaged or no program of psotrack; the program is compiled again", path)
         return None
     # JAX loads LAPACK when it lowers a function; a program that calls it earlier ends the process.
@@ -181,6 +181,20 @@ def _load(path: Path, device: jax.Device) -> Callable[..., Any] | None:
         return None
     logger.info("loaded the compiled program %s", path.name)
     return program
+
+
+def is_whole_program(path: Path) -> bool:
+    """Whether a file is a stored program of which no byte was changed."""
+    try:
+        return _agrees(path.read_bytes())
+    except OSError:
+        return False
+
+
+def _agrees(data: bytes) -> bool:
+    """Whether the bytes of a file agree with the digest that they begin with."""
+    start = len(_MAGIC) + _DIGEST_BYTES
+    return data[:start] == _MAGIC + hashlib.sha256(data[start:]).digest()
 
 
 def _make(path: Path, jitted: Any, static: dict[str, Any], arguments: dict[str, Any]) -> Callable[..., Any]:

@@ -7,6 +7,7 @@ killed, cells may run again, and other runners may work on the same folder.
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import logging
 import os
 import secrets
@@ -49,6 +50,8 @@ from psotrack.sweep.store import Store
 if TYPE_CHECKING:
     from distributed import Client
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Cluster:
@@ -70,6 +73,25 @@ class Cluster:
     def __post_init__(self) -> None:
         if self.workers is not None and self.address != "local":
             raise SettingsError("--workers", expected="--cluster local", found=f"--cluster {self.address}")
+
+
+def _warn_of_open_network(address: str) -> None:
+    """Warn of a scheduler to which data go unencrypted: Dask runs pickled code of whoever reaches the connection."""
+    protocol, _, place = address.rpartition("://")
+    host = place.rpartition(":")[0].strip("[]")
+    if protocol not in ("tls", "wss", "inproc") and not _is_loopback(host):
+        logger.warning(
+            "--cluster %s: neither TLS nor this machine; whoever reaches this network can run code in the workers: "
+            "use tls://",
+            address,
+        )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True)
@@ -158,6 +180,7 @@ def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
     if address == "local":
         with (
             dask.LocalCluster(
+                host="127.0.0.1",  # Nobody on the network may send code to the scheduler and the workers.
                 n_workers=workers,
                 threads_per_worker=1,  # JAX starts threads itself.
                 processes=True,
@@ -168,9 +191,10 @@ def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
         ):
             yield client
         return
+    _warn_of_open_network(address)
     try:
         client = dask.Client(address)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without certificates
         why = f"{error}".partition("\n")[0]
         raise InputError("--cluster", expected=f"a Dask scheduler at {address}", found=why) from error
     with client:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
@@ -30,14 +31,19 @@ import msgspec
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import atomic_write, convert, read_json
+from psotrack.support import convert
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.older_folders import rename_columns, rename_manifest
+from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
+
+logger = logging.getLogger(__name__)
 
 #: A temporary file that is older was left by a runner that was killed, seconds.
 _LEFT_BEHIND_S = 3600.0
-#: What helps against a damaged file.
-_REMEDY = "remove it, and run the sweep again"
+
+
+#: Remedy for a damaged file that a sweep makes anew.
+_RUN_AGAIN = "run the same `psotrack sweep` again"
 
 
 class _Failure(msgspec.Struct, frozen=True):
@@ -82,11 +88,9 @@ class Store:
         self._locks = Locks()
 
     def finished_seeds(self, key: str) -> set[int]:
-        """Seeds of a cell's finished runs."""
-        try:
-            return set(_read_table(self._rows_path(key))["seed"].tolist())
-        except FileNotFoundError:
-            return set()
+        """Seeds of a cell's finished runs; none, and a warning, if the cell's file is damaged."""
+        rows = self._rows_if_whole(key)
+        return set() if rows is None else set(rows["seed"].tolist())
 
     def adopt(self, older_key: str, key: str) -> None:
         """Move the results of a cell, if version 0.1 stored any, to the cell's key and names of today.
@@ -103,8 +107,8 @@ class Store:
         """
         older_rows, older_errors = self._rows_path(older_key), _present(self._errors_path(older_key))
         if older_rows.exists() and older_errors.exists():
-            rows = rename_columns(_read_table(older_rows)).assign(cell=key)
-            self.add(key, rows, _read_table(older_errors))
+            rows = rename_columns(_read_table(older_rows, _remove(older_rows))).assign(cell=key)
+            self.add(key, rows, _read_table(older_errors, _remove(older_rows)))
             older_rows.unlink()
         older_errors.unlink(missing_ok=True)
 
@@ -126,16 +130,20 @@ class Store:
             errors: one row per frame and drone of every run, with a column `seed`.
 
         Raises:
+            DamagedError: the errors of other seeds are damaged, whose rows are whole.
             OutputError: the files cannot be written.
         """
+        # A cell whose rows are damaged is run again as a whole.
+        before_rows = self._rows_if_whole(key)
+        before_errors = None if before_rows is None else self._errors_if_present(key)
         # The rows come last, because a cell with rows counts as finished.
-        for path, new in ((self._errors_path(key), errors), (self._rows_path(key), rows)):
-            before_path = _present(path)
-            if before_path.exists():
-                before = _read_table(before_path)
+        for path, before, new in (
+            (self._errors_path(key), before_errors, errors),
+            (self._rows_path(key), before_rows, rows),
+        ):
+            if before is not None:
                 new = pd.concat([before[~before["seed"].isin(rows["seed"])], new], ignore_index=True)
-            with atomic_write(path) as temporary:
-                new.sort_values("seed", kind="stable").to_parquet(temporary, index=False)
+            write_parquet(path, new.sort_values("seed", kind="stable"))
 
     def add_failure(self, name: str, error: str, cell: Mapping[str, Any]) -> None:
         """Store why a cell failed, and a description of the cell.
@@ -143,8 +151,7 @@ class Store:
         Raises:
             OutputError: the file cannot be written.
         """
-        with atomic_write(self._failure_path(name)) as temporary:
-            temporary.write_text(json.dumps({"error": error, **cell}, indent=2) + "\n", encoding="utf-8")
+        write_json(self._failure_path(name), {"error": error, **cell})
 
     def remove_failure(self, name: str) -> None:
         """Remove the record of a cell's earlier failure, because the cell is finished."""
@@ -183,14 +190,16 @@ class Store:
         Raises:
             InputError: there is no file of the cell's errors, or it has no errors of these runs.
         """
-        path = _present(self._errors_path(key))
-        if not path.exists():
-            raise InputError(path, expected="errors of a finished cell", found="no file")
-        errors = _read_table(path, ("seed", "frame", "drone", "error_m"))
+        errors = self._errors_if_present(key)
+        if errors is None:
+            raise InputError(self._errors_path(key), expected="errors of a finished cell", found="no file")
         wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
         if wanted.empty:
+            path = _present(self._errors_path(key))
             expected = f"errors of seeds {', '.join(map(str, seeds))}"
-            raise InputError(path, expected=expected, found="none", remedy=_REMEDY)
+            raise InputError(
+                path, expected=expected, found="none", remedy=_remove(self._rows_path(key))
+            )
         return wanted
 
     def status(self) -> dict[str, Any]:
@@ -201,11 +210,8 @@ class Store:
         """
         if not (self.folder / "cells").is_dir():
             raise InputError(self.folder, expected="results of a sweep", found="none")
-        failures = [
-            failure
-            for path in self._cell_files("error.json")
-            if (failure := _read_if_present(path, _Failure))
-        ]
+        read = (_read_if_present(path, _Failure) for path in self._cell_files("error.json"))
+        failures = [failure for failure in read if failure is not None]
         locks = sorted((self.folder / "cells").glob(".*.lock"))
         at_work = [holder for path in locks if (holder := self._locks.holder(path))]
         return {
@@ -221,7 +227,9 @@ class Store:
     def manifest(self) -> dict[str, Any]:
         """Content of the manifest: runs and inputs; both are empty before the first run."""
         content = _read_if_present(self.folder / "_manifest.json", _Manifest)
-        return rename_manifest(content) if content else {"runs": [], "inputs": {}}
+        if content is None:
+            return {"runs": [], "inputs": {}}
+        return rename_manifest(content)
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
         """Change the manifest while no other runner does.
@@ -238,8 +246,7 @@ class Store:
             before = json.dumps(manifest)
             change(manifest)
             if json.dumps(manifest) != before:
-                with atomic_write(path) as temporary:
-                    temporary.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+                write_json(path, manifest)
 
     def tidy(self) -> None:
         """Remove half-written files of runners that were killed, and rename files that an older version wrote."""
@@ -254,6 +261,26 @@ class Store:
             for path in (self.folder / name for name in names):
                 if _present(path) != path:
                     _present(path).rename(path)
+
+    def _rows_if_whole(self, key: str) -> pd.DataFrame | None:
+        """Rows of a cell as they are stored; None without such a file, and with a warning for a damaged file."""
+        path = self._rows_path(key)
+        try:
+            return _read_table(path, "")
+        except FileNotFoundError:
+            return None
+        except DamagedError:
+            logger.warning("%s: damaged rows of a cell; a sweep runs the cell again", path)
+            return None
+
+    def _errors_if_present(self, key: str) -> pd.DataFrame | None:
+        path = _present(self._errors_path(key))
+        try:
+            return _read_table(
+                path, _remove(self._rows_path(key)), ("seed", "frame", "drone", "error_m")
+            )
+        except FileNotFoundError:
+            return None
 
     def _rows_path(self, key: str) -> Path:
         return self.folder / "cells" / f"{key}.parquet"
@@ -284,33 +311,22 @@ def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
     for path in paths:
         # Another process may remove the file of a cell that version 0.1 stored (see `Store.adopt`).
         with contextlib.suppress(FileNotFoundError):
-            parts.append(rename_columns(_read_table(path)))
+            parts.append(rename_columns(_read_table(path, _RUN_AGAIN)))
     return parts
 
 
-def _read_table(path: Path, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
+def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
     """A table of runs or of their errors, which must have some columns: names in `drone`, numbers in the others.
 
     Raises:
+        DamagedError: the file is damaged, or is another table.
         FileNotFoundError: the file does not exist.
-        InputError: the file is damaged, or is another table.
     """
-    import pyarrow as pa
-
-    expected = "a table of results of a sweep"
-    try:
-        table = pd.read_parquet(path)
-    except FileNotFoundError:
-        raise
-    # pandas raises more than Arrow's errors for a file whose metadata are damaged.
-    except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
-        # The libraries' own messages repeat the path.
-        found = "a damaged file, or one of another format"
-        raise InputError(path, expected=expected, found=found, remedy=_REMEDY) from error
+    table = read_parquet(path, remedy)
     for name in columns:
         if name not in table or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name])):
             found = "others" if name in table else "none"
-            raise InputError(path, expected=f"values in the column {name}", found=found, remedy=_REMEDY)
+            raise DamagedError(path, expected=f"values in the column {name}", found=found, remedy=remedy)
     return table
 
 
@@ -318,15 +334,23 @@ def _read_if_present(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any] |
     """The JSON object in a file, which is checked to be like `kind`; None if the file does not exist.
 
     Raises:
-        InputError: the file is damaged.
+        DamagedError: the file is damaged.
     """
     path = _present(path)
-    if not path.exists():
+    try:
+        content = read_json(path, _remove(path))
+    except FileNotFoundError:
         return None
-    content = read_json(path, "JSON that a sweep wrote", _REMEDY)
 
-    def wrong(field: str, expected: str, found: str, remedy: str) -> InputError:
-        return InputError(f"{path}, {field}", expected=expected, found=found, remedy=remedy or _REMEDY)
+    def wrong(field: str, expected: str, found: str, remedy: str) -> DamagedError:
+        return DamagedError(
+            f"{path}, {field}", expected=expected, found=found, remedy=remedy or _remove(path)
+        )
 
     convert(content, kind, wrong)
     return content
+
+
+def _remove(path: Path) -> str:
+    """Remedy for a damaged file that a sweep does not make anew as long as the file at a path is there."""
+    return f"{_RUN_AGAIN} after `rm {path}`"

@@ -1,0 +1,154 @@
+"""What a cache folder holds: silhouettes of videos, and compiled programs; and how entries are removed.
+
+Only what psotrack itself put into the folder is an entry: a folder whose name is a key and which holds nothing but an
+array and its seal, and files of compiled programs. Everything else in the folder is left alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from psotrack.errors import InputError, OutputError
+from psotrack.recordings import ARRAY_FILE
+from psotrack.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole, removable
+
+#: Name of a folder of silhouettes, and names of compiled programs: of psotrack's own store, and of JAX's cache.
+_KEY = re.compile(r"[0-9a-f]{40}")
+_PROGRAM = re.compile(r"psotrack\.[\w.]+-[0-9a-f]{40}\.program|jit_\w+-[0-9a-f]{64}-(cache|atime)")
+#: Folder of the compiled programs, in the cache.
+_COMPILED = "compiled"
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """An entry of a cache.
+
+    Attributes:
+        path: folder of silhouettes, or file of a compiled program.
+        kind: what the entry is.
+        video: file name of the video of silhouettes; "" for a program, and where the entry is damaged.
+        size_bytes: size of all files.
+        used_s: time of the last use, seconds since 1970.
+    """
+
+    path: Path
+    kind: Literal["silhouettes", "program"]
+    video: str
+    size_bytes: int
+    used_s: float
+
+
+def list_entries(cache: Path) -> list[CacheEntry]:
+    """Entries of a cache, those that were used last at the end.
+
+    Raises:
+        InputError: the folder does not exist or cannot be read.
+    """
+    try:
+        folders = [path for path in cache.iterdir() if _is_silhouettes(path)]
+    except OSError as error:
+        found = (error.strerror or f"{error}").lower()
+        raise InputError(cache, expected="a cache folder", found=found) from error
+    programs = [path for path in (cache / _COMPILED).glob("*") if _is_program(path)]
+    entries = [_entry(path) for path in (*folders, *programs)]
+    return sorted((entry for entry in entries if entry is not None), key=lambda entry: entry.used_s)
+
+
+def is_damaged(entry: CacheEntry) -> bool:
+    """Whether an entry was changed or cut short after it was written; every byte is read.
+
+    Programs of JAX's own cache have no digest and count as undamaged: JAX reads them or compiles again.
+    """
+    if entry.kind == "silhouettes":
+        return not is_whole(entry.path)
+    if entry.path.suffix != ".program":
+        return False
+    from psotrack.support import is_whole_program
+
+    return not is_whole_program(entry.path)
+
+
+def choose_to_prune(
+    entries: Sequence[CacheEntry], now_s: float, older_than_days: float | None, max_bytes: float | None
+) -> list[CacheEntry]:
+    """The entries to remove: those that are too old, and then those that were used longest ago.
+
+    Args:
+        entries: entries of a cache, those that were used last at the end.
+        now_s: time now, seconds since 1970.
+        older_than_days: entries that were not used for this number of days are removed; None removes none.
+        max_bytes: largest size of the entries that stay; None sets no limit.
+    """
+    chosen = []
+    size_bytes = sum(entry.size_bytes for entry in entries)
+    for entry in entries:
+        old = older_than_days is not None and now_s - entry.used_s > older_than_days * 24 * 3600
+        if old or (max_bytes is not None and size_bytes > max_bytes):
+            chosen.append(entry)
+            size_bytes -= entry.size_bytes
+    return chosen
+
+
+def remove_entry(entry: CacheEntry) -> bool:
+    """Remove an entry; False where a process reads the entry, which then stays.
+
+    Raises:
+        OutputError: the entry cannot be removed.
+    """
+    try:
+        if entry.kind == "program":
+            entry.path.unlink(missing_ok=True)
+            return True
+        with removable(entry.path) as free:
+            if not free:
+                return False
+            # A folder that is half removed must not stand under its own name.
+            aside = entry.path.with_name(f".{entry.path.name}.{secrets.token_hex(4)}.partial")
+            os.rename(entry.path, aside)
+        shutil.rmtree(aside)
+    except FileNotFoundError:
+        return True  # Another process has removed the entry.
+    except OSError as error:
+        found = error.strerror or f"{error}"
+        raise OutputError(entry.path, expected="an entry that can be removed", found=found) from error
+    return True
+
+
+def _is_silhouettes(path: Path) -> bool:
+    if not _KEY.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
+        return False
+    return {each.name for each in path.iterdir()} <= {ARRAY_FILE, SEAL_FILE, CHUNKS}
+
+
+def _is_program(path: Path) -> bool:
+    return bool(_PROGRAM.fullmatch(path.name)) and not path.is_symlink() and path.is_file()
+
+
+def _entry(path: Path) -> CacheEntry | None:
+    """The entry at a path; None where another process has just removed it."""
+    try:
+        files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+        size_bytes = sum(file.stat().st_size for file in files)
+        seal = path / SEAL_FILE
+        used_s = (seal if seal.exists() else path).stat().st_mtime
+    except OSError:
+        return None
+    if path.is_file():
+        return CacheEntry(path, "program", "", size_bytes, used_s)
+    return CacheEntry(path, "silhouettes", _video_of(path), size_bytes, used_s)
+
+
+def _video_of(folder: Path) -> str:
+    try:
+        video = json.loads((folder / ARRAY_FILE).read_bytes())["attributes"]["video"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return ""
+    return video if isinstance(video, str) else ""
