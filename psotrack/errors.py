@@ -77,6 +77,12 @@ def _unpickled(kind: type[PsotrackError], message: str) -> PsotrackError:
     return kind.__new__(kind, message)
 
 
+def one_short_line(text: str, remedy: str = "") -> str:
+    """A message of another library as one line that is no longer than `LONGEST_MESSAGE` with a remedy after it."""
+    (text,) = _shortened([_on_one_line(text)], LONGEST_MESSAGE - len(remedy))
+    return f"{text}{remedy}"
+
+
 @contextlib.contextmanager
 def errors_name(path: object) -> Iterator[None]:
     """Errors of the block that do not name a file, because they are about its content, begin with its name.

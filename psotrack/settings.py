@@ -7,6 +7,7 @@ fast.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal, get_args
 
@@ -67,9 +68,26 @@ def renamed(name: str) -> str:
     )
 
 
+#: Largest numbers of what takes memory and time. Memory for scores grows by half a kilobyte or more per particle and
+#: drone; the paper has 100 particles and 70 iterations.
+_MOST_PARTICLES, _MOST_ITERATIONS, _MOST_DRONES = 100_000, 100_000, 1000
+#: Largest seed of JAX and NumPy.
+_MOST_SEED = 2**63 - 1
+
+
+def _check_count(name: str, value: int, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise SettingsError(name, expected=f"a number from {least} to {most}", found=f"{value}")
+
+
 def _check_least(name: str, value: int, least: int) -> None:
     if value < least:
         raise SettingsError(name, expected=f"at least {least}", found=f"{value}")
+
+
+def _check_finite(name: str, values: tuple[float, ...]) -> None:
+    if not all(map(math.isfinite, values)):
+        raise SettingsError(name, expected="finite numbers", found=f"{values}")
 
 
 def _check_range(name: str, value: float | int, low: float, high: float = float("inf")) -> None:
@@ -144,8 +162,8 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_choice("swarm.kind", self.kind, get_args(SwarmKind))
-        _check_least("swarm.particles", self.particles, 2)
-        _check_least("swarm.iterations", self.iterations, 0)
+        _check_count("swarm.particles", self.particles, 2, _MOST_PARTICLES)
+        _check_count("swarm.iterations", self.iterations, 1, _MOST_ITERATIONS)
         check_positive("swarm.spread_m", self.spread_m)
 
 
@@ -255,9 +273,10 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.count is not None:
-            _check_least("drones.count", self.count, 1)
+            _check_count("drones.count", self.count, 1, _MOST_DRONES)
         for length_m in self.size_m or ():
             check_positive("drones.size_m", length_m)
+        _check_finite("drones.body_offset_m", self.body_offset_m)
 
 
 class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -387,10 +406,11 @@ class TrackSettings(
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_least("seed", self.seed, 0)
+        _check_count("seed", self.seed, 0, _MOST_SEED)
         _check_choice("clocks", self.clocks, get_args(Clocks))
         if self.rate_hz is not None:
             check_positive("rate_hz", self.rate_hz)
+        _check_finite("bounds_m", self.bounds_m or ())
         if self.bounds_m is not None and any(
             low >= high for low, high in zip(self.bounds_m[::2], self.bounds_m[1::2], strict=True)
         ):

@@ -43,6 +43,9 @@ _COMPRESSED = frozenset({".avi", ".mp4", ".mkv", ".mov", ".png", ".jpg", ".jpeg"
 _PIECE = 1 << 20
 #: Largest size of a manifest, bytes: a day of sixteen cameras has a tenth of it.
 _MOST_MANIFEST = 1 << 28
+#: Bytes that every archive may unpack to, and how many times its own size a larger one. Tables of numbers, which shrink
+#: most of what is packed, have a tenth of that.
+_SMALL, _MOST_RATIO = 1 << 28, 100
 
 
 def write_sealed(
@@ -146,6 +149,7 @@ def _opened(path: Path) -> Iterator[tuple[zipfile.ZipFile, Manifest]]:
         with zipfile.ZipFile(path) as zipped:
             entries = zipped.infolist()
             _check_entries(path, entries)
+            _check_ratio(path, entries)
             manifest = _read_manifest(path, zipped)
             _check_listed(path, {entry.filename: entry.file_size for entry in entries}, manifest)
             yield zipped, manifest
@@ -268,6 +272,14 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
         if entry.filename.casefold() in seen:
             raise InputError(f"{path}, {entry.filename}", expected="each file once", found="the file twice")
         seen.add(entry.filename.casefold())
+
+
+def _check_ratio(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Raise `InputError` for an archive that unpacks to far more than it could have been made from."""
+    size, most = sum(entry.file_size for entry in entries), max(_SMALL, _MOST_RATIO * path.stat().st_size)
+    if size > most:
+        expected = f"files of at most {most} bytes in an archive of {path.stat().st_size}"
+        raise InputError(path, expected=expected, found=f"{size} bytes", remedy="do not trust it")
 
 
 def _check_name(path: Path, name: str) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig, make_camera, undistort
+from psotrack.support import whole_number
 
 #: Number of unknowns of a lens before the distortion: fx, fy, cx, cy.
 PINHOLE = 4
@@ -124,13 +125,14 @@ def parse_lens_model(word: str) -> LensModel | None:
         return None
     if word.lower() == "fisheye":
         return LensModel(_FISHEYE_COEFFICIENTS, fisheye=True)
-    if not word.isdecimal() or int(word) not in _PINHOLE_COEFFICIENTS:
+    count = whole_number(word)
+    if count not in _PINHOLE_COEFFICIENTS:
         raise SettingsError(
             "lens",
             expected=f"auto, fisheye, or one of {', '.join(map(str, _PINHOLE_COEFFICIENTS))}",
             found=word,
         )
-    return LensModel(int(word))
+    return LensModel(count)
 
 
 def known_lenses(rig: Rig) -> dict[str, tuple[LensModel, np.ndarray]]:

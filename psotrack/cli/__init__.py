@@ -19,7 +19,7 @@ from psotrack import __version__
 from psotrack.cli.interrupts import orderly_interrupts
 from psotrack.cli.lazy import LazyCommand, LazyGroup
 from psotrack.cli.log_file import FirstOnly
-from psotrack.errors import PsotrackError, SettingsError
+from psotrack.errors import PsotrackError, SettingsError, one_short_line
 
 __all__ = ["cli", "main"]
 
@@ -182,7 +182,7 @@ def main(started: float | None = None) -> None:
         # `error.show` would print four lines.
         failed = error.ctx if isinstance(error, click.UsageError) else None
         remedy = f"; see `{failed.command_path} --help`" if failed else ""
-        sys.stderr.write(f"psotrack: {error.format_message().rstrip('.')}{remedy}\n")
+        sys.stderr.write(f"psotrack: {one_short_line(error.format_message().rstrip('.'), remedy)}\n")
         sys.exit(2)
     except PsotrackError as error:
         sys.stderr.write(f"psotrack: {error}\n")

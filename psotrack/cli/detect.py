@@ -108,14 +108,14 @@ def detect(
       psotrack detect pictures/ --blobs --out boxes --min-blob 16
     """
     from psotrack.recordings import write_detections
-    from psotrack.support import refuse_to_overwrite
+    from psotrack.support import check_file_name, refuse_to_overwrite
 
     if blobs == (chosen is not None):
         raise SettingsError(
             "detect", expected="--detector MODEL.onnx or --blobs", found="both" if blobs else "neither"
         )
     recording = filmed_recording(sequence, cameras, num_frames)
-    files = {name: out / f"{name}.csv" for name in recording.videos}
+    files = {name: out / f"{check_file_name(name, sequence)}.csv" for name in recording.videos}
     for path in files.values():
         refuse_to_overwrite(path, force)
     counts: dict[str, int] = {}

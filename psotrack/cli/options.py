@@ -16,7 +16,7 @@ from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import RENAMED, ErrorSettings, TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
-from psotrack.support import ARCHIVE_SUFFIX
+from psotrack.support import ARCHIVE_SUFFIX, whole_number
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -60,9 +60,10 @@ class Size(click.ParamType):
         if not isinstance(value, str):
             return value
         words = value.replace("x", ",").split(",")
-        if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+        numbers = [whole_number(word) for word in words]
+        if len(numbers) != 2 or not all(numbers):
             self.fail(f"expected two whole numbers above 0, such as 1920,1080, found {value!r}", param, ctx)
-        return int(words[0]), int(words[1])
+        return tuple(numbers)
 
 
 class SequencePath(click.Path):
@@ -160,7 +161,7 @@ ITERATIONS = click.option(
 )
 MOST_DRONES = click.option(
     "--most-drones",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 1000),
     default=16,
     show_default=True,
     help="Largest number of drones at one time, where no frame uses a later one.",
@@ -354,7 +355,10 @@ def filmed_recording(source: Path, cameras: str | None, num_frames: int | None) 
 
 def camera_names(cameras: str | None) -> list[str] | None:
     """Names of the option `CAMERAS`; None where it is not given."""
-    return None if cameras is None else [name.strip() for name in cameras.split(",")]
+    names = None if cameras is None else [name.strip() for name in cameras.split(",")]
+    if names is not None and not all(names):
+        raise SettingsError("--cameras", expected="names with commas between them", found=repr(cameras))
+    return names
 
 
 def cache_folder(chosen: str | Path | None) -> Path:

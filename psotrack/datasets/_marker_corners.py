@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.support import Column, Table, TextRow, read_rows, read_text, write_rows
+from psotrack.support import Column, Table, TextRow, read_rows, read_text, whole_number, write_rows
 
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
 _METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1.0}
@@ -45,8 +45,10 @@ _WIDE = re.compile(
     rf"(?P<before>[xyz]){_WHICH.format(group='after_axis')}|{_WHICH.format(group='before_axis')}(?P<after>[xyz])"
 )
 _LONG = re.compile(r"(?:pos|position|coord|corner|c|p|point)?(?P<axis>[xyz])")
-_LABEL = re.compile(r"(?:marker|aruco|tag|id|m)?[ _]*(\d+)[ ]?[:_. -][ ]?(?:corner|c)?([0-4])", re.IGNORECASE)
-_ID = re.compile(r"(?:[a-z][a-z _:-]*)?(?P<number>\d+)(?:\.0*)?", re.IGNORECASE)
+_LABEL = re.compile(
+    r"(?:marker|aruco|tag|id|m)?[ _]*(\d{1,9})[ ]?[:_. -][ ]?(?:corner|c)?([0-4])", re.IGNORECASE
+)
+_ID = re.compile(r"(?:[a-z][a-z _:-]*)?(?P<number>\d{1,9})(?:\.0*)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -188,8 +190,8 @@ def _marker(row: TextRow, column: Column) -> int:
 def _corner(row: TextRow, column: Column) -> int:
     """Number of a corner as in the file; named corners are numbered from 1."""
     text = row.text(column)
-    number = _NAMED.get(_bare(text), int(text) if text.isdecimal() else -1)
-    if not 0 <= number <= 4:
+    number = _NAMED.get(_bare(text), whole_number(text))
+    if number is None or not 0 <= number <= 4:
         raise row.error(column, "a corner, 1 to 4, or tl, tr, br or bl", repr(text))
     return number
 

@@ -32,13 +32,17 @@ _ZIP_ERRORS = (
     *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, struct.error, ValueError),
 )
 
+#: Largest size of an image that an archive states, bytes: more than those of a large camera. `zipfile` unpacks no more
+#: than is stated.
+_MOST_IMAGE = 1 << 26
+
 Mask = Bool[np.ndarray, "height width"]
 
 _EXPECTED = "images such as cam1i/dron1/000000.png (camera, drone, frame)"
 _IMAGE_SUFFIXES = {".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".webp"}
 _CAMERA = re.compile(r"cam[a-z]*_?(?:\d{6,}|\d+i?)|\d{6,}(?=[^\d].*/)", re.IGNORECASE)
-_DRONE = re.compile(r"drone?_?(\d+)", re.IGNORECASE)
-_NUMBER = re.compile(r"\d+")
+_DRONE = re.compile(r"drone?_?(\d{1,9})(?!\d)", re.IGNORECASE)
+_NUMBER = re.compile(r"(?<!\d)\d{1,9}(?!\d)")
 
 
 class MaskWriter:
@@ -115,6 +119,9 @@ class Masks:
             raise InputError(
                 self._path, expected=f"a mask of dron{drone} in frame {frame} of {camera}", found="none"
             )
+        if self._archive and (size := self._archive.getinfo(name).file_size) > _MOST_IMAGE:
+            expected = f"an image of at most {_MOST_IMAGE} bytes"
+            raise InputError(f"{self._path}: {name}", expected=expected, found=f"{size} bytes")
         try:
             data = self._archive.read(name) if self._archive else (self._path / name).read_bytes()
         except (OSError, *_ZIP_ERRORS) as error:

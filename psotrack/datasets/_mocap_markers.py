@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.datasets._frames import rows_by_frame
 from psotrack.rig_files import METRES_PER_UNIT
 from psotrack.support import read_table, write_rows
 
@@ -46,13 +47,8 @@ def read_mocap_markers(path: Path | str) -> Float[np.ndarray, "frames 4 3"]:
     id_column = table.column("id")
     columns = [table.column(name.lower()) for name in _COLUMNS]
     metres = np.array([table.factor(column, METRES_PER_UNIT) for column in columns])
-    rows: dict[int, np.ndarray] = {}
-    for row in table.rows:
-        frame = row.count(id_column)
-        if frame in rows:
-            raise row.error(id_column, "each frame once", f"{frame} again")
-        rows[frame] = np.array([row.number(column) for column in columns]) * metres
+    rows = rows_by_frame(table, id_column)
     markers_m = np.full((max(rows) + 1, len(_COLUMNS)), np.nan)
-    for frame, values in rows.items():
-        markers_m[frame] = values
+    for frame, row in rows.items():
+        markers_m[frame] = np.array([row.number(column) for column in columns]) * metres
     return markers_m.reshape(-1, len(MOCAP_MARKERS), 3)

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from psotrack.datasets._poses import read_poses
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import OnboardVideo, VideoInfo, probe
-from psotrack.support import read_table, write_rows
+from psotrack.support import read_table, whole_number, write_rows
 
 ONBOARD_CALIBRATION = "drone_cameras_calibration.csv"
 
@@ -130,7 +130,9 @@ def numbered_files(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int,
         match = pattern.fullmatch(path.name)
         if match is None:
             continue
-        number = int(match["number"])
+        number = whole_number(match["number"])
+        if number is None:
+            raise InputError(path, expected="the number of a drone in the name", found=match["number"])
         if number in found:
             raise InputError(path, expected="one file per drone", found=f"{found[number].name} as well")
         found[number] = path

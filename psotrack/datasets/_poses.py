@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from psotrack.datasets._frames import rows_by_frame
 from psotrack.errors import SettingsError
 from psotrack.rig_files import METRES_PER_UNIT
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
@@ -25,8 +26,6 @@ Orientations = Float[np.ndarray, "frames 4"]
 
 _QUATERNION = re.compile(r"(?P<stem>[a-z_ .]*q[a-z_ .]*?)[_ .]?(?P<axis>[wxyz])")
 #: Largest deviation of a quaternion's norm from 1: the effect of rounding to two decimals.
-#: Largest frame number, whatever the number of rows, and per row: the poses of all frames take memory.
-_FRAMES, _FRAMES_PER_ROW = 1_000_000, 100
 _NORM_TOLERANCE = 0.02
 
 
@@ -44,11 +43,7 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
     position = [table.column(f"pos_{axis}") for axis in "xyz"]
     metres = np.array([table.factor(column, METRES_PER_UNIT) for column in position])
     quaternion = _quaternion_columns(table)
-    rows = _by_frame(table, id_column)
-    last, most = max(rows), max(_FRAMES, _FRAMES_PER_ROW * len(rows))
-    if last > most:
-        expected = f"a frame number of at most {most} in a file of {len(rows)} rows"
-        raise rows[last].error(id_column, expected, f"{last}")
+    rows = rows_by_frame(table, id_column)
     position_m = np.full((max(rows) + 1, 3), np.nan)
     orientation_wxyz = np.full((max(rows) + 1, 4), np.nan)
     for frame, row in rows.items():
@@ -101,16 +96,6 @@ def pose_file(number: int, fps: float = 25.0) -> str:
 def _euler_rad(orientation_wxyz: Orientations) -> Positions:
     """Angles about x, y, z in radians, with R = Rz Ry Rx."""
     return Rotation.from_quat(orientation_wxyz, scalar_first=True).as_euler("xyz")
-
-
-def _by_frame(table: Table, column: Column) -> dict[int, TextRow]:
-    rows: dict[int, TextRow] = {}
-    for row in table.rows:
-        frame = row.count(column)
-        if frame in rows:
-            raise row.error(column, "each frame once", f"{frame} again, after line {rows[frame].line}")
-        rows[frame] = row
-    return rows
 
 
 def _quaternion_columns(table: Table) -> list[Column]:

@@ -129,7 +129,7 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     videos = _videos(folder, files, names)
     rig = read_calibration(calibration, _image_sizes(names, videos))
     _check_principal_points(rig, videos)
-    detections = files_by_camera((folder / DETECTIONS).glob("*.csv"), names)
+    detections = files_by_camera(_detection_files(folder / DETECTIONS), names)
     corners = folder / MARKER_CORNERS
     return Recording(
         name=folder.resolve().name,
@@ -166,6 +166,21 @@ def detection_files(folder: Path | str, cameras: Sequence[str]) -> dict[str, Pat
             found="no such file" if folder.is_dir() else "no such folder",
         )
     return found
+
+
+def _detection_files(folder: Path) -> list[Path]:
+    """The files of a sequence's detections; none without such a folder.
+
+    Raises:
+        InputError: there is a file of the folder's name, or the folder cannot be read.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix == ".csv")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        found = (error.strerror or str(error)).lower()
+        raise InputError(folder, expected="a folder of detections, or none", found=found) from error
 
 
 def _check_folder(folder: Path) -> None:

@@ -17,6 +17,7 @@ from psotrack.datasets._reference import read_reference, reference_at
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, Rig, chosen_camera, make_rig
 from psotrack.recordings import (
+    MOST_INSTANTS,
     RECORDING_FILE,
     CameraTable,
     FrameTimes,
@@ -305,6 +306,11 @@ def _times(
     else:
         num_frames = 0 if detections is None else int(read_detections(detections).frame.max(initial=-1)) + 1
     assert table.fps is not None, "the schema asks for fps of a camera without video"
+    if num_frames > MOST_INSTANTS:
+        where = (
+            detections if table.frames is None and silhouettes is None else f"{path}, cameras.{name}.frames"
+        )
+        raise InputError(where, expected=f"at most {MOST_INSTANTS} frames", found=f"{num_frames}")
     return FrameTimes(num_frames, table.fps, offset_s)
 
 

@@ -200,9 +200,14 @@ class OnnxDetector:
             cv2.utils.logging.setLogLevel(level)
 
 
+#: Memory, bytes, and time, seconds, that a network may take for one image.
+_MOST_BYTES, _MOST_S = 8 << 30, 120.0
 #: Reads a network and runs it on a black image. Errors of OpenCV are no concern here.
 _RUN_ONCE = """
-import sys, cv2, numpy
+import contextlib, sys, cv2, numpy
+with contextlib.suppress(ImportError):  # Windows
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[3]),) * 2)
 side = int(sys.argv[2])
 network = cv2.dnn.readNetFromONNX(sys.argv[1])
 network.setInput(cv2.dnn.blobFromImage(numpy.zeros((side, side, 3), numpy.uint8)))
@@ -215,14 +220,22 @@ def _check_survives(model: Path, size: int) -> None:
     code = _exit_code(str(model.resolve()), model.stat().st_mtime_ns, size)
     # An error of Python has the exit code 1.
     if code not in (0, 1):
-        found = f"one that ends the process that runs it (exit code {code})"
+        found = (
+            f"one that takes more than {_MOST_S:g} s for an image"
+            if code is None
+            else f"one that ends the process that runs it (exit code {code})"
+        )
         raise InputError(model, expected="an ONNX model that OpenCV can run", found=found)
 
 
 @functools.lru_cache(maxsize=16)
-def _exit_code(model: str, _modified_ns: int, size: int) -> int:
-    command = [sys.executable, "-c", _RUN_ONCE, model, str(size)]
-    return subprocess.run(command, capture_output=True, check=False).returncode
+def _exit_code(model: str, _modified_ns: int, size: int) -> int | None:
+    """Exit code of a process that runs the network once; None where it takes too long."""
+    command = [sys.executable, "-c", _RUN_ONCE, model, str(size), str(_MOST_BYTES)]
+    try:
+        return subprocess.run(command, capture_output=True, check=False, timeout=_MOST_S).returncode
+    except subprocess.TimeoutExpired:
+        return None
 
 
 def find_detector(name: str, settings: DetectorSettings) -> Detector:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from psotrack.detection.detector import Detector, OnnxDetector, detect_drones
 from psotrack.recordings import Recording, digest_video, write_detections
-from psotrack.support import Report, digest_record, identify, no_progress
+from psotrack.support import Report, check_file_name, digest_record, identify, no_progress
 
 
 def stored_detections(
@@ -33,7 +33,7 @@ def stored_detections(
     """
     folder = Path(cache) / "detections" / _key(detector, recording)
     for name, video in recording.videos.items():
-        path = folder / f"{name}.csv"
+        path = folder / f"{check_file_name(name, recording.folder)}.csv"
         if not path.exists():
             write_detections(path, detect_drones(detector, name, video, report=report))
     return folder

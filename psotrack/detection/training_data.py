@@ -21,7 +21,15 @@ from jaxtyping import Float, Int
 from psotrack.detection.labels import LabelSettings, box_corners, label_boxes
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import Recording, VideoInfo, read_frames
-from psotrack.support import Advance, Report, atomic_write, map_in_processes, no_progress, refuse_to_overwrite
+from psotrack.support import (
+    Advance,
+    Report,
+    atomic_write,
+    check_file_name,
+    map_in_processes,
+    no_progress,
+    refuse_to_overwrite,
+)
 from psotrack.trajectories import Trajectories, resample
 
 #: Name of the file that describes a data set; every folder with a data set has one.
@@ -184,7 +192,7 @@ def _tasks(recording: Recording, part: str, settings: LabelSettings, every: int,
         num_wanted = max(num_wanted, len(known))
         if known.any():
             xyxy = label_boxes(recording.rig.select((name,)).cameras, corners_m[known], settings)[:, :, 0]
-            stem = f"{recording.name}_{name}"
+            stem = check_file_name(f"{recording.name}_{name}", recording.folder)
             tasks.append(_Task(out, part, stem, recording.videos[name], every, truth.frame[known], xyxy))
     if not tasks:
         raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.support import read_json
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import Status, Trajectories, check_cells
 
 #: Value of the key `format`, and version of the keys' meaning.
 NAME, VERSION = "psotrack tracks", 1
@@ -63,6 +63,8 @@ def read_json_tracks(path: Path) -> Trajectories:
     try:
         frame = np.array(content["frame"], np.int64)
         drones = content["drones"]
+        rows = sum(len(drone["position_m"]) for drone in drones)
+        check_cells(path, len(frame), len(drones), rows)
         values: dict[str, Any] = {name: _stacked(name, drones, len(frame)) for name in QUANTITIES}
         return Trajectories(
             frame=frame,

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.exchange.number_lines import read_numbers
 from psotrack.exchange.timed_paths import TimedPath, known_orientations
+from psotrack.support import check_file_name
 from psotrack.trajectories import Trajectories
 
 POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
@@ -30,8 +31,7 @@ def write_kitti(folder: Path, trajectories: Trajectories) -> int:
         InputError: a drone's name cannot be the name of a file.
     """
     for drone, name in enumerate(trajectories.drones):
-        if not name or Path(name).name != name:
-            raise InputError("drones", expected="names that can be names of files", found=repr(name))
+        check_file_name(name, "drones")
         seen = trajectories.seen[:, drone]
         poses = np.zeros((int(seen.sum()), 3, 4))
         poses[:, :, :3] = _rotations(trajectories, drone)[seen]

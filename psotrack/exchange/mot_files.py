@@ -24,8 +24,8 @@ from psotrack.exchange.camera_boxes import boxes_in_camera, camera_frames
 from psotrack.exchange.formats import Footage, interval_s
 from psotrack.exchange.number_lines import read_numbers
 from psotrack.recordings import Recording
-from psotrack.support import Report
-from psotrack.trajectories import UNASSIGNED, Trajectories
+from psotrack.support import Report, check_file_name
+from psotrack.trajectories import UNASSIGNED, Trajectories, check_cells
 from psotrack.trajectories.association import align, fixed_identity
 
 #: The folder of TrackEval: with the benchmark MOT15, TrackEval leaves nothing out.
@@ -76,7 +76,7 @@ def write_mot_folder(folder: Path, trajectories: Trajectories, footage: Footage,
     names = []
     with report("boxes", len(cameras)) as advance:
         for camera in cameras:
-            name = f"{recording.name}-{camera.name}"
+            name = check_file_name(f"{recording.name}-{camera.name}", recording.folder)
             names.append(name)
             sequence = folder / "gt" / split / name
             _write_info(sequence, name, camera.fps, len(camera.time_s), camera.image_size_wh)
@@ -115,6 +115,7 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
     position_m = _positions(path)
     frame, row = np.unique(table[:, 0].astype(np.int64) - 1, return_inverse=True)
     identities, drone = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
+    check_cells(path, len(frame), len(identities), len(row))
     cell = row * len(identities) + drone
     if len(np.unique(cell)) < len(cell):
         again = int(np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0])

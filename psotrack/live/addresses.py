@@ -8,6 +8,8 @@ import socket
 import sys
 from urllib.parse import urlsplit
 
+from psotrack.support import whole_number
+
 #: How long a stream may take to answer and to bring a frame, seconds.
 ANSWER_S = 5.0
 _PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443, "rtmp": 1935}
@@ -20,7 +22,8 @@ def device_of(address: str) -> int | str | None:
     if not address.startswith(_DEVICE):
         return None
     device = address.removeprefix(_DEVICE)
-    return int(device) if device.isdecimal() else device
+    number = whole_number(device)
+    return device if number is None else number
 
 
 def shown_address(address: str) -> str:

@@ -8,6 +8,7 @@ import socket
 from typing import Any, TextIO
 
 from psotrack.errors import OutputError, SettingsError
+from psotrack.support import whole_number
 from psotrack.trajectories import Status, Trajectories
 
 logger = logging.getLogger(__name__)
@@ -70,7 +71,7 @@ class UdpLines:
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
-        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        if not host or not 0 < (whole_number(port) or 0) < 65536:
             raise SettingsError("--udp", expected="HOST:PORT, such as 127.0.0.1:9000", found=address)
         try:
             family, _, _, _, target = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]

@@ -36,6 +36,7 @@ from psotrack.recordings import (
     write_recording_file,
 )
 from psotrack.rig_files import write_rig
+from psotrack.support import check_file_name
 
 #: MPEG-4 part 2, which all wheels of OpenCV can write. A frame of 1920 x 1080, textured with a little noise, took 6.0
 #: ms of one thread and 34 kB, and 1.5 ms to decode. MJPEG took 11 ms and 309 kB, VP8 109 ms, FFV1 74 ms and 3.1 MB. Of
@@ -96,6 +97,7 @@ class CameraRecorder:
     ) -> None:
         self.folder, self.name, self.fps, self.image_size_wh = folder, name, fps, image_size_wh
         self.least_free_bytes = least_free_bytes
+        check_file_name(name, "cameras")
         self.video, self.times = folder / f"{name}{_SUFFIX}", folder / f"{name}_times.csv"
         self.counts = RecordedCounts()
         self.loss: str | None = None

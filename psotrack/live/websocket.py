@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from psotrack.errors import OutputError, SettingsError
 from psotrack.live.messages import lines_of
+from psotrack.support import whole_number
 from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ class WebSocketLines:
 
 def _host_and_port(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
-    if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65536:
+    if not 0 < (whole_number(port) or 0) < 65536:
         raise SettingsError(
             "--websocket", expected="PORT or HOST:PORT, such as 9000 or 0.0.0.0:9000", found=address
         )

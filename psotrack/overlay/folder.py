@@ -30,6 +30,7 @@ from psotrack.recordings import FrameTimes, Recording, nearest_frames
 from psotrack.support import (
     Report,
     atomic_write,
+    check_file_name,
     digest_record,
     map_in_processes,
     no_progress,
@@ -108,6 +109,8 @@ def write_overlays(
     if recording is None or not cameras:
         where = "overlay" if recording is None else recording.folder
         raise InputError(where, expected="a recording with videos", found="none")
+    for name in cameras:
+        check_file_name(name, recording.folder)
     codec = find_codec()
     videos = {
         f"{name}.mp4": _digest(flight, recording, codec, options, cameras if name == "mosaic" else [name])

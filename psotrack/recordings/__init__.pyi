@@ -31,7 +31,7 @@ from .recording_file import (
 )
 from .stored_silhouettes import ARRAY_FILE, MADE_OF, StoredSilhouettes, probe_silhouettes
 from .timestamps import read_timestamps
-from .timing import REACH, FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
+from .timing import MOST_INSTANTS, REACH, FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
 from .video import (
     TruncatedVideoError,
     VideoInfo,
@@ -50,6 +50,7 @@ __all__ = [
     "ARRAY_FILE",
     "IMAGE_SUFFIXES",
     "MADE_OF",
+    "MOST_INSTANTS",
     "REACH",
     "RECORDING_FILE",
     "CameraTable",

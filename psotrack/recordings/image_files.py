@@ -18,6 +18,8 @@ from psotrack.recordings.opencv_messages import decode_image
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: First bytes of a PNG, and the least size of a part of it: length, name and checksum.
+#: Largest number of pixels of an image, ten times that of a large camera.
+MOST_PIXELS = 2**28
 _PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
@@ -129,10 +131,21 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
     """
     if coded[: len(_PNG)].tobytes() == _PNG and not _is_whole_png(coded):
         raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
+    if coded[: len(_PNG)].tobytes() == _PNG:
+        # The first part of a PNG says width and height, before anything takes memory.
+        width, height = (int.from_bytes(coded[at : at + 4].tobytes()) for at in (16, 20))
+        check_pixels(where, width, height)
     image = decode_image(coded, flags, where)
     if image is None:
         raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
     return image
+
+
+def check_pixels(where: object, width: int, height: int) -> None:
+    """Raise `InputError` for an image, or the images of a video, that would take gigabytes."""
+    if width * height > MOST_PIXELS:
+        expected = f"images of at most {MOST_PIXELS} pixels"
+        raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
 
 
 def _is_whole_png(coded: UInt8[np.ndarray, " bytes"]) -> bool:

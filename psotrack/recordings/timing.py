@@ -54,7 +54,8 @@ class FrameTimes:
         listed_s: time of each frame, seconds; None where frame i was exposed at `time_offset_s` + i / `fps`.
 
     Raises:
-        SettingsError: the rate is not above 0, the number of frames is negative, or the time of frame 0 is not finite.
+        SettingsError: the rate is not above 0, the number of frames is negative or
+            above that of a day, or the time of frame 0 is not finite.
     """
 
     num_frames: int
@@ -66,8 +67,9 @@ class FrameTimes:
 
     def __post_init__(self) -> None:
         check_positive("fps", self.fps)
-        if self.num_frames < 0:
-            raise SettingsError("num_frames", expected="at least 0", found=f"{self.num_frames}")
+        if not 0 <= self.num_frames <= MOST_INSTANTS:
+            expected = f"a number from 0 to {MOST_INSTANTS}"
+            raise SettingsError("num_frames", expected=expected, found=f"{self.num_frames}")
         if not np.isfinite(self.time_offset_s):
             raise SettingsError("time_offset_s", expected="a finite number", found=f"{self.time_offset_s:g}")
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
-from psotrack.recordings.image_files import depth_of, read_image
+from psotrack.recordings.image_files import check_pixels, depth_of, read_image
 from psotrack.recordings.opencv_messages import silence_opencv
 from psotrack.support import atomic_write, digest_file, digest_record
 
@@ -80,6 +80,7 @@ def probe(path: Path | str) -> VideoInfo:
         )
     finally:
         capture.release()
+    check_pixels(path, width, height)
     is_finished = num_frames >= 1
     if not is_finished:
         num_frames = _count_packets(path) - 1

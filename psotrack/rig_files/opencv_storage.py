@@ -37,7 +37,7 @@ from psotrack.rig_files.fields import (
 )
 from psotrack.rig_files.xml_text import parse_xml
 from psotrack.rig_files.yaml_text import as_matrix, parse_yaml
-from psotrack.support import atomic_write, read_text
+from psotrack.support import atomic_write, read_text, whole_number
 
 #: Field of one camera of two: M1, cameraMatrix2, K_left, D_right.
 _OF_TWO = re.compile(
@@ -195,7 +195,7 @@ def _of_element(element: ElementTree.Element) -> Any:
     if text.startswith('"'):
         return text.strip('"')
     try:
-        numbers = [int(word) if word.isdecimal() else float(word) for word in text.split()]
+        numbers = [float(word) if (whole := whole_number(word)) is None else whole for word in text.split()]
     except ValueError:
         return text
     # A matrix of one number has a sequence of one number.

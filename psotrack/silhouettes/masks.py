@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings import VideoInfo, silence_opencv
 from psotrack.silhouettes.store import Task, foreground_of
-from psotrack.support import Advance, atomic_write
+from psotrack.support import Advance, atomic_write, check_file_name
 
 #: Codecs of videos of masks, by ending; that of .avi loses nothing.
 CODECS = {".mp4": "mp4v", ".avi": "FFV1"}
@@ -132,4 +132,4 @@ def masks_out(out: Path, cameras: tuple[str, ...]) -> dict[str, Path]:
         raise InputError(
             out, expected=f"a folder, or a file that ends in {', '.join(CODECS)}", found="another file"
         )
-    return {name: out / name for name in cameras}
+    return {name: out / check_file_name(name, "--cameras") for name in cameras}

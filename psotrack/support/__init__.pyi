@@ -5,6 +5,8 @@ from .figures import COLOURS, drone_colour, save_figure
 from .files import (
     ARCHIVE_SUFFIX,
     atomic_write,
+    check_file_name,
+    check_no_nul,
     digest_file,
     digest_record,
     read_text,
@@ -12,7 +14,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_paths, html_table
-from .numbers import LARGEST, MODERATE, is_moderate
+from .numbers import LARGEST, MODERATE, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
@@ -35,7 +37,9 @@ __all__ = [
     "TextRow",
     "assign",
     "atomic_write",
+    "check_file_name",
     "check_interface",
+    "check_no_nul",
     "check_types",
     "convert",
     "digest_file",
@@ -77,6 +81,7 @@ __all__ = [
     "toml_value",
     "use_device",
     "user_cache",
+    "whole_number",
     "with_traceback",
     "worker_processes",
     "write_rows",

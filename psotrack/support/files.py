@@ -20,6 +20,9 @@ import platformdirs
 
 from psotrack.errors import InputError, OutputError
 
+#: Longest name that becomes the name of a file, bytes.
+_LONGEST_NAME = 180
+
 #: Ending of the names of archives (`psotrack.archives`).
 ARCHIVE_SUFFIX = ".psotrack"
 
@@ -73,7 +76,7 @@ def read_text(path: Path | str) -> str:
         InputError: the file cannot be read or is not UTF-8 text.
     """
     try:
-        return Path(path).read_text(encoding="utf-8-sig")
+        text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         found = (error.strerror or str(error)).lower()
         raise InputError(path, expected="a file to read", found=found) from error
@@ -81,6 +84,36 @@ def read_text(path: Path | str) -> str:
         raise InputError(
             path, expected="UTF-8 text", found=f"an invalid byte at offset {error.start}"
         ) from error
+    check_no_nul(path, text)
+    return text
+
+
+def check_no_nul(path: Path | str, text: str) -> None:
+    """Raise `InputError` for a NUL, which no text has: the file is damaged, or is text in UTF-16 or UTF-32."""
+    if "\0" in text:
+        raise InputError(path, expected="UTF-8 text", found=f"a NUL at character {text.index(chr(0))}")
+
+
+def check_file_name(name: str, where: object) -> str:
+    """Return a name, such as that of a camera, that becomes the name of a file; on any system it stays in its folder.
+
+    Args:
+        name: the name, without a suffix.
+        where: where the name comes from, for the message.
+
+    Raises:
+        InputError: the name has a mark that leads to another folder, or that no system allows, or is too long.
+    """
+    is_plain = name.isprintable() and name == name.strip() and name.strip(".")
+    # With a suffix, and the marks of a temporary name, names of files have at most 255 bytes.
+    if not is_plain or set(name) & set('/\\:*?"<>|') or len(os.fsencode(name)) > _LONGEST_NAME:
+        raise InputError(
+            where,
+            expected="names that can be names of files",
+            found=repr(name),
+            remedy="rename it: no / \\ : and other marks of paths",
+        )
+    return name
 
 
 def digest_file(

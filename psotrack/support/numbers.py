@@ -8,6 +8,15 @@ LARGEST = 1e60
 MODERATE = f"a number of at most {LARGEST:g} in size"
 
 
+#: Largest number of digits of a whole number: such a number is exact as a float, too.
+_MOST_DIGITS = 15
+
+
+def whole_number(word: str) -> int | None:
+    """Value of a word of digits; None for another word, and for one that has more digits than any count."""
+    return int(word) if word.isdecimal() and len(word) <= _MOST_DIGITS else None
+
+
 def is_moderate(value: float) -> bool:
     """Whether a number is finite and not so large that computing with it overflows."""
     return abs(value) <= LARGEST

@@ -13,7 +13,7 @@ import pandas as pd
 
 from psotrack.errors import SettingsError
 from psotrack.settings import renamed
-from psotrack.support import nearest
+from psotrack.support import nearest, whole_number
 
 logger = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ def _natural(key: tuple[Any, ...]) -> list[Any]:
         else (
             1,
             0,
-            [(not part.isdigit(), int(part) if part.isdigit() else 0, part) for part in _parts(value)],
+            [(whole_number(part) is None, whole_number(part) or 0, part) for part in _parts(value)],
         )
         for value in key
     ]

@@ -1,5 +1,5 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
-from .files import read_trajectories, write_ambiguity, write_trajectories
+from .files import check_cells, read_trajectories, write_ambiguity, write_trajectories
 from .resampling import resample
 from .row_streams import RowStream
 from .showing import drones_html
@@ -17,6 +17,7 @@ __all__ = [
     "Status",
     "Tracks",
     "Trajectories",
+    "check_cells",
     "drones_html",
     "fixed_partner_values",
     "read_trajectories",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import LARGEST, atomic_write, refuse_to_overwrite
+from psotrack.support import LARGEST, atomic_write, check_no_nul, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Status, Trajectories
 
 if TYPE_CHECKING:
@@ -50,6 +50,8 @@ COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov
 RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
 #: The unit quaternion that turns body coordinates into world coordinates, if orientations are known.
 ORIENTATION_COLUMNS = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
+#: Numbers of frames times drones that are never refused, and per row of a file.
+_LEAST_CELLS, _CELLS_PER_ROW = 1_000_000, 100
 _READ = COLUMNS | COVARIANCE_COLUMNS | RELATIVE_COLUMNS | ORIENTATION_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
@@ -159,6 +161,21 @@ class _Table:
         return InputError(f"{self.path}, {self.place(row)}", expected=expected, found=f"{found}")
 
 
+def check_cells(where: object, num_frames: int, num_drones: int, num_rows: int) -> None:
+    """Raise `InputError` where drones have so few rows that arrays over frames and drones are nearly empty, and large.
+
+    Args:
+        where: the file, for the message.
+        num_frames: number of frames.
+        num_drones: number of drones.
+        num_rows: number of rows of the file.
+    """
+    most = max(_LEAST_CELLS, _CELLS_PER_ROW * num_rows)
+    if num_frames * num_drones > most:
+        found = f"{num_frames} frames and {num_drones} drones in {num_rows} rows"
+        raise InputError(where, expected="drones that are there in most frames", found=found)
+
+
 def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
     if path.suffix not in functions:
         expected = f"a name that ends in {' or '.join(functions)}"
@@ -261,7 +278,7 @@ def _read_csv(path: Path) -> _Table:
     rows: list[list[str]] = []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, strict=True)
+            reader = csv.reader(_without_nul(path, file), strict=True)
             header = [name.strip() for name in next(reader, [])]
             _check_columns(path, header)
             for row in reader:
@@ -295,11 +312,23 @@ def _read_csv(path: Path) -> _Table:
     return _Table(path, columns, lambda row: f"line {lines[row]}")
 
 
+def _without_nul(path: Path, lines: Iterable[str]) -> Iterator[str]:
+    """The lines of a text, which are checked one by one, because tracks may be large."""
+    for line in lines:
+        check_no_nul(path, line)
+        yield line
+
+
 def _read_parquet(path: Path) -> _Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
+        # A column of one repeated value takes next to no bytes in the file.
+        rows, most = pq.read_metadata(path).num_rows, max(_LEAST_CELLS, path.stat().st_size)
+        if rows > most:
+            expected = f"at most {most} rows in a file of {path.stat().st_size} bytes"
+            raise InputError(path, expected=expected, found=f"{rows}")
         table = pq.read_table(path)
     # A damaged file is also found by errors of Python in the library.
     except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
@@ -342,6 +371,7 @@ def _from_table(table: _Table, fps: float | None) -> Trajectories:
     frame, frame_index = np.unique(columns["frame"].astype(np.int64), return_inverse=True)
     names: dict[str, int] = {}
     drone_index = np.array([names.setdefault(name, len(names)) for name in columns["drone"]])
+    check_cells(table.path, len(frame), len(names), len(frame_index))
     cell = frame_index * len(names) + drone_index
     first = np.unique(cell, return_index=True)[1]
     if len(first) < len(cell):
@@ -407,7 +437,8 @@ def _check_values(table: _Table) -> None:
 
 
 def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
-    return np.isfinite(values) & (values >= 0) & (values == np.floor(values))
+    # Larger numbers are not exact as floats.
+    return (values >= 0) & (values < 2**53) & (values == np.floor(values))
 
 
 def _times(

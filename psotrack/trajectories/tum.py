@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import atomic_write, is_moderate, refuse_to_overwrite
+from psotrack.support import atomic_write, check_file_name, is_moderate, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Trajectories
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
@@ -39,8 +39,7 @@ def write_tum(folder: Path | str, trajectories: Trajectories, *, force: bool = F
     """
     folder = Path(folder)
     for name in trajectories.drones:
-        if not name or Path(name).name != name:
-            raise InputError("drones", expected="names that can be names of files", found=repr(name))
+        check_file_name(name, "drones")
     paths = [folder / f"{name}.tum" for name in trajectories.drones]
     for path in paths:
         refuse_to_overwrite(path, force)

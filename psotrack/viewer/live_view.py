@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from psotrack.flights import USUAL_SIZE_M, TrackedFlight, ellipsoids_90, status_rgb
 from psotrack.recordings import Recording
-from psotrack.support import COLOURS
+from psotrack.support import COLOURS, whole_number
 from psotrack.trajectories import Status, Trajectories
 from psotrack.viewer.entity_log import FRAME, TIME, EntityLog, part, shown_rgb
 from psotrack.viewer.flight_file import APPLICATION
@@ -112,7 +112,8 @@ class LiveView:
 
     def _begin(self, name: str) -> None:
         """Choose the colour of a drone that is seen for the first time, and log how its status and its lines look."""
-        number = int(name) if name.isdecimal() else len(self._colours)
+        number = whole_number(name)
+        number = len(self._colours) if number is None else number
         self._colours[name] = shown_rgb(COLOURS[number % len(COLOURS)])
         log_status_words(self._entities, f"status/{part(name)}")
         for quantity in ("height_m", "deviation_mm"):

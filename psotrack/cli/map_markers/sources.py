@@ -24,12 +24,14 @@ def known_corners(
     """Corners of the known markers, (4, 3) in metres, by id."""
     from psotrack.datasets import find_marker_corners, is_recording
     from psotrack.inside_out import corners_in_own_frame, read_marker_map
+    from psotrack.support import whole_number
 
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
-    if not words or not all(word.isdecimal() for word in words):
+    numbers = [whole_number(word) for word in words]
+    ids = list(dict.fromkeys(number for number in numbers if number is not None))
+    if not numbers or None in numbers:
         expected = "numbers of markers that are known, such as 7 or 7,12"
         raise SettingsError("--known", expected=expected, found=known or "none")
-    ids = list(dict.fromkeys(map(int, words)))
     if table is None and side_m is None and is_recording(sources[0]):
         table = find_marker_corners(sources[0])
     if table is not None:

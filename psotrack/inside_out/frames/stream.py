@@ -11,6 +11,7 @@ import numpy as np
 from psotrack.errors import InputError
 from psotrack.inside_out.frames.records import Frame, FrameSource
 from psotrack.recordings import silence_opencv
+from psotrack.support import whole_number
 
 
 def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
@@ -24,8 +25,9 @@ def open_stream(address: str, fps: float | None, live: bool) -> FrameSource:
     Raises:
         InputError: the stream cannot be opened or has no frames; or, when frames are read, frame sizes differ.
     """
+    number = whole_number(address)
     with silence_opencv():
-        capture = cv2.VideoCapture(int(address) if address.isdecimal() else address)
+        capture = cv2.VideoCapture(address if number is None else number)
     there, first = capture.read() if capture.isOpened() else (False, None)
     if not there or first is None:
         capture.release()

@@ -1,0 +1,143 @@
+"""Names in files of strangers never lead out of the folder that a command writes to."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import flight_files
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_bad_input_limits import check_line
+
+from psotrack.errors import InputError, PsotrackError
+from psotrack.exchange import export_tracks
+from psotrack.flights import TrackedFlight
+from psotrack.overlay import OverlayOptions, write_overlays
+from psotrack.recordings import Recording
+from psotrack.silhouettes import masks_out
+from psotrack.support import check_file_name
+from psotrack.trajectories import read_trajectories, write_trajectories
+
+#: Names that lead elsewhere, that are no names of files, or that are too long.
+EVIL = [
+    "../evil",
+    "../../x",
+    "/tmp/evil",
+    "a/b",
+    "..",
+    ".",
+    "",
+    "a\0b",
+    "a\nb",
+    "C:evil",
+    "..\\evil",
+    "a" * 300,
+]
+
+
+@pytest.mark.parametrize("name", [*EVIL, " a", "a ", "...", "a*", "a?b", '"', "a|b", "ä" * 100])
+def test_a_name_that_is_none_of_a_file(name):
+    with pytest.raises(InputError, match="here: expected names that can be names of files"):
+        check_file_name(name, "here")
+
+
+@pytest.mark.parametrize("name", ["0", "cam1i_s", "dron1", "GoPro 3.left", "ä", "a" * 180, ".hidden", "a..b"])
+def test_a_name_that_is_one(name):
+    assert check_file_name(name, "here") == name
+
+
+@given(st.text(max_size=40))
+def test_a_name_that_is_taken_stays_in_its_folder(name):
+    folder = Path("/data/out")
+    try:
+        path = folder / f"{check_file_name(name, 'here')}.csv"
+    except InputError:
+        return
+    assert path.parent == folder
+    assert path.resolve().parent == folder
+
+
+def everything_in(folder: Path) -> set[Path]:
+    return set(folder.rglob("*"))
+
+
+@pytest.mark.parametrize("name", EVIL[:-1])
+@pytest.mark.parametrize("to", ["tum", "kitti"])
+def test_names_of_drones_in_exports(to, name, tmp_path):
+    """A drone is read from a file of tracks, and is a file of the export."""
+    tracks = replace(flight_files.make_tracks(), drones=(name, "b"))
+    before = everything_in(tmp_path)
+    with pytest.raises(PsotrackError):
+        export_tracks(tracks, to, tmp_path / "in" / "out")
+    assert not [path for path in everything_in(tmp_path) - before if path.is_file()]
+
+
+def test_a_file_of_tracks_with_evil_names(tmp_path, run_psotrack):
+    path = tmp_path / "t.csv"
+    write_trajectories(path, replace(flight_files.make_tracks(), drones=("../../evil", "b")))
+    assert read_trajectories(path).drones == ("../../evil", "b")
+    check_line(run_psotrack("export", path, "--to", "tum", "--out", tmp_path / "in" / "out"), path)
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+@pytest.fixture
+def evil_recording(tmp_path):
+    """A recording whose first camera is called ../evil, as Python may build it; files have names that are checked."""
+    from psotrack.datasets import open_recording
+
+    recording = open_recording(flight_files.make_sequence(tmp_path / "flight"))
+    return _renamed(recording, "../evil")
+
+
+def _renamed(recording: Recording, name: str) -> Recording:
+    old = recording.rig.names[0]
+    names = tuple(name if each == old else each for each in recording.rig.names)
+
+    def with_name(values):
+        return {name if key == old else key: value for key, value in values.items()}
+
+    return replace(
+        recording,
+        rig=replace(recording.rig, names=names),
+        videos=with_name(recording.videos),
+        frame_times=with_name(recording.frame_times),
+    )
+
+
+def test_names_of_cameras_in_overlays(evil_recording, tmp_path):
+    flight = TrackedFlight("flight", (), evil_recording)
+    with pytest.raises(InputError, match=r"found '\.\./evil'"):
+        write_overlays(tmp_path / "in" / "out", flight, OverlayOptions())
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_names_of_cameras_in_masks(tmp_path):
+    with pytest.raises(InputError, match=r"found '\.\./evil'"):
+        masks_out(tmp_path / "in" / "out", ("a", "../evil"))
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/b", ".."])
+def test_a_camera_of_a_recording_file(name, tmp_path, run_psotrack):
+    """What --blobs --out writes is named like the camera."""
+    folder = flight_files.make_sequence(tmp_path / "flight")
+    text = (folder / "recording.toml").read_text().replace("[cameras.c0]", f'[cameras."{name}"]')
+    (folder / "recording.toml").write_text(text)
+    output = run_psotrack(
+        "detect", folder, "--blobs", "--out", tmp_path / "in" / "out", "--cache", tmp_path / "c"
+    )
+    assert output.code == 2
+    check_line(output, folder)
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+@pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "a/b", "..", "a\\b"])
+def test_the_name_of_a_scenario(name, tmp_path, run_psotrack):
+    """It becomes the name of the folder of the sequence."""
+    from psotrack.simulation import preset_text
+
+    path = tmp_path / "scenario.toml"
+    text = preset_text("S02_D4_A")
+    line = next(line for line in text.splitlines() if line.startswith("name"))
+    path.write_text(text.replace(line, f"name = {name!r}"))
+    check_line(run_psotrack("simulate", path, "--out", tmp_path / "in" / "out"), path, "name")
+    assert not list(tmp_path.rglob("*evil*"))

@@ -1,0 +1,204 @@
+"""Files of strangers are data: no reader runs what is in them."""
+
+import ast
+import contextlib
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import psotrack
+from psotrack.datasets import open_recording
+from psotrack.errors import InputError, PsotrackError
+from psotrack.exchange import read_tracks
+from psotrack.rig_files import read_rig
+from psotrack.simulation import load
+from psotrack.sweep import read_grid
+from psotrack.trajectories import read_trajectories
+
+PACKAGE = Path(psotrack.__file__).parent
+#: Modules whose readers run code, and calls that do. Written as parts of dotted names.
+MODULES = {
+    "pickle",
+    "cPickle",
+    "dill",
+    "cloudpickle",
+    "joblib",
+    "marshal",
+    "shelve",
+    "torch",
+    "runpy",
+    "code",
+}
+CALLS = {"eval", "exec", "compile", "__import__", "execfile"}
+ARGUMENTS = {"allow_pickle", "shell"}
+#: `yaml.load` takes a loader; only safe loaders build no objects.
+LOADERS = {"load", "load_all", "full_load", "unsafe_load", "FullLoader", "UnsafeLoader", "Loader"}
+#: Where it is right, and why.
+ALLOWED = {
+    # JAX's compiled programs, in the user's own cache; see the page on trust.
+    ("support/stored_programs.py", "pickle"),
+    # A loader that is derived from SafeLoader, which the tests below try.
+    ("rig_files/yaml_text.py", "yaml.load"),
+}
+
+
+def suspects(tree: ast.AST) -> set[str]:
+    """What in a module could run code from data."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {one.name for one in node.names if one.name.partition(".")[0] in MODULES}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in MODULES:
+            found.add(str(node.module))
+        elif isinstance(node, ast.Call):
+            if isinstance(node.func, ast.Name) and node.func.id in CALLS:
+                found.add(node.func.id)
+            of = node.func.value if isinstance(node.func, ast.Attribute) else None
+            if isinstance(of, ast.Name) and of.id == "yaml" and node.func.attr in LOADERS:
+                found.add(f"yaml.{node.func.attr}")
+            if isinstance(of, ast.Name) and (of.id, node.func.attr) in {("os", "system"), ("os", "popen")}:
+                found.add(f"os.{node.func.attr}")
+            for word in node.keywords:
+                if word.arg in ARGUMENTS and not (
+                    isinstance(word.value, ast.Constant) and word.value.value is False
+                ):
+                    found.add(str(word.arg))
+    return found
+
+
+def test_the_package_calls_nothing_that_runs_data():
+    found = {
+        (path.relative_to(PACKAGE).as_posix(), name)
+        for path in PACKAGE.rglob("*.py")
+        for name in suspects(ast.parse(path.read_text(encoding="utf-8")))
+    }
+    assert found == ALLOWED
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import pickle",
+        "from joblib import load",
+        "import torch.serialization",
+        "eval('1')",
+        "exec(text)",
+        "np.load(path, allow_pickle=True)",
+        "np.load(path, allow_pickle=trusted)",
+        "subprocess.run(text, shell=True)",
+        "yaml.load(text)",
+        "yaml.unsafe_load(text)",
+        "os.system(text)",
+    ],
+)
+def test_the_search_finds(text):
+    assert suspects(ast.parse(text))
+
+
+class Bomb:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self):
+        return Path.touch, (self.mark,)
+
+
+@pytest.fixture
+def mark(tmp_path):
+    """A file that exists if code of a file has run."""
+    return tmp_path / "it_ran"
+
+
+def test_the_bomb_works(mark):
+    pickle.loads(pickle.dumps(Bomb(mark)))
+    assert mark.exists()
+
+
+def pickled(mark: Path) -> bytes:
+    return pickle.dumps(Bomb(mark))
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("t.csv", read_trajectories),
+        ("t.parquet", read_trajectories),
+        *((f"t.{ending}", read_tracks) for ending in ("json", "tum", "txt", "c3d", "mcap")),
+        *(
+            (f"r.{ending}", lambda path: read_rig(path, (320, 240)))
+            for ending in ("toml", "yml", "csv", "json", "npz")
+        ),
+        ("recording.toml", open_recording),
+        ("grid.toml", read_grid),
+        ("scenario.toml", load),
+    ],
+)
+def test_a_pickle_in_the_place_of_a_file(name, read, tmp_path, mark):
+    path = tmp_path / name
+    path.write_bytes(pickled(mark))
+    with pytest.raises(PsotrackError):
+        read(path)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz"])
+def test_arrays_of_objects(suffix, tmp_path, mark):
+    path = tmp_path / f"rig{suffix}"
+    objects = np.array([Bomb(mark)], object)
+    np.save(path, objects) if suffix == ".npy" else np.savez(path, K=objects)
+    with pytest.raises(InputError):
+        read_rig(path, (320, 240))
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("tag", ["python/object/apply:os.mkdir", "python/object/new:os.mkdir"])
+@pytest.mark.parametrize("place", ["whole", "value"])
+def test_tags_of_yaml(tag, place, tmp_path, mark):
+    path = tmp_path / "camchain.yaml"
+    call = f"!!{tag} ['{mark}']"
+    path.write_text(call if place == "whole" else f"cam0:\n  intrinsics: {call}\n  resolution: [320, 240]\n")
+    with pytest.raises(InputError, match=r"camchain\.yaml"):
+        read_rig(path, (320, 240))
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("key", [b"pandas", b"ARROW:schema", b"psotrack.units", b"PANDAS_ATTRS"])
+def test_metadata_of_parquet(key, tmp_path, mark):
+    """Tracks with a pickle in the metadata of file and column are read as tracks."""
+    columns = {"frame": [0], "time_s": [0.0], "drone": ["a"], "x_m": [0.0], "y_m": [0.0], "z_m": [1.0]}
+    table = pa.table(columns)
+    path = tmp_path / "t.parquet"
+    pq.write_table(table.replace_schema_metadata({key: pickled(mark)}), path, store_schema=False)
+    # Refused is right, too: Arrow cannot decode such a schema.
+    with contextlib.suppress(InputError):
+        assert read_trajectories(path).drones == ("a",)
+    assert not mark.exists()
+
+
+def test_an_extension_type_of_parquet(tmp_path, mark):
+    """Arrow had a type that was stored as a pickle, and loaded with its file."""
+    storage = pa.field("x_m", pa.float64(), metadata={
+        b"ARROW:extension:name": b"arrow.py_extension_type",
+        b"ARROW:extension:metadata": pickled(mark),
+    })  # fmt: skip
+    names = [pa.field("frame", pa.int64()), pa.field("time_s", pa.float64()), pa.field("drone", pa.string())]
+    schema = pa.schema([*names, storage, pa.field("y_m", pa.float64()), pa.field("z_m", pa.float64())])
+    values = [[0], [0.0], ["a"], [0.0], [0.0], [1.0]]
+    pq.write_table(pa.table(values, schema=schema), tmp_path / "t.parquet")
+    assert read_trajectories(tmp_path / "t.parquet").drones == ("a",)
+    assert not mark.exists()
+
+
+def test_toml_is_text(tmp_path, mark):
+    """A value that looks like code is a text, and no number."""
+    path = tmp_path / "recording.toml"
+    path.write_text(f"version = \"__import__('pathlib').Path('{mark}').touch()\"\n")
+    with pytest.raises(InputError, match=r"recording\.toml"):
+        open_recording(path)
+    assert not mark.exists()
