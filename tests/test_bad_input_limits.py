@@ -1,5 +1,6 @@
 """Numbers in files and options that would take gigabytes or hours, or mean nothing, are refused in one line."""
 
+import io
 import resource
 import struct
 import zipfile
@@ -8,12 +9,15 @@ from pathlib import Path
 
 import flight_files
 import numpy as np
+import onnx_models
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import test_archives
 import test_dpjait
 from helpers import make_once
 
+from psotrack import archives
 from psotrack.datasets import open_recording
 from psotrack.datasets.dpjait import read_marker_corners, read_masks, read_mocap_markers, read_poses
 from psotrack.detection import DetectorSettings, OnnxDetector
@@ -295,6 +299,26 @@ def test_masks_that_unpack_to_more_than_they_state(tmp_path):
         masks.mask("cam1i", 1, 0)
 
 
+def test_an_archive_that_unpacks_to_far_more_than_it_is(tmp_path, monkeypatch):
+    """The limit is lowered, so that the test needs no 256 MiB."""
+    path = test_archives.crafted(
+        tmp_path / "a.psotrack", [*test_archives.FILES.items(), ("x.csv", bytes(4 << 20))]
+    )
+    compressed = io.BytesIO()
+    with zipfile.ZipFile(path) as stored, zipfile.ZipFile(compressed, "w", zipfile.ZIP_DEFLATED) as zipped:
+        zipped.comment = stored.comment
+        for name in stored.namelist():
+            zipped.writestr(name, stored.read(name))
+    path.write_bytes(test_archives.sealed(compressed.getvalue()))
+    archives.unpack(path, tmp_path / "usual")
+    monkeypatch.setattr("psotrack.archives.sealed_zip._SMALL", 1 << 20)
+    with pytest.raises(
+        InputError, match=r"a\.psotrack: expected files of at most \d+ bytes in an archive of \d+"
+    ):
+        archives.unpack(path, tmp_path / "folder")
+    assert not (tmp_path / "folder").exists()
+
+
 def test_numbers_of_thousands_of_digits_in_names_of_masks(tmp_path):
     path = tmp_path / "drone_masks.zip"
     with zipfile.ZipFile(path, "w") as archive:
@@ -304,6 +328,39 @@ def test_numbers_of_thousands_of_digits_in_names_of_masks(tmp_path):
 
 
 # Networks
+
+
+@pytest.mark.parametrize("place", ["../secret.bin", "secret.bin", "{folder}/secret.bin"])
+@pytest.mark.parametrize("inside", ["initializer", "attribute"])
+def test_a_network_that_reads_another_file(place, inside, tmp_path, monkeypatch):
+    """OpenCV reads every file that a tensor names; here it is not asked to."""
+    values = np.full((1, 3, 64, 64), 7, np.float32)
+    (tmp_path / "in").mkdir()
+    for folder in (tmp_path, tmp_path / "in"):
+        (folder / "secret.bin").write_bytes(values.tobytes())
+    message, path = onnx_models._message, tmp_path / "in" / "net.onnx"
+    location = message((1, "location"), (2, place.format(folder=tmp_path)))
+    shape = [(1, side) for side in values.shape]
+    tensor = message(*shape, (2, 1), (8, "secret"), (13, location), (14, 1))
+    if inside == "initializer":
+        monkeypatch.setattr(onnx_models, "_tensor", lambda name, values: tensor)
+        nodes, tensors = [onnx_models._node("Add", ["images", "secret"], "output")], {"secret": values}
+    else:
+        constant = message((2, "secret"), (4, "Constant"), (5, message((1, "value"), (5, tensor), (20, 4))))
+        nodes, tensors = [constant, onnx_models._node("Add", ["images", "secret"], "output")], {}
+    path.write_bytes(onnx_models.model(nodes, tensors, (1, 3, 64, 64), (1, 3, 64, 64)))
+    with pytest.raises(InputError, match=r"net\.onnx: .* found tensors in other files"):
+        OnnxDetector(path, DetectorSettings(size=64))
+
+
+def test_a_network_that_asks_for_terabytes(tmp_path):
+    """A constant of 10^12 numbers in a few bytes."""
+    path = tmp_path / "net.onnx"
+    shape = np.array([1000, 1000, 1000, 1000], np.int64)
+    node = onnx_models._node("ConstantOfShape", ["shape"], "output")
+    path.write_bytes(onnx_models.model([node], {"shape": shape}, (1, 3, 64, 64), (1, 1, 1, 1)))
+    with pytest.raises(InputError, match=r"net\.onnx: expected"):
+        OnnxDetector(path, DetectorSettings(size=64)).boxes(np.zeros((64, 64, 3), np.uint8))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import click
 
 from psotrack.cli.options import FORCE, QUIET, TRACKS, Numbers, SequencePath
 from psotrack.cli.output import print_line, report_to
-from psotrack.errors import OutputError, SettingsError
+from psotrack.errors import OutputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,7 +72,8 @@ def export(
     if recording is not None:
         sizes_m = _sizes_m(trajectories, tracks, drone_size_m) if to == "mot" else None
         footage = Footage(recording, sizes_m, images)
-    lost = export_tracks(trajectories, to, out, footage=footage, force=force, report=report_to(quiet))
+    with errors_name(tracks):
+        lost = export_tracks(trajectories, to, out, footage=footage, force=force, report=report_to(quiet))
     left = f"; not in this format: {', '.join(lost)}" if lost else ""
     drones = f"{trajectories.num_drones} drone{'s' if trajectories.num_drones != 1 else ''}"
     print_line(quiet, None, f"{out}: {to}, {drones}, {trajectories.num_frames} frames{left}")
