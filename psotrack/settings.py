@@ -163,7 +163,7 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         super().__post_init__()
         _check_choice("swarm.kind", self.kind, get_args(SwarmKind))
         _check_count("swarm.particles", self.particles, 2, _MOST_PARTICLES)
-        _check_count("swarm.iterations", self.iterations, 1, _MOST_ITERATIONS)
+        _check_count("swarm.iterations", self.iterations, 0, _MOST_ITERATIONS)
         check_positive("swarm.spread_m", self.spread_m)
 
 
