@@ -20,8 +20,6 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".p
 #: Largest number of pixels of an image, ten times that of a large camera.
 MOST_PIXELS = 2**28
 #: First bytes of a PNG, and the least size of a part of it: length, name and checksum.
-#: Largest number of pixels of an image, ten times that of a large camera.
-MOST_PIXELS = 2**28
 _PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
