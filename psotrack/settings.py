@@ -8,7 +8,7 @@ fast.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, Literal, get_args
 
 import msgspec
@@ -85,7 +85,7 @@ def _check_least(name: str, value: int, least: int) -> None:
         raise SettingsError(name, expected=f"at least {least}", found=f"{value}")
 
 
-def _check_finite(name: str, values: tuple[float, ...]) -> None:
+def _check_finite(name: str, values: Iterable[float]) -> None:
     if not all(map(math.isfinite, values)):
         raise SettingsError(name, expected="finite numbers", found=f"{values}")
 
@@ -163,7 +163,7 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         super().__post_init__()
         _check_choice("swarm.kind", self.kind, get_args(SwarmKind))
         _check_count("swarm.particles", self.particles, 2, _MOST_PARTICLES)
-        _check_count("swarm.iterations", self.iterations, 1, _MOST_ITERATIONS)
+        _check_count("swarm.iterations", self.iterations, 0, _MOST_ITERATIONS)
         check_positive("swarm.spread_m", self.spread_m)
 
 
@@ -410,7 +410,8 @@ class TrackSettings(
         _check_choice("clocks", self.clocks, get_args(Clocks))
         if self.rate_hz is not None:
             check_positive("rate_hz", self.rate_hz)
-        _check_finite("bounds_m", self.bounds_m or ())
+        if self.bounds_m is not None:
+            _check_finite("bounds_m", self.bounds_m)
         if self.bounds_m is not None and any(
             low >= high for low, high in zip(self.bounds_m[::2], self.bounds_m[1::2], strict=True)
         ):

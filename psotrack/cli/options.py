@@ -162,7 +162,7 @@ PARTICLES = click.option(
 )
 ITERATIONS = click.option(
     "--iterations",
-    type=int,
+    type=click.IntRange(min=1),
     default=TRACK.swarm.iterations,
     show_default=True,
     help="Number of iterations per frame.",

@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from psotrack.detection.onnx_files import check_values_beside
+from psotrack.detection.onnx_files import names_other_files
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Detections, VideoInfo, read_frames
 from psotrack.support import Report, digest_file, make_plugin, no_progress
@@ -103,8 +103,7 @@ class OnnxDetector:
         settings: settings of the detection.
 
     Raises:
-        InputError: the file does not exist, or OpenCV cannot read it, or would end the process, or the network reads
-            files outside of its folder.
+        InputError: the file does not exist, or OpenCV cannot read it, or would end the process.
     """
 
     def __init__(self, model: Path | str, settings: DetectorSettings) -> None:
@@ -113,7 +112,7 @@ class OnnxDetector:
             raise InputError(model, expected="an ONNX model", found="no such file")
         self.model = model
         self.settings = settings
-        check_values_beside(model)
+        _check_own_numbers(model)
         _check_survives(model, settings.size)
         with self._opencv_errors("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
@@ -216,6 +215,23 @@ network = cv2.dnn.readNetFromONNX(sys.argv[1])
 network.setInput(cv2.dnn.blobFromImage(numpy.zeros((side, side, 3), numpy.uint8)))
 network.forward()
 """
+
+
+def _check_own_numbers(model: Path) -> None:
+    """Raise `InputError` for a network with numbers in other files, which may be any files of the machine."""
+    try:
+        elsewhere = names_other_files(model.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            model, expected="an ONNX model that OpenCV can read", found=f"a file with {error}"
+        ) from error
+    if elsewhere:
+        raise InputError(
+            model,
+            expected="a network with all its numbers in one file",
+            found="tensors in other files",
+            remedy="export it without external data",
+        )
 
 
 def _check_survives(model: Path, size: int) -> None:

@@ -1,113 +1,70 @@
-"""Names of the files that an ONNX model reads beside itself.
+"""What an ONNX file says of other files, read from its bytes, before OpenCV reads the network.
 
-OpenCV follows such a name to any place: a model of a stranger could read a file of the user's as weights. The numbers
-of the fields are those of onnx.proto3 of ONNX 1.16; the encoding is the wire format of Protocol Buffers.
+A tensor may name a file with its numbers. OpenCV reads any such file, also one outside of the folder, and a digest of
+the ONNX file says nothing about the numbers. The field numbers are those of onnx.proto; in Protobuf's wire format, a
+field is a varint, 4 or 8 bytes, or bytes preceded by their length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
-from psotrack.errors import InputError
-
-#: Kind of message -> number of a field -> kind of the message in the field, on the ways from a model to its tensors.
-_FIELDS = {
+#: Message -> field number -> message of the field. Only what leads to tensors is listed.
+_MESSAGES = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "training": {1: "graph", 2: "graph"},
     "function": {7: "node", 11: "attribute"},
-    "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
-    "sparse tensor": {1: "tensor", 2: "tensor"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
     "node": {5: "attribute"},
-    "attribute": {
-        5: "tensor",
-        6: "graph",
-        10: "tensor",
-        11: "graph",
-        22: "sparse tensor",
-        23: "sparse tensor",
-    },
-    "tensor": {13: "entry"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+    "tensor": {},
 }
-#: Fields of an entry of a tensor that lies in another file.
-_KEY, _VALUE = 1, 2
-#: Wire types: a varint, eight bytes, bytes preceded by their length, and four bytes.
-_VARINT, _EIGHT, _LENGTH, _FOUR = 0, 1, 2, 5
-#: Largest number of bytes of a varint.
-_LONGEST_VARINT = 10
+#: Fields of a tensor: the place of its numbers in another file, and whether there is one.
+_EXTERNAL = {13, 14}
+_VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
+#: Deepest nesting of messages that Protobuf reads.
+_DEEPEST = 100
 
 
-def check_values_beside(model: Path) -> None:
-    """Raise `InputError` for a model that cannot be read, or that reads a file outside of its own folder.
-
-    Args:
-        model: path of an ONNX file.
+def names_other_files(content: bytes) -> bool:
+    """Whether a tensor of an ONNX model has its numbers in another file.
 
     Raises:
-        InputError: the file is no ONNX model, or names a file that is in another folder or is a link.
+        ValueError: the content is not in Protobuf's wire format.
     """
-    try:
-        names = _outside_files(model.read_bytes())
-    except OSError as error:
-        raise InputError(
-            model, expected="an ONNX model", found=(error.strerror or str(error)).lower()
-        ) from error
-    except ValueError as error:
-        raise InputError(
-            model, expected="an ONNX model that OpenCV can read", found="a file of another format, or damaged"
-        ) from error
-    for name in sorted(names):
-        if set(name) & set("/\\:\0") or name in {"", ".", ".."} or (model.parent / name).is_symlink():
-            raise InputError(
-                model,
-                expected="an ONNX model that reads only files beside it",
-                found=f"values in {name!r}",
-                remedy="export the network as one file",
-            )
-
-
-def _outside_files(content: bytes) -> set[str]:
-    """Names of the files with values of a model's tensors. Raises `ValueError` for what is no model."""
-    names = set()
-    # A list, not recursion: graphs may be nested as deep as the file is long.
-    waiting = [("model", memoryview(content))]
+    waiting = [("model", memoryview(content), 0)]
     while waiting:
-        kind, message = waiting.pop()
-        if kind == "entry":
-            texts = {number: bytes(value) for number, value in _fields_of(message)}
-            if texts.get(_KEY) == b"location":
-                names.add(texts.get(_VALUE, b"").decode())
-            continue
-        inner = _FIELDS[kind]
-        waiting.extend((inner[number], value) for number, value in _fields_of(message) if number in inner)
-    return names
+        kind, data, depth = waiting.pop()
+        if depth > _DEEPEST:
+            raise ValueError("messages that are nested too deeply")
+        at = 0
+        while at < len(data):
+            tag, at = _varint(data, at)
+            number, wire = tag >> 3, tag & 7
+            if kind == "tensor" and number in _EXTERNAL:
+                return True
+            length = {_EIGHT: 8, _FOUR: 4}.get(wire, 0)
+            if wire in (_VARINT, _BYTES):
+                value, at = _varint(data, at)
+                length = value if wire == _BYTES else 0
+            elif not length:
+                raise ValueError(f"a field of the unknown kind {wire}")
+            if at + length > len(data):
+                raise ValueError("a field that is cut short")
+            if wire == _BYTES and number in _MESSAGES[kind]:
+                waiting.append((_MESSAGES[kind][number], data[at : at + length], depth + 1))
+            at += length
+    return False
 
 
-def _fields_of(message: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Numbers and bytes of a message's fields that are preceded by their length."""
-    at = 0
-    while at < len(message):
-        tag, at = _varint(message, at)
-        number, wire = tag >> 3, tag & 7
-        if wire == _VARINT:
-            _, at = _varint(message, at)
-            continue
-        if wire not in (_EIGHT, _LENGTH, _FOUR):
-            raise ValueError(f"wire type {wire}")
-        length, at = _varint(message, at) if wire == _LENGTH else (8 if wire == _EIGHT else 4, at)
-        if at + length > len(message):
-            raise ValueError("the file ends within a field")
-        if wire == _LENGTH:
-            yield number, message[at : at + length]
-        at += length
-
-
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """Value of a varint, and the place behind it."""
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    """A number of 7 bits per byte, the lowest first, and the place after it."""
     value = 0
-    for index in range(min(_LONGEST_VARINT, len(message) - at)):
-        byte = message[at + index]
-        value |= (byte & 127) << (7 * index)
+    for shift in range(0, 70, 7):
+        if at >= len(data):
+            break
+        byte = data[at]
+        at += 1
+        value |= (byte & 127) << shift
         if byte < 128:
-            return value, at + index + 1
-    raise ValueError("a number does not end")
+            return value, at
+    raise ValueError("a number that is cut short")

@@ -197,9 +197,7 @@ class Store:
         if wanted.empty:
             path = _present(self._errors_path(key))
             expected = f"errors of seeds {', '.join(map(str, seeds))}"
-            raise InputError(
-                path, expected=expected, found="none", remedy=_remove(self._rows_path(key))
-            )
+            raise InputError(path, expected=expected, found="none", remedy=_remove(self._rows_path(key)))
         return wanted
 
     def status(self) -> dict[str, Any]:
@@ -276,9 +274,7 @@ class Store:
     def _errors_if_present(self, key: str) -> pd.DataFrame | None:
         path = _present(self._errors_path(key))
         try:
-            return _read_table(
-                path, _remove(self._rows_path(key)), ("seed", "frame", "drone", "error_m")
-            )
+            return _read_table(path, _remove(self._rows_path(key)), ("seed", "frame", "drone", "error_m"))
         except FileNotFoundError:
             return None
 
