@@ -18,7 +18,7 @@ oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python 
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow fuzz lint format bench bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
+.PHONY: help demo test test-slow fuzz kills lint format bench bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -44,6 +44,9 @@ test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and 
 
 fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINUTES=60 for more, SEED=7 for others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
+
+kills: $(VENV)/.installed  ## kill commands at random moments and run them again; COUNT=1000 for more, SEED=7 for others
+	@$(BIN)/python experiments/kills.py --count $(or $(COUNT),300) --seed $(or $(SEED),0) --out build/kills-$(or $(SEED),0)
 
 lint: $(VENV)/.installed  ## ruff, its format check, mypy
 	@$(BIN)/ruff check .

@@ -435,14 +435,14 @@ class TestBadInput:
         fails(sequence, "dron2_pos_25.csv", "line 6", "nan")
 
     def test_no_drones(self, fails: Callable[..., None], sequence: Path) -> None:
-        fails(sequence, "drones", "at least 1", "0", more=("--drones", 0))
+        fails(sequence, "drones", "from 1 to 1000", "found 0", more=("--drones", 0))
 
     def test_initial_positions_from_a_missing_file(self, fails: Callable[..., None], sequence: Path) -> None:
         fails(sequence, "start.csv", more=("--init", "start.csv"))
 
     def test_unknown_camera(self, fails: Callable[..., None], sequence: Path) -> None:
         fails(sequence, "cam9", more=("--cameras", "cam1,cam9"))
-        fails(sequence, "cam1, cam2", "found ''", more=("--cameras", ""))
+        fails(sequence, "names with commas", "found ''", more=("--cameras", ""))
 
     def test_broken_detections(self, run: Run, sequence: Path) -> None:
         (sequence / "dl_data" / "cam1i_s.csv").write_text("0,1,2,3,4,2.5,4,0.9\n1,5,6\n")

@@ -263,8 +263,8 @@ class TestReading:
     @pytest.mark.parametrize(
         ("content", "message"),
         [
-            ("{", r"tracks.json: expected JSON"),
-            ("[1]", r"tracks.json: expected the record of a run, found JSON with a list"),
+            ("{", r"tracks.json: expected the record of a run, .*, found an error"),
+            ("[1]", r"tracks.json: expected the record of a run, .*, found JSON with a list"),
             ('{"encounters": 3}', r"tracks.json, encounters: expected a list"),
         ],
     )

@@ -14,7 +14,8 @@ _MOST_DIGITS = 15
 
 def whole_number(word: str) -> int | None:
     """Value of a word of digits; None for another word, and for one that has more digits than any count."""
-    return int(word) if word.isdecimal() and len(word) <= _MOST_DIGITS else None
+    is_number = word.isascii() and word.isdecimal() and len(word) <= _MOST_DIGITS
+    return int(word) if is_number else None
 
 
 def is_moderate(value: float) -> bool:

@@ -1,0 +1,381 @@
+"""Kill commands at random moments, run them again, and compare the results with those of runs that were left alone.
+
+    python experiments/kills.py --count 300 --out build/kills --seed 0
+
+Each kill starts a command on a small recording, waits for a random part of the command's usual time, or for a file
+that is being written, and sends SIGKILL, SIGTERM or SIGINT. Then the command runs to its end. A kill fails if
+
+- the results are other bytes than undisturbed (seconds, rates and versions of records are left out),
+- a temporary file or a process is left, or the next run needs a hand,
+- SIGTERM or SIGINT do not end the command with one line, exit code 143 or 130, within a limit.
+
+The folder keeps the outcome of each kill: the same call goes on where it was stopped, and a larger --count adds kills.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+#: Time to the end that is counted as a failure, seconds. The machine may be busy.
+LONGEST_S = 3.0
+#: Exit codes of signals that a command answers.
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+#: Keys of records whose values are those of the run, not of the result.
+OF_THE_RUN = {
+    "seconds",
+    "real_time_factor",
+    "versions",
+    "device",
+    "created",
+    "started",
+    "command",
+    "digest",
+    "machine",
+}
+FIELDS = ("number", "command", "signal", "phase", "seconds_to_end", "failure")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command that is killed.
+
+    Attributes:
+        arguments: makes the arguments from the folder of the input and the folder of the output.
+        outputs: makes the paths of the results, files or folders, from the folder of the output.
+        processes: number of the same commands that run at once, on one output.
+    """
+
+    arguments: Callable[[Path, Path], list[object]]
+    outputs: Callable[[Path], list[Path]]
+    processes: int = 1
+
+
+SEQUENCE = Path("Simulated_Data") / "S02_D4_A"
+QUICK = ("--particles", 20, "--iterations", 15, "--reduction", 2)
+COMMANDS = {
+    "simulate": Command(
+        lambda given, out: [
+            *("simulate", "S01_D2_A", "--out", out, "--frames", 12, "--scale", 0.2, "--no-onboard")
+        ],
+        lambda out: [out / "Simulated_Data"],
+    ),
+    "silhouettes": Command(
+        lambda given, out: ["silhouettes", given / SEQUENCE, "--cache", out / "cache"],
+        lambda out: [],
+    ),
+    "track": Command(
+        lambda given, out: [
+            *("track", given / SEQUENCE, "--out", out / "tracks.csv", *QUICK, "--force"),
+            *("--cache", out / "cache"),
+        ],
+        lambda out: [out / "tracks.csv", out / "tracks.json", out / "tracks.ambiguity.csv"],
+    ),
+    "sweep": Command(
+        lambda given, out: [
+            *(
+                "sweep",
+                given / "grid.toml",
+                "--data",
+                given,
+                "--out",
+                out / "results",
+                "--cache",
+                given / "cache",
+            )
+        ],
+        lambda out: [out / "results" / "cells"],
+    ),
+    "two sweeps": Command(
+        lambda given, out: [
+            *(
+                "sweep",
+                given / "grid.toml",
+                "--data",
+                given,
+                "--out",
+                out / "results",
+                "--cache",
+                given / "cache",
+            )
+        ],
+        lambda out: [out / "results" / "cells"],
+        processes=2,
+    ),
+    "labels": Command(
+        lambda given, out: ["labels", given / SEQUENCE, "--out", out / "labels", "--force"],
+        lambda out: [out / "labels"],
+    ),
+    "export": Command(
+        lambda given, out: [
+            *(
+                "export",
+                given / "tracks.csv",
+                given / SEQUENCE,
+                "--to",
+                "mot",
+                "--out",
+                out / "mot",
+                "--force",
+            )
+        ],
+        lambda out: [out / "mot"],
+    ),
+    "pack": Command(
+        lambda given, out: [
+            *("pack", given / "tracks.csv", given / SEQUENCE, "--out", out / "flight.psotrack", "--force"),
+            *("--cache", given / "cache"),
+        ],
+        lambda out: [out / "flight.psotrack"],
+    ),
+    "overlay": Command(
+        lambda given, out: ["overlay", given / "tracks.csv", given / SEQUENCE, "--out", out / "videos"],
+        lambda out: sorted((out / "videos").glob("*.mp4")),
+    ),
+    "report": Command(
+        lambda given, out: [
+            *("report", given / "tracks.csv", given / SEQUENCE, "--out", out / "report.html", "--force")
+        ],
+        lambda out: [],
+    ),
+}
+GRID = """
+sequences = ["S02_D4_A"]
+runs = 2
+[settings]
+silhouettes.reduction = 2
+swarm.iterations = 10
+[grid]
+swarm.particles = [10, 20]
+"""
+
+
+def main() -> None:
+    """Kill, and print a table of commands and signals."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--count", type=int, default=300, help="number of kills in all")
+    parser.add_argument("--out", type=Path, default=Path("build/kills"), help="folder of inputs and outcomes")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", default=",".join(COMMANDS), help="names of commands")
+    options = parser.parse_args()
+    names = options.commands.split(",")
+    given = options.out.resolve() / "given"
+    if not (given / "finished").exists():
+        prepare(given)
+    outcomes = options.out / "outcomes.csv"
+    done = read(outcomes)
+    expected: dict[str, tuple[float, dict[str, str]]] = {}
+    for number in range(options.count):
+        if number in done:
+            continue
+        choice = random.Random(f"{options.seed} {number}")
+        name = names[number % len(names)]
+        if name not in expected:
+            expected[name] = undisturbed(name, given, options.out.resolve() / "undisturbed")
+        outcome = kill(name, choice, given, options.out.resolve() / "killed", *expected[name])
+        done[number] = {"number": number, "command": name, **outcome}
+        with outcomes.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, FIELDS)
+            if not file.tell():
+                writer.writeheader()
+            writer.writerow(done[number])
+        print(
+            f"{number + 1} of {options.count}: {name}, {outcome['signal']}, {outcome['failure'] or 'as undisturbed'}",
+            flush=True,
+        )
+    show([done[number] for number in range(options.count)], options.seed)
+
+
+def prepare(given: Path) -> None:
+    """Make the inputs: a recording, its tracks, their cache, and a grid."""
+    shutil.rmtree(given, ignore_errors=True)
+    run("simulate", "S02_D4_A", "--out", given, "--frames", 12, "--scale", 0.35, "--no-onboard")
+    run("track", given / SEQUENCE, "--out", given / "tracks.csv", *QUICK, "--cache", given / "cache")
+    (given / "grid.toml").write_text(GRID, encoding="utf-8")
+    run("sweep", given / "grid.toml", "--data", given, "--out", given / "warm", "--cache", given / "cache")
+    (given / "finished").touch()
+
+
+def undisturbed(name: str, given: Path, folder: Path) -> tuple[float, dict[str, str]]:
+    """Seconds and results of a command that is left alone."""
+    shutil.rmtree(folder, ignore_errors=True)
+    began_s = time.monotonic()
+    run(*COMMANDS[name].arguments(given, folder))
+    return time.monotonic() - began_s, digests(COMMANDS[name].outputs(folder), folder)
+
+
+def kill(
+    name: str,
+    choice: random.Random,
+    given: Path,
+    folder: Path,
+    usual_s: float,
+    expected: dict[str, str],
+) -> dict[str, object]:
+    """Kill a command once, run the command again, and say what is wrong."""
+    shutil.rmtree(folder, ignore_errors=True)
+    command = COMMANDS[name]
+    number = choice.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
+    writing = choice.random() < 0.5
+    moment_s = choice.uniform(0.02, usual_s)
+    arguments = command.arguments(given, folder)
+    processes = [start(*arguments) for _ in range(command.processes)]
+    began_s = time.monotonic()
+    while time.monotonic() - began_s < moment_s and processes[0].poll() is None:
+        time.sleep(0.002)
+    while writing and processes[0].poll() is None and not partial(folder):
+        time.sleep(0.002)
+    phase = "over" if processes[0].poll() is not None else "writing" if partial(folder) else "other"
+    sent_s = time.monotonic()
+    processes[0].send_signal(number)
+    _, said = processes[0].communicate(timeout=120)
+    took_s = time.monotonic() - sent_s
+    code = processes[0].returncode
+    faults = []
+    if phase != "over" and code != 0 and number in CODES:
+        if code not in (CODES[number], -number) or (code == CODES[number] and said.count("\n") != 1):
+            faults.append(f"code {code}: {said[-200:]!r}")
+        if took_s > LONGEST_S:
+            faults.append(f"{took_s:.1f} s to the end")
+    for process in processes[1:]:
+        process.communicate(timeout=300)
+    if number != signal.SIGKILL and (left := partial(folder)):
+        faults.append(f"left {left[0].name}")
+    again = start(*arguments)
+    _, said = again.communicate(timeout=300)
+    if again.returncode != 0 and "--force" not in said:
+        faults.append(f"again: {said[-200:]!r}")
+    if (found := digests(command.outputs(folder), folder)) != expected:
+        names = sorted(set(found.items()) ^ set(expected.items()))
+        faults.append(f"other results: {names[0][0]}")
+    if left := partial(folder):
+        faults.append(f"left after all {left[0].name}")
+    end_s = time.monotonic() + 10
+    while (alive := group_of(processes)) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    if alive:
+        faults.append(f"{len(alive)} processes left")
+    return {
+        "signal": number.name,
+        "phase": phase,
+        "seconds_to_end": round(took_s, 2),
+        "failure": "; ".join(faults),
+    }
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """A command in a session of its own, which hears Ctrl-C also where this program runs in the background."""
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from psotrack.__main__ import main; main()"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *map(str, arguments), "--quiet"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PSOTRACK_PROGRESS": "none"},
+    )
+
+
+def run(*arguments: object) -> None:
+    """Run a command that must succeed."""
+    process = start(*arguments)
+    _, said = process.communicate()
+    if process.returncode != 0:
+        raise SystemExit(f"{arguments[0]}: {said}")
+
+
+def group_of(processes: list[subprocess.Popen[str]]) -> list[str]:
+    """Processes that commands have started and that still run."""
+    groups = ",".join(f"{process.pid}" for process in processes)
+    return subprocess.run(["pgrep", "-g", groups], capture_output=True, text=True, check=False).stdout.split()
+
+
+def partial(folder: Path) -> list[Path]:
+    """Files that are being written, or that were left."""
+    return [
+        Path(place, name)
+        for place, folders, files in os.walk(folder)
+        for name in (*folders, *files)
+        if ".partial" in name
+    ]
+
+
+def digests(paths: list[Path], folder: Path) -> dict[str, str]:
+    """A digest of each file of the results."""
+    files = [file for path in paths for file in ([path] if path.is_file() else sorted(path.rglob("*")))]
+    return {
+        str(file.relative_to(folder)): hashlib.sha256(content_of(file)).hexdigest()
+        for file in files
+        if file.is_file() and not file.name.startswith(".")
+    }
+
+
+def content_of(path: Path) -> bytes:
+    """What must be the same in every run."""
+    if path.suffix == ".parquet":
+        import pandas as pd
+
+        table = pd.read_parquet(path)
+        kept = [
+            name
+            for name in table
+            if not any(word in name for word in ("seconds", "_ms", "real_time", "device"))
+        ]
+        return table[kept].to_csv(index=False).encode()
+    if path.suffix == ".json":
+        return json.dumps(without(json.loads(path.read_text(encoding="utf-8"))), sort_keys=True).encode()
+    return path.read_bytes()
+
+
+def without(value: object) -> object:
+    """A record without what belongs to the run."""
+    if isinstance(value, dict):
+        return {key: without(each) for key, each in value.items() if key not in OF_THE_RUN}
+    return [without(each) for each in value] if isinstance(value, list) else value
+
+
+def read(path: Path) -> dict[int, dict[str, object]]:
+    """Outcomes of earlier calls."""
+    if not path.exists():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        return {int(row["number"]): dict(row) for row in csv.DictReader(file)}
+
+
+def show(outcomes: list[dict[str, object]], seed: int) -> None:
+    """Print kills, failures and the slowest end per command and signal."""
+    print(
+        f"{'command':<12} {'signal':<8} {'kills':>6} {'writing':>8} {'failures':>9} {'slowest end (s)':>16}"
+    )
+    for command, name in sorted({(str(each["command"]), str(each["signal"])) for each in outcomes}):
+        those = [each for each in outcomes if (each["command"], each["signal"]) == (command, name)]
+        slowest = max(float(str(each["seconds_to_end"])) for each in those)
+        failures = sum(bool(each["failure"]) for each in those)
+        writing = sum(each["phase"] == "writing" for each in those)
+        print(f"{command:<12} {name:<8} {len(those):>6} {writing:>8} {failures:>9} {slowest:>16.2f}")
+    failed = [each for each in outcomes if each["failure"]]
+    for each in failed:
+        print(f"kill {each['number']}, {each['command']}, {each['signal']}: {each['failure']}")
+    print(f"{len(outcomes)} kills, {len(failed)} failures, seed {seed}")
+    raise SystemExit(bool(failed))
+
+
+if __name__ == "__main__":
+    main()
