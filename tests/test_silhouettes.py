@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import itertools
+import logging
 import os
 import shutil
 import signal
@@ -421,7 +422,7 @@ def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
     (damaged / file).write_bytes(content)
     caplog.clear()
     again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    lines = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert lines == [f"{damaged}: damaged silhouettes in the cache; they are made anew"]
     assert is_whole(damaged)
     np.testing.assert_array_equal(_read_all(again), _expected(recording))

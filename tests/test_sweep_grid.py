@@ -281,7 +281,10 @@ WRONG = [
     ({"settings": 3}, "settings: expected a table, found 3"),
     ({"methods": {"paper": 3}}, "methods.paper: expected a table, found 3"),
     # Values that are out of range.
-    ({"grid": {"swarm.particles": [20, 1]}}, "grid.swarm.particles[1]: expected a number from 2 to 100000, found 1"),
+    (
+        {"grid": {"swarm.particles": [20, 1]}},
+        "grid.swarm.particles[1]: expected a number from 2 to 100000, found 1",
+    ),
     ({"grid": {"flipped": [0.5, 2]}}, "grid.flipped[1]: expected a number from 0 to 1, found 2"),
     ({"grid": {"clock_frames": [-1]}}, "grid.clock_frames[0]: expected a number of at least 0, found -1"),
     (
