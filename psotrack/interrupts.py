@@ -53,6 +53,9 @@ def orderly_interrupts() -> Iterator[None]:
         yield
         return
     hook = sys.unraisablehook
+    # Processes of `multiprocessing` take these options. One of them counts semaphores that an ended program left, and
+    # removes them; that is no news.
+    sys.warnoptions.append("ignore:resource_tracker:UserWarning")
 
     def dropped(unraisable: sys.UnraisableHookArgs) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):

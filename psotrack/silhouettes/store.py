@@ -59,6 +59,8 @@ _GREY = 127
 
 #: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
 _STALE_S = 24 * 3600
+#: Longest time that zarr goes on writing, seconds.
+_ZARR_WRITES_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -198,8 +200,16 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
             remedy="what was stored before is unchanged",
         ) from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _remove(temporary)
     return seconds
+
+
+def _remove(folder: Path) -> None:
+    """Remove an unfinished folder. Zarr writes in a thread of its own, after an exception for some moments too."""
+    end_s = time.monotonic() + _ZARR_WRITES_S
+    while folder.exists() and time.monotonic() < end_s:
+        shutil.rmtree(folder, ignore_errors=True)
+        time.sleep(0.02)
 
 
 def remove_stale(cache: Path) -> None:
