@@ -30,9 +30,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 #: Time to the end that is counted as a failure, seconds. The machine may be busy.
-LONGEST_S = 3.0
-#: Exit codes of signals that a command answers.
-CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+LONGEST_S = 2.0
+#: Exit codes of signals that a command answers, and the first word of its line.
+CODES = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
+#: Time from which on psotrack's own lines run and answer signals, seconds after the start.
+ANSWERS_S = 0.3
+#: Time after which a command counts as hanging, seconds.
+HANGS_S = 300.0
 #: Keys of records whose values are those of the run, not of the result.
 OF_THE_RUN = {
     "seconds",
@@ -74,7 +78,7 @@ COMMANDS = {
     ),
     "silhouettes": Command(
         lambda given, out: ["silhouettes", given / SEQUENCE, "--cache", out / "cache"],
-        lambda out: [],
+        lambda out: [out / "cache"],
     ),
     "track": Command(
         lambda given, out: [
@@ -148,7 +152,7 @@ COMMANDS = {
         lambda given, out: [
             *("report", given / "tracks.csv", given / SEQUENCE, "--out", out / "report.html", "--force")
         ],
-        lambda out: [],
+        lambda out: [out / "report.html"],
     ),
 }
 GRID = """
@@ -231,7 +235,7 @@ def kill(
     command = COMMANDS[name]
     number = choice.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
     writing = choice.random() < 0.5
-    moment_s = choice.uniform(0.02, usual_s)
+    moment_s = choice.uniform(ANSWERS_S, max(usual_s, 2 * ANSWERS_S))
     arguments = command.arguments(given, folder)
     processes = [start(*arguments) for _ in range(command.processes)]
     began_s = time.monotonic()
@@ -242,22 +246,26 @@ def kill(
     phase = "over" if processes[0].poll() is not None else "writing" if partial(folder) else "other"
     sent_s = time.monotonic()
     processes[0].send_signal(number)
-    _, said = processes[0].communicate(timeout=120)
+    faults = []
+    said = ended(processes[0], faults)
     took_s = time.monotonic() - sent_s
     code = processes[0].returncode
-    faults = []
-    if phase != "over" and code != 0 and number in CODES:
-        if code not in (CODES[number], -number) or (code == CODES[number] and said.count("\n") != 1):
+    if phase != "over" and number in CODES:
+        # A command may have just finished when the signal came.
+        right = code == 0 and not said
+        right |= code == CODES[number][0] and said.startswith(f"psotrack: {CODES[number][1]}; ")
+        if not right or said.count("\n") > 1:
             faults.append(f"code {code}: {said[-200:]!r}")
         if took_s > LONGEST_S:
             faults.append(f"{took_s:.1f} s to the end")
     for process in processes[1:]:
-        process.communicate(timeout=300)
+        ended(process, faults)
     if number != signal.SIGKILL and (left := partial(folder)):
         faults.append(f"left {left[0].name}")
     again = start(*arguments)
-    _, said = again.communicate(timeout=300)
-    if again.returncode != 0 and "--force" not in said:
+    said = ended(again, faults)
+    # What had just finished is not made again.
+    if again.returncode != 0 and not (code == 0 and "--force" in said):
         faults.append(f"again: {said[-200:]!r}")
     if (found := digests(command.outputs(folder), folder)) != expected:
         names = sorted(set(found.items()) ^ set(expected.items()))
@@ -265,7 +273,7 @@ def kill(
     if left := partial(folder):
         faults.append(f"left after all {left[0].name}")
     end_s = time.monotonic() + 10
-    while (alive := group_of(processes)) and time.monotonic() < end_s:
+    while (alive := group_of([*processes, again])) and time.monotonic() < end_s:
         time.sleep(0.1)
     if alive:
         faults.append(f"{len(alive)} processes left")
@@ -275,6 +283,16 @@ def kill(
         "seconds_to_end": round(took_s, 2),
         "failure": "; ".join(faults),
     }
+
+
+def ended(process: subprocess.Popen[str], faults: list[str]) -> str:
+    """What a command said on stderr until its end; a command that hangs is a fault, and is killed."""
+    try:
+        return process.communicate(timeout=HANGS_S)[1]
+    except subprocess.TimeoutExpired:
+        faults.append("hangs")
+        os.killpg(process.pid, signal.SIGKILL)
+        return process.communicate()[1]
 
 
 def start(*arguments: object) -> subprocess.Popen[str]:
@@ -323,7 +341,8 @@ def digests(paths: list[Path], folder: Path) -> dict[str, str]:
     return {
         str(file.relative_to(folder)): hashlib.sha256(content_of(file)).hexdigest()
         for file in files
-        if file.is_file() and not file.name.startswith(".")
+        # Compiled programs are a cache of JAX's, not results.
+        if file.is_file() and not file.name.startswith(".") and "compiled" not in file.parts
     }
 
 
