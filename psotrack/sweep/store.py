@@ -190,7 +190,7 @@ class Store:
         Raises:
             InputError: there is no file of the cell's errors, or it has no errors of these runs.
         """
-        errors = self._errors_if_present(key)
+        errors = self._errors_if_present(key, ("seed", "frame", "drone", "error_m"))
         if errors is None:
             raise InputError(self._errors_path(key), expected="errors of a finished cell", found="no file")
         wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
@@ -271,10 +271,10 @@ class Store:
             logger.warning("%s: damaged rows of a cell; a sweep runs the cell again", path)
             return None
 
-    def _errors_if_present(self, key: str) -> pd.DataFrame | None:
+    def _errors_if_present(self, key: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame | None:
         path = _present(self._errors_path(key))
         try:
-            return _read_table(path, _remove(self._rows_path(key)), ("seed", "frame", "drone", "error_m"))
+            return _read_table(path, _remove(self._rows_path(key)), columns)
         except FileNotFoundError:
             return None
 
