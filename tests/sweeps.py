@@ -136,6 +136,8 @@ def make_older(results: Path, older_keys: dict[str, str]) -> None:
         (results / "_errors" / f"{key}.parquet").rename(results / "errors" / f"{older_key}.parquet")
     (results / "_errors").rmdir()
     manifest = json.loads((results / "_manifest.json").read_text())
+    # Version 0.1 wrote no digest.
+    manifest.pop("digest", None)
     for run in manifest["runs"]:
         for part in ("settings", "axes"):
             values = run["grid"][part]

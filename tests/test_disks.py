@@ -17,9 +17,9 @@ resource = pytest.importorskip("resource", reason="limits on the size of files a
 #: Content of the file that every command is to replace.
 OLDER = b"older"
 #: Smallest limit, bytes. What pytest captures is a file too, and must take a line.
-LEAST = 200
+LEAST = 320
 #: Number of limits that are tried between no byte and the whole file; more for small and quick outputs.
-TRIES = 8
+TRIES = 4
 
 
 @pytest.fixture(scope="module")

@@ -194,7 +194,7 @@ class Store:
         if errors is None:
             raise InputError(self._errors_path(key), expected="errors of a finished cell", found="no file")
         wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
-        if wanted.empty:
+        if wanted.empty and not errors.empty:
             path = _present(self._errors_path(key))
             expected = f"errors of seeds {', '.join(map(str, seeds))}"
             raise InputError(path, expected=expected, found="none", remedy=_remove(self._rows_path(key)))
@@ -319,7 +319,8 @@ def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -
         FileNotFoundError: the file does not exist.
     """
     table = read_parquet(path, remedy)
-    for name in columns:
+    # A run without any drone has no errors, and their table has no columns but the seed.
+    for name in columns if len(table) else ("seed",):
         if name not in table or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name])):
             found = "others" if name in table else "none"
             raise DamagedError(path, expected=f"values in the column {name}", found=found, remedy=remedy)
