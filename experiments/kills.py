@@ -26,7 +26,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 #: Time to the end that is counted as a failure, seconds. The machine may be busy.
@@ -102,22 +102,6 @@ COMMANDS = {
         ],
         lambda out: [out / "results" / "cells"],
     ),
-    "two sweeps": Command(
-        lambda given, out: [
-            *(
-                "sweep",
-                given / "grid.toml",
-                "--data",
-                given,
-                "--out",
-                out / "results",
-                "--cache",
-                given / "cache",
-            )
-        ],
-        lambda out: [out / "results" / "cells"],
-        processes=2,
-    ),
     "labels": Command(
         lambda given, out: ["labels", given / SEQUENCE, "--out", out / "labels", "--force"],
         lambda out: [out / "labels"],
@@ -155,6 +139,7 @@ COMMANDS = {
         lambda out: [out / "report.html"],
     ),
 }
+COMMANDS["two sweeps"] = replace(COMMANDS["sweep"], processes=2)
 GRID = """
 sequences = ["S02_D4_A"]
 runs = 2

@@ -21,6 +21,9 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
+#: Signals that end the program, and the handlers that Python gives them.
+_ANSWERED = (signal.SIGINT, signal.SIGTERM)
+_USUAL_HANDLERS = (signal.SIG_DFL, signal.default_int_handler)
 #: Time after which a signal that came at a bad moment is repeated, seconds.
 _AGAIN_S = 0.02
 #: Time that the program has to end in order, seconds. Removing temporary files takes a part of it.
@@ -47,7 +50,6 @@ def orderly_interrupts() -> Iterator[None]:
     A program that has not ended after `_IN_ORDER_S`, or that gets a second signal, is ended at once: its temporary
     files are removed, its worker processes are told to end, and the line is written.
     """
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     # Only the main thread has signals.
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -59,28 +61,27 @@ def orderly_interrupts() -> Iterator[None]:
 
     def dropped(unraisable: sys.UnraisableHookArgs) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            number = signal.SIGTERM if issubclass(unraisable.exc_type, Terminated) else signal.SIGINT
-            _repeat(number)
+            _repeat(signal.SIGTERM if issubclass(unraisable.exc_type, Terminated) else signal.SIGINT)
         else:
             hook(unraisable)
 
-    # `nohup` and `&` in scripts start commands with Ctrl-C ignored.
-    answered = [
-        number for number, old in zip((signal.SIGINT, signal.SIGTERM), before, strict=True) if _is_usual(old)
-    ]
-    for number in answered:
+    # `nohup` and `&` in scripts start commands with Ctrl-C ignored, and such commands go on ignoring it.
+    before = {
+        number: handler for number in _ANSWERED if (handler := signal.getsignal(number)) in _USUAL_HANDLERS
+    }
+    for number in before:
         signal.signal(number, _interrupt)
     sys.unraisablehook = dropped
     try:
         with _watched():
             yield
     except KeyboardInterrupt:
-        for number in answered:
+        for number in before:
             signal.signal(number, signal.SIG_IGN)
         raise
     else:
-        for number, old in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
-            signal.signal(number, old)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     finally:
         sys.unraisablehook = hook
 
@@ -114,10 +115,6 @@ def end(number: int) -> NoReturn:
             stream.write(text)
             stream.flush()
     os._exit(128 + number)
-
-
-def _is_usual(handler: object) -> bool:
-    return handler in (signal.SIG_DFL, signal.default_int_handler)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -172,6 +169,9 @@ def _watch(pipe: int) -> None:
     is_second = False
     while numbers := os.read(pipe, 1):
         number = numbers[0]
+        # Libraries may have handlers for other signals.
+        if number not in _ANSWERED:
+            continue
         if _State.repeats:
             _State.repeats -= 1
             continue

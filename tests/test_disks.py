@@ -85,6 +85,16 @@ def words_of(command, flight, out):
     return command.format(flight=flight, out=out).split()
 
 
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The current folder, which is empty."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "place"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
 def limits_up_to(num_bytes):
     """Limits from `LEAST` to one byte too few."""
     spread = (
@@ -95,11 +105,7 @@ def limits_up_to(num_bytes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_is_whole_or_as_it_was(run_psotrack, flight, tmp_path, monkeypatch, name):
-    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
-    place = tmp_path / "place"
-    place.mkdir()
-    monkeypatch.chdir(place)
+def test_a_file_is_whole_or_as_it_was(run_psotrack, flight, place, name):
     out = Path(name)
     words = words_of(COMMANDS[name], flight, out)
     undisturbed = run_psotrack(*words)
@@ -122,11 +128,7 @@ def test_a_file_is_whole_or_as_it_was(run_psotrack, flight, tmp_path, monkeypatc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FOLDERS)
-def test_a_folder_has_whole_files_only(run_psotrack, flight, tmp_path, monkeypatch, name):
-    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
-    place = tmp_path / "place"
-    place.mkdir()
-    monkeypatch.chdir(place)
+def test_a_folder_has_whole_files_only(run_psotrack, flight, place, name):
     out = Path(name)
     words = words_of(FOLDERS[name], flight, out)
     undisturbed = run_psotrack(*words)

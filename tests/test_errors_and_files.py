@@ -5,6 +5,8 @@ import functools
 import hashlib
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -295,3 +297,23 @@ def test_paths_may_be_strings(tmp_path):
     join_videos(path("b.avi"), [path("a.avi"), path("a.avi")])
     assert probe(path("b.avi")).num_frames == 2
     assert digest_file(path("a.avi")) != digest_file(path("b.avi"))
+
+
+def test_a_folder_is_not_listed_for_each_file(tmp_path):
+    """A sweep adds files to a folder of 10,000 files."""
+    program = """
+import sys
+from pathlib import Path
+from psotrack.support import atomic_write
+folder, listed = Path(sys.argv[1]), []
+sys.addaudithook(lambda event, arguments: event in ("os.listdir", "os.scandir") and listed.append(arguments[0]))
+for number in range(20):
+    with atomic_write(folder / f"{number}.txt") as temporary:
+        temporary.write_text("text")
+print(sum(Path(place) == folder for place in listed if isinstance(place, (str, Path))))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) <= 1
+    assert len(list(tmp_path.iterdir())) == 20

@@ -1,10 +1,10 @@
 """Flying by hand: dynamics, limits, input devices, the command `fly`. Scripts and fakes of pyglet give the sticks."""
 
+import functools
 import re
 import signal
 import sys
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from psotrack import cli
 from psotrack.errors import InputError, SettingsError
 from psotrack.simulation import flight_space
 from psotrack.simulation.flights import devices
@@ -596,22 +595,11 @@ def test_the_keyboard_flies_in_a_window_that_shows_keys_and_position(pyglet):
 
 
 @pytest.fixture
-def run_fly(monkeypatch, capfd, tmp_path):
-    """Return a function that runs `psotrack fly` in this process, in a folder that holds a script of sticks."""
+def run_fly(monkeypatch, run_psotrack, tmp_path):
+    """Runs `psotrack fly` in a folder that holds a script of sticks."""
     monkeypatch.chdir(tmp_path)
     write_sticks(tmp_path / "script.csv", SCRIPT)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["psotrack", "fly", *arguments])
-        capfd.readouterr()
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return SimpleNamespace(code=code, **capfd.readouterr()._asdict())
-
-    return call
+    return functools.partial(run_psotrack, "fly")
 
 
 def test_the_command_writes_a_flight_and_sticks_that_reproduce_it(run_fly, tmp_path):
@@ -636,7 +624,7 @@ def test_the_command_writes_a_flight_and_sticks_that_reproduce_it(run_fly, tmp_p
             "--quiet",
         )
     )
-    assert again == SimpleNamespace(code=0, out="", err="")
+    assert again == (0, "", "")
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "new" / "loop.csv").read_bytes()
 
 

@@ -118,7 +118,7 @@ def prune(
     force: bool,
     json_path: Path | None,
 ) -> None:
-    """Remove entries that were not used for long, or so many that the cache keeps to a size.
+    """Remove entries that were not used for some days, or that make the cache larger than a size.
 
     \b
     Examples:

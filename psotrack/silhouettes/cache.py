@@ -65,7 +65,7 @@ def list_entries(cache: Path) -> list[CacheEntry]:
 def is_damaged(entry: CacheEntry) -> bool:
     """Whether an entry was changed or cut short after it was written; every byte is read.
 
-    Programs of JAX's own cache have no digest and count as undamaged: JAX reads them or compiles again.
+    Programs of JAX's own cache have no digest, so damage in them is not found: they count as undamaged.
     """
     if entry.kind == "silhouettes":
         return not is_whole(entry.path)

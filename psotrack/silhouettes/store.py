@@ -59,6 +59,7 @@ _GREY = 127
 
 #: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
 _STALE_S = 24 * 3600
+
 #: Longest time that zarr goes on writing, seconds.
 _ZARR_WRITES_S = 1.0
 

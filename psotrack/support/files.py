@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import glob
 import hashlib
 import os
 import platform
@@ -37,8 +36,8 @@ ARCHIVE_SUFFIX = ".psotrack"
 #: Hash functions of `digest_file`: BLAKE2b with 512 and with 160 bits, and SHA-256.
 Algorithm = Literal["blake2b", "blake2b-160", "sha256"]
 
-#: Names that `atomic_write` gives: machine and process that write, and a random part.
-_TEMPORARY = re.compile(r"\..*\.([0-9a-f]{4})-([0-9]+)-[0-9a-f]{8}\.partial")
+#: Names that `atomic_write` gives: stem of the output, machine and process that write, and a random part.
+_TEMPORARY = re.compile(r"\.(.*)\.([0-9a-f]{4})-([0-9]+)-[0-9a-f]{8}\.partial")
 #: Temporary files that this process writes just now.
 _OPEN: set[Path] = set()
 
@@ -181,11 +180,26 @@ def remove_temporary_files() -> None:
 
 def _remove_left_over(output: _Output) -> None:
     """Remove temporary files of an output that killed processes of this machine have left."""
+    for path in _left_over(output.target.parent.resolve()):
+        found = _TEMPORARY.match(path.name)
+        if found and found[1] == output.path.stem:
+            _remove(path)
+
+
+@functools.lru_cache(maxsize=1000)
+def _left_over(folder: Path) -> tuple[Path, ...]:
+    """Temporary files that killed processes of this machine have left in a folder.
+
+    A process looks once: listing a folder of 10,000 results takes longer than writing one.
+    """
     with contextlib.suppress(OSError):
-        for path in output.target.parent.glob(f".{glob.escape(output.path.stem)}.*.partial*"):
-            found = _TEMPORARY.match(path.name)
-            if found and found[1] == _machine() and not _is_running(int(found[2])):
-                _remove(path)
+        found = [(path, _TEMPORARY.match(path.name)) for path in folder.glob(".*.partial*")]
+        return tuple(
+            path
+            for path, parts in found
+            if parts and parts[2] == _machine() and not _is_running(int(parts[3]))
+        )
+    return ()
 
 
 def _is_running(process: int) -> bool:

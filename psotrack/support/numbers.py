@@ -6,8 +6,6 @@ from __future__ import annotations
 LARGEST = 1e60
 #: What is expected, for messages.
 MODERATE = f"a number of at most {LARGEST:g} in size"
-
-
 #: Largest number of digits of a whole number: such a number is exact as a float, too.
 _MOST_DIGITS = 15
 

@@ -41,7 +41,6 @@ logger = logging.getLogger(__name__)
 #: A temporary file that is older was left by a runner that was killed, seconds.
 _LEFT_BEHIND_S = 3600.0
 
-
 #: Remedy for a damaged file that a sweep makes anew.
 _RUN_AGAIN = "run the same `psotrack sweep` again"
 

@@ -162,7 +162,7 @@ class _Table:
 
 
 def check_cells(where: object, num_frames: int, num_drones: int, num_rows: int) -> None:
-    """Raise `InputError` where drones have so few rows that arrays over frames and drones are nearly empty, and large.
+    """Raise `InputError` where arrays over frames and drones would be large and nearly empty.
 
     Args:
         where: the file, for the message.
