@@ -3,9 +3,11 @@
     python experiments/kills.py --count 300 --out build/kills --seed 0
 
 Each kill starts a command on a small recording, waits for a random part of the command's usual time, or for a file
-that is being written, and sends SIGKILL, SIGTERM or SIGINT. Then the command runs to its end. A kill fails if
+that is being written, and sends SIGKILL, SIGTERM or SIGINT. Where two commands work in one folder, one or both are
+killed; of a Dask cluster, also a worker alone. Then the command runs to its end. A kill fails if
 
 - the results are other bytes than undisturbed (seconds, rates and versions of records are left out),
+- a unit that was finished (a video, silhouettes of a camera, a cell of a sweep) is made once more,
 - a temporary file or a process is left, or the next run needs a hand,
 - SIGTERM or SIGINT do not end the command with one line, exit code 143 or 130, within a limit.
 
@@ -15,6 +17,7 @@ The folder keeps the outcome of each kill: the same call goes on where it was st
 from __future__ import annotations
 
 import argparse
+import contextlib
 import csv
 import hashlib
 import json
@@ -25,7 +28,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -41,6 +43,7 @@ HANGS_S = 300.0
 OF_THE_RUN = {
     "seconds",
     "real_time_factor",
+    "real_time_factor_running",
     "versions",
     "device",
     "created",
@@ -49,7 +52,7 @@ OF_THE_RUN = {
     "digest",
     "machine",
 }
-FIELDS = ("number", "command", "signal", "phase", "seconds_to_end", "failure")
+FIELDS = ("number", "command", "signal", "victim", "phase", "seconds_to_end", "kept", "failure")
 
 
 @dataclass(frozen=True)
@@ -57,89 +60,68 @@ class Command:
     """A command that is killed.
 
     Attributes:
-        arguments: makes the arguments from the folder of the input and the folder of the output.
-        outputs: makes the paths of the results, files or folders, from the folder of the output.
+        words: words of the command; `{given}` is the folder of the input, `{out}` the folder of the output.
+        outputs: results in the folder of the output, files or folders.
+        units: pattern of the files in the folder of the output that a second run keeps; "" where the second run makes
+            all files anew.
         processes: number of the same commands that run at once, on one output.
+        has_workers: whether the command has worker processes that may be killed alone.
     """
 
-    arguments: Callable[[Path, Path], list[object]]
-    outputs: Callable[[Path], list[Path]]
+    words: str
+    outputs: tuple[str, ...]
+    units: str = ""
     processes: int = 1
+    has_workers: bool = False
+
+    def start(self, given: Path, out: Path) -> subprocess.Popen[str]:
+        """Start the command."""
+        return start(*(word.format(given=given, out=out) for word in self.words.split()))
 
 
-SEQUENCE = Path("Simulated_Data") / "S02_D4_A"
-QUICK = ("--particles", 20, "--iterations", 15, "--reduction", 2)
+QUICK = "--particles 20 --iterations 15 --reduction 2"
+FLIGHT = "{given}/Simulated_Data/S02_D4_A"
+SWEEP = Command(
+    "sweep {given}/grid.toml --data {given} --out {out}/results --cache {given}/cache",
+    ("results/cells",),
+    units="results/cells/*.parquet",
+)
 COMMANDS = {
     "simulate": Command(
-        lambda given, out: [
-            *("simulate", "S01_D2_A", "--out", out, "--frames", 12, "--scale", 0.2, "--no-onboard")
-        ],
-        lambda out: [out / "Simulated_Data"],
+        "simulate S01_D2_A --out {out} --frames 12 --scale 0.2",
+        ("Simulated_Data",),
+        units="Simulated_Data/S01_D2_A/*.avi",
     ),
     "silhouettes": Command(
-        lambda given, out: ["silhouettes", given / SEQUENCE, "--cache", out / "cache"],
-        lambda out: [out / "cache"],
+        f"silhouettes {FLIGHT} --cache {{out}}/cache", ("cache",), units="cache/[0-9a-f]*/c/**/*"
     ),
     "track": Command(
-        lambda given, out: [
-            *("track", given / SEQUENCE, "--out", out / "tracks.csv", *QUICK, "--force"),
-            *("--cache", out / "cache"),
-        ],
-        lambda out: [out / "tracks.csv", out / "tracks.json", out / "tracks.ambiguity.csv"],
+        f"track {FLIGHT} --out {{out}}/tracks.csv {QUICK} --force --cache {{out}}/cache",
+        ("tracks.csv", "tracks.json", "tracks.ambiguity.csv"),
+        units="cache/[0-9a-f]*/c/**/*",
     ),
-    "sweep": Command(
-        lambda given, out: [
-            *(
-                "sweep",
-                given / "grid.toml",
-                "--data",
-                given,
-                "--out",
-                out / "results",
-                "--cache",
-                given / "cache",
-            )
-        ],
-        lambda out: [out / "results" / "cells"],
-    ),
-    "labels": Command(
-        lambda given, out: ["labels", given / SEQUENCE, "--out", out / "labels", "--force"],
-        lambda out: [out / "labels"],
+    "sweep": SWEEP,
+    "two sweeps": replace(SWEEP, processes=2),
+    "cluster": replace(SWEEP, words=f"{SWEEP.words} --cluster local --workers 2", has_workers=True),
+    "labels": Command(f"labels {FLIGHT} --out {{out}}/labels --drone-size 0.3,0.3,0.15 --force", ("labels",)),
+    "localise": Command(
+        "localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force", ("poses.csv",)
     ),
     "export": Command(
-        lambda given, out: [
-            *(
-                "export",
-                given / "tracks.csv",
-                given / SEQUENCE,
-                "--to",
-                "mot",
-                "--out",
-                out / "mot",
-                "--force",
-            )
-        ],
-        lambda out: [out / "mot"],
+        f"export {{given}}/tracks.csv {FLIGHT} --to mot --out {{out}}/mot --force",
+        ("mot",),
     ),
     "pack": Command(
-        lambda given, out: [
-            *("pack", given / "tracks.csv", given / SEQUENCE, "--out", out / "flight.psotrack", "--force"),
-            *("--cache", given / "cache"),
-        ],
-        lambda out: [out / "flight.psotrack"],
+        f"pack {{given}}/tracks.csv {FLIGHT} --out {{out}}/flight.psotrack --force --cache {{given}}/cache",
+        ("flight.psotrack",),
     ),
     "overlay": Command(
-        lambda given, out: ["overlay", given / "tracks.csv", given / SEQUENCE, "--out", out / "videos"],
-        lambda out: sorted((out / "videos").glob("*.mp4")),
+        f"overlay {{given}}/tracks.csv {FLIGHT} --out {{out}}/videos", ("videos",), units="videos/*.mp4"
     ),
     "report": Command(
-        lambda given, out: [
-            *("report", given / "tracks.csv", given / SEQUENCE, "--out", out / "report.html", "--force")
-        ],
-        lambda out: [out / "report.html"],
+        f"report {{given}}/tracks.csv {FLIGHT} --out {{out}}/report.html --force", ("report.html",)
     ),
 }
-COMMANDS["two sweeps"] = replace(COMMANDS["sweep"], processes=2)
 GRID = """
 sequences = ["S02_D4_A"]
 runs = 2
@@ -174,8 +156,8 @@ def main() -> None:
         choice = random.Random(f"{options.seed} {number}")
         name = names[number % len(names)]
         if name not in expected:
-            expected[name] = undisturbed(name, given, options.out.resolve() / "undisturbed")
-        outcome = kill(name, choice, given, options.out.resolve() / "killed", *expected[name])
+            expected[name] = undisturbed(COMMANDS[name], given, options.out.resolve() / "undisturbed")
+        outcome = kill(COMMANDS[name], choice, given, options.out.resolve() / "killed", *expected[name])
         done[number] = {"number": number, "command": name, **outcome}
         with outcomes.open("a", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, FIELDS)
@@ -183,32 +165,46 @@ def main() -> None:
                 writer.writeheader()
             writer.writerow(done[number])
         print(
-            f"{number + 1} of {options.count}: {name}, {outcome['signal']}, {outcome['failure'] or 'as undisturbed'}",
+            f"{number + 1} of {options.count}: {name}, {outcome['signal']} to {outcome['victim']}, "
+            f"{outcome['failure'] or 'as undisturbed'}",
             flush=True,
         )
     show([done[number] for number in range(options.count)], options.seed)
 
 
 def prepare(given: Path) -> None:
-    """Make the inputs: a recording, its tracks, their cache, and a grid."""
+    """Make the inputs: recordings, tracks, a cache, and a grid."""
     shutil.rmtree(given, ignore_errors=True)
     run("simulate", "S02_D4_A", "--out", given, "--frames", 12, "--scale", 0.35, "--no-onboard")
-    run("track", given / SEQUENCE, "--out", given / "tracks.csv", *QUICK, "--cache", given / "cache")
+    run("simulate", "S01_D2_A", "--out", given, "--frames", 25, "--scale", 0.3)
+    flight = FLIGHT.format(given=given)
+    run("track", flight, "--out", given / "tracks.csv", *QUICK.split(), "--cache", given / "cache")
     (given / "grid.toml").write_text(GRID, encoding="utf-8")
     run("sweep", given / "grid.toml", "--data", given, "--out", given / "warm", "--cache", given / "cache")
     (given / "finished").touch()
 
 
-def undisturbed(name: str, given: Path, folder: Path) -> tuple[float, dict[str, str]]:
+def undisturbed(command: Command, given: Path, folder: Path) -> tuple[float, dict[str, str]]:
     """Seconds and results of a command that is left alone."""
-    shutil.rmtree(folder, ignore_errors=True)
+    make_place(folder, given, with_programs=True)
     began_s = time.monotonic()
-    run(*COMMANDS[name].arguments(given, folder))
-    return time.monotonic() - began_s, digests(COMMANDS[name].outputs(folder), folder)
+    process = command.start(given, folder)
+    _, said = process.communicate()
+    if process.returncode != 0:
+        raise SystemExit(f"{command.words}: {said}")
+    return time.monotonic() - began_s, digests(command.outputs, folder)
+
+
+def make_place(folder: Path, given: Path, *, with_programs: bool) -> None:
+    """Make the empty folder of the output, with or without the compiled programs."""
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "cache").mkdir(parents=True)
+    if with_programs:
+        shutil.copytree(given / "cache" / "compiled", folder / "cache" / "compiled")
 
 
 def kill(
-    name: str,
+    command: Command,
     choice: random.Random,
     given: Path,
     folder: Path,
@@ -216,43 +212,57 @@ def kill(
     expected: dict[str, str],
 ) -> dict[str, object]:
     """Kill a command once, run the command again, and say what is wrong."""
-    shutil.rmtree(folder, ignore_errors=True)
-    command = COMMANDS[name]
+    # Compiling takes longer than all other work; one kill in five meets a compiler.
+    make_place(folder, given, with_programs=choice.random() < 0.8)
     number = choice.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
+    victim = choice.choice(("one", "all")) if command.processes > 1 else "one"
+    if command.has_workers and choice.random() < 0.3:
+        number, victim = signal.SIGKILL, "worker"
     writing = choice.random() < 0.5
     moment_s = choice.uniform(ANSWERS_S, max(usual_s, 2 * ANSWERS_S))
-    arguments = command.arguments(given, folder)
-    processes = [start(*arguments) for _ in range(command.processes)]
+    processes = [command.start(given, folder) for _ in range(command.processes)]
     began_s = time.monotonic()
     while time.monotonic() - began_s < moment_s and processes[0].poll() is None:
         time.sleep(0.002)
     while writing and processes[0].poll() is None and not partial(folder):
         time.sleep(0.002)
     phase = "over" if processes[0].poll() is not None else "writing" if partial(folder) else "other"
+    faults: list[str] = []
+    killed = processes if victim == "all" else processes[:1]
     sent_s = time.monotonic()
-    processes[0].send_signal(number)
-    faults = []
-    said = ended(processes[0], faults)
-    took_s = time.monotonic() - sent_s
-    code = processes[0].returncode
+    if victim == "worker":
+        kill_worker(processes[0], choice)
+        # The sweep goes on with another worker.
+        killed = []
+    for process in killed:
+        process.send_signal(number)
+    codes = {process.pid: (ended(process, faults), process.returncode) for process in killed}
+    took_s = time.monotonic() - sent_s if killed else 0.0
     if phase != "over" and number in CODES:
-        # A command may have just finished when the signal came.
-        right = code == 0 and not said
-        right |= code == CODES[number][0] and said.startswith(f"psotrack: {CODES[number][1]}; ")
-        if not right or said.count("\n") > 1:
-            faults.append(f"code {code}: {said[-200:]!r}")
+        for said, code in codes.values():
+            # A command may have just finished when the signal came.
+            right = code == 0 and not said
+            right |= code == CODES[number][0] and said.startswith(f"psotrack: {CODES[number][1]}; ")
+            if not right or said.count("\n") > 1:
+                faults.append(f"code {code}: {said[-200:]!r}")
         if took_s > LONGEST_S:
             faults.append(f"{took_s:.1f} s to the end")
-    for process in processes[1:]:
-        ended(process, faults)
+    for process in processes:
+        if process not in killed and (said := ended(process, faults)) and process.returncode != 0:
+            faults.append(f"the other: code {process.returncode}: {said[-200:]!r}")
     if number != signal.SIGKILL and (left := partial(folder)):
         faults.append(f"left {left[0].name}")
-    again = start(*arguments)
+    before = stamps(command.units, folder)
+    again = command.start(given, folder)
     said = ended(again, faults)
     # What had just finished is not made again.
-    if again.returncode != 0 and not (code == 0 and "--force" in said):
+    had_finished = any(code == 0 for _, code in codes.values())
+    if again.returncode != 0 and not (had_finished and "--force" in said):
         faults.append(f"again: {said[-200:]!r}")
-    if (found := digests(command.outputs(folder), folder)) != expected:
+    after = stamps(command.units, folder)
+    if made_again := [name for name, stamp in before.items() if after.get(name) != stamp]:
+        faults.append(f"made once more: {made_again[0]}")
+    if (found := digests(command.outputs, folder)) != expected:
         names = sorted(set(found.items()) ^ set(expected.items()))
         faults.append(f"other results: {names[0][0]}")
     if left := partial(folder):
@@ -264,9 +274,29 @@ def kill(
         faults.append(f"{len(alive)} processes left")
     return {
         "signal": number.name,
+        "victim": victim,
         "phase": phase,
         "seconds_to_end": round(took_s, 2),
+        "kept": len(before),
         "failure": "; ".join(faults),
+    }
+
+
+def kill_worker(process: subprocess.Popen[str], choice: random.Random) -> None:
+    """Kill one of the processes that a command has started, if there is one."""
+    workers = [int(number) for number in group_of([process]) if int(number) != process.pid]
+    if workers:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(choice.choice(workers), signal.SIGKILL)
+
+
+def stamps(units: str, folder: Path) -> dict[str, tuple[int, int]]:
+    """Finished units: name -> inode and time of the last change, which differ where a file was made again."""
+    found = sorted(folder.glob(units)) if units else []
+    return {
+        str(file.relative_to(folder)): (file.stat().st_ino, file.stat().st_mtime_ns)
+        for file in found
+        if file.is_file()
     }
 
 
@@ -320,8 +350,9 @@ def partial(folder: Path) -> list[Path]:
     ]
 
 
-def digests(paths: list[Path], folder: Path) -> dict[str, str]:
+def digests(outputs: tuple[str, ...], folder: Path) -> dict[str, str]:
     """A digest of each file of the results."""
+    paths = [folder / name for name in outputs]
     files = [file for path in paths for file in ([path] if path.is_file() else sorted(path.rglob("*")))]
     return {
         str(file.relative_to(folder)): hashlib.sha256(content_of(file)).hexdigest()
@@ -364,16 +395,20 @@ def read(path: Path) -> dict[int, dict[str, object]]:
 
 
 def show(outcomes: list[dict[str, object]], seed: int) -> None:
-    """Print kills, failures and the slowest end per command and signal."""
+    """Print kills, kept units, failures and the slowest end per command and signal."""
     print(
-        f"{'command':<12} {'signal':<8} {'kills':>6} {'writing':>8} {'failures':>9} {'slowest end (s)':>16}"
+        f"{'command':<12} {'signal':<8} {'kills':>6} {'writing':>8} {'kept units':>11} {'failures':>9} "
+        f"{'slowest end (s)':>16}"
     )
     for command, name in sorted({(str(each["command"]), str(each["signal"])) for each in outcomes}):
         those = [each for each in outcomes if (each["command"], each["signal"]) == (command, name)]
         slowest = max(float(str(each["seconds_to_end"])) for each in those)
         failures = sum(bool(each["failure"]) for each in those)
         writing = sum(each["phase"] == "writing" for each in those)
-        print(f"{command:<12} {name:<8} {len(those):>6} {writing:>8} {failures:>9} {slowest:>16.2f}")
+        kept = sum(int(str(each["kept"])) for each in those)
+        print(
+            f"{command:<12} {name:<8} {len(those):>6} {writing:>8} {kept:>11} {failures:>9} {slowest:>16.2f}"
+        )
     failed = [each for each in outcomes if each["failure"]]
     for each in failed:
         print(f"kill {each['number']}, {each['command']}, {each['signal']}: {each['failure']}")

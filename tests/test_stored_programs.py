@@ -14,7 +14,8 @@ import psotrack
 
 #: A program that smooths a track, and prints a digest of the result's bytes.
 SMOOTHING = """
-import hashlib, logging, sys, threading
+import hashlib, logging, os, sys, threading
+import jax
 import numpy as np
 from psotrack.motion import motion_params, smooth
 from psotrack.settings import MotionSettings
@@ -22,6 +23,8 @@ from psotrack.support import keep_compiled, load_ahead
 logging.basicConfig(level=logging.INFO, format="%(message)s (%(threadName)s)")
 if len(sys.argv) > 1:
     keep_compiled(sys.argv[1])
+if "DEVICE" in os.environ:
+    jax.config.update("jax_default_device", jax.devices()[int(os.environ["DEVICE"])])
 if "ahead" in sys.argv:
     before = threading.enumerate()
     load_ahead()
@@ -62,10 +65,10 @@ print(largest_eigenvalue(np.diag(np.float32([1, 5, 3]))), multiplied(np.float32(
 
 
 def start(
-    program: str, folder: Path | None, package: Path | None = None, *options: str
+    program: str, folder: Path | None, package: Path | None = None, *options: str, **variables: str
 ) -> subprocess.Popen[str]:
     """Start a program that logs its tracing; the package may be a copy in a folder."""
-    environment = environment_without_jax_settings() | {"JAX_LOG_COMPILES": "1"}
+    environment = environment_without_jax_settings() | {"JAX_LOG_COMPILES": "1"} | variables
     source = Path(psotrack.__file__).parents[1] if package is None else package
     environment["PYTHONPATH"] = str(source)
     return subprocess.Popen(
@@ -79,9 +82,11 @@ def start(
     )
 
 
-def run(program: str, folder: Path | None, package: Path | None = None, *options: str) -> tuple[str, str]:
+def run(
+    program: str, folder: Path | None, package: Path | None = None, *options: str, **variables: str
+) -> tuple[str, str]:
     """What a program prints and what it logs."""
-    process = start(program, folder, package, *options)
+    process = start(program, folder, package, *options, **variables)
     printed, log = process.communicate()
     assert process.returncode == 0, log
     return printed, log
@@ -122,6 +127,19 @@ def test_a_thread_loads_the_programs_of_the_last_run_ahead(filled: tuple[Path, s
     loaded = [line for line in log.splitlines() if line.startswith("loaded the compiled program")]
     assert len(loaded) == len(list(folder.glob("*.program")))
     assert not any("(MainThread)" in line for line in loaded)
+
+
+def test_programs_of_other_devices_are_passed_over_in_silence(
+    filled: tuple[Path, str], tmp_path: Path
+) -> None:
+    """A sweep stores programs of several devices; a run on one device loads all of them ahead."""
+    folder = shutil.copytree(filled[0], tmp_path / "stored")
+    run(SMOOTHING, folder, None, XLA_FLAGS="--xla_force_host_platform_device_count=2", DEVICE="1")
+    assert len(list(folder.glob("*._smoothed-*.program"))) == 2
+    again, log = run(SMOOTHING, folder, None, "ahead")
+    assert again == filled[1]
+    assert "compiled again" not in log
+    assert not traces(log, "_smoothed")
 
 
 def test_without_a_folder_the_result_has_the_same_bytes(filled: tuple[Path, str]) -> None:

@@ -146,28 +146,38 @@ class stored_jit(Generic[_R]):  # noqa: N801  a decorator
 
 
 def _loaded(path: Path, device: jax.Device) -> Callable[..., Any] | None:
-    """A stored program, loaded now or ahead; None where it is not stored or cannot be used."""
+    """A stored program, loaded now or ahead; None where it is not stored or cannot be used, which the log says."""
     loading = _ahead.pop((path, device), None)
-    program = _load(path, device) if loading is None or loading.cancel() else loading.result()
+    try:
+        program = _load(path, device) if loading is None or loading.cancel() else loading.result()
+    except _UnusableError as error:
+        logger.warning("%s; the program is compiled again", error)
+        return None
     if program is not None:
         with contextlib.suppress(OSError):  # a folder that cannot be written
             path.touch()
     return program
 
 
+class _UnusableError(Exception):
+    """A stored program cannot be used; the text names the file and the reason."""
+
+
 def _load(path: Path, device: jax.Device) -> Callable[..., Any] | None:
-    """A stored program; None where it is not stored or cannot be used."""
+    """A stored program; None where it is not stored.
+
+    Raises:
+        _UnusableError: the program is damaged or, where it is loaded ahead, perhaps of another device.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:
         return None
     except OSError as error:
-        logger.warning("%s: %s; the program is compiled again", path, error.strerror or error)
-        return None
+        raise _UnusableError(f"{path}: {error.strerror or error}") from error
     content = unseal_program(data)
     if content is None:
-        logger.warning("%s is damaged or no program of psotrack; the program is compiled again", path)
-        return None
+        raise _UnusableError(f"{path} is damaged or no program of psotrack")
     # JAX loads LAPACK when it lowers a function; a program that calls it earlier ends the process.
     lapack.prepare_lapack_call("potrf_ffi", np.float32)
     try:
@@ -176,8 +186,7 @@ def _load(path: Path, device: jax.Device) -> Callable[..., Any] | None:
             executable, taken, returned, execution_devices=[device]
         )
     except (ValueError, RuntimeError) as error:
-        logger.warning("%s: %s; the program is compiled again", path, f"{error}".partition("\n")[0])
-        return None
+        raise _UnusableError(f"{path}: {error}".partition("\n")[0]) from error
     logger.info("loaded the compiled program %s", path.name)
     return program
 
