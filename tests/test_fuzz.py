@@ -37,6 +37,7 @@ def judges(tmp_path_factory):
     return of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_are_read_or_refused_in_one_line(name, judges):
     judge = judges(name)

@@ -591,6 +591,7 @@ def with_insets(seen, seed):
     return replace(seen, corners_px=seen.corners_px - inset_px[seen.marker, None, None] * outward(seen))
 
 
+@pytest.mark.slow
 def test_the_covariance_agrees_with_the_errors_of_a_camera_of_another_power():
     """Found: an average of 1.6, because the covariance had whole insets, and the adjustment finds a part of them."""
     normalised = []

@@ -164,6 +164,7 @@ def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path)
         assert len(list(read_frames(found.videos[name]))) == found.frame_times[name].num_frames
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_recording_and_nothing_else(laboratory: Recording, tmp_path: Path) -> None:
     """A limit on the size of files stands for a full disk: OpenCV reports an error in neither case."""
     folder = tmp_path / "flight"

@@ -56,7 +56,7 @@ class Format:
         command: arguments of `psotrack`, with {file}, {folder} and {out}; "" for none.
         inside: change of what the file, a container, holds.
         is_refused: whether the sound file is refused, because what it names does not exist.
-        is_slow: whether a try is slow; the fast tests make one try of the format.
+        is_slow: whether a try is slow; the tests make one try of the format.
     """
 
     make: Callable[[Path], object]
