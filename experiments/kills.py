@@ -103,7 +103,10 @@ COMMANDS = {
     "sweep": SWEEP,
     "two sweeps": replace(SWEEP, processes=2),
     "cluster": replace(SWEEP, words=f"{SWEEP.words} --cluster local --workers 2", has_workers=True),
-    "labels": Command(f"labels {FLIGHT} --out {{out}}/labels --drone-size 0.3,0.3,0.15 --force", ("labels",)),
+    "labels": Command(
+        f"labels {FLIGHT} {{given}}/Simulated_Data/S01_D2_A --out {{out}}/labels --drone-size 0.3,0.3,0.15 --force",
+        ("labels",),
+    ),
     "localise": Command(
         "localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force", ("poses.csv",)
     ),
