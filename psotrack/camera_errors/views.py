@@ -53,7 +53,7 @@ class CameraViews:
         """Number of cameras."""
         return self.weight.shape[2]
 
-    @property
+    @cached_property
     def shown(self) -> Bool[np.ndarray, "frames drones cameras"]:
         """(frames, drones, cameras), whether the camera shows the place of the drone."""
         return np.asarray(np.isfinite(self.residual_px).all(axis=-1) & (self.weight > 0).all(axis=-1))
