@@ -155,6 +155,13 @@ class TestViews:
         )
         assert (views.gain == 0).all()
 
+    def test_what_cameras_show_is_computed_once(self):
+        """Learning asks block by block: 100,000 frames took half an hour, because each block computed all frames."""
+        rig = ring_rig(2)
+        unknown = np.full((2, 1, 3), np.nan)
+        views = views_of_places(rig.cameras, np.zeros((2, 1, 2, 2)), np.ones((2, 1, 2, 2)), unknown, unknown)
+        assert views.shown is views.shown
+
 
 class TestLearning:
     def test_variances_of_cameras_are_not_shrunk_by_the_fit(self):
