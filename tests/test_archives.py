@@ -483,9 +483,11 @@ class TestStoredSilhouettes:
         ],
     )
     def test_other_settings_are_refused(self, flight: Path, settings: dict[str, Any], words: str) -> None:
+        recording = open_recording(flight)
         with pytest.raises(SettingsError, match=words) as error:
-            compute(open_recording(flight), SilhouetteSettings(**settings), cache=flight / "none")
-        assert "other silhouettes need the camera's video" in str(error.value)
+            compute(recording, SilhouetteSettings(**settings), cache=flight / "none")
+        stored = recording.silhouettes["cam1"].path
+        assert f"other silhouettes than {stored} need the camera's video" in str(error.value)
 
     def test_the_settings_with_which_they_were_made_are_accepted(self, flight: Path) -> None:
         recording = open_recording(flight)

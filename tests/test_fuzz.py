@@ -14,6 +14,7 @@ FINDS = sorted(path for path in (Path(__file__).parent / "data" / "fuzz").rglob(
 NESTED = {
     "tracks-json": b'{"a":' * 20_000,
     "archive-manifest": b"[" * 20_000,
+    "stored-silhouettes": b'{"a":' * 20_000,
     "run-record": b"[" * 20_000,
     "sweep-manifest": b"[" * 20_000,
     "calibration-record": b"[" * 20_000,

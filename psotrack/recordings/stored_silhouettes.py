@@ -45,11 +45,18 @@ class StoredSilhouettes:
         return digest_record({**self.made_of, "first_frames": self.num_frames})
 
 
+class _Model(msgspec.Struct, frozen=True):
+    """Identity of a background model, as of `identify`."""
+
+    name: str = msgspec.field(name="class")
+
+
 class _MadeOf(msgspec.Struct, frozen=True):
     schema: int
     content: str
     num_frames: int
     settings: dict[str, Any]
+    background: _Model | None = None
 
 
 class _Attributes(msgspec.Struct, frozen=True):
@@ -77,7 +84,7 @@ def probe_silhouettes(path: Path | str) -> StoredSilhouettes:
     except OSError as error:
         found = f"no {ARRAY_FILE}: {(error.strerror or str(error)).lower()}"
         raise InputError(path, expected="a folder with stored silhouettes", found=found) from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(
             path / ARRAY_FILE,
             expected="the description of silhouettes that say what they were made of",

@@ -194,21 +194,23 @@ def _check_made_with(
     for setting in ScaledSettings.__struct_fields__:
         asked, made = getattr(scaled, setting), getattr(made_with, setting)
         if asked != made:
-            raise _made_otherwise(setting, name, made, asked)
+            raise _made_otherwise(setting, name, stored, made, asked)
     asked, made = None if model is None else identify(model), stored.made_of.get("background")
     if asked != made:
         kinds = [MOG2 if each is None else each["class"].rpartition(".")[2] for each in (made, asked)]
         # Two models of one kind differ in their keys.
         words = kinds if kinds[0] != kinds[1] else [f"{made}", f"{asked}"]
-        raise _made_otherwise("background", name, *words)
+        raise _made_otherwise("background", name, stored, *words)
 
 
-def _made_otherwise(setting: str, name: str, made: object, asked: object) -> SettingsError:
+def _made_otherwise(
+    setting: str, name: str, stored: StoredSilhouettes, made: object, asked: object
+) -> SettingsError:
     return SettingsError(
         f"silhouettes.{setting}",
         expected=f"{made}, with which the stored silhouettes of camera {name} were made",
         found=f"{asked}",
-        remedy="other silhouettes need the camera's video",
+        remedy=f"other silhouettes than {stored.path} need the camera's video",
     )
 
 
@@ -443,7 +445,7 @@ def _with_open_values(
     given = {setting: getattr(settings, setting) for setting in _OPEN}
     for setting, value in given.items():
         if value is not None and value != getattr(made_with, setting):
-            raise _made_otherwise(setting, name, getattr(made_with, setting), value)
+            raise _made_otherwise(setting, name, stored, getattr(made_with, setting), value)
     return msgspec.structs.replace(settings, **{setting: getattr(made_with, setting) for setting in _OPEN})
 
 

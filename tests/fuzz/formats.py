@@ -33,6 +33,9 @@ from psotrack.detection import DetectorSettings, OnnxDetector
 from psotrack.errors import errors_name
 from psotrack.reports import write_calibration_report
 from psotrack.rig_files import read_lenses, read_rig, write_rig
+from psotrack.silhouettes import compute
+from psotrack.simulation.flights.piloting import read_sticks
+from psotrack.simulation.flights.recordings import read_recorded_flight
 from psotrack.sweep import Store, read_grid
 from psotrack.trajectories import read_trajectories
 
@@ -572,6 +575,24 @@ def _calibration_record(folder: Path) -> None:
     (folder / "calibration.json").write_text(json.dumps(content, indent=1))
 
 
+def _unpacked(file: str) -> Format:
+    """Silhouettes of a camera in an archive that was unpacked."""
+    return Format(
+        lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
+        f"flight/silhouettes/cam1/{file}",
+        (_frames_of_silhouettes,),
+        "pack {folder}/flight/tracks.csv {folder}/flight --out {out}/a.psotrack",
+    )
+
+
+def _frames_of_silhouettes(path: Path) -> object:
+    (flight,) = (each for each in path.parents if each.name == "flight")
+    recording = datasets.open_recording(flight).usable(silhouettes=True)
+    return compute(recording, cache=flight / "none").read(0, recording.num_frames)
+
+
+_FLIGHT = "time_s,x_m,y_m,z_m\n" + "".join(f"{i / 25},{i / 50},0.5,1.25\n" for i in range(12))
+_STICKS = "time_s,forward,left,up,turn\n0,0,0,0,0\n0.2,0.5,0,0.25,-0.5\n0.4,-1,1,0,0\n0.6,0,0,0,0\n"
 _OTHERS = {
     "scenario": Format(
         lambda folder: (folder / "mine.toml").write_text(simulation.preset_text("S02_D4_A")),
@@ -610,6 +631,15 @@ _OTHERS = {
         (_unpack,),
         "unpack {file} --out {out}/unpacked",
         members(lambda content: test_archives.sealed(content + bytes(test_archives.SEAL_DIGITS))),
+    ),
+    "stored-silhouettes": _unpacked("zarr.json"),
+    "stored-silhouettes-chunk": _unpacked("c/0/0/0"),
+    "recorded-flight": Format(_text("flight.csv", _FLIGHT), "flight.csv", (read_recorded_flight,)),
+    "sticks": Format(
+        _text("sticks.csv", _STICKS),
+        "sticks.csv",
+        (read_sticks,),
+        "fly --out {out}/flight.csv --device {file}",
     ),
     "archive-manifest": Format(
         lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
