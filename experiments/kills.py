@@ -35,8 +35,6 @@ from pathlib import Path
 LONGEST_S = 2.0
 #: Exit codes of signals that a command answers, and the first word of its line.
 CODES = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
-#: Time from which on psotrack's own lines run and answer signals, seconds after the start.
-ANSWERS_S = 0.3
 #: Time after which a command counts as hanging, seconds.
 HANGS_S = 300.0
 #: Keys of records whose values are those of the run, not of the result.
@@ -147,7 +145,8 @@ def main() -> None:
     parser.add_argument("--commands", default=",".join(COMMANDS), help="names of commands")
     options = parser.parse_args()
     names = options.commands.split(",")
-    given = options.out.resolve() / "given"
+    # Results may contain their paths, so all runs write to one place.
+    given, place = options.out.resolve() / "given", options.out.resolve() / "place"
     if not (given / "finished").exists():
         prepare(given)
     outcomes = options.out / "outcomes.csv"
@@ -159,8 +158,8 @@ def main() -> None:
         choice = random.Random(f"{options.seed} {number}")
         name = names[number % len(names)]
         if name not in expected:
-            expected[name] = undisturbed(COMMANDS[name], given, options.out.resolve() / "undisturbed")
-        outcome = kill(COMMANDS[name], choice, given, options.out.resolve() / "killed", *expected[name])
+            expected[name] = undisturbed(COMMANDS[name], given, place)
+        outcome = kill(COMMANDS[name], choice, given, place, *expected[name])
         done[number] = {"number": number, "command": name, **outcome}
         with outcomes.open("a", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, FIELDS)
@@ -222,8 +221,11 @@ def kill(
     if command.has_workers and choice.random() < 0.3:
         number, victim = signal.SIGKILL, "worker"
     writing = choice.random() < 0.5
-    moment_s = choice.uniform(ANSWERS_S, max(usual_s, 2 * ANSWERS_S))
+    moment_s = choice.uniform(0, usual_s)
     processes = [command.start(given, folder) for _ in range(command.processes)]
+    # Until its first lines run, Python answers signals in its own way.
+    while not all(map(answers, processes)):
+        time.sleep(0.002)
     began_s = time.monotonic()
     while time.monotonic() - began_s < moment_s and processes[0].poll() is None:
         time.sleep(0.002)
@@ -283,6 +285,15 @@ def kill(
         "kept": len(before),
         "failure": "; ".join(faults),
     }
+
+
+def answers(process: subprocess.Popen[str]) -> bool:
+    """Whether a command answers SIGTERM itself, or has ended."""
+    if process.poll() is not None:
+        return True
+    lines = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii").splitlines()
+    (caught,) = (int(line.split()[1], 16) for line in lines if line.startswith("SigCgt:"))
+    return bool(caught >> (signal.SIGTERM - 1) & 1)
 
 
 def kill_worker(process: subprocess.Popen[str], choice: random.Random) -> None:
