@@ -30,6 +30,8 @@ from psotrack.camera_errors.views import CameraViews
 
 #: Time over which stated and found noise are compared, seconds, and number of levels of the stated noise.
 _WINDOW_S, _NUM_LEVELS = 1.0, 8
+#: Number of frames whose covariances are computed at once.
+_FRAMES_AT_ONCE = 1000
 
 
 def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarray, "frames drones 3 3"]:
@@ -78,8 +80,9 @@ def lasting_covariances(
     lasting_px2 = np.maximum(np.square(errors.lasting_px), pixel_error_px**2)
     by_place = np.einsum("fdcik,ck,fdcjk->fdij", gain, lasting_px2, gain, optimize=True)
     turned = gain @ views.turn_px
-    found = np.abs(turned).sum(axis=(-3, -2, -1)) > 0
-    mean = np.where(found[..., None, None, None], turned, 0.0).sum(axis=0)
+    found = turned.any(axis=(-3, -2, -1))
+    # Where nothing was found, the turns are 0.
+    mean = turned.sum(axis=0)
     mean /= np.maximum(found.sum(axis=0), 1)[:, None, None, None]
     late = -np.einsum("fdcik,fdck->fdci", gain, views.flow_px_s)[..., None]
     constant = errors.constant_covariance.copy()
@@ -87,12 +90,17 @@ def lasting_covariances(
     given_rad2 = float(np.radians(rig_error_deg)) ** 2 / 3
     constant[of_turns, of_turns] += max(0.0, given_rad2 - float(np.diag(constant)[of_turns].mean()))
 
-    def by_constant(turns: Float[np.ndarray, "frames drones cameras 3 3"]) -> np.ndarray:
-        moved = np.concatenate([turns, late], axis=-1).swapaxes(2, 3)
-        moved = moved.reshape(*moved.shape[:3], -1)
-        return _filled(by_place + moved @ constant @ moved.swapaxes(-1, -2), found, 0.0)
+    def by_constant(offset: Float[np.ndarray, "drones cameras 3 3"] | float) -> np.ndarray:
+        total_m2 = np.empty_like(by_place)
+        # All frames at once would take several times the memory of the views.
+        for first in range(0, len(total_m2), _FRAMES_AT_ONCE):
+            part = slice(first, first + _FRAMES_AT_ONCE)
+            moved = np.concatenate([turned[part] - offset, late[part]], axis=-1).swapaxes(2, 3)
+            moved = moved.reshape(*moved.shape[:3], -1)
+            total_m2[part] = by_place[part] + moved @ constant @ moved.swapaxes(-1, -2)
+        return _filled(total_m2, found, 0.0)
 
-    return LastingCovariances(by_constant(turned), by_constant(turned - mean))
+    return LastingCovariances(by_constant(0.0), by_constant(mean))
 
 
 def _filled(
