@@ -263,7 +263,7 @@ def kill(
     # What had just finished is not made again.
     had_finished = any(code == 0 for _, code in codes.values())
     if again.returncode != 0 and not (had_finished and "--force" in said):
-        faults.append(f"again: {said[-200:]!r}")
+        faults.append(f"again: code {again.returncode}: {said[-200:]!r}")
     after = stamps(command.units, folder)
     if made_again := [name for name, stamp in before.items() if after.get(name) != stamp]:
         faults.append(f"made once more: {made_again[0]}")
