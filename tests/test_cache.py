@@ -4,6 +4,7 @@ import gc
 import hashlib
 import json
 import os
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ Run = Callable[..., Output]
 SIZE_WH = (64, 48)
 DAY_S = 24 * 3600
 NAME_OF_PROGRAM = f"psotrack.tracking.batch._track_batch-{'a' * 40}.program"
+NAME_IN_CACHE_OF_JAX = f"jit__scores-{'a' * 64}-cache"
 
 
 def _compute(tmp_path: Path) -> Silhouettes:
@@ -93,13 +95,14 @@ def test_check_names_what_is_damaged(run_psotrack: Run, cache: Path) -> None:
     assert (whole.code, "0 damaged" in whole.out) == (0, True)
     silhouettes = Path(str(_listed(run_psotrack, cache)[0]["path"]))
     program = cache / "compiled" / NAME_OF_PROGRAM
-    for path in (silhouettes / "c" / "0" / "0" / "0", program):
+    of_jax = shutil.copy(program, cache / "compiled" / NAME_IN_CACHE_OF_JAX)
+    for path in (silhouettes / "c" / "0" / "0" / "0", program, of_jax):
         content = bytearray(path.read_bytes())
         content[-1] ^= 1
         path.write_bytes(content)
     result = run_psotrack("cache", "check", "--cache", cache, "--json", "-")
     assert result.code == 2
-    assert set(json.loads(result.out)["damaged"]) == {str(silhouettes), str(program)}
+    assert set(json.loads(result.out)["damaged"]) == {str(silhouettes), str(program), str(of_jax)}
 
 
 def test_prune_removes_what_is_old_and_then_what_is_too_much(run_psotrack: Run, cache: Path) -> None:

@@ -1,6 +1,5 @@
 """Compile cache on disk: entries are reused, damaged entries are replaced, and an unusable folder is no error."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -22,21 +21,38 @@ def twice_the_sine(x):
     return 2 * jax.numpy.sin(x)
 print(f"{jax.jit(twice_the_sine)(0.5):.6f}", jax.config.jax_compilation_cache_dir)
 """
+#: More of the program: each file of damaged content becomes the entry, and the program is needed again.
+AGAIN = """
+import warnings
+warnings.simplefilter("always")
+folder = Path(sys.argv[1])
+for number in range(len(list(folder.glob("*.damaged")))):
+    (entry,) = folder.glob("jit_twice_the_sine-*-cache")
+    entry.write_bytes((folder / f"{number}.damaged").read_bytes())
+    jax.clear_caches()
+    print(f"{jax.jit(twice_the_sine)(0.5):.6f}")
+"""
 #: What the program prints: 2 sin(0.5).
 RESULT = "0.958851"
 
 
-def run(folder: Path, **environment: str) -> list[str]:
-    """Run the program without any output on stderr; return the number and the folder that it prints."""
+def run_program(program: str, folder: Path, **environment: str) -> tuple[str, str]:
+    """Run a program; return what it prints on stdout and on stderr."""
     result = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(folder)],
+        [sys.executable, "-c", program, str(folder)],
         capture_output=True,
         text=True,
         env=environment_without_jax_settings() | environment,
         check=True,
     )
-    assert result.stderr == ""
-    return result.stdout.rstrip("\n").split(" ", 1)
+    return result.stdout, result.stderr
+
+
+def run(folder: Path, **environment: str) -> list[str]:
+    """Run the program without any output on stderr; return the number and the folder that it prints."""
+    printed, said = run_program(PROGRAM, folder, **environment)
+    assert said == ""
+    return printed.rstrip("\n").split(" ", 1)
 
 
 def entry(folder: Path) -> Path:
@@ -52,14 +68,20 @@ def test_a_program_is_compiled_once(tmp_path: Path) -> None:
     assert entry(folder).stat().st_mtime_ns == written
 
 
-@pytest.mark.parametrize("size", [pytest.param(0, marks=pytest.mark.slow), 300])
-def test_a_truncated_entry_is_replaced(tmp_path: Path, size: int) -> None:
-    """JAX by itself never replaces an entry: each run would compile again and warn."""
+def test_a_damaged_entry_is_named_and_replaced(tmp_path: Path) -> None:
+    """JAX by itself does not notice each changed bit, and never replaces an entry."""
     run(tmp_path)
-    whole = entry(tmp_path).stat().st_size
-    os.truncate(entry(tmp_path), size)
-    assert run(tmp_path)[0] == RESULT
-    assert entry(tmp_path).stat().st_size == whole > 300
+    whole = entry(tmp_path).read_bytes()
+    places = [*range(0, len(whole), len(whole) // 40), len(whole) - 1]
+    damaged = [whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :] for place in places]
+    damaged += [b"", whole[:300], whole[:-1]]
+    for number, content in enumerate(damaged):
+        (tmp_path / f"{number}.damaged").write_bytes(content)
+    printed, said = run_program(PROGRAM + AGAIN, tmp_path)
+    assert printed.splitlines()[1:] == [RESULT] * len(damaged)
+    line = "damaged entry, or entry of an older version: jit_twice_the_sine; the program is compiled again"
+    assert said.splitlines() == [f"{tmp_path}: {line}"] * len(damaged)
+    assert entry(tmp_path).stat().st_size == pytest.approx(len(whole), rel=0.1)  # It holds its compile time.
 
 
 def test_a_folder_that_cannot_be_created_is_no_error(tmp_path: Path) -> None:

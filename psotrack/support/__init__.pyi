@@ -20,11 +20,12 @@ from .html import html_block, html_lines, html_paths, html_table
 from .numbers import LARGEST, MODERATE, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
+from .program_seals import is_whole_program
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
 from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
-from .stored_programs import is_whole_program, load_ahead, stored_jit
+from .stored_programs import load_ahead, stored_jit
 
 __all__ = [
     "ARCHIVE_SUFFIX",

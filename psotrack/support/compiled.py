@@ -10,10 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from jax._src import compilation_cache as cache_of_jax
 
+from psotrack.support.program_seals import seal_program, unseal_program
 from psotrack.support.stored_programs import forget_programs, store_programs
 
 logger = logging.getLogger(__name__)
+
+_compress, _decompress = cache_of_jax.compress_executable, cache_of_jax.decompress_executable
+#: Reason why JAX does not use an entry; JAX's warning contains these words.
+_DAMAGED = "damaged entry, or entry of an older version"
 
 #: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
 WORTH_KEEPING_S = 0.3
@@ -43,6 +49,9 @@ def keep_compiled(folder: Path | str) -> None:
     store_programs(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_S)
+    # JAX stores programs without a digest. Its developers offer no public way to add one.
+    cache_of_jax.compress_executable = _compress_and_seal
+    cache_of_jax.decompress_executable = _check_and_decompress
     show = warnings.showwarning
 
     def show_or_repair(message: Warning | str, *where: Any, **more: Any) -> None:
@@ -50,12 +59,31 @@ def keep_compiled(folder: Path | str) -> None:
         if unreadable is None:
             show(message, *where, **more)
             return
-        logger.info("%s: %s", folder, message)
+        if _DAMAGED in str(message):
+            logger.warning("%s: %s: %s; the program is compiled again", folder, _DAMAGED, unreadable[1])
+        else:
+            logger.info("%s: %s", folder, message)
         # JAX never replaces an entry, so an entry that a full disk cut short would fail in every later run.
         for entry in folder.glob(f"{unreadable[1]}-*-cache"):
             entry.unlink(missing_ok=True)
 
     warnings.showwarning = show_or_repair
+
+
+def _compress_and_seal(executable: bytes) -> bytes:
+    return seal_program(_compress(executable))
+
+
+def _check_and_decompress(stored: bytes) -> bytes:
+    """The program of an entry of JAX's cache.
+
+    Raises:
+        ValueError: the entry is damaged or was not written by psotrack; JAX then warns and compiles.
+    """
+    content = unseal_program(stored)
+    if content is None:
+        raise ValueError(_DAMAGED)
+    return bytes(_decompress(content))
 
 
 def drop_programs_if_many(most_maps: int | None = None) -> bool:

@@ -35,14 +35,13 @@ from jaxlib import lapack
 
 from psotrack.errors import OutputError
 from psotrack.support.files import atomic_write
+from psotrack.support.program_seals import seal_program, unseal_program
 
 logger = logging.getLogger(__name__)
 
 _R = TypeVar("_R")
 
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
-#: First bytes of a stored program; a digest of the rest follows, then the rest: a pickled tuple, compressed.
-_MAGIC, _DIGEST_BYTES = b"psotrack program 1\n", 32
 #: Variables that change programs, by the beginnings of their names; JAX's own variables become settings of JAX.
 _VARIABLES = ("XLA_", "PJRT_", "TF_XLA_")
 #: Settings of JAX that do not change programs, by parts of their names.
@@ -165,14 +164,14 @@ def _load(path: Path, device: jax.Device) -> Callable[..., Any] | None:
     except OSError as error:
         logger.warning("%s: %s; the program is compiled again", path, error.strerror or error)
         return None
-    start = len(_MAGIC) + _DIGEST_BYTES
-    if not _agrees(data):
+    content = unseal_program(data)
+    if content is None:
         logger.warning("%s is damaged or no program of psotrack; the program is compiled again", path)
         return None
     # JAX loads LAPACK when it lowers a function; a program that calls it earlier ends the process.
     lapack.prepare_lapack_call("potrf_ffi", np.float32)
     try:
-        executable, taken, returned = pickle.loads(zlib.decompress(data[start:]))
+        executable, taken, returned = pickle.loads(zlib.decompress(content))
         program = serialize_executable.deserialize_and_load(
             executable, taken, returned, execution_devices=[device]
         )
@@ -183,20 +182,6 @@ def _load(path: Path, device: jax.Device) -> Callable[..., Any] | None:
     return program
 
 
-def is_whole_program(path: Path) -> bool:
-    """Whether a file is a stored program of which no byte was changed."""
-    try:
-        return _agrees(path.read_bytes())
-    except OSError:
-        return False
-
-
-def _agrees(data: bytes) -> bool:
-    """Whether the bytes of a file agree with the digest that they begin with."""
-    start = len(_MAGIC) + _DIGEST_BYTES
-    return data[:start] == _MAGIC + hashlib.sha256(data[start:]).digest()
-
-
 def _make(path: Path, jitted: Any, static: dict[str, Any], arguments: dict[str, Any]) -> Callable[..., Any]:
     """A program that is compiled and stored."""
     # A program that JAX took from its own cache loses functions when it is stored (seen with JAX 0.10 on a CPU).
@@ -205,7 +190,7 @@ def _make(path: Path, jitted: Any, static: dict[str, Any], arguments: dict[str, 
     content = zlib.compress(pickle.dumps(serialize_executable.serialize(compiled)), level=1)
     try:
         with atomic_write(path) as temporary:
-            temporary.write_bytes(_MAGIC + hashlib.sha256(content).digest() + content)
+            temporary.write_bytes(seal_program(content))
     except OutputError as error:
         logger.info("%s", error)
     else:
