@@ -192,7 +192,10 @@ def live(
         server = (
             None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
         )
-        outputs += [] if server is None else [server]
+        if server is not None:
+            outputs.append(server)
+            if not quiet:
+                click.echo(f"rows are sent to clients of {server.address}", err=True)
         if kept is not None:
             kept.begin()
             stack.callback(kept.end)
