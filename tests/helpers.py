@@ -74,6 +74,18 @@ def environment_without_jax_settings() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
 
 
+def listening_at(process: int) -> set[str]:
+    """The addresses of this computer at which a process and its children listen."""
+    psutil = pytest.importorskip("psutil", reason="comes with Dask")
+    one = psutil.Process(process)
+    return {
+        connection.laddr.ip
+        for each in (one, *one.children(recursive=True))
+        for connection in each.net_connections()
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
 def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """The folder `name`, which `make` fills once per test run: the first worker that needs the folder calls `make`.
 

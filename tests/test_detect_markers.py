@@ -293,7 +293,7 @@ def test_the_table_of_a_video(tmp_path):
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (["{text}"], InputError, "notes.png: expected an image, found a file that OpenCV cannot decode"),
+        (["{text}"], InputError, "notes.png: expected an image, found a file that is no PNG"),
         (["{gone}"], InputError, "gone.jpg: expected an image, found no such file"),
         (["{empty}"], InputError, "empty: expected images, which end in .png"),
         (["{image}", "--dictionary", "9x9"], SettingsError, "dictionary: expected one of 4x4_100"),

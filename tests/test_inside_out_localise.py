@@ -203,6 +203,35 @@ def test_a_video_gives_the_same_path_as_its_images(room, tmp_path):
     np.testing.assert_allclose(video.position_m, images.position_m, atol=0.005)
 
 
+@pytest.mark.parametrize(("pairs", "roll"), [([(5, 8)], 0), ([(5, 20), (14, 29)], 1)])
+def test_exchanged_markers_of_a_map_are_named(room, tmp_path, pairs, roll):
+    """Also where the map counts their corners from another one."""
+    corners_m = wall_markers()
+    for one, other in pairs:
+        exchanged = corners_m[other], corners_m[one]
+        corners_m[one], corners_m[other] = (np.roll(corners, roll, axis=0) for corners in exchanged)
+    write_marker_corners(tmp_path / "wrong.csv", corners_m)
+    result = run(
+        room.video, "--markers", tmp_path / "wrong.csv", "--camera", room.lens, "--out", tmp_path / "o.csv",
+        "--json", tmp_path / "o.json",
+    )  # fmt: skip
+    assert result.exit_code == 0
+    named = json.loads((tmp_path / "o.json").read_text())["wrong_markers"]
+    assert named == sorted(marker for pair in pairs for marker in pair)
+    path, _ = read_camera_path(tmp_path / "o.csv")
+    # As without the wrong markers, of which few frames have others.
+    assert np.nanmax(error_m(path, room)[shows_all_markers(path)]) < 0.02
+
+
+def test_two_markers_at_one_place_are_refused(room, tmp_path):
+    corners_m = wall_markers()
+    write_marker_corners(tmp_path / "wrong.csv", corners_m | {5: corners_m[40]})
+    message = r"wrong\.csv, line 11, marker 40: .* found both markers at the place of marker 5"
+    with pytest.raises(InputError, match=message):
+        run(room.video, "--markers", tmp_path / "wrong.csv", "--fov", "70,55.4", "--out", tmp_path / "o.csv")
+    assert not (tmp_path / "o.csv").exists()
+
+
 def test_frames_with_few_or_no_markers_are_reported(room, tmp_path):
     source = open_source(room.folder / "images", fps=FPS)
     raw = localise_video(source, room.marker_map, LENS, LocaliseSettings(filter=None)).path
@@ -673,9 +702,7 @@ def test_an_unreadable_folder_is_named(tmp_path, monkeypatch):
 
 def test_a_broken_image_is_named(tmp_path):
     (tmp_path / "a1.png").write_bytes(b"no image")
-    with pytest.raises(
-        InputError, match=r"a1.png: expected an image, found a file that OpenCV cannot decode"
-    ):
+    with pytest.raises(InputError, match=r"a1.png: expected an image, found a file that is no PNG"):
         open_source(tmp_path, fps=25.0)
 
 

@@ -2,10 +2,11 @@
 
 import re
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -689,6 +690,35 @@ def test_several_wrong_markers_are_all_named():
         ("corner order", (6,)),
         ("exchanged", (11, 15)),
     }
+
+
+@pytest.fixture(scope="module")
+def noisy_sightings():
+    return sightings(noise_px=0.3)
+
+
+@pytest.mark.slow
+@given(
+    pairs=st.lists(st.sampled_from(list(combinations(ROOM, 2))), min_size=1, max_size=3, unique=True),
+    rolls=st.tuples(st.integers(0, 3), st.integers(0, 3)),
+    left_out=st.sets(st.sampled_from(list(ROOM)), max_size=4),
+)
+@settings(max_examples=6)
+def test_exchanged_markers_are_findings(noisy_sightings, pairs, rolls, left_out):
+    """Also with their corners counted from others, with pairs that share a marker, and in a part of the map."""
+    given_m = dict(ROOM)
+    for one, other in pairs:
+        given_m[one], given_m[other] = (
+            np.roll(given_m[marker], roll, axis=0) for marker, roll in zip((other, one), rolls, strict=True)
+        )
+    kept = {marker: corners for marker, corners in given_m.items() if marker not in left_out}
+    checkup = check_map(noisy_sightings, MarkerMap(kept))
+    wrong = {marker for marker, corners in kept.items() if not np.array_equal(corners, ROOM[marker])}
+    named = {marker for finding in checkup.findings for marker in finding.markers}
+    assert named == wrong
+    if rolls == (0, 0) and len({marker for pair in pairs for marker in pair}) == 2 * len(pairs):
+        exchanged = {pair for pair in pairs if not left_out & set(pair)}
+        assert {one.markers for one in checkup.findings if one.kind == "exchanged"} == exchanged
 
 
 def test_a_map_of_another_room_is_one_finding():

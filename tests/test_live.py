@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import listening_at
 from network_cameras import (
     CAMERAS,
     EFFORT,
@@ -146,11 +147,13 @@ def test_rows_come_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> 
                 break
         assert live.poll() is None, live.communicate()
         time.sleep(0.1)
+    assert listening_at(live.pid) == {"127.0.0.1"}
     # The server listens before anything is compiled, so a client that comes then gets all rows.
     with client.connect(f"ws://127.0.0.1:{port}") as connection:
         received = list(connection)
     _, err = live.communicate(timeout=60)
     assert live.returncode == 0, err
+    assert f"rows are sent to clients of ws://127.0.0.1:{port}\n" in err
     assert received == lines.read_text().splitlines()
     assert received, (tmp_path / "live.json").read_text()
     assert json.loads(received[-1])["status"] == "tracked"

@@ -175,6 +175,15 @@ def test_a_wrong_map_is_reported_and_changes_the_exit_status(walk, tmp_path):
     assert "marker 22: it is 0.11 m from where the map has it" in said.output
 
 
+def test_exchanged_markers_are_reported(walk, tmp_path):
+    write_marker_corners(tmp_path / "wrong.csv", CORNERS | {7: CORNERS[22], 22: CORNERS[7]})
+    words = ("--check", tmp_path / "wrong.csv", "--camera", walk / "lens.toml", "--json", "-")
+    result = CliRunner().invoke(map_markers, [str(word) for word in (walk / "walk.avi", *words)])
+    assert result.exit_code == FOUND
+    findings = json.loads(result.stdout)["findings"]
+    assert [(one["kind"], one["markers"]) for one in findings] == [("exchanged", [7, 22])]
+
+
 def test_a_map_from_motion_capture(tmp_path):
     write_c3d(tmp_path / "room.c3d", recorded_corners(ROOM))
     out = tmp_path / "corners.csv"

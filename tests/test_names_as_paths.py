@@ -1,21 +1,27 @@
 """Names in files of strangers never lead out of the folder that a command writes to."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import flight_files
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from test_bad_input_limits import check_line
 
+from psotrack.archives import Manifest
+from psotrack.archives.sealed_zip import write_sealed
+from psotrack.detection import LabelSettings, write_data_set
 from psotrack.errors import InputError, PsotrackError
-from psotrack.exchange import export_tracks
+from psotrack.exchange import Footage, export_tracks
 from psotrack.flights import TrackedFlight
+from psotrack.live import RecordingFolder
 from psotrack.overlay import OverlayOptions, write_overlays
 from psotrack.recordings import Recording
 from psotrack.silhouettes import masks_out
-from psotrack.support import check_file_name
+from psotrack.support import check_file_name, no_progress
 from psotrack.trajectories import read_trajectories, write_trajectories
 
 #: Names that lead elsewhere, that are no names of files, or that are too long.
@@ -128,6 +134,63 @@ def test_a_camera_of_a_recording_file(name, tmp_path, run_psotrack):
     assert output.code == 2
     check_line(output, folder)
     assert not list(tmp_path.rglob("*evil*"))
+
+
+@pytest.mark.parametrize("name", ["../evil", "..", "CON:", "a*b"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("silhouettes", "{flight}", "--masks", "{out}"),
+        ("detect", "{flight}", "--blobs", "--out", "{out}"),
+        ("overlay", "{tracks}", "{flight}", "--out", "{out}"),
+        ("export", "{tracks}", "{flight}", "--to", "mot", "--drone-size", "0.3,0.3,0.1", "--out", "{out}"),
+        ("labels", "{flight}", "{other}", "--drone-size", "0.3,0.3,0.1", "--out", "{out}"),
+        ("live", "{flight}", "--replay", "--lines", "--record", "{out}"),
+        ("track", "{flight}", "--out", "{out}.csv"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_commands_that_name_files_like_cameras(words, name, tmp_path, run_psotrack):
+    """Refused in one line, in which the recording is named, and nothing is written."""
+    folder = flight_files.make_sequence(tmp_path / "flight")
+    for file in (folder / "recording.toml", folder / "rig.toml"):
+        file.write_text(file.read_text().replace("[cameras.c0]", f"[cameras.{json.dumps(name)}]"))
+    other = flight_files.make_sequence(tmp_path / "other")
+    tracks = flight_files.make_tracks_file(tmp_path / "tracks.csv")
+    before = everything_in(tmp_path)
+    places = {"flight": folder, "other": other, "tracks": tracks, "out": tmp_path / "in" / "out"}
+    check_line(run_psotrack(*(word.format(**places) for word in words)), folder, name)
+    assert everything_in(tmp_path) == before
+
+
+def test_names_of_cameras_in_labels(evil_recording, tmp_path):
+    other = replace(evil_recording, name="other")
+    with pytest.raises(InputError, match=r"found 'flight_\.\./evil'"):
+        write_data_set([evil_recording, other], tmp_path / "in" / "out", LabelSettings((0.3, 0.3, 0.1)))
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_names_of_cameras_in_boxes_of_motchallenge(evil_recording, tmp_path):
+    footage = Footage(evil_recording, np.full((2, 3), 0.3))
+    with pytest.raises(InputError, match=r"found 'flight-\.\./evil'"):
+        export_tracks(flight_files.make_tracks(), "mot", tmp_path / "in" / "out", footage=footage)
+    assert not [path for path in (tmp_path / "in").rglob("*") if path.is_file()]
+
+
+def test_names_of_cameras_in_a_recording_of_a_live_session(evil_recording, tmp_path):
+    folder = RecordingFolder(tmp_path / "in" / "out", evil_recording, evil_recording.rig.names)
+    with pytest.raises(InputError, match=r"found '\.\./evil'"):
+        folder.begin()
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_names_of_files_in_an_archive(tmp_path):
+    """An archive that nobody can unpack is not written; cameras give names to files in archives."""
+    manifest = Manifest(psotrack="0.2.0", sequence="flight", tracks="tracks.csv", settings={})
+    for name in ("detections/../evil.csv", "silhouettes/..", "/evil", "a\\b"):
+        with pytest.raises(InputError, match=r"a\.psotrack: expected names of files inside of the folder"):
+            write_sealed(tmp_path / "a.psotrack", manifest, {name: b"x"}, force=False, report=no_progress)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["../evil", "/tmp/evil", "a/b", "..", "a\\b"])

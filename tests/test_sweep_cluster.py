@@ -1,13 +1,17 @@
 """Sweeps as tasks of a Dask cluster: when a worker is killed, its cell runs again, and the results are complete."""
 
 import json
+import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+import test_signals
+from helpers import listening_at
 from sweeps import all_rows, environment, grid_file, psotrack, small_sequence
 
 from psotrack.errors import InputError, SettingsError
@@ -61,34 +65,32 @@ def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
         run_on_cluster(read_grid(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)
 
 
-#: Starts the local cluster of a sweep, and prints the addresses at which its processes listen.
-LISTENING = """
-import json
-import distributed
-import psutil
-from psotrack.sweep import cluster
-
-if __name__ == "__main__":
-    with cluster._client(distributed, "local", 2):
-        me = psutil.Process()
-        found = [
-            connection.laddr.ip
-            for process in (me, *me.children(recursive=True))
-            for connection in process.net_connections()
-            if connection.status == psutil.CONN_LISTEN
-        ]
-        print(json.dumps(found))
-"""
-
-
 @pytest.mark.slow
-def test_a_local_cluster_listens_on_the_loopback_only(tmp_path):
-    script = tmp_path / "listening.py"
-    script.write_text(LISTENING)
-    result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
-    addresses = json.loads(result.stdout)
-    assert len(addresses) >= 3, "the scheduler, its dashboard and the workers"
-    assert set(addresses) <= {"127.0.0.1", "::1"}
+def test_a_local_cluster_listens_on_the_loopback_only_and_ctrl_c_ends_it_with_one_line(
+    tmp_path_factory, tmp_path
+):
+    root, results = small_sequence(tmp_path_factory), tmp_path / "results"
+    # A cell of minutes, so that Ctrl-C comes while a worker computes.
+    grid = grid_file(tmp_path, [100_000], runs=100)
+    words = ("sweep", grid, "--data", root, "--out", results, "--cluster", "local", "--workers", 2)
+    process = test_signals.start(test_signals.AT_A_TERMINAL, *words, env=environment(root))
+    try:
+        line = process.stderr.readline()
+        end_s = time.monotonic() + 120
+        while not list(results.glob("cells/*.lock")) and time.monotonic() < end_s:
+            time.sleep(0.1)
+        time.sleep(1.0)  # The worker is in the computation.
+        addresses = listening_at(process.pid)
+        err, took_s = test_signals.end(process, signal.SIGINT)
+    finally:
+        process.kill()
+    listens = r"the cluster listens at tcp://127\.0\.0\.1:\d+, for programs on this computer only\n"
+    assert re.fullmatch(listens, line)
+    assert addresses == {"127.0.0.1"}
+    assert err == "psotrack: interrupted; earlier results are unchanged; run the command again to finish\n"
+    assert process.returncode == 130
+    assert took_s < test_signals.LONGEST_S
+    test_signals.assert_nothing_left(process)
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from flight_files import (
     make_tracks,
     make_tracks_file,
 )
+from helpers import listening_at
 from rerun.chunk import RrdReader
 
 from psotrack import cli
@@ -359,6 +360,7 @@ def test_the_page_for_a_browser(folder):
         assert page.startswith("http://127.0.0.1:")
         with urllib.request.urlopen(page, timeout=60) as answer:
             assert b"<html" in answer.read().lower()
+        assert listening_at(process.pid) == {"127.0.0.1"}
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
     finally:

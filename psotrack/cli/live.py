@@ -151,7 +151,7 @@ def live(
         WebSocketLines,
         live_cameras,
     )
-    from psotrack.pipeline import environment, with_real_time
+    from psotrack.pipeline import environment, warn_of_missing_drones, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
@@ -192,7 +192,10 @@ def live(
         server = (
             None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
         )
-        outputs += [] if server is None else [server]
+        if server is not None:
+            outputs.append(server)
+            if not quiet:
+                click.echo(f"rows are sent to clients of {server.address}", err=True)
         if kept is not None:
             kept.begin()
             stack.callback(kept.end)
@@ -208,6 +211,7 @@ def live(
             table.show(result, films)
 
         result = session.run([*rows, *outputs], show, longest_s=seconds or float("inf"))
+    warn_of_missing_drones(chosen, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}

@@ -118,7 +118,7 @@ def sweep(
     if where_to_run is None:
         outcome = _run_here(grid, out, data, cache, jobs, device, report_to(quiet))
     else:
-        outcome = _run_on_cluster(grid, out, data, cache, where_to_run, report_to(quiet))
+        outcome = _run_on_cluster(grid, out, data, cache, where_to_run, quiet)
     counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
     output_json(json_path, counts, force)
     failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
@@ -150,14 +150,21 @@ def _run_here(
 
 
 def _run_on_cluster(
-    grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster, report: Report
+    grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster, quiet: bool
 ) -> SweepOutcome:
     """Run the cells as tasks of a cluster's workers."""
     from psotrack.support import use_device
     from psotrack.sweep import run_on_cluster
 
     use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
-    return run_on_cluster(grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=report)
+
+    def say(address: str) -> None:
+        if not quiet:
+            click.echo(f"the cluster listens at {address}, for programs on this computer only", err=True)
+
+    return run_on_cluster(
+        grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=report_to(quiet), say=say
+    )
 
 
 @click.command()

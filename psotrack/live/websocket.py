@@ -63,6 +63,7 @@ class WebSocketLines:
         address: PORT, which programs on this computer reach, or HOST:PORT, where HOST is an address of this computer.
 
     Attributes:
+        address: address for clients, such as ws://127.0.0.1:9000.
         num_clients: number of clients that have connected.
         left_out: messages that were left out, because a client read too slowly.
 
@@ -82,6 +83,7 @@ class WebSocketLines:
                 found="it is not installed",
                 remedy="pip install 'psotrack[live]'",
             ) from error
+        self.address = f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
         self.num_clients = self.left_out = 0
         self._clients: dict[_Client, ServerConnection] = {}
         self._loop = asyncio.new_event_loop()

@@ -1,6 +1,13 @@
 from .causal_run import CausalRecording, CausalRun, causal_settings
 from .parts import Parts
-from .results import TrackedRecording, changed_settings, environment, real_time_factors, with_real_time
+from .results import (
+    TrackedRecording,
+    changed_settings,
+    environment,
+    real_time_factors,
+    warn_of_missing_drones,
+    with_real_time,
+)
 from .running import track_recording, track_runs
 
 __all__ = [
@@ -14,5 +21,6 @@ __all__ = [
     "real_time_factors",
     "track_recording",
     "track_runs",
+    "warn_of_missing_drones",
     "with_real_time",
 ]

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig
 from psotrack.initiation import DroneSearch, flight_volume
-from psotrack.pipeline.results import environment
+from psotrack.pipeline.results import environment, warn_of_missing_drones
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures, compute, exposures_of
@@ -178,6 +178,7 @@ class CausalRecording:
         report: Report = no_progress,
     ) -> None:
         settings = causal_settings(settings)
+        self._settings = settings
         self._report = report
         self._timed = recording.at_rate(settings.rate_hz)
         timeline = self._timed.timeline()
@@ -231,6 +232,7 @@ class CausalRecording:
                     seen += int((rows.status == Status.TRACKED).sum())
                     yield rows
                 advance(stop - first)
+        warn_of_missing_drones(self._settings, len(drones))
         self.record |= {
             "drones": len(drones),
             "tracked_rows": seen,

@@ -122,6 +122,7 @@ def finish(
         logger.warning("%s", limited)
     if not tracks.num_drones:
         return _no_drones(recording, silhouettes, run)
+    warn_of_missing_drones(settings, tracks.num_drones)
     began = time.perf_counter()
     errors = result.errors
     trajectories, identities = postprocess(
@@ -165,6 +166,13 @@ def finish(
         **environment(),
     }
     return TrackedRecording(trajectories, tracks.sizes.size_m, identities, record)
+
+
+def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:
+    """Say how many drones were seen, where the settings ask for more."""
+    count = settings.drones.count
+    if count is not None and num_drones < count:
+        logger.warning("--drones %d: only %d drones were seen; the tracks have no others", count, num_drones)
 
 
 def _no_drones(recording: Recording, silhouettes: Silhouettes | None, run: PreparedRun) -> InputError:

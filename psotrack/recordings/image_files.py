@@ -13,14 +13,15 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from psotrack.errors import InputError
+from psotrack.recordings.image_headers import PNG, claimed_size_wh
 from psotrack.recordings.opencv_messages import decode_image
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: Largest number of pixels of an image, ten times that of a large camera.
 MOST_PIXELS = 2**28
-#: First bytes of a PNG, and the least size of a part of it: length, name and checksum.
-_PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
+#: Least size of a part of a PNG: length, name and checksum.
+_PNG_PART = 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -127,14 +128,17 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
         where: the file, for messages.
 
     Raises:
-        InputError: the content is no image.
+        InputError: the content is no image of a format that psotrack reads, or would take gigabytes.
     """
-    if coded[: len(_PNG)].tobytes() == _PNG and not _is_whole_png(coded):
+    data = coded.tobytes()
+    if data.startswith(PNG) and not _is_whole_png(data):
         raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
-    if coded[: len(_PNG)].tobytes() == _PNG:
-        # The first part of a PNG says width and height, before anything takes memory.
-        width, height = (int.from_bytes(coded[at : at + 4].tobytes()) for at in (16, 20))
-        check_pixels(where, width, height)
+    size_wh = claimed_size_wh(data)
+    if size_wh is None:
+        # Of the other formats that OpenCV decodes, a few bytes can take gigabytes.
+        found = "a file that is no PNG, JPEG, BMP, TIFF, WebP or PNM"
+        raise InputError(where, expected="an image", found=found)
+    check_pixels(where, *size_wh)
     image = decode_image(coded, flags, where)
     if image is None:
         raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
@@ -148,20 +152,21 @@ def check_pixels(where: object, width: int, height: int) -> None:
         raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
 
 
-def _is_whole_png(coded: UInt8[np.ndarray, " bytes"]) -> bool:
+def _is_whole_png(data: bytes) -> bool:
     """Whether a PNG's parts up to its end are there, and those that an image needs fit their checksums.
 
     libpng writes about parts that do not straight to the terminal, which no setting of OpenCV prevents.
     """
-    data = memoryview(coded.tobytes())
-    at, name = len(_PNG), b""
+    at, name = len(PNG), b""
     while name != b"IEND":
         end = at + _PNG_PART + int.from_bytes(data[at : at + 4])
         if end > len(data):
             return False
-        name = bytes(data[at + 4 : at + 8])
+        name = data[at + 4 : at + 8]
         # The name of a part that an image needs begins with a capital letter.
-        if name[:1].isupper() and zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+        if name[:1].isupper() and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(
+            data[end - 4 : end]
+        ):
             return False
         at = end
     return True

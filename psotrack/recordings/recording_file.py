@@ -14,7 +14,7 @@ import msgspec
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key
 from psotrack.recordings.timing import check_rate
-from psotrack.support import atomic_write, convert, read_toml, toml_key, toml_value
+from psotrack.support import atomic_write, check_file_name, convert, read_toml, toml_key, toml_value
 
 #: Name of the file in a folder.
 RECORDING_FILE = "recording.toml"
@@ -218,8 +218,10 @@ def _check_names(path: Path, tables: Mapping[str, Any]) -> None:
     """Raise `InputError` for a name that cannot be the name of a file, and for two spellings of one name."""
     spellings: dict[str, str] = {}
     for name in tables:
-        if not name.strip() or not name.isprintable() or any(mark in name for mark in "/\\,="):
-            raise _error(path, "cameras", "names without slashes, commas and equals signs", repr(name))
+        check_file_name(name, f"{path}, cameras")
+        # Options have lists of names, and pairs of a name and a value.
+        if set(name) & set(",="):
+            raise _error(path, "cameras", "names without commas and equals signs", repr(name))
         key = camera_key(name)
         if key in spellings:
             raise _error(

@@ -12,7 +12,7 @@ import logging
 import os
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import lru_cache
@@ -121,6 +121,7 @@ def run_on_cluster(
     cache: Path | str,
     cluster: Cluster = Cluster(),
     report: Report = no_progress,
+    say: Callable[[str], object] = lambda address: None,
 ) -> SweepOutcome:
     """Run the unfinished cells of a grid as tasks of a cluster; see `runner.run_in_process` for runs without a cluster.
 
@@ -131,6 +132,7 @@ def run_on_cluster(
         cache: folder of the stored silhouettes and of compiled programs.
         cluster: the cluster.
         report: progress bar for the cells.
+        say: receives the address at which the scheduler of a local cluster listens.
 
     Raises:
         InputError: a sequence does not exist, or there is no cluster at the address.
@@ -155,7 +157,7 @@ def run_on_cluster(
     with report("sweep", len(cells) + len(results)) as advance:
         advance(len(results))
         if cells:
-            with _client(dask, cluster.address, workers) as client:
+            with _client(dask, cluster.address, workers, say) as client:
                 for result in _results(dask, client, cells, job, inputs, store):
                     results.append(result)
                     advance(1)
@@ -176,7 +178,7 @@ def _distributed() -> Any:
 
 
 @contextlib.contextmanager
-def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
+def _client(dask: Any, address: str, workers: int, say: Callable[[str], object]) -> Iterator[Client]:
     if address == "local":
         with (
             dask.LocalCluster(
@@ -189,6 +191,8 @@ def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
             ) as cluster,
             dask.Client(cluster) as client,
         ):
+            client.register_plugin(_quiet_worker(dask))
+            say(cluster.scheduler_address)
             yield client
         return
     _warn_of_open_network(address)
@@ -199,6 +203,19 @@ def _client(dask: Any, address: str, workers: int) -> Iterator[Client]:
         raise InputError("--cluster", expected=f"a Dask scheduler at {address}", found=why) from error
     with client:
         yield client
+
+
+def _quiet_worker(dask: Any) -> Any:
+    """A plugin for local workers, which write to the terminal of the sweep.
+
+    What happens to a cell is in its result. When Ctrl-C ends the cluster, workers would report their cancelled tasks.
+    """
+
+    class QuietWorker(dask.WorkerPlugin):
+        def setup(self, worker: object) -> None:
+            logging.getLogger("distributed").setLevel(logging.CRITICAL)
+
+    return QuietWorker()
 
 
 def _result_without_worker(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
