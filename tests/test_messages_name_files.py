@@ -51,6 +51,14 @@ BOARD = ("--squares", "10x7", "--square", "0.025", "--out", "out.toml")
 BY_POINT = ("--points", "--lenses", "{flight}/rig.toml", "--out", "out.toml")
 
 
+def test_a_setting_of_a_config_names_the_file_and_a_typed_one_does_not(files, flight, run_psotrack):
+    (files / "run.toml").write_text("particles = -5\n")
+    words = ("track", flight, "--config", "run.toml", "--out", "out.csv")
+    check_line(run_psotrack(*words), "run.toml, swarm.particles: expected", "found -5")
+    typed = run_psotrack(*words, "--particles", "-6")
+    check_line(typed, "psotrack: swarm.particles: expected", "found -6")
+
+
 @pytest.mark.parametrize(
     ("words", "names"),
     [
