@@ -155,7 +155,7 @@ def test_the_made_images_are_images_where_their_size_is_true(make, tmp_path):
 @pytest.mark.parametrize("make", FORMATS)
 def test_headers_that_are_cut_short(make, tmp_path):
     path, data = tmp_path / "a.png", make(WIDTH, HEIGHT)
-    for length in range(1, 40):
+    for length in range(1, 40, 3):
         path.write_bytes(data[:length])
         with pytest.raises(InputError, match=r"a\.png: expected an image, found"):
             read_image(path)

@@ -203,7 +203,9 @@ def test_a_video_gives_the_same_path_as_its_images(room, tmp_path):
     np.testing.assert_allclose(video.position_m, images.position_m, atol=0.005)
 
 
-@pytest.mark.parametrize(("pairs", "roll"), [([(5, 8)], 0), ([(5, 20), (14, 29)], 1)])
+@pytest.mark.parametrize(
+    ("pairs", "roll"), [([(5, 8)], 0), pytest.param([(5, 20), (14, 29)], 1, marks=pytest.mark.slow)]
+)
 def test_exchanged_markers_of_a_map_are_named(room, tmp_path, pairs, roll):
     """Also where the map counts their corners from another one."""
     corners_m = wall_markers()

@@ -136,7 +136,7 @@ def test_a_camera_of_a_recording_file(name, tmp_path, run_psotrack):
     assert not list(tmp_path.rglob("*evil*"))
 
 
-@pytest.mark.parametrize("name", ["../evil", "..", "CON:", "a*b"])
+@pytest.mark.parametrize("name", ["../evil", ".."])
 @pytest.mark.parametrize(
     "words",
     [

@@ -12,7 +12,7 @@ import numpy as np
 
 from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
 from psotrack.cli.output import output_json
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -70,11 +70,12 @@ def evaluate(
         raise InputError(sequence, expected="a reference to compare with", found="none")
     estimate = read_tracks(tracks, recording=recording)
     recording = _at_rate_of(estimate, recording)
-    truth, offset_s = recording.truth, 0.0
+    truth, offset_s, both = recording.truth, 0.0, f"{tracks} and {sequence}"
     assert truth is not None
     if offset is not None:
-        truth, offset_s = _shifted_reference(recording, estimate, offset)
-    evaluation = compare(estimate, truth)
+        truth, offset_s = _shifted_reference(recording, estimate, offset, where=both)
+    with errors_name(both):
+        evaluation = compare(estimate, truth)
     content = evaluation.to_dict() | ({"reference_offset_s": offset_s} if offset else {})
     output_json(json_path, content, force)
     if plot is not None:
@@ -100,7 +101,7 @@ def _at_rate_of(estimate: Trajectories, recording: Recording) -> Recording:
 
 
 def _shifted_reference(
-    recording: Recording, estimate: Trajectories, offset: str
+    recording: Recording, estimate: Trajectories, offset: str, *, where: str
 ) -> tuple[Trajectories, float]:
     """The reference at the frames of the videos, and the time by which the reference's clock is ahead, seconds."""
     from psotrack.clocks import find_offset, own_reference, shifted
@@ -108,7 +109,8 @@ def _shifted_reference(
     reference = own_reference(recording)
     if offset == "auto":
         clock = (reference.time_s, reference.position_m, reference.orientation_wxyz)
-        offset_s = find_offset(estimate, *clock, max_offset_s=2.0).offset_s
+        with errors_name(where):
+            offset_s = find_offset(estimate, *clock, max_offset_s=2.0).offset_s
     else:
         try:
             offset_s = float(offset)

@@ -18,7 +18,7 @@ import click
 import msgspec
 
 from psotrack import __version__
-from psotrack.cli.options import Command, Numbers, Size
+from psotrack.cli.options import Command, Numbers, Size, setting_name
 from psotrack.errors import InputError, SettingsError
 from psotrack.support import (
     atomic_write,
@@ -36,6 +36,8 @@ _logger = logging.getLogger(__name__)
 _TYPED = {"config", "save_config", "force", "help"}
 #: Keys about the file itself: the command that the file is for, and the version that wrote it.
 _COMMAND, _VERSION = "command", "psotrack"
+#: Key of the path of `--config` in the notes of a command.
+_CONFIG = "psotrack.config"
 _WIDTH = 100
 
 
@@ -75,7 +77,13 @@ def run_file_options(command: Command) -> Command:
                     "--save-config", expected="a file that ends in .toml", found=save_config.name
                 )
             refuse_to_overwrite(save_config, context.params.get("force", False))
-        command(*args, **options)
+        try:
+            command(*args, **options)
+        except SettingsError as error:
+            named = {f"{setting_name(name)}:" for name in _from_config(context)}
+            if not str(error).startswith(tuple(named)):
+                raise
+            raise error.within(context.meta[_CONFIG]) from error
         if save_config is not None:
             with atomic_write(save_config) as temporary:
                 temporary.write_text(config_text(context, save_config.parent), encoding="utf-8")
@@ -127,7 +135,17 @@ def _take_config(context: click.Context, _: click.Parameter, path: Path | None) 
     """Make the values of a file the defaults of the command."""
     if path is None or context.resilient_parsing:
         return
+    context.meta[_CONFIG] = path
     context.default_map = {**(context.default_map or {}), **_read_config(path, context.command)}
+
+
+def _from_config(context: click.Context) -> list[str]:
+    """Names of the parameters whose values are from the file of `--config`."""
+    return [
+        param.name or ""
+        for param in _saved_params(context.command)
+        if context.get_parameter_source(param.name or "") is click.core.ParameterSource.DEFAULT_MAP
+    ]
 
 
 def _read_config(path: Path, command: click.Command) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import click
 
 from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
 from psotrack.cli.output import output_json, print_line
+from psotrack.errors import errors_name
 
 if TYPE_CHECKING:
     from psotrack.clocks import Offset
@@ -58,13 +59,14 @@ def synchronise(
     recording = open_recording(sequence, bodies=bodies)
     reference = own_reference(recording)
     estimate = read_trajectories(tracks, fps=recording.fps)
-    offset = find_offset(
-        estimate,
-        reference.time_s,
-        reference.position_m,
-        reference.orientation_wxyz,
-        max_offset_s=max_offset_s,
-    )
+    with errors_name(f"{tracks} and {sequence}"):
+        offset = find_offset(
+            estimate,
+            reference.time_s,
+            reference.position_m,
+            reference.orientation_wxyz,
+            max_offset_s=max_offset_s,
+        )
     output_json(json_path, _content(offset, estimate, reference), force)
     if plot is not None:
         save_curve(plot if plot.name else tracks.with_suffix(".offset.png"), offset, force=force)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.errors import InputError, SettingsError, check_positive, errors_name
 from psotrack.geometry import Rig, chosen_cameras
 from psotrack.recordings.detections import read_detections
 from psotrack.recordings.stored_silhouettes import StoredSilhouettes
@@ -157,7 +157,8 @@ class Recording:
 
     @cached_property
     def _timeline(self) -> Timeline:
-        timeline = make_timeline(self._times, self.rate_hz)
+        with errors_name(self.folder):
+            timeline = make_timeline(self._times, self.rate_hz)
         line_time_s = np.array([self.line_time_s.get(name, 0.0) for name in timeline.cameras])
         if line_time_s.any():
             timeline = replace(timeline, line_time_s=line_time_s)

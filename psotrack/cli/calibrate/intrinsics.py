@@ -10,7 +10,7 @@ import numpy as np
 from psotrack.cli.calibrate.options import LENS, OUT, board_of, board_options
 from psotrack.cli.options import FORCE, JSON, reporting
 from psotrack.cli.output import output_json, print_line, print_table, report_to
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, errors_name
 from psotrack.support import refuse_to_overwrite
 
 #: Names of the distortion coefficients in OpenCV's order.
@@ -68,7 +68,9 @@ def intrinsics(
         raise SettingsError("board", expected="--squares, the number of squares", found="none")
     board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary, first_marker)
     (images,) = open_images([video], [name] if name else None)
-    found = lens_of_board(images, board, parse_lens_model(lens), report_to(quiet))
+    model = parse_lens_model(lens)
+    with errors_name(video):
+        found = lens_of_board(images, board, model, report_to(quiet))
     # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.
     write = write_lenses if out.suffix.lower() == ".toml" else write_rig
     write(out, make_rig({images.name: found.camera}), force=force)

@@ -20,7 +20,7 @@ from psotrack.cli.calibrate.rig_points import (
 from psotrack.cli.calibrate.shown import show_cameras
 from psotrack.cli.options import FORCE, JSON, plot_option, reporting
 from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table, report_to
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, errors_name
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
@@ -175,7 +175,8 @@ def rig(
             else f"camera {calibrated.rig.names[0]}: x right, y down, z forward; --floor and --world place it elsewhere"
         )
     else:
-        change, left_m = fit_world(calibrated.rig, given, with_scale=False)
+        with errors_name(given.path):
+            change, left_m = fit_world(calibrated.rig, given, with_scale=False)
         calibrated, place = in_new_world(calibrated, change), in_words(given.path, left_m)
     _write(out, calibrated.rig, force)
     if plot is not None:
@@ -218,13 +219,17 @@ def _by_board(
         cameras = open_images(sources, names.split(",") if names else None)
         instants = instants_of_numbers(cameras, floor)
     report = report_to(quiet)
-    found = find_views(board, cameras, instants, report)
+    named = f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else f"{sources[0]}"
+    with errors_name(named):
+        found = find_views(board, cameras, instants, report)
     every = {camera.name: len(camera.frames) for camera in cameras}
     searched = dict(zip(found.views.names, found.searched.tolist(), strict=True))
     said = say_print(found)
     for sentence in [*say_searched({name: (count, every[name]) for name, count in searched.items()}), *said]:
         print_line(quiet, json_path, sentence)
-    return calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report), said
+    with errors_name(named):
+        calibrated = calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report)
+    return calibrated, said
 
 
 def _report(

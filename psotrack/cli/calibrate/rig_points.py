@@ -10,7 +10,7 @@ import numpy as np
 
 from psotrack.cli.calibrate.located import locate_cameras
 from psotrack.cli.calibrate.shown import row_of
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
     from psotrack.calibration import PointRig, PointViews, Similarity
@@ -71,7 +71,8 @@ def calibrate_points(
         )
     views = _read_views(sources)
     if distance is not None:
-        check_two_cameras(views.names, *distance[:2])
+        with errors_name(sources[0]):
+            check_two_cameras(views.names, *distance[:2])
     if stick_m is not None and not views.point.any():
         raise InputError(
             sources[0],
@@ -79,7 +80,8 @@ def calibrate_points(
             found="one point",
         )
     lenses = known_lenses_of(views.names, lenses_path)
-    found = calibrate_by_point(lenses, views)
+    with errors_name(sources[0]):
+        found = calibrate_by_point(lenses, views)
     stated = None if world is None else read_world(world)
 
     def world_of(found: PointRig) -> Similarity:
@@ -90,7 +92,8 @@ def calibrate_points(
             return world_of_camera(rig, 0, distance[2] / distance_between(rig, *distance[:2]))
         return world_of_camera(rig, 0, (stick_m or 1.0) / stick_length(found))
 
-    change = world_of(found)
+    with errors_name(sources[0] if world is None else world):
+        change = world_of(found)
     covariance = covariance_of_centres(found, world_of)
     if stated is not None:
         _, left = fit_world(found.adjusted.rig, stated, _numbered(found), with_scale=True)
@@ -190,7 +193,8 @@ def calibrate_pairs(
         }
     lenses = known_lenses_of(tuple(marks), lenses_path)
     by_name = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
-    found, rows = locate_cameras(marks, by_name, noise_px)
+    with errors_name(pairs or markers):
+        found, rows = locate_cameras(marks, by_name, noise_px)
     return found, rows, [f"the world is that of {pairs or markers}"]
 
 
@@ -251,7 +255,8 @@ def _read_views(sources: tuple[Path, ...]) -> PointViews:
     if not recording.detections:
         raise InputError(sources[0], expected="detections of a moving point", found="none")
     boxes = {name: read_detections(path) for name, path in recording.detections.items()}
-    if not any(name in recording.frame_times for name in boxes):
-        # Detections without any times, as in a folder of the dataset without videos.
-        return views_of_detections(boxes)
-    return views_of_detections(boxes, recording.frame_times, recording.line_time_s)
+    with errors_name(sources[0]):
+        if not any(name in recording.frame_times for name in boxes):
+            # Detections without any times, as in a folder of the dataset without videos.
+            return views_of_detections(boxes)
+        return views_of_detections(boxes, recording.frame_times, recording.line_time_s)
