@@ -36,7 +36,8 @@ class RowStream:
 
     Args:
         path: path that ends in .csv or .parquet.
-        force: replace an existing file.
+        force: replace an existing file. The first row replaces a CSV file, because the file grows row by row; a Parquet
+            file is replaced at the end.
 
     Raises:
         InputError: the path has another suffix.
@@ -60,8 +61,10 @@ class RowStream:
     def __enter__(self) -> RowStream:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            # Not buffered: what a full disk does not take is known at once, and not written later.
-            self._file = self._rows_path.open("wb", buffering=0)
+            self._replaces = self._rows_path.is_file()
+            # Appending, because an older file stays until the first row. Not buffered: what a full disk does not take
+            # is known at once, and not written later.
+            self._file = self._rows_path.open("ab", buffering=0)
         except OSError as error:
             raise self._error(error) from error
         return self
@@ -77,6 +80,9 @@ class RowStream:
         writer.writerows(words_of(columns))
         rows = text.getvalue().encode()
         try:
+            if self._replaces:
+                self._file.truncate(0)
+                self._replaces = False
             rest = memoryview(rows)
             while rest:
                 rest = rest[self._file.write(rest) :]
@@ -99,8 +105,9 @@ class RowStream:
         except OSError as failed:
             raise self._error(failed) from failed
         if not self._num_bytes:
-            # An empty file would only be in the way of the next session. Links to devices stay.
-            if self._rows_path.is_file():
+            # An empty file would only be in the way of the next session. Links to devices stay, and so does an older
+            # file after an error.
+            if self._rows_path.is_file() and not (self._replaces and kind):
                 self._rows_path.unlink()
             return
         if not self._is_parquet:
