@@ -18,6 +18,9 @@ from flight_files import make_sequence, make_tracks_file
 from helpers import make_once, ring_rig
 from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
 from test_cli_calibrate import pairs_of
+from test_fuse_command import make_files
+from test_map_markers import make_walk
+from test_synchronisation import make_recording
 
 from psotrack.rig_files import write_rig
 
@@ -95,6 +98,9 @@ def inputs(tmp_path_factory, root):
         rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
         write_rig(folder / "lenses.yml", rig)
         pairs_of(folder / "pairs.csv", rig)
+        for name, make_inputs in (("walk", make_walk), ("fuse", make_files), ("clocks", make_recording)):
+            (folder / name).mkdir()
+            make_inputs(folder / name)
         tracked = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
         assert tracked.returncode == 0, tracked.stderr
         sequence = root / "Simulated_Data" / "S01_D2_A"
@@ -135,6 +141,19 @@ COMMANDS = {
         "rig.toml",
     ): "calibrate extrinsics --pairs {inputs}/pairs.csv --intrinsics {inputs}/lenses.yml --out rig.toml "
     "--force",
+    (
+        "rig.yml",
+    ): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.yml --force",
+    ("camera.csv",): "localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    "--out camera.csv --force --frames 8 --quiet",
+    ("corners.csv",): "map-markers {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    "--known 7 --out corners.csv --force --quiet",
+    (
+        "markers.csv",
+    ): "detect-markers {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
+    ("fused.csv",): "fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
+    ("offset.png",): "synchronise {inputs}/clocks/tracks.csv {inputs}/clocks/Real_Data/R12_D2 --max-offset 1 "
+    "--plot offset.png --force",
     ("doctor.json",): "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
 }
 
@@ -143,7 +162,7 @@ COMMANDS = {
 @pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
 def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, monkeypatch, names):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
-    words = COMMANDS[names].format(root=root, inputs=inputs).split()
+    words = COMMANDS[names].format(root=root, inputs=inputs, walk=inputs / "walk" / "walk.avi").split()
 
     def reset():
         for path in disk.place.iterdir():

@@ -177,6 +177,7 @@ def test_a_folder_that_cannot_be_written_is_no_error(filled: tuple[Path, str], t
     assert run(SMOOTHING, tmp_path / "file" / "compiled")[0] == filled[1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="limits on the size of files are a matter of Unix")
 def test_a_full_disk_costs_no_result_and_leaves_no_program_cut_short(
     filled: tuple[Path, str], tmp_path: Path
