@@ -15,10 +15,8 @@ from psotrack.inside_out import read_camera_path, write_camera_path
 from psotrack.trajectories import read_trajectories, write_trajectories
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    """Folder with two camera paths and with tracks that have an identity swap at frame 60, and the ground truth."""
-    folder = tmp_path_factory.mktemp("fuse")
+def make_files(folder):
+    """Write two camera paths, and tracks that have an identity swap at frame 60; the ground truth."""
     paths, outside, truths = recording(31, 100, num_drones=2, distance_m=1.5)
     outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
     paths["dron1"] = remove_poses(paths["dron1"], slice(20, 30))
@@ -29,7 +27,14 @@ def files(tmp_path_factory):
     write_camera_path(folder / "blind.csv", remove_poses(paths["dron1"], slice(0, 100)), "dron3")
     for name, path in paths.items():
         write_camera_path(folder / f"{name}.csv", path, name)
-    return folder, truths
+    return truths
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The folder that `make_files` fills, and the ground truth."""
+    folder = tmp_path_factory.mktemp("fuse")
+    return folder, make_files(folder)
 
 
 def run(*words):

@@ -72,10 +72,8 @@ def draw_image(cam):
     return cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
 
 
-@pytest.fixture(scope="module")
-def walk(tmp_path_factory):
-    """A folder with a video of the two walls, `walk.avi`, and the lens, `lens.toml`."""
-    folder = tmp_path_factory.mktemp("walk")
+def make_walk(folder):
+    """Write a video of the two walls, `walk.avi`, the lens, `lens.toml`, and the corners, `truth.csv`."""
     write_rig(folder / "lens.toml", make_rig({"gopro": LENS}))
     with VideoWriter(folder / "walk.avi", 25.0, SIZE_WH) as writer:
         for turn in np.linspace(0, 2 * np.pi, 24):
@@ -86,6 +84,12 @@ def walk(tmp_path_factory):
             writer.write(draw_image(make_camera(R=R, t_m=t_m, K=LENS.K, image_size_wh=SIZE_WH)))
     write_marker_corners(folder / "truth.csv", CORNERS)
     return folder
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """The folder that `make_walk` fills."""
+    return make_walk(tmp_path_factory.mktemp("walk"))
 
 
 def centres_off_m(path):

@@ -40,6 +40,20 @@ def test_json_for_the_null_device_needs_no_force(run_psotrack, flight, force):
     assert is_device("/dev/null")
 
 
+@pytest.mark.parametrize(("name", "force"), [("older.json", []), ("folder", ["--force"])])
+def test_json_that_cannot_be_written_is_refused_before_the_work(
+    run_psotrack, flight, tmp_path, monkeypatch, name, force
+):
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "older.json").write_text("older")
+    (tmp_path / "folder").mkdir()
+    result = run_psotrack("track", flight, "--out", tmp_path / "t.csv", "--json", tmp_path / name, *force)
+    assert result.code == 2
+    assert f"{name}: expected" in result.err
+    assert result.err.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "older.json"]
+
+
 @pytest.mark.parametrize("force", [[], ["--force"]])
 def test_a_full_device_is_named_and_not_replaced(run_psotrack, flight, force):
     result = run_psotrack("info", flight, "--json", "/dev/full", *force)

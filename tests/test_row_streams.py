@@ -143,6 +143,31 @@ def test_a_disk_that_takes_nothing_is_one_line(tmp_path: Path) -> None:
         rows.write(_frames(_flight())[0])
 
 
+@pytest.mark.parametrize("name", ["rows.csv", "rows.parquet"])
+def test_an_older_file_stays_until_the_first_row(tmp_path: Path, name: str) -> None:
+    path, flight = tmp_path / name, _flight()
+    record = tmp_path / "rows.json"
+    record.write_text("about the older rows")
+    write_trajectories(path, flight)
+    older = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt), RowStream(path, force=True, record=record):
+        raise KeyboardInterrupt
+    assert path.read_bytes() == older
+    assert {each.name for each in tmp_path.iterdir()} == {name, "rows.json"}
+    with RowStream(path, force=True, record=record) as rows:
+        for frame in _frames(flight)[:2]:
+            rows.write(frame)
+    assert read_trajectories(path).num_frames == 2
+    assert [each.name for each in tmp_path.iterdir()] == [name]
+
+
+def test_a_session_without_rows_leaves_no_older_rows(tmp_path: Path) -> None:
+    (tmp_path / "rows.csv").write_text("older")
+    with RowStream(tmp_path / "rows.csv", force=True):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(("name", "kept"), [("rows.csv", "rows.csv"), ("rows.parquet", "rows.rows.csv")])
 def test_a_killed_process_leaves_all_its_rows(tmp_path: Path, name: str, kept: str) -> None:
     done = _write_in_a_process(tmp_path / name, "", "if index == 99: os.kill(os.getpid(), signal.SIGKILL)")

@@ -195,6 +195,26 @@ def test_a_folder_that_cannot_be_written_is_no_error(filled: tuple[Path, str], t
     assert run(SMOOTHING, tmp_path / "file" / "compiled")[0] == filled[1]
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="limits on the size of files are a matter of Unix")
+def test_a_full_disk_costs_no_result_and_leaves_no_program_cut_short(
+    filled: tuple[Path, str], tmp_path: Path
+) -> None:
+    """A limit on the size of files stands for a full disk. JAX itself leaves entries cut short, which are not used."""
+    limited = (
+        "import resource, sys; sys.dont_write_bytecode = True; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (999, 999))"
+    )
+    assert run(limited + SMOOTHING, tmp_path)[0] == filled[1]
+    assert not [
+        path.name for path in tmp_path.iterdir() if path.suffix == ".program" or "partial" in path.name
+    ]
+    assert run(SMOOTHING, tmp_path)[0] == filled[1]
+    printed, log = run(SMOOTHING, tmp_path)
+    assert printed == filled[1]
+    assert not traces(log, "_smoothed")
+
+
 def test_a_loaded_program_may_call_lapack(tmp_path: Path) -> None:
     """The first process, which traces, and the second print the largest eigenvalue, 5, and 2 * 3."""
     printed, log = run(OTHERS, tmp_path)

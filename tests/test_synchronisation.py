@@ -427,10 +427,9 @@ class TestCameraOffsets:
             camera_offsets(RIG, np.zeros((10, 1, 8, 2)), FPS, max_offset_frames=0.0)
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
+def make_recording(root):
     """A real sequence with black videos, and tracks. The .c3d file, at 100 Hz, begins 0.4321 s before the videos."""
-    folder = tmp_path_factory.mktemp("data") / "Real_Data" / "R12_D2"
+    folder = root / "Real_Data" / "R12_D2"
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
     one = make_camera(
@@ -449,9 +448,15 @@ def recording(tmp_path_factory):
     estimate = simulate_estimate(
         random_motion(0), random_motion(1), seconds=6, start_s=0.4321, offset_s=0.4321, noise_m=0.01
     )
-    tracks = folder.parent.parent / "tracks.csv"
+    tracks = root / "tracks.csv"
     write_trajectories(tracks, estimate)
     return folder, tracks
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """The sequence and the tracks of `make_recording`."""
+    return make_recording(tmp_path_factory.mktemp("data"))
 
 
 class TestCommand:

@@ -16,7 +16,7 @@ from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import RENAMED, ErrorSettings, TrackSettings
 from psotrack.silhouettes import Shadows, SilhouetteSettings
-from psotrack.support import ARCHIVE_SUFFIX, whole_number
+from psotrack.support import ARCHIVE_SUFFIX, refuse_files, whole_number
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -131,14 +131,26 @@ def _stdout_as_dash(_: click.Context, __: click.Parameter, path: Path | None) ->
     return Path("-") if path == Path("/dev/stdout") else path
 
 
-JSON = click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    metavar="OUT",
-    callback=_stdout_as_dash,
-    help="Write the results as JSON to OUT; - is stdout.",
-)
+def JSON(command: Command) -> Command:
+    """Add `--json`; a file that cannot be written, or must not be replaced, is refused before the work."""
+
+    @functools.wraps(command)
+    def checking(*args: Any, json_path: Path | None, **options: Any) -> None:
+        if json_path is not None and json_path != Path("-"):
+            refuse_files(json_path, force=click.get_current_context().params.get("force", False))
+        command(*args, json_path=json_path, **options)
+
+    option = click.option(
+        "--json",
+        "json_path",
+        type=click.Path(path_type=Path),
+        metavar="OUT",
+        callback=_stdout_as_dash,
+        help="Write the results as JSON to OUT; - is stdout.",
+    )
+    return option(checking)
+
+
 JOBS = click.option(
     "--jobs", type=click.IntRange(min=1), help="Largest number of processes.  [default: one per processor]"
 )

@@ -136,17 +136,16 @@ def format_numbers(values: Iterable[float], digits: int) -> str:
 
 
 def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None:
-    """Check the output files before any work.
+    """Check the output files before any work; the option `--json` itself checks that its file can be written.
 
     Raises:
         SettingsError: `out` is not a CSV file, or `json_path` is the same file.
-        OutputError: a file exists and `force` is not set.
+        OutputError: `out` exists and `force` is not set, or it cannot be written.
     """
     if out is not None and out.suffix != ".csv":
         raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
-    for path in (out, json_path):
-        if path is not None and path != Path("-"):
-            refuse_to_overwrite(path, force)
+    if out is not None:
+        refuse_to_overwrite(out, force)
     if out is not None and json_path == out:
         raise SettingsError("--json", expected="another file than --out", found=f"{out} twice")
 

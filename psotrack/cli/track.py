@@ -329,7 +329,7 @@ def _track_causally(
         most_drones=most_drones,
         report=report_to(quiet),
     )
-    with RowStream(out, force=force) as rows:
+    with RowStream(out, force=force, record=out.with_suffix(".json")) as rows:
         for frame in run:
             rows.write(frame)
     record = with_real_time(run.record, time.perf_counter() - started, start_s=start_s)

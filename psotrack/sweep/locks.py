@@ -17,6 +17,7 @@ from pathlib import Path
 
 from filelock import LeaseCompromise, SoftFileLease, Timeout
 
+from psotrack.errors import OutputError
 from psotrack.support import atomic_write
 
 logger = logging.getLogger(__name__)
@@ -50,10 +51,19 @@ class Locks:
             work: description of the work, for `holder`.
 
         Raises:
-            OutputError: the folder cannot be written.
+            OutputError: the folder cannot be written, or the disk is full.
         """
         lease = self._lease(path)
-        if lease.is_locked or not _acquire(lease):
+        try:
+            is_held = not lease.is_locked and _acquire(lease)
+        except OSError as error:
+            raise OutputError(
+                path.parent,
+                expected="a folder that can be written",
+                found=error.strerror or f"{error}",
+                remedy="earlier results are unchanged",
+            ) from error
+        if not is_held:
             yield False
             return
         try:

@@ -36,7 +36,10 @@ class RowStream:
 
     Args:
         path: path that ends in .csv or .parquet.
-        force: replace an existing file.
+        force: replace an existing file. The first row replaces a CSV file, because the file grows row by row; a Parquet
+            file is replaced at the end.
+        record: file about the rows that the caller writes after them; None for none. An older one is removed with the
+            older rows, because it is not about the new rows.
 
     Raises:
         InputError: the path has another suffix.
@@ -44,8 +47,8 @@ class RowStream:
             rows so far stay.
     """
 
-    def __init__(self, path: Path | str, *, force: bool = False) -> None:
-        self._path = Path(path)
+    def __init__(self, path: Path | str, *, force: bool = False, record: Path | None = None) -> None:
+        self._path, self._record = Path(path), record
         if self._path.suffix not in {".csv", ".parquet"}:
             expected = "a name that ends in .csv or .parquet"
             raise InputError(self._path, expected=expected, found=repr(self._path.name))
@@ -60,8 +63,10 @@ class RowStream:
     def __enter__(self) -> RowStream:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            # Not buffered: what a full disk does not take is known at once, and not written later.
-            self._file = self._rows_path.open("wb", buffering=0)
+            self._replaces = self._rows_path.is_file()
+            # Appending, because an older file stays until the first row. Not buffered: what a full disk does not take
+            # is known at once, and not written later.
+            self._file = self._rows_path.open("ab", buffering=0)
         except OSError as error:
             raise self._error(error) from error
         return self
@@ -77,6 +82,11 @@ class RowStream:
         writer.writerows(words_of(columns))
         rows = text.getvalue().encode()
         try:
+            if self._replaces:
+                self._file.truncate(0)
+                self._replaces = False
+            if not (self._num_bytes or self._is_parquet):
+                self._remove_older_record()
             rest = memoryview(rows)
             while rest:
                 rest = rest[self._file.write(rest) :]
@@ -99,8 +109,9 @@ class RowStream:
         except OSError as failed:
             raise self._error(failed) from failed
         if not self._num_bytes:
-            # An empty file would only be in the way of the next session. Links to devices stay.
-            if self._rows_path.is_file():
+            # An empty file would only be in the way of the next session. Links to devices stay, and so does an older
+            # file after an error.
+            if self._rows_path.is_file() and not (self._replaces and kind):
                 self._rows_path.unlink()
             return
         if not self._is_parquet:
@@ -109,11 +120,17 @@ class RowStream:
         try:
             if kind is None and not self._has_failed:
                 self._publish()
+                self._remove_older_record()
                 self._rows_path.unlink()
                 is_published = True
         finally:
             if not is_published:
                 logger.warning("%s is not written; the rows so far are in %s", self._path, self._rows_path)
+
+    def _remove_older_record(self) -> None:
+        # A link stays, and a device too.
+        if self._record is not None and self._record.is_file():
+            self._record.resolve().unlink()
 
     def _publish(self) -> None:
         """Write the Parquet file from the rows, piece by piece."""
