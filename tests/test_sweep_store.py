@@ -44,6 +44,24 @@ def lock_path(store: Store) -> Path:
     return store.folder / "cells" / f".{KEY}.lock"
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the threads of a process are listed there")
+def test_reading_starts_no_threads(tmp_path: Path) -> None:
+    """A thread of Arrow's that still had the content when a sweep ended aborted the sweep, once in fifty times."""
+    add(Store(tmp_path), KEY, rows(2, 0))
+    program = """
+import os, sys
+import pandas, pyarrow.parquet
+from psotrack.sweep import Store
+store, before = Store(sys.argv[1]), len(os.listdir("/proc/self/task"))
+assert store.finished_seeds(sys.argv[2]) == {0, 2}
+print(len(os.listdir("/proc/self/task")) - before)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path), KEY], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "0\n"
+
+
 def test_rows_of_more_seeds_are_added(tmp_path: Path) -> None:
     store = Store(tmp_path)
     assert store.finished_seeds(KEY) == set()

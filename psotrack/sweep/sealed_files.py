@@ -8,7 +8,6 @@ other keys under the key "digest". Files of older versions lack the digest, and 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -38,11 +37,11 @@ def write_parquet(path: Path, table: pd.DataFrame) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    rows, buffer = pa.Table.from_pandas(table, preserve_index=False), io.BytesIO()
+    rows, buffer = pa.Table.from_pandas(table, preserve_index=False), pa.BufferOutputStream()
     with pq.ParquetWriter(buffer, rows.schema) as writer:
         writer.write_table(rows)
         writer.add_key_value_metadata({_FOOTER_KEY: _EMPTY})
-    content = buffer.getvalue()
+    content = buffer.getvalue().to_pybytes()
     start = _place(content)
     assert start is not None, "a written file has a place for its digest"
     with atomic_write(path) as temporary:
@@ -73,7 +72,9 @@ def read_parquet(path: Path, remedy: str) -> pd.DataFrame:
         if _digest(emptied) != content[start : start + _DIGITS]:
             raise _damaged(path, "a file that was changed after it was written", remedy)
     try:
-        return pd.read_parquet(io.BytesIO(content))
+        # In this thread alone: a thread of Arrow's that frees the content while the program ends aborts the program.
+        with pq.ParquetFile(pa.BufferReader(content), pre_buffer=False) as file:
+            return file.read(use_threads=False).to_pandas(use_threads=False)
     except Exception as error:  # PyArrow raises whatever a damaged byte leads to.
         raise _damaged(path, "a Parquet file that cannot be read", remedy) from error
 
