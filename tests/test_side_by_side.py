@@ -166,6 +166,7 @@ def test_middles_side_by_side_are_those_one_after_another(silhouettes):
         np.testing.assert_allclose(one, other, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_runs_together_have_the_covariances_and_camera_errors_of_each_run_alone(silhouettes, tmp_path):
     """The errors of the cameras are learned from all runs' middles, which are found together."""
     frame = np.arange(NUM_FRAMES)

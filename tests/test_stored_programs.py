@@ -156,8 +156,12 @@ def changed_byte(content: bytes) -> bytes:
 
 @pytest.mark.parametrize(
     "change",
-    [changed_byte, lambda content: content[:1000], lambda content: b"", lambda content: b"foreign" * 99],
-    ids=["a byte", "cut short", "empty", "foreign"],
+    [
+        pytest.param(changed_byte, id="a byte"),
+        pytest.param(lambda content: content[:1000], id="cut short", marks=pytest.mark.slow),
+        pytest.param(lambda content: b"", id="empty", marks=pytest.mark.slow),
+        pytest.param(lambda content: b"foreign" * 99, id="foreign", marks=pytest.mark.slow),
+    ],
 )
 def test_a_damaged_or_foreign_file_is_named_and_replaced(filled, tmp_path, change) -> None:
     folder = shutil.copytree(filled[0], tmp_path / "stored")
@@ -183,6 +187,7 @@ def test_another_source_makes_another_program(filled: tuple[Path, str], tmp_path
     assert len(list(folder.glob("*._smoothed-*.program"))) == 2
 
 
+@pytest.mark.slow
 def test_processes_may_use_a_folder_at_once(filled: tuple[Path, str], tmp_path: Path) -> None:
     together = [start(SMOOTHING, tmp_path) for _ in range(3)]
     assert {process.communicate()[0] for process in together} == {filled[1]}

@@ -74,9 +74,12 @@ def read_parquet(path: Path, remedy: str) -> pd.DataFrame:
     try:
         # In this thread alone: a thread of Arrow's that frees the content while the program ends aborts the program.
         with pq.ParquetFile(pa.BufferReader(content), pre_buffer=False) as file:
-            return file.read(use_threads=False).to_pandas(use_threads=False)
+            table = file.read(use_threads=False).to_pandas(use_threads=False)
     except Exception as error:  # PyArrow raises whatever a damaged byte leads to.
         raise _damaged(path, "a Parquet file that cannot be read", remedy) from error
+    if not table.columns.is_unique:
+        raise _damaged(path, "two columns of one name", remedy)
+    return table
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
