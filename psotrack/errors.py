@@ -32,7 +32,8 @@ class PsotrackError(Exception):
     def __init__(self, where: object, *, expected: str, found: str, remedy: str = "") -> None:
         place = _on_one_line(os.fspath(where) if isinstance(where, os.PathLike) else str(where))
         parts = [_on_one_line(part) for part in (expected, found, remedy)]
-        folder = os.path.dirname(place)
+        # After the name of an archive, the place has the path of a file in the archive.
+        folder = os.path.dirname(place.partition(": ")[0])
         room = max(LONGEST_MESSAGE - len(f"{place[len(folder) :]}: expected , found ; "), _SHORTEST)
         if folder:
             room += len(folder) * sum(part.count(folder) for part in parts)

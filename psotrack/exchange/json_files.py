@@ -105,4 +105,6 @@ def _stacked(name: str, drones: list[dict[str, Any]], frames: int) -> np.ndarray
         for row, value in enumerate(values):
             if value is not None:
                 stacked[row, index] = _STATUS[value] if name == "status" else value
+    if np.isinf(stacked).any():
+        raise ValueError(f"an infinite number in {name}")
     return stacked

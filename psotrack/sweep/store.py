@@ -313,6 +313,8 @@ def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
 def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
     """A table of runs or of their errors, which must have some columns: names in `drone`, numbers in the others.
 
+    Only the error of a drone may be missing.
+
     Raises:
         DamagedError: the file is damaged, or is another table.
         FileNotFoundError: the file does not exist.
@@ -320,7 +322,11 @@ def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -
     table = read_parquet(path, remedy)
     # A run without any drone has no errors, and their table has no columns but the seed.
     for name in columns if len(table) else ("seed",):
-        if name not in table or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name])):
+        if (
+            name not in table
+            or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name]))
+            or (name != "error_m" and table[name].isna().any())
+        ):
             found = "others" if name in table else "none"
             raise DamagedError(path, expected=f"values in the column {name}", found=found, remedy=remedy)
     return table

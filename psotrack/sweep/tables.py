@@ -113,6 +113,8 @@ def _label(value: Any) -> Any:
         value = value.item()
     if isinstance(value, list | tuple | np.ndarray):
         return " ".join(f"{_label(part)}" for part in value)
+    if isinstance(value, dict):
+        return f"{value}"
     if pd.isna(value):
         return "-"
     # pandas stores whole numbers as floats in columns with missing values.
