@@ -295,6 +295,17 @@ def test_a_video_of_huge_images(make, name, size_wh, tmp_path, little_memory):
         list(read_frames(probe(path)))
 
 
+def test_a_video_that_claims_to_last_for_days(tmp_path):
+    """Found: the message did not name the file."""
+    path = tmp_path / "a.avi"
+    data = little_video(path, "XVID")
+    for part, at in ((b"avih", 16), (b"strh", 32)):
+        data = with_bytes(data, data.index(part) + 8 + at, struct.pack("<I", 20_000_000))
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=rf"{path}: expected a video of at most \d+ frames, found 20000000"):
+        probe(path)
+
+
 @pytest.mark.parametrize("size_wh", SIZES_WH)
 @pytest.mark.parametrize(("make", "name"), [(avi, "a.avi"), (mp4, "a.mp4")])
 def test_a_video_of_which_only_the_container_claims_a_size(make, name, size_wh, tmp_path, little_memory):

@@ -18,7 +18,7 @@ from psotrack.cli.options import (
     reporting,
 )
 from psotrack.cli.output import output_json, print_line, report_to
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, errors_name
 from psotrack.support import Device, Report, refuse_to_overwrite
 
 if TYPE_CHECKING:
@@ -210,13 +210,14 @@ def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale:
     rows = [name for name in rows_by.split(",") if name]
     if columns_by is None:
         columns_by = next((name for name in ("method", "sequence") if name not in rows), "")
-    shown = pivot(
-        Store(folder).rows(),
-        rows_by=rows,
-        columns_by=[name for name in columns_by.split(",") if name],
-        value=value,
-        scale=scale,
-    )
+    with errors_name(folder):
+        shown = pivot(
+            Store(folder).rows(),
+            rows_by=rows,
+            columns_by=[name for name in columns_by.split(",") if name],
+            value=value,
+            scale=scale,
+        )
     click.echo(render_table(shown, layout).rstrip("\n"))
 
 

@@ -23,6 +23,7 @@ from jaxtyping import UInt8
 from psotrack.errors import InputError, OutputError, SettingsError, check_positive
 from psotrack.recordings.image_files import check_pixels, depth_of, read_image
 from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.timing import MOST_INSTANTS
 from psotrack.support import atomic_write, digest_file, digest_record
 
 #: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
@@ -86,6 +87,9 @@ def probe(path: Path | str) -> VideoInfo:
         num_frames = _count_packets(path) - 1
     if num_frames < 1:
         raise InputError(path, expected="a video with frames", found="no frames")
+    if num_frames > MOST_INSTANTS:
+        expected = f"a video of at most {MOST_INSTANTS} frames"
+        raise InputError(path, expected=expected, found=f"{num_frames} in its header")
     if not (math.isfinite(fps) and fps > 0):
         raise InputError(path, expected="a video with a frame rate", found=f"{fps:g} frames per second")
     return VideoInfo(path, num_frames, fps, (width, height), is_finished=is_finished)

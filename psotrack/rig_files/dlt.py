@@ -33,6 +33,8 @@ from psotrack.rig_files.number_table import NumberTable, parse_numbers
 from psotrack.support import LARGEST
 
 _COEFFICIENTS = 11
+#: Largest condition number of the 3 x 3 part. That of a camera is below the square of its focal length in pixels.
+_LARGEST_CONDITION = 1e12
 
 
 def recognises(text: str) -> bool:
@@ -56,14 +58,14 @@ def read(source: Source) -> FileRig:
                 f"{source.path}, camera {name}", expected="finite numbers", found="NaN or infinity"
             )
     matrices = [np.append(column, 1.0).reshape(3, 4) for column in columns]
+    for name, matrix in zip(names, matrices, strict=True):
+        if np.linalg.cond(matrix[:, :3]) > _LARGEST_CONDITION:
+            raise InputError(
+                f"{source.path}, camera {name}",
+                expected="the coefficients of a camera",
+                found="a determinant of 0",
+            )
     signs = np.sign([np.linalg.det(matrix[:, :3]) for matrix in matrices])
-    if (signs == 0).any():
-        name = names[int(np.argmin(np.abs(signs)))]
-        raise InputError(
-            f"{source.path}, camera {name}",
-            expected="the coefficients of a camera",
-            found="a determinant of 0",
-        )
     if not signs.sum():
         raise InputError(
             source.path,

@@ -103,11 +103,13 @@ class Silhouettes:
                 read = np.asarray(array[start:stop])
                 count, height, width = read.shape
                 frames[:count, index, :height, :width] = read
-            except (OSError, ValueError, RuntimeError) as error:
+            # A damaged size asks for any amount of memory.
+            except (OSError, ValueError, RuntimeError, MemoryError) as error:
+                reason = f"{error}" or "more than the memory"
                 raise InputError(
                     _folder_of(array),
                     expected="readable silhouettes",
-                    found=f"damage after they were opened ({error})",
+                    found=f"damage after they were opened ({reason})",
                     remedy="the same command, run again, makes the silhouettes of a cache anew",
                 ) from error
         return frames

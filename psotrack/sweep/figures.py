@@ -116,8 +116,7 @@ def error_against_work(
                 verticalalignment="bottom",
                 color=_DARK,
             )
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        _make_logarithmic(axes, "xy")
         _finish(axes, "track stage (ms per frame)", "mean error (mm)" if axes is panels[0] else "", sequence)
         _plain_numbers(axes)
     _legend(figure, panels)
@@ -171,10 +170,11 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
                     label="switch in another run",
                 )
         error_mm = 1e3 * run["error_m"].dropna()
-        if error_mm.max() > 10 * error_mm.median():
-            # A few very small errors would take half of the logarithmic scale.
+        # A few very small errors would take half of the logarithmic scale.
+        smallest_mm = error_mm.quantile(0.02)
+        if error_mm.max() > 10 * error_mm.median() and smallest_mm > 0:
             axes.set_yscale("log")
-            axes.set_ylim(bottom=error_mm.quantile(0.02))
+            axes.set_ylim(bottom=smallest_mm)
             _plain_numbers(axes, "y")
         else:
             axes.set_ylim(bottom=0.0)
@@ -219,7 +219,7 @@ def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
             )
             boxes["boxes"][0].set_label(method)
             axes.set_xticks(np.arange(len(groups)), [name for name, _ in groups])
-        axes.set_yscale("log")
+        _make_logarithmic(axes, "y")
         _plain_numbers(axes, "y")
         _finish(axes, "", "error (mm)", sequence)
     _legend(figure, panels)
@@ -272,6 +272,13 @@ def _finish(axes: Axes, x: str, y: str, title: str) -> None:
     axes.tick_params(colors=_DARK, labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_GREY)
+
+
+def _make_logarithmic(axes: Axes, names: str) -> None:
+    """Make the axes x or y logarithmic, where there are numbers above 0."""
+    for name in names:
+        if np.isfinite(getattr(axes.dataLim, f"minpos{name}")):
+            getattr(axes, f"set_{name}scale")("log")
 
 
 def _plain_numbers(axes: Axes, which: str = "both") -> None:

@@ -31,7 +31,7 @@ import msgspec
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import convert
+from psotrack.support import LARGEST, convert
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.older_folders import rename_columns, rename_manifest
 from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
@@ -313,8 +313,6 @@ def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
 def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
     """A table of runs or of their errors, which must have some columns: names in `drone`, numbers in the others.
 
-    Only the error of a drone may be missing.
-
     Raises:
         DamagedError: the file is damaged, or is another table.
         FileNotFoundError: the file does not exist.
@@ -322,14 +320,18 @@ def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -
     table = read_parquet(path, remedy)
     # A run without any drone has no errors, and their table has no columns but the seed.
     for name in columns if len(table) else ("seed",):
-        if (
-            name not in table
-            or (name != "drone" and not pd.api.types.is_numeric_dtype(table[name]))
-            or (name != "error_m" and table[name].isna().any())
-        ):
+        if name not in table or not _fits(name, table[name]):
             found = "others" if name in table else "none"
             raise DamagedError(path, expected=f"values in the column {name}", found=found, remedy=remedy)
     return table
+
+
+def _fits(name: str, values: pd.Series) -> bool:
+    """Whether a column has names of drones, or numbers of 0 and more; only the error of a drone may be missing."""
+    if name == "drone":
+        return bool(values.notna().all())
+    known = values.dropna() if name == "error_m" else values
+    return pd.api.types.is_numeric_dtype(values) and bool(known.between(0, LARGEST).all())
 
 
 def _read_if_present(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any] | None:

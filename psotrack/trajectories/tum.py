@@ -168,6 +168,7 @@ def _numbers(place: str, line: str) -> list[float]:
         raise InputError(place, expected=expected, found=f"{error}") from None
     if len(values) != 8 or not all(map(is_moderate, values)):
         raise InputError(place, expected=expected, found=repr(line.strip()))
-    if not any(values[4:]):
-        raise InputError(place, expected="a quaternion", found="0 0 0 0")
+    if not np.linalg.norm(values[4:]):
+        found = " ".join(f"{value:g}" for value in values[4:])
+        raise InputError(place, expected="a quaternion", found=found)
     return values
