@@ -157,7 +157,8 @@ def _read_config(path: Path, command: click.Command) -> dict[str, Any]:
     data = read_toml(path)
     name, version = data.pop(_COMMAND, command.name), data.pop(_VERSION, __version__)
     if name != command.name:
-        raise InputError(f"{path}, {_COMMAND}", expected=f'"{command.name}"', found=toml_value(name))
+        found = toml_value(name) if isinstance(name, str) else f"{name}"
+        raise InputError(f"{path}, {_COMMAND}", expected=f'"{command.name}"', found=found)
     if version != __version__:
         _logger.warning(
             "%s was written by psotrack %s; this is %s, whose results may differ", path, version, __version__

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError
@@ -330,8 +331,10 @@ def _fits(name: str, values: pd.Series) -> bool:
     """Whether a column has names of drones, or numbers of 0 and more; only the error of a drone may be missing."""
     if name == "drone":
         return bool(values.notna().all())
-    known = values.dropna() if name == "error_m" else values
-    return pd.api.types.is_numeric_dtype(values) and bool(known.between(0, LARGEST).all())
+    if not pd.api.types.is_numeric_dtype(values):
+        return False
+    numbers = (values.dropna() if name == "error_m" else values).to_numpy(np.float64, na_value=np.nan)
+    return bool(((numbers >= 0) & (numbers <= LARGEST)).all())
 
 
 def _read_if_present(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any] | None:
