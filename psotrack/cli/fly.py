@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import FORCE, QUIET, Numbers
+from psotrack.errors import errors_name
 from psotrack.interrupts import unhurried_end
 from psotrack.support import refuse_to_overwrite
 
@@ -90,7 +91,7 @@ def fly(
     start = np.array(start_m)
     piloting.check(start, space, rate_hz)
     # Ctrl-C ends the flight, which is then written.
-    with unhurried_end():
+    with unhurried_end(), errors_name(device):
         with devices.open_device(device, space) as opened:
             samples = piloting.until(opened.samples(), max_seconds)
             flown = piloting.fly(samples, start, space, rate_hz=rate_hz, watch=opened.watch)

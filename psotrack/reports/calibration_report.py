@@ -15,6 +15,9 @@ from psotrack.reports.tables import PageCell, PageTable, number, percent
 from psotrack.rig_files import read_rig
 from psotrack.support import convert, read_json
 
+#: Largest number of views, corners and pixels along a side.
+_MOST = 10**9
+
 
 class CalibratedCamera(msgspec.Struct, frozen=True):
     """Figures of one camera, as `calibrate rig --json` writes them."""
@@ -114,6 +117,11 @@ def _read(path: Path) -> CalibrationRecord:
     for name, camera in record.cameras.items():
         if len({len(line) for line in camera.coverage}) > 1:
             raise wrong(f"cameras.{name}.coverage", "lines of equal length", "different ones", "")
+        for field in ("views", "corners", "shared"):
+            if not 0 <= (count := getattr(camera, field)) <= _MOST:
+                raise wrong(f"cameras.{name}.{field}", f"a number from 0 to {_MOST}", f"{count}", "")
+        if not all(1 <= side <= _MOST for side in camera.image_size_wh):
+            raise wrong(f"cameras.{name}.image_size_wh", "a width and height", f"{camera.image_size_wh}", "")
     return record
 
 

@@ -38,11 +38,13 @@ def fit_distortion(
     distorted = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1).reshape(-1, 2)
     centre = np.array([(centre_px[0] - K[0, 2]) / K[0, 0], (centre_px[1] - K[1, 2]) / K[1, 1]])
     arm = distorted - centre
-    r2 = (arm**2).sum(axis=-1)
     powers = np.arange(1, len(radial) + 1)
-    gain = 1 + (radial * r2[:, None] ** powers).sum(axis=-1)
-    slope = 1 + ((2 * powers + 1) * radial * r2[:, None] ** powers).sum(axis=-1)
-    if (slope <= 0).any():
+    # A centre far outside of the image has no finite squares.
+    with np.errstate(over="ignore", invalid="ignore"):
+        r2 = (arm**2).sum(axis=-1)
+        gain = 1 + (radial * r2[:, None] ** powers).sum(axis=-1)
+        slope = 1 + ((2 * powers + 1) * radial * r2[:, None] ** powers).sum(axis=-1)
+    if not (np.isfinite(slope) & (slope > 0)).all():
         return None
     points = centre + arm * gain[:, None]
     fits = [_polynomial(points, distorted)]

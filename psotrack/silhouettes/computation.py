@@ -224,7 +224,7 @@ def _made_with(stored: StoredSilhouettes) -> ScaledSettings:
     """
     try:
         return msgspec.convert(stored.made_of["settings"], ScaledSettings)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, SettingsError) as error:
         expected = "silhouettes that were made with settings of this version"
         raise InputError(stored.path, expected=expected, found=f"{error}") from error
 

@@ -118,7 +118,6 @@ def error_against_work(
             )
         _make_logarithmic(axes, "xy")
         _finish(axes, "track stage (ms per frame)", "mean error (mm)" if axes is panels[0] else "", sequence)
-        _plain_numbers(axes)
     _legend(figure, panels)
     return figure
 
@@ -173,9 +172,8 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
         # A few very small errors would take half of the logarithmic scale.
         smallest_mm = error_mm.quantile(0.02)
         if error_mm.max() > 10 * error_mm.median() and smallest_mm > 0:
-            axes.set_yscale("log")
+            _make_logarithmic(axes, "y")
             axes.set_ylim(bottom=smallest_mm)
-            _plain_numbers(axes, "y")
         else:
             axes.set_ylim(bottom=0.0)
         runs = rows["seed"].nunique()
@@ -199,6 +197,9 @@ def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
     for axes, (sequence, methods) in zip(panels, errors.items(), strict=True):
         width = _BOXES / len(methods)
         for number, (method, rows) in enumerate(methods.items()):
+            # Runs without any drone have no errors.
+            if rows.empty:
+                continue
             colour = COLOURS[number % len(COLOURS)]
             groups = [
                 (str(name), of["error_m"].dropna()) for name, of in rows.groupby("drone", observed=True)
@@ -220,7 +221,6 @@ def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
             boxes["boxes"][0].set_label(method)
             axes.set_xticks(np.arange(len(groups)), [name for name, _ in groups])
         _make_logarithmic(axes, "y")
-        _plain_numbers(axes, "y")
         _finish(axes, "", "error (mm)", sequence)
     _legend(figure, panels)
     return figure
@@ -275,18 +275,13 @@ def _finish(axes: Axes, x: str, y: str, title: str) -> None:
 
 
 def _make_logarithmic(axes: Axes, names: str) -> None:
-    """Make the axes x or y logarithmic, where there are numbers above 0."""
+    """Make the axes x or y logarithmic where they have numbers above 0, with labels such as 20 and 50."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     for name in names:
         if np.isfinite(getattr(axes.dataLim, f"minpos{name}")):
             getattr(axes, f"set_{name}scale")("log")
-
-
-def _plain_numbers(axes: Axes, which: str = "both") -> None:
-    """Print numbers such as 20 and 50 on a logarithmic scale instead of powers of ten."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
-        if which in (name, "both"):
+            axis = getattr(axes, f"{name}axis")
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axis.set_minor_formatter(NullFormatter())
@@ -303,7 +298,7 @@ def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
         list(labelled.values()),
         list(labelled),
         loc="outside lower center",
-        ncols=min(len(labelled), 7),
+        ncols=max(1, min(len(labelled), 7)),
         frameon=False,
         fontsize=8.5,
         labelcolor=_DARK,
