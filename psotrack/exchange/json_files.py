@@ -74,7 +74,7 @@ def read_json_tracks(path: Path) -> Trajectories:
         )
     except PsotrackError as error:
         raise InputError(path, expected="consistent tracks", found=f"{error}") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         found = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise InputError(
             path, expected="frame, time_s and drones with a value per frame", found=found
