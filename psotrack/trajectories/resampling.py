@@ -44,8 +44,9 @@ def resample(
         matrices = rotation_matrices(trajectories.orientation_wxyz)
         rotation = interpolated(trajectories.time_s, matrices, gap_s)(wanted_s)
         orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
-        # Between samples that are about half a turn apart, the spline gives no rotation. It gives NaN in gaps.
-        known = np.linalg.det(rotation) > 0
+        known = np.asarray(np.isfinite(rotation).all(axis=(-2, -1)))
+        # Between samples that are about half a turn apart, the spline gives matrices that are no rotations.
+        known[known] = np.linalg.det(rotation[known]) > 0
         if known.any():
             orientation_wxyz[known] = Rotation.from_matrix(rotation[known]).as_quat(scalar_first=True)
     return Trajectories(frame, time_s, trajectories.drones, position_m, orientation_wxyz=orientation_wxyz)
