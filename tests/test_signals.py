@@ -39,6 +39,26 @@ def run(started):
 psotrack.cli.main = run
 psotrack.__main__.main()
 """
+#: A command whose worker processes say something when they end.
+WITH_NOISY_WORKERS = """
+import atexit, signal, sys, time
+from psotrack.support import map_in_processes
+
+def work(task, advance):
+    atexit.register(print, "noise", file=sys.stderr, flush=True)
+    print("works", flush=True)
+    time.sleep(60)
+
+def run(started):
+    map_in_processes(work, [1, 2], jobs=2, advance=int)
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    import psotrack.__main__
+    import psotrack.cli
+    psotrack.cli.main = run
+    psotrack.__main__.main()
+"""
 CODES = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
 #: The issue asks for 2 s. A loaded machine may give the processor to others meanwhile.
 LONGEST_S = 6.0
@@ -111,6 +131,25 @@ def test_a_computation_that_answers_no_signal_is_ended(tmp_path, number):
     assert word in err
     assert took_s < LONGEST_S
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
+def test_workers_end_without_a_word(tmp_path, number):
+    """Found: warnings of zarr, in workers that were ended while they made an array."""
+    (tmp_path / "noisy.py").write_text(WITH_NOISY_WORKERS)
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / "noisy.py"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert [process.stdout.readline() for _ in range(2)] == ["works\n"] * 2
+    err, _ = end(process, number)
+    code, word = CODES[number]
+    assert process.returncode == code, err
+    assert err == f"psotrack: {word}; earlier results are unchanged; run the command again to finish\n"
+    assert_nothing_left(process)
 
 
 def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(flight, tmp_path):

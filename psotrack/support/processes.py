@@ -13,7 +13,8 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
-from typing import Any, TypeVar
+from types import FrameType
+from typing import Any, NoReturn, TypeVar
 
 import cv2
 
@@ -182,10 +183,18 @@ class _Progress:
 def _run(target: Callable[[_Task, Connection], None], task: _Task, connection: Connection) -> None:
     """Run `target` in a worker process, until the pipe breaks."""
     cv2.setNumThreads(1)
-    # Where the parent process terminates the worker, the clean-up of `target` runs.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    signal.signal(signal.SIGTERM, _end_in_silence)
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         target(task, connection)
+
+
+def _end_in_silence(number: int, frame: FrameType | None) -> NoReturn:
+    """End a worker process that the parent process terminates; the clean-up of its target runs.
+
+    What libraries say when they are interrupted is not for the user: the parent process says why it ends.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    sys.exit(1)
 
 
 def _serve(function: Callable[..., Any], connection: Connection) -> None:
