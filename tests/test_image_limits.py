@@ -17,6 +17,8 @@ from psotrack.recordings import probe, read_frames, read_image
 little_memory = test_bad_input_limits.little_memory
 
 WIDTH, HEIGHT = 24, 16
+#: Options of a chessboard.
+BOARD = ("--squares", "10x7", "--square", "0.03")
 PICTURE = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
 
 
@@ -186,29 +188,8 @@ def flight(tmp_path_factory):
         ("map-markers", "{folder}", "--fov", "70,55", "--side", "0.2", "--known", "1", "--out", "{out}.csv"),
         ("detect-markers", "{image}", "--out", "{out}.csv"),
         ("detect-markers", "{folder}", "--out", "{out}.csv"),
-        (
-            "calibrate",
-            "intrinsics",
-            "{folder}",
-            "--squares",
-            "10x7",
-            "--square",
-            "0.03",
-            "--out",
-            "{out}.toml",
-        ),
-        (
-            "calibrate",
-            "rig",
-            "{folder}",
-            "{flight}/c1.avi",
-            "--squares",
-            "10x7",
-            "--square",
-            "0.03",
-            "--out",
-            "{out}.toml",
-        ),
+        ("calibrate", "intrinsics", "{folder}", *BOARD, "--out", "{out}.toml"),
+        ("calibrate", "rig", "{folder}", "{flight}/c1.avi", *BOARD, "--out", "{out}.toml"),
         ("detect", "{folder}", "--blobs", "--out", "{out}"),
         ("silhouettes", "{folder}", "--masks", "{out}"),
         ("info", "{recording}"),

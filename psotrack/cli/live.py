@@ -199,9 +199,9 @@ def live(
         if kept is not None:
             kept.begin()
             stack.callback(kept.end)
-        rows = [] if out is None else [RowStream(out, force=force, record=out.with_suffix(".json"))]
-        for table_of_rows in rows:
-            stack.enter_context(table_of_rows)
+        rows = []
+        if out is not None:
+            rows.append(stack.enter_context(RowStream(out, force=force, record=out.with_suffix(".json"))))
         shown = None if viewer is None else stack.enter_context(_open_view(viewer, recording, quiet or lines))
         outputs += [] if shown is None else [shown]
         table = stack.enter_context(_Table(quiet or lines, shown))
