@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM: each command ends within two seconds with one line, a code that shells know, and nothing left."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -41,12 +42,13 @@ psotrack.__main__.main()
 """
 #: A command whose worker processes say something when they end.
 WITH_NOISY_WORKERS = """
-import atexit, signal, sys, time
+import atexit, os, signal, sys, time
 from psotrack.support import map_in_processes
 
 def work(task, advance):
     atexit.register(print, "noise", file=sys.stderr, flush=True)
-    print("works", flush=True)
+    # One write: with PYTHONUNBUFFERED, print makes two, and the lines of two workers can mix.
+    os.write(1, b"works\\n")
     time.sleep(60)
 
 def run(started):
@@ -70,15 +72,26 @@ def flight(tmp_path_factory):
     return make_once(tmp_path_factory, "recording_of_signals", make_sequence)
 
 
-def start(program, *arguments, **options):
-    return subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        **options,
-    )
+@pytest.fixture
+def start():
+    """A function that starts Python with arguments, in a session of its own, which ends with the test."""
+    processes = []
+
+    def start(*arguments):
+        process = subprocess.Popen(
+            [sys.executable, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        with process, contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
 
 
 def end(process, number):
@@ -104,10 +117,10 @@ def assert_nothing_left(process, wait_s=5.0):
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
 @pytest.mark.parametrize("wait_s", [0.3, 1.5])
-def test_a_command_ends_with_one_line(flight, tmp_path, number, wait_s):
+def test_a_command_ends_with_one_line(start, flight, tmp_path, number, wait_s):
     out = tmp_path / "silhouettes"
     process = start(
-        AT_A_TERMINAL, "track", flight, "--out", out / "tracks.csv", "--cache", tmp_path / "cache"
+        "-c", AT_A_TERMINAL, "track", flight, "--out", out / "tracks.csv", "--cache", tmp_path / "cache"
     )
     time.sleep(wait_s)
     err, took_s = end(process, number)
@@ -120,8 +133,8 @@ def test_a_command_ends_with_one_line(flight, tmp_path, number, wait_s):
 
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
-def test_a_computation_that_answers_no_signal_is_ended(tmp_path, number):
-    process = start(IN_A_LONG_COMPUTATION, tmp_path / "out.txt")
+def test_a_computation_that_answers_no_signal_is_ended(start, tmp_path, number):
+    process = start("-c", IN_A_LONG_COMPUTATION, tmp_path / "out.txt")
     assert process.stdout.readline() == "computes\n"
     time.sleep(0.5)
     err, took_s = end(process, number)
@@ -134,16 +147,10 @@ def test_a_computation_that_answers_no_signal_is_ended(tmp_path, number):
 
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
-def test_workers_end_without_a_word(tmp_path, number):
+def test_workers_end_without_a_word(start, tmp_path, number):
     """Found: warnings of zarr, in workers that were ended while they made an array."""
     (tmp_path / "noisy.py").write_text(WITH_NOISY_WORKERS)
-    process = subprocess.Popen(
-        [sys.executable, tmp_path / "noisy.py"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    process = start(tmp_path / "noisy.py")
     assert [process.stdout.readline() for _ in range(2)] == ["works\n"] * 2
     err, _ = end(process, number)
     code, word = CODES[number]
@@ -152,9 +159,11 @@ def test_workers_end_without_a_word(tmp_path, number):
     assert_nothing_left(process)
 
 
-def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(flight, tmp_path):
+def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(start, flight, tmp_path):
     program = AT_A_TERMINAL.replace("signal.default_int_handler", "signal.SIG_IGN")
-    process = start(program, "track", flight, "--out", tmp_path / "tracks.csv", "--cache", tmp_path / "cache")
+    process = start(
+        "-c", program, "track", flight, "--out", tmp_path / "tracks.csv", "--cache", tmp_path / "cache"
+    )
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)
     time.sleep(0.3)
