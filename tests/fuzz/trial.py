@@ -137,10 +137,11 @@ class Judge:
         if not fault and message is not None and any(self._out.iterdir()):
             fault = f"written in spite of the error: {sorted(self._out.rglob('*'))[:3]}"
         if not fault and limit is not None:
-            if cost.seconds > 2 * limit.seconds + SECONDS:
-                fault = f"took {cost.seconds:.1f} s instead of {limit.seconds:.1f} s"
-            elif cost.mebibytes > 2 * limit.mebibytes + MEBIBYTES:
+            # Memory first: where the machine has little of it, it also takes time.
+            if cost.mebibytes > 2 * limit.mebibytes + MEBIBYTES:
                 fault = f"took {cost.mebibytes:.0f} MiB instead of {limit.mebibytes:.0f} MiB"
+            elif cost.seconds > 2 * limit.seconds + SECONDS:
+                fault = f"took {cost.seconds:.1f} s instead of {limit.seconds:.1f} s"
         return fault, message is not None, cost
 
     def _command(self, name: str, path: Path) -> tuple[str | None, str]:
