@@ -30,8 +30,8 @@ from psotrack.camera_errors.views import CameraViews
 
 #: Time over which stated and found noise are compared, seconds, and number of levels of the stated noise.
 _WINDOW_S, _NUM_LEVELS = 1.0, 8
-#: Number of frames whose covariances are computed at once.
-_FRAMES_AT_ONCE = 1000
+#: Sum over cameras of gain x variances of their places x gain transposed.
+_MOVED_BY_PLACES = "fdcik,ck,fdcjk->fdij"
 
 
 def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarray, "frames drones 3 3"]:
@@ -40,8 +40,10 @@ def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarr
     NaN where the noise is not known, or where the cameras do not determine a position.
     """
     noise_px = np.where(np.isnan(errors.noise_px), _mean(errors.noise_px), errors.noise_px)
-    gain = views.gain
-    covariance_m2 = np.einsum("fdcik,ck,fdcjk->fdij", gain, np.square(noise_px), gain, optimize=True)
+    covariance_m2 = np.empty((*views.shown.shape[:2], 3, 3))
+    for frames, part in views.parts():
+        gain = part.gain
+        covariance_m2[frames] = np.einsum(_MOVED_BY_PLACES, gain, np.square(noise_px), gain, optimize=True)
     return np.where((np.trace(covariance_m2, axis1=-2, axis2=-1) > 0)[..., None, None], covariance_m2, np.nan)
 
 
@@ -76,31 +78,37 @@ def lasting_covariances(
         rig_error_deg: angle by which each camera is turned at least, about a random axis, degrees.
         pixel_error_px: standard deviation of each camera's lasting error along either axis at least, pixels.
     """
-    gain = views.gain
     lasting_px2 = np.maximum(np.square(errors.lasting_px), pixel_error_px**2)
-    by_place = np.einsum("fdcik,ck,fdcjk->fdij", gain, lasting_px2, gain, optimize=True)
-    turned = gain @ views.turn_px
-    found = turned.any(axis=(-3, -2, -1))
-    # Where nothing was found, the turns are 0.
-    mean = turned.sum(axis=0)
-    mean /= np.maximum(found.sum(axis=0), 1)[:, None, None, None]
-    late = -np.einsum("fdcik,fdck->fdci", gain, views.flow_px_s)[..., None]
     constant = errors.constant_covariance.copy()
     of_turns = np.arange(len(constant)) % 4 < 3
     given_rad2 = float(np.radians(rig_error_deg)) ** 2 / 3
     constant[of_turns, of_turns] += max(0.0, given_rad2 - float(np.diag(constant)[of_turns].mean()))
-
-    def by_constant(offset: Float[np.ndarray, "drones cameras 3 3"] | float) -> np.ndarray:
-        total_m2 = np.empty_like(by_place)
-        # All frames at once would take several times the memory of the views.
-        for first in range(0, len(total_m2), _FRAMES_AT_ONCE):
-            part = slice(first, first + _FRAMES_AT_ONCE)
-            moved = np.concatenate([turned[part] - offset, late[part]], axis=-1).swapaxes(2, 3)
+    mean = _mean_turned(views)
+    found = np.empty(views.shown.shape[:2], bool)
+    absolute_m2, relative_m2 = (np.empty((*found.shape, 3, 3)) for _ in range(2))
+    for frames, part in views.parts():
+        gain = part.gain
+        by_place = np.einsum(_MOVED_BY_PLACES, gain, lasting_px2, gain, optimize=True)
+        turned = gain @ part.turn_px
+        found[frames] = turned.any(axis=(-3, -2, -1))
+        late = -np.einsum("fdcik,fdck->fdci", gain, part.flow_px_s)[..., None]
+        for total_m2, offset in ((absolute_m2, 0.0), (relative_m2, mean)):
+            moved = np.concatenate([turned - offset, late], axis=-1).swapaxes(2, 3)
             moved = moved.reshape(*moved.shape[:3], -1)
-            total_m2[part] = by_place[part] + moved @ constant @ moved.swapaxes(-1, -2)
-        return _filled(total_m2, found, 0.0)
+            total_m2[frames] = by_place + moved @ constant @ moved.swapaxes(-1, -2)
+    return LastingCovariances(_filled(absolute_m2, found, 0.0), _filled(relative_m2, found, 0.0))
 
-    return LastingCovariances(by_constant(0.0), by_constant(mean))
+
+def _mean_turned(views: CameraViews) -> Float[np.ndarray, "drones cameras 3 3"]:
+    """Mean of the derivatives of the positions by the cameras' turns, over the frames in which there are any."""
+    total = np.zeros((*views.shown.shape[1:], 3, 3))
+    count = np.zeros(views.shown.shape[1], int)
+    for _, part in views.parts():
+        turned = part.gain @ part.turn_px
+        # Where nothing was found, the derivatives are 0.
+        total += turned.sum(axis=0)
+        count += turned.any(axis=(-3, -2, -1)).sum(axis=0)
+    return total / np.maximum(count, 1)[:, None, None, None]
 
 
 def _filled(

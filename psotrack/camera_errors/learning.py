@@ -72,31 +72,33 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
         usual: how noise fades, where too few frames show it.
     """
     num_cameras, dt_s = views.num_cameras, 1 / fps
-    found = _rows(views, 1).determined.reshape(views.shown.shape[:2])
+    found = np.concatenate([_rows(part).determined for _, part in views.parts()])
+    found = found.reshape(views.shown.shape[:2])
     step = max(1, -(-int(found.sum()) // _MAX_ROWS))
     if found[::step].sum() < 2:
         none = np.zeros((num_cameras, 2))
         unknown = np.zeros((4 * num_cameras, 4 * num_cameras))
         return CameraErrors(none * np.nan, usual.without_lasting(), none, 0.0, 0.0, unknown)
-    rows = _rows(views, step)
+    sample = views[::step]
+    rows = _rows(sample)
     which = np.flatnonzero(rows.determined)
     fitted = partial(
         fit_constant_errors,
         rows.only(which),
-        views.turn_px[::step].reshape(-1, num_cameras, 2, 3)[which],
-        views.flow_px_s[::step].reshape(-1, num_cameras, 2)[which],
+        sample.turn_px.reshape(-1, num_cameras, 2, 3)[which],
+        sample.flow_px_s.reshape(-1, num_cameras, 2)[which],
     )
     # First as if there were next to no noise: the noise of residuals that contain a turn would hide the turn.
     constant = fitted(np.ones((num_cameras, 2)), _NO_NOISE, with_covariance=False)
     for round_number in range(_ROUNDS):
         rest = _without(views, constant)
-        total_px2 = _total_variances(rest, step)
+        total_px2 = _total_variances(rest[::step])
         fading = fading_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, usual)
         noise_px = np.sqrt(total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE))
         inflation = fading.without_lasting().inflation(step * dt_s)
         constant = fitted(noise_px, inflation, with_covariance=round_number == _ROUNDS - 1)
     rest = _without(views, constant)
-    total_px2 = _total_variances(rest, step)
+    total_px2 = _total_variances(rest[::step])
     fading = fading_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, usual)
     noise = fading.without_lasting()
     length = max(1, round(max(_BLOCK_S, _BLOCK_TIMES * noise.time_s) * fps))
@@ -116,41 +118,37 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
     )
 
 
-def _rows(views: CameraViews, step: int) -> FittedPlaces:
-    """Every `step`-th frame of all drones, as rows."""
+def _rows(views: CameraViews) -> FittedPlaces:
+    """The views of all frames and drones, as rows."""
     cameras = views.num_cameras
     return FittedPlaces(
-        np.nan_to_num(views.residual_px[::step]).reshape(-1, cameras, 2),
-        views.jacobian[::step].reshape(-1, cameras, 2, 3),
-        views.shown[::step].reshape(-1, cameras),
+        np.nan_to_num(views.residual_px).reshape(-1, cameras, 2),
+        views.jacobian.reshape(-1, cameras, 2, 3),
+        views.shown.reshape(-1, cameras),
     )
 
 
-def _total_variances(views: CameraViews, step: int) -> Float[np.ndarray, "cameras 2"]:
+def _total_variances(views: CameraViews) -> Float[np.ndarray, "cameras 2"]:
     """(cameras, 2), variances of the places in single frames; the mean of the others where a camera shows nothing."""
-    rows = _rows(views, step)
+    rows = _rows(views)
     variance_px2 = camera_variances(rows, np.zeros(rows.residual_px.shape))
     return np.where(np.isnan(variance_px2), np.nanmean(variance_px2), variance_px2)
 
 
 def _without(views: CameraViews, constant: ConstantErrors) -> CameraViews:
     """The views without the fitted turns and clocks, with residuals of positions that are fitted anew."""
-    turned_px = np.einsum("fdcip,cp->fdci", views.turn_px, constant.turn_rad)
-    late_px = -views.flow_px_s * constant.clock_s[:, None]
-    shown = views.shown
-    residual_px = np.where(shown[..., None], views.residual_px - turned_px - late_px, 0.0)
-    rows = FittedPlaces(
-        residual_px.reshape(-1, *residual_px.shape[2:]),
-        views.jacobian.reshape(-1, *views.jacobian.shape[2:]),
-        shown.reshape(-1, shown.shape[2]),
-    )
-    determined = rows.determined
-    fitted_px = rows.residual_px.copy()
-    weight = np.repeat(rows.shown[determined][..., None].astype(float), 2, axis=-1)
-    fitted_px[determined] = weighted_residuals(rows.only(determined), weight)[0]
-    return replace(
-        views, residual_px=np.where(shown[..., None], fitted_px.reshape(residual_px.shape), np.nan)
-    )
+    residual_px = np.empty_like(views.residual_px)
+    for frames, part in views.parts():
+        turned_px = np.einsum("fdcip,cp->fdci", part.turn_px, constant.turn_rad)
+        late_px = -part.flow_px_s * constant.clock_s[:, None]
+        rows = _rows(replace(part, residual_px=part.residual_px - turned_px - late_px))
+        determined = rows.determined
+        fitted_px = np.where(rows.shown[..., None], rows.residual_px, np.nan)
+        weight = np.repeat(rows.shown[determined][..., None].astype(float), 2, axis=-1)
+        refitted_px = weighted_residuals(rows.only(determined), weight)[0]
+        fitted_px[determined] = np.where(rows.shown[determined][..., None], refitted_px, np.nan)
+        residual_px[frames] = fitted_px.reshape(part.residual_px.shape)
+    return replace(views, residual_px=residual_px)
 
 
 def _blocks(views: CameraViews, length: int) -> tuple[FittedPlaces, np.ndarray]:
