@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -30,9 +29,9 @@ from psotrack.recordings import (
     MarkersTable,
     Recording,
     RecordingFile,
+    VideoEncoder,
     WorldTable,
     probe,
-    silence_opencv,
     write_recording_file,
 )
 from psotrack.rig_files import write_rig
@@ -199,13 +198,13 @@ class _Encoder:
         try:
             with recorder.times.open("w", encoding="utf-8", newline="") as times:
                 times.write("frame,time_s\n")
-                writer = self._opened()
+                encoder = VideoEncoder(recorder.video, _CODEC, recorder.fps, recorder.image_size_wh)
                 try:
                     while (frame := self._waiting.get()) is not None:
                         self._look_at_disk()
-                        self._encode(writer, times, *frame)
+                        self._encode(encoder, times, *frame)
                 finally:
-                    writer.release()
+                    encoder.close()
         except OSError as error:
             found = error.strerror.lower() if error.strerror else f"{error}"
             self.failure = (
@@ -213,18 +212,7 @@ class _Encoder:
                 "what was recorded before stays, tracking goes on"
             )
 
-    def _opened(self) -> cv2.VideoWriter:
-        recorder = self._recorder
-        codec = cv2.VideoWriter.fourcc(*_CODEC)
-        with silence_opencv():
-            writer = cv2.VideoWriter(
-                os.path.abspath(recorder.video), cv2.CAP_FFMPEG, codec, recorder.fps, recorder.image_size_wh
-            )
-        if not writer.isOpened():
-            raise OSError(f"that {recorder.video.name} cannot be written")
-        return writer
-
-    def _encode(self, writer: cv2.VideoWriter, times: TextIO, image: np.ndarray, time_s: float) -> None:
+    def _encode(self, encoder: VideoEncoder, times: TextIO, image: np.ndarray, time_s: float) -> None:
         recorder = self._recorder
         if image.shape[1::-1] != recorder.image_size_wh:
             width, height = recorder.image_size_wh
@@ -232,7 +220,7 @@ class _Encoder:
         # The row first: if the program is killed, times without a frame are left aside when the recording is opened.
         times.write(f"{self.num_encoded},{time_s!r}\n")
         times.flush()
-        writer.write(image)
+        encoder.write(image)
         self.num_encoded += 1
         self._num_since += 1
 

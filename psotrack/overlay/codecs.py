@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from psotrack.errors import OutputError
-from psotrack.recordings import check_video_written, silence_opencv
+from psotrack.recordings import VideoEncoder, check_video_written
 from psotrack.support import atomic_write
 
 
@@ -47,9 +44,9 @@ def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
         with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
             path = Path(folder) / "tried.mp4"
             with contextlib.suppress(OutputError):
-                with video_writer(path, codec, 25.0, _TRIED_WH) as write:
+                with video_writer(path, codec, 25.0, _TRIED_WH) as encoder:
                     for level in (0, 255):
-                        write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
+                        encoder.write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
                 return codec
     raise OutputError(
         "overlay",
@@ -59,20 +56,9 @@ def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
     )
 
 
-class _Writer:
-    """Appends frames of one size."""
-
-    def __init__(self, writer: cv2.VideoWriter) -> None:
-        self._writer, self.num_frames = writer, 0
-
-    def __call__(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
-        self._writer.write(bgr)
-        self.num_frames += 1
-
-
 @contextlib.contextmanager
-def video_writer(path: Path, codec: Codec, fps: float, size_wh: tuple[int, int]) -> Iterator[_Writer]:
-    """A function that appends BGR frames to a video, which appears under its name when it is complete.
+def video_writer(path: Path, codec: Codec, fps: float, size_wh: tuple[int, int]) -> Iterator[VideoEncoder]:
+    """An encoder of BGR frames to a video, which appears under its name when it is complete.
 
     Args:
         path: path of the file, ending in .mp4.
@@ -84,19 +70,13 @@ def video_writer(path: Path, codec: Codec, fps: float, size_wh: tuple[int, int])
         OutputError: the codec does not work here, or the file cannot be written completely.
     """
     with atomic_write(path) as temporary:
-        with silence_opencv():
-            writer = cv2.VideoWriter(
-                os.path.abspath(temporary),
-                cv2.CAP_FFMPEG,
-                cv2.VideoWriter.fourcc(*codec.fourcc),
-                fps,
-                size_wh,
-            )
-        if not writer.isOpened():
-            raise OutputError(path, expected=f"a video in {codec.name}", found="that OpenCV cannot encode it")
-        append = _Writer(writer)
         try:
-            yield append
+            encoder = VideoEncoder(temporary, codec.fourcc, fps, size_wh)
+        except OSError as error:
+            found = "that OpenCV cannot encode it"
+            raise OutputError(path, expected=f"a video in {codec.name}", found=found) from error
+        try:
+            yield encoder
         finally:
-            writer.release()
-        check_video_written(path, temporary, append.num_frames)
+            encoder.close()
+        check_video_written(path, temporary, encoder.num_frames)

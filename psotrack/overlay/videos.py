@@ -114,10 +114,10 @@ def write_video(task: CameraVideoTask | MosaicTask, advance: Advance) -> None:
         return
     camera = task.camera
     trail_rows = round(TRAIL_S * camera.video.fps)
-    with video_writer(task.path, task.codec, camera.video.fps, camera.size_wh) as append:
+    with video_writer(task.path, task.codec, camera.video.fps, camera.size_wh) as encoder:
         for number, frame in enumerate(read_frames(camera.video, into_one=True)):
             words = f"{task.time_s[number]:.2f} s"
-            append(camera.drawn(frame, task.row[number], trail_rows, words))
+            encoder.write(camera.drawn(frame, task.row[number], trail_rows, words))
             advance(1)
 
 
@@ -127,7 +127,7 @@ def _write_mosaic(task: MosaicTask, advance: Advance) -> None:
     lines = -(-(len(task.cameras) + 1) // columns)
     readers = [_FramesInOrder(camera.video) if camera.video.num_frames else None for camera in task.cameras]
     trail_rows = round(TRAIL_S * task.fps)
-    with video_writer(task.path, task.codec, task.fps, (columns * width, lines * height)) as append:
+    with video_writer(task.path, task.codec, task.fps, (columns * width, lines * height)) as encoder:
         for instant in range(len(task.time_s)):
             words = f"{task.time_s[instant]:.2f} s"
             whole = np.zeros((lines * height, columns * width, 3), np.uint8)
@@ -142,7 +142,7 @@ def _write_mosaic(task: MosaicTask, advance: Advance) -> None:
             for place, tile in enumerate([*tiles, map_image]):
                 line, column = divmod(place, columns)
                 whole[line * height : (line + 1) * height, column * width : (column + 1) * width] = tile
-            append(whole)
+            encoder.write(whole)
             advance(1)
 
 

@@ -35,17 +35,15 @@ from .timing import MOST_INSTANTS, REACH, FrameTimes, Timeline, check_rate, make
 from .video import (
     TruncatedVideoError,
     VideoInfo,
-    VideoWriter,
     check_end,
-    check_video_written,
     digest_video,
-    join_videos,
     probe,
     probe_images,
     read_frames,
     read_frames_at,
     read_near,
 )
+from .video_writing import VideoEncoder, VideoWriter, check_video_written, join_videos
 
 __all__ = [
     "ARRAY_FILE",
@@ -67,6 +65,7 @@ __all__ = [
     "StoredSilhouettes",
     "Timeline",
     "TruncatedVideoError",
+    "VideoEncoder",
     "VideoInfo",
     "VideoWriter",
     "WorldTable",

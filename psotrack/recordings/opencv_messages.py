@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import tempfile
 import threading
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import cv2
 import numpy as np
@@ -17,30 +16,49 @@ logger = logging.getLogger(__name__)
 
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
-#: Levels are the process's: two threads that set and restore them at once would leave them set.
-_opening = threading.Lock()
+#: stderr is the process's: images are decoded one after the other, so that each has its own messages.
+_decoding = threading.Lock()
 
 
-@contextlib.contextmanager
-def silence_opencv() -> Iterator[None]:
-    """Suppress the messages of OpenCV and FFmpeg about a file that is opened or decoded in this block.
+class _Silence:
+    """Levels of messages, which are the process's: the first of several threads sets them, the last restores them."""
+
+    def __init__(self) -> None:
+        self._lock, self._num_threads = threading.Lock(), 0
+        self._level, self._is_chosen = 0, False
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._num_threads == 0:
+                self._level, self._is_chosen = (
+                    cv2.utils.logging.getLogLevel(),
+                    _FFMPEG_LOG_LEVEL in os.environ,
+                )
+                cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+                os.environ.setdefault(_FFMPEG_LOG_LEVEL, _FFMPEG_QUIET)
+            self._num_threads += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._num_threads -= 1
+            if self._num_threads == 0:
+                cv2.utils.logging.setLogLevel(self._level)
+                if not self._is_chosen:
+                    del os.environ[_FFMPEG_LOG_LEVEL]
+
+
+_silence = _Silence()
+
+
+def silence_opencv() -> AbstractContextManager[None]:
+    """Suppress the messages of OpenCV and FFmpeg about a file that is opened, decoded or written in this block.
 
     Errors replace them. Libraries that write to the terminal themselves, such as libpng, are not silenced: see
     `decode_image`.
     FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user has set is
     kept.
     """
-    with _opening:
-        level = cv2.utils.logging.getLogLevel()
-        chosen = _FFMPEG_LOG_LEVEL in os.environ
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        os.environ.setdefault(_FFMPEG_LOG_LEVEL, _FFMPEG_QUIET)
-        try:
-            yield
-        finally:
-            cv2.utils.logging.setLogLevel(level)
-            if not chosen:
-                del os.environ[_FFMPEG_LOG_LEVEL]
+    return _silence
 
 
 def decode_image(
@@ -58,7 +76,7 @@ def decode_image(
     """
     if not len(coded):
         return None
-    with silence_opencv(), tempfile.TemporaryFile() as taken:
+    with _decoding, silence_opencv(), tempfile.TemporaryFile() as taken:
         stderr = os.dup(2)
         try:
             os.dup2(taken.fileno(), 2)

@@ -1,35 +1,29 @@
-"""Reading, writing and joining of videos.
+"""Reading of videos.
 
-FFmpeg, inside OpenCV, decodes and encodes. FFmpeg trusts the header, drops frames that it cannot decode, and reports no
-failed writes; in this module each of these cases is an error that names the file. Frame rates are as exact as in the
-container: 29 instead of 29.97 would lose a second in half a minute.
+FFmpeg, inside OpenCV, decodes. FFmpeg trusts the header, and drops frames that it cannot decode; in this module either
+is an error that names the file. Frame rates are as exact as in the container: 29 instead of 29.97 would lose a second
+in half a minute.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.errors import InputError, OutputError, SettingsError, check_positive
+from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.recordings.image_files import check_pixels, depth_of, read_image
 from psotrack.recordings.opencv_messages import silence_opencv
 from psotrack.recordings.timing import MOST_INSTANTS
-from psotrack.support import atomic_write, digest_file, digest_record
+from psotrack.support import digest_file, digest_record
 
-#: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
-_CODEC = "XVID"
-#: Properties of a writer that takes encoded frames and the flags of key frames.
-_CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
 #: Largest number of images of which the depth is read.
 _READ_IMAGES = 5
 #: To reach a frame, OpenCV decodes from the last key frame that is at least this number of frames before it.
@@ -72,7 +66,7 @@ def probe(path: Path | str) -> VideoInfo:
         InputError: the file does not exist, is empty, is not a video, or has no frames.
     """
     path = Path(path)
-    capture = _open(path)
+    capture = open_capture(path)
     try:
         num_frames = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         fps = capture.get(cv2.CAP_PROP_FPS)
@@ -84,7 +78,7 @@ def probe(path: Path | str) -> VideoInfo:
     check_pixels(path, width, height)
     is_finished = num_frames >= 1
     if not is_finished:
-        num_frames = _count_packets(path) - 1
+        num_frames = count_packets(path) - 1
     if num_frames < 1:
         raise InputError(path, expected="a video with frames", found="no frames")
     if num_frames > MOST_INSTANTS:
@@ -104,14 +98,14 @@ def check_end(video: VideoInfo) -> None:
         path = video.images[video.num_frames - 1]
         _check_size(path, video, read_image(path))
         return
-    capture = _open(video.path)
+    capture = open_capture(video.path)
     try:
         with silence_opencv():
             capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
             reached = capture.grab()
     finally:
         capture.release()
-    if not reached and (count := _count_packets(video.path)) < video.num_frames:
+    if not reached and (count := count_packets(video.path)) < video.num_frames:
         raise TruncatedVideoError(video, count)
 
 
@@ -168,7 +162,7 @@ def read_frames(
             _check_size(path, video, frame)
             yield frame
         return
-    capture = _open(video.path)
+    capture = open_capture(video.path)
     place: UInt8[np.ndarray, "height width 3"] | None = None
     try:
         for index in range(video.num_frames):
@@ -207,7 +201,7 @@ def read_frames_at(
             _check_size(video.images[number], video, frame)
             yield number, frame
         return
-    capture = _open(video.path)
+    capture = open_capture(video.path)
     following = 0
     try:
         for number in numbers:
@@ -251,7 +245,7 @@ def read_near(
     if not len(key_frames):
         return
     nearest = np.abs(key_frames + _SEEK_BEFORE - np.array(places)[:, None]).argmin(axis=1)
-    capture = _open(video.path)
+    capture = open_capture(video.path)
     try:
         for key_frame in np.unique(key_frames[nearest]).tolist():
             number = min(key_frame + _SEEK_BEFORE, video.num_frames - 1)
@@ -266,7 +260,7 @@ def read_near(
 
 def _key_frames(video: VideoInfo) -> list[int]:
     """Numbers of the frames that can be decoded without others, found without decoding."""
-    capture = _open(video.path)
+    capture = open_capture(video.path)
     found = []
     try:
         capture.set(cv2.CAP_PROP_FORMAT, -1)
@@ -291,194 +285,12 @@ def _check_size(
         raise InputError(path, expected=expected, found=f"{frame.shape[1]} x {frame.shape[0]}{where}")
 
 
-class VideoWriter:
-    """Writes BGR frames to an .avi file with lossy compression (MPEG-4).
-
-    The file appears at `path` when the `with` block ends without an error. The container stores the frame rate to 0.001
-    per second.
-
-    Args:
-        path: path of the file, ending in .avi; its folder is created.
-        fps: frames per second.
-        image_size_wh: width and height in pixels, even numbers.
+def open_capture(path: Path) -> cv2.VideoCapture:
+    """Open a video by FFmpeg, without FFmpeg's messages.
 
     Raises:
-        SettingsError: the suffix, the rate or the size is not allowed, or a frame has another size.
-        OutputError: the file cannot be written completely, for example because the disk is full.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with VideoWriter(Path(folder) / "cam1i_s.avi", 25.0, (64, 48)) as writer:
-        ...         writer.write(np.zeros((48, 64, 3), np.uint8))
-        ...     probe(Path(folder) / "cam1i_s.avi").num_frames
-        1
+        InputError: the video cannot be opened.
     """
-
-    def __init__(self, path: Path | str, fps: float, image_size_wh: tuple[int, int]) -> None:
-        path = Path(path)
-        if path.suffix.lower() != ".avi":
-            raise SettingsError("video", expected="a file name ending in .avi", found=path.name)
-        check_positive("fps", fps)
-        if any(side < 2 or side % 2 for side in image_size_wh):
-            raise SettingsError(
-                "image size",
-                expected="even numbers of pixels, because the codec halves the resolution of colours",
-                found=f"{image_size_wh[0]} x {image_size_wh[1]}",
-            )
-        self._path = path
-        self._fps = fps
-        self._size_wh = image_size_wh
-        self._num_frames = 0
-        self._open_until_exit = contextlib.ExitStack()
-
-    def __enter__(self) -> VideoWriter:
-        with contextlib.ExitStack() as stack:
-            self._temporary = stack.enter_context(atomic_write(self._path))
-            self._writer = _writer(self._path, self._temporary, self._fps, self._size_wh)
-            # From here on __exit__ removes the temporary file.
-            self._open_until_exit = stack.pop_all()
-        return self
-
-    def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Append one frame, (height, width, 3)."""
-        width, height = self._size_wh
-        if bgr.shape != (height, width, 3):
-            raise SettingsError("frame", expected=f"shape {(height, width, 3)}", found=f"{bgr.shape}")
-        self._writer.write(bgr)
-        self._num_frames += 1
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        with self._open_until_exit:
-            self._writer.release()
-            if error is not None:
-                raise error
-            check_video_written(self._path, self._temporary, self._num_frames)
-
-
-def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
-    """Join videos without encoding their frames again; the file appears at `path` when it is complete.
-
-    Decoding the joined video gives the same frames as decoding the parts, and seeking works as in the parts.
-
-    Args:
-        path: path of the new file, ending in .avi.
-        parts: paths of at least one video of `VideoWriter`, all of one size and one rate.
-
-    Raises:
-        InputError: a part cannot be read, ends early, or has another size or rate than the first part.
-        OutputError: the file cannot be written completely, for example because the disk is full.
-    """
-    path = Path(path)
-    videos = [probe(part) for part in parts]
-    first = videos[0]
-    for video in videos:
-        if (video.fps, video.image_size_wh) != (first.fps, first.image_size_wh):
-            raise InputError(
-                video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
-            )
-    with atomic_write(path) as temporary:
-        writer = _writer(path, temporary, first.fps, first.image_size_wh, _CODED)
-        try:
-            for video in videos:
-                _copy_packets(video, writer)
-        finally:
-            writer.release()
-        check_video_written(path, temporary, sum(video.num_frames for video in videos))
-
-
-def _writer(
-    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Sequence[int] = ()
-) -> cv2.VideoWriter:
-    codec = cv2.VideoWriter.fourcc(*_CODEC)
-    with silence_opencv():
-        writer = cv2.VideoWriter(
-            os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, fps, image_size_wh, settings
-        )
-    if not writer.isOpened():
-        raise OutputError(path, expected="a video that can be written", found="one that cannot be opened")
-    return writer
-
-
-def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
-    """Check a finished video before it gets its name: FFmpeg reports no failed writes.
-
-    Args:
-        path: the video's final path, for the message.
-        temporary: the video.
-        num_frames: number of frames that were written.
-
-    Raises:
-        OutputError: a frame or the index of frames is missing, or there is no frame.
-    """
-    # The header may count frames that are missing: count the frames themselves.
-    found = _count_packets(temporary) if num_frames else 0
-    has_its_end = _mp4_has_its_end if path.suffix.lower() == ".mp4" else _has_its_end
-    if found != num_frames or found == 0 or not has_its_end(temporary):
-        raise OutputError(
-            path,
-            expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
-            found=f"{found} written"
-            if found != num_frames or found == 0
-            else "an incomplete index of frames",
-            remedy="is the disk full? earlier results are unchanged" if num_frames else "",
-        )
-
-
-def _has_its_end(path: Path) -> bool:
-    """Whether an AVI file has the length that its `RIFF` chunks state; the index of frames is at their end."""
-    size, position = path.stat().st_size, 0
-    with path.open("rb") as file:
-        while position < size:
-            file.seek(position)
-            name, length = file.read(4), file.read(4)
-            if name != b"RIFF":
-                return False
-            position += 8 + int.from_bytes(length, "little")
-    return position == size
-
-
-def _mp4_has_its_end(path: Path) -> bool:
-    """Whether an MP4 file has the length that its boxes state."""
-    size, position = path.stat().st_size, 0
-    with path.open("rb") as file:
-        while position < size:
-            file.seek(position)
-            length = int.from_bytes(file.read(4), "big")
-            if length == 1:
-                # A box above 4 GB states its length after its name.
-                file.seek(position + 8)
-                length = int.from_bytes(file.read(8), "big")
-            if length < 8:
-                return False
-            position += length
-    return position == size
-
-
-def _copy_packets(video: VideoInfo, writer: cv2.VideoWriter) -> None:
-    capture = _open(video.path)
-    try:
-        capture.set(cv2.CAP_PROP_FORMAT, -1)
-        for index in range(video.num_frames):
-            there, packet = capture.read()
-            if not there:
-                raise TruncatedVideoError(video, index)
-            writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
-            writer.write(packet)
-    finally:
-        capture.release()
-
-
-def _kind(video: VideoInfo) -> str:
-    return "{} x {} pixels at {:g} Hz".format(*video.image_size_wh, video.fps)
-
-
-def _open(path: Path) -> cv2.VideoCapture:
     try:
         with path.open("rb") as file:
             empty = not file.read(1)
@@ -496,10 +308,10 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _count_packets(path: Path) -> int:
+def count_packets(path: Path) -> int:
     """Number of encoded frames in a file, counted without decoding: a few microseconds per frame."""
     try:
-        capture = _open(path)
+        capture = open_capture(path)
     except InputError:
         return 0
     try:

@@ -6,7 +6,6 @@ A mask is what the background model yields, before it is reduced to the stored s
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import VideoInfo, check_video_written, silence_opencv
+from psotrack.recordings import VideoEncoder, VideoInfo, check_video_written
 from psotrack.silhouettes.store import Task, foreground_of
 from psotrack.support import Advance, atomic_write, check_file_name
 
@@ -78,24 +77,19 @@ def _write_video(path: Path, video: VideoInfo, masks: Iterator[UInt8[np.ndarray,
             expected="a folder, because a video has an even width and height",
             found=f"{path.name} for {width} x {height} pixels",
         )
-    count = 0
     with atomic_write(path) as temporary:
         # The ending of the temporary file says the container.
-        codec = cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()])
-        with silence_opencv():
-            writer = cv2.VideoWriter(
-                os.path.abspath(temporary), cv2.CAP_FFMPEG, codec, video.fps, (width, height)
-            )
-        if not writer.isOpened():
-            raise OutputError(path, expected="a video that can be written", found="one that cannot be opened")
+        try:
+            encoder = VideoEncoder(temporary, CODECS[path.suffix.lower()], video.fps, (width, height))
+        except OSError as error:
+            raise OutputError(path, expected="a video that can be written", found=str(error)) from error
         try:
             for mask in masks:
-                writer.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
-                count += 1
+                encoder.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
         finally:
-            writer.release()
-        check_video_written(path, temporary, count)
-    return count
+            encoder.close()
+        check_video_written(path, temporary, encoder.num_frames)
+    return encoder.num_frames
 
 
 def masks_out(out: Path, cameras: tuple[str, ...]) -> dict[str, Path]:

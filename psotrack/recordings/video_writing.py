@@ -1,0 +1,261 @@
+"""Writing and joining of videos.
+
+FFmpeg, inside OpenCV, encodes. FFmpeg reports no failed writes: a video is checked before it gets its name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.errors import InputError, OutputError, SettingsError, check_positive
+from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.video import TruncatedVideoError, VideoInfo, count_packets, open_capture, probe
+from psotrack.support import atomic_write
+
+#: MPEG-4 part 2: OpenCV's wheels can encode and decode it, and decoding is faster than with MJPEG.
+_CODEC = "XVID"
+#: Properties of a writer that takes encoded frames and the flags of key frames.
+_CODED = (cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1, cv2.VIDEOWRITER_PROP_KEY_INTERVAL, 2**31 - 1)
+
+
+class VideoEncoder:
+    """Encodes BGR frames into a file by FFmpeg, without FFmpeg's messages: `check_video_written` finds what is missing.
+
+    Args:
+        file: the file; its ending says the container.
+        codec: four letters.
+        fps: frames per second.
+        image_size_wh: width and height in pixels.
+        settings: pairs of a property of `cv2.VideoWriter` and its value.
+
+    Raises:
+        OSError: FFmpeg cannot open the file, or does not have the codec.
+    """
+
+    def __init__(
+        self,
+        file: Path,
+        codec: str,
+        fps: float,
+        image_size_wh: tuple[int, int],
+        settings: Sequence[int] = (),
+    ) -> None:
+        self.num_frames = 0
+        with silence_opencv():
+            # An absolute path, because FFmpeg reads the text before a colon as a protocol.
+            self._writer = cv2.VideoWriter(
+                os.path.abspath(file),
+                cv2.CAP_FFMPEG,
+                cv2.VideoWriter.fourcc(*codec),
+                fps,
+                image_size_wh,
+                settings,
+            )
+        if not self._writer.isOpened():
+            raise OSError(f"that FFmpeg cannot open {file.name}")
+
+    def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Append one frame, (height, width, 3)."""
+        with silence_opencv():
+            self._writer.write(bgr)
+        self.num_frames += 1
+
+    def write_encoded(self, packet: UInt8[np.ndarray, "..."], key_flag: float) -> None:
+        """Append one frame that is encoded; the file was opened with the property of raw video."""
+        with silence_opencv():
+            self._writer.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, key_flag)
+            self._writer.write(packet)
+        self.num_frames += 1
+
+    def close(self) -> None:
+        """Write the end of the file."""
+        with silence_opencv():
+            self._writer.release()
+
+
+class VideoWriter:
+    """Writes BGR frames to an .avi file with lossy compression (MPEG-4).
+
+    The file appears at `path` when the `with` block ends without an error. The container stores the frame rate to 0.001
+    per second.
+
+    Args:
+        path: path of the file, ending in .avi; its folder is created.
+        fps: frames per second.
+        image_size_wh: width and height in pixels, even numbers.
+
+    Raises:
+        SettingsError: the suffix, the rate or the size is not allowed, or a frame has another size.
+        OutputError: the file cannot be written completely, for example because the disk is full.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with VideoWriter(Path(folder) / "cam1i_s.avi", 25.0, (64, 48)) as writer:
+        ...         writer.write(np.zeros((48, 64, 3), np.uint8))
+        ...     probe(Path(folder) / "cam1i_s.avi").num_frames
+        1
+    """
+
+    def __init__(self, path: Path | str, fps: float, image_size_wh: tuple[int, int]) -> None:
+        path = Path(path)
+        if path.suffix.lower() != ".avi":
+            raise SettingsError("video", expected="a file name ending in .avi", found=path.name)
+        check_positive("fps", fps)
+        if any(side < 2 or side % 2 for side in image_size_wh):
+            raise SettingsError(
+                "image size",
+                expected="even numbers of pixels, because the codec halves the resolution of colours",
+                found=f"{image_size_wh[0]} x {image_size_wh[1]}",
+            )
+        self._path = path
+        self._fps = fps
+        self._size_wh = image_size_wh
+        self._open_until_exit = contextlib.ExitStack()
+
+    def __enter__(self) -> VideoWriter:
+        with contextlib.ExitStack() as stack:
+            self._temporary = stack.enter_context(atomic_write(self._path))
+            self._encoder = _encoder(self._path, self._temporary, self._fps, self._size_wh)
+            # From here on __exit__ removes the temporary file.
+            self._open_until_exit = stack.pop_all()
+        return self
+
+    def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Append one frame, (height, width, 3)."""
+        width, height = self._size_wh
+        if bgr.shape != (height, width, 3):
+            raise SettingsError("frame", expected=f"shape {(height, width, 3)}", found=f"{bgr.shape}")
+        self._encoder.write(bgr)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with self._open_until_exit:
+            self._encoder.close()
+            if error is not None:
+                raise error
+            check_video_written(self._path, self._temporary, self._encoder.num_frames)
+
+
+def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
+    """Join videos without encoding their frames again; the file appears at `path` when it is complete.
+
+    Decoding the joined video gives the same frames as decoding the parts, and seeking works as in the parts.
+
+    Args:
+        path: path of the new file, ending in .avi.
+        parts: paths of at least one video of `VideoWriter`, all of one size and one rate.
+
+    Raises:
+        InputError: a part cannot be read, ends early, or has another size or rate than the first part.
+        OutputError: the file cannot be written completely, for example because the disk is full.
+    """
+    path = Path(path)
+    videos = [probe(part) for part in parts]
+    first = videos[0]
+    for video in videos:
+        if (video.fps, video.image_size_wh) != (first.fps, first.image_size_wh):
+            raise InputError(
+                video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
+            )
+    with atomic_write(path) as temporary:
+        encoder = _encoder(path, temporary, first.fps, first.image_size_wh, _CODED)
+        try:
+            for video in videos:
+                _copy_packets(video, encoder)
+        finally:
+            encoder.close()
+        check_video_written(path, temporary, sum(video.num_frames for video in videos))
+
+
+def _encoder(
+    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Sequence[int] = ()
+) -> VideoEncoder:
+    try:
+        return VideoEncoder(temporary, _CODEC, fps, image_size_wh, settings)
+    except OSError as error:
+        raise OutputError(path, expected="a video that can be written", found=str(error)) from error
+
+
+def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
+    """Check a finished video before it gets its name: FFmpeg reports no failed writes.
+
+    Args:
+        path: the video's final path, for the message.
+        temporary: the video.
+        num_frames: number of frames that were written.
+
+    Raises:
+        OutputError: a frame or the index of frames is missing, or there is no frame.
+    """
+    # The header may count frames that are missing: count the frames themselves.
+    found = count_packets(temporary) if num_frames else 0
+    has_its_end = _mp4_has_its_end if path.suffix.lower() == ".mp4" else _has_its_end
+    if found != num_frames or found == 0 or not has_its_end(temporary):
+        raise OutputError(
+            path,
+            expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
+            found=f"{found} written"
+            if found != num_frames or found == 0
+            else "an incomplete index of frames",
+            remedy="is the disk full? earlier results are unchanged" if num_frames else "",
+        )
+
+
+def _has_its_end(path: Path) -> bool:
+    """Whether an AVI file has the length that its `RIFF` chunks state; the index of frames is at their end."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            name, length = file.read(4), file.read(4)
+            if name != b"RIFF":
+                return False
+            position += 8 + int.from_bytes(length, "little")
+    return position == size
+
+
+def _mp4_has_its_end(path: Path) -> bool:
+    """Whether an MP4 file has the length that its boxes state."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            length = int.from_bytes(file.read(4), "big")
+            if length == 1:
+                # A box above 4 GB states its length after its name.
+                file.seek(position + 8)
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            position += length
+    return position == size
+
+
+def _copy_packets(video: VideoInfo, encoder: VideoEncoder) -> None:
+    capture = open_capture(video.path)
+    try:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)
+        for index in range(video.num_frames):
+            there, packet = capture.read()
+            if not there:
+                raise TruncatedVideoError(video, index)
+            encoder.write_encoded(packet, capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
+    finally:
+        capture.release()
+
+
+def _kind(video: VideoInfo) -> str:
+    return "{} x {} pixels at {:g} Hz".format(*video.image_size_wh, video.fps)
