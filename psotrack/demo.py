@@ -18,7 +18,7 @@ from psotrack.recordings import Recording, read_frames
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
+from psotrack.support import Report, atomic_write, atomic_write_all, no_progress, refuse_to_overwrite
 from psotrack.tracking import on_device
 from psotrack.trajectories import write_trajectories
 
@@ -46,8 +46,10 @@ def run(
 ) -> Demo:
     """Simulate, track, evaluate; all files go to `out`.
 
+    After an interruption, the next call keeps the simulated sequence and the silhouettes.
+
     Raises:
-        OutputError: there are results in `out` and `force` is not set.
+        OutputError: there are results in `out`, or a sequence with another seed, and `force` is not set.
     """
     tracks, picture = out / "tracks.csv", out / "demo.png"
     for path in (tracks, picture):
@@ -59,17 +61,19 @@ def run(
         SimulationSettings(NUM_FRAMES, SCALE, seed, masks=False, onboard=False),
         jobs=jobs,
         force=force,
+        keep=not force,
         report=report,
     )
     simulated = time.perf_counter()
     recording = read_sequence(folder).usable()
     settings = TrackSettings(seed=seed, silhouettes=SILHOUETTES)
     tracked = track_recording(recording, settings, cache=out / "silhouettes", jobs=jobs, report=report)
-    write_trajectories(tracks, tracked.trajectories, force=force)
     ended = time.perf_counter()
     assert recording.truth is not None, "the simulator writes one"
     evaluation = evaluate(tracked.trajectories, recording.truth)
-    save_picture(picture, recording, tracked)
+    with atomic_write_all(tracks, picture) as (tracks_file, picture_file):
+        write_trajectories(tracks_file, tracked.trajectories)
+        save_picture(picture_file, recording, tracked)
     seconds = tracked.record["seconds"]
     stages = {
         "simulate": simulated - began,

@@ -247,13 +247,13 @@ def test_extrinsics_from_markers_on_the_walls(tmp_path):
     assert np.linalg.norm(centres(again) - centres(rig)) < 0.01
 
 
-@pytest.mark.slow
-def test_intrinsics_of_a_board(tmp_path):
+def film_board(path):
+    """A video of a ChArUco board of 7 x 5 squares of 4 cm, by a camera of 620 pixels focal length."""
     board, per_m = Board((7, 5), 0.04, 0.03), 3000.0
     K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
     sheet = board.opencv().generateImage((int(0.28 * per_m), int(0.2 * per_m)))
     rng = np.random.default_rng(0)
-    with VideoWriter(tmp_path / "board.avi", 25.0, (640, 480)) as writer:
+    with VideoWriter(path, 25.0, (640, 480)) as writer:
         for _ in range(14):
             R = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
             shift = (rng.uniform(-0.08, 0.08), rng.uniform(-0.06, 0.06), rng.uniform(0.32, 0.5))
@@ -264,6 +264,11 @@ def test_intrinsics_of_a_board(tmp_path):
             H = K @ np.column_stack([R[:, 0], R[:, 1], shift]) @ to_board
             image = cv2.warpPerspective(sheet, H, (640, 480), flags=cv2.INTER_AREA, borderValue=200)
             writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+
+
+@pytest.mark.slow
+def test_intrinsics_of_a_board(tmp_path):
+    film_board(tmp_path / "board.avi")
     size = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03", "--lens", "4")
     out = tmp_path / "lens.toml"
     output = run(
@@ -289,7 +294,7 @@ def test_intrinsics_of_a_board(tmp_path):
 HALF_PX = np.array([60.0, 35.0])
 
 
-def flight(folder, rig, wrong):
+def write_flight(folder, rig, wrong):
     """Write a sequence with detections by `rig` (noise of 0.5 px) and the calibration `wrong`; returns its tracks."""
     folder.mkdir()
     rng = np.random.default_rng(3)
@@ -337,7 +342,7 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
     R = Rotation.from_rotvec([0.01, -0.012, 0.006]).as_matrix() @ T[2, :3, :3]
     T[2, :3, :3], T[2, :3, 3] = R, -R @ (centres(rig)[2] + (0.02, -0.02, 0.01))
     wrong = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
-    tracks = flight(tmp_path / "SEQ", rig, wrong)
+    tracks = write_flight(tmp_path / "SEQ", rig, wrong)
     fixed = ("--fixed", "c0,c1,c3,c4", "--noise", "0.5")
     out = tmp_path / "better.csv"
     shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, *fixed, "--out", out).stdout
@@ -376,7 +381,7 @@ def test_a_rig_is_adjusted_to_its_drones(tmp_path):
 def test_why_a_rig_in_which_all_cameras_may_be_off_is_written_unchanged(tmp_path, monkeypatch):
     """The finding itself is tested with the doctor's other findings; here, what the command says of it."""
     rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
-    tracks = flight(tmp_path / "SEQ", rig, rig)
+    tracks = write_flight(tmp_path / "SEQ", rig, rig)
     monkeypatch.setattr(
         "psotrack.doctor.improve_with_check",
         lambda *args, **more: replace(improve_with_check(*args, **more), all_off=True),
@@ -389,7 +394,7 @@ def test_why_a_rig_in_which_all_cameras_may_be_off_is_written_unchanged(tmp_path
 
 def test_a_right_rig_is_written_unchanged(tmp_path):
     rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
-    tracks = flight(tmp_path / "SEQ", rig, rig)
+    tracks = write_flight(tmp_path / "SEQ", rig, rig)
     out = tmp_path / "same.toml"
     shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--refine-focal-length", "--out", out).stdout
     assert "no camera is off by more than the uncertainty of these detections" in shown

@@ -17,7 +17,7 @@ import pytest
 from flight_files import make_sequence, make_tracks_file
 from helpers import make_once, ring_rig
 from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
-from test_cli_calibrate import pairs_of
+from test_cli_calibrate import film_board, pairs_of, square_pixels, write_flight
 from test_fuse_command import make_files
 from test_map_markers import make_walk
 from test_synchronisation import make_recording
@@ -98,12 +98,16 @@ def inputs(tmp_path_factory, root):
         rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
         write_rig(folder / "lenses.yml", rig)
         pairs_of(folder / "pairs.csv", rig)
+        film_board(folder / "board.avi")
+        write_flight(folder / "boxes", *[square_pixels(ring_rig(5, image_size_wh=(1280, 720)))] * 2)
         for name, make_inputs in (("walk", make_walk), ("fuse", make_files), ("clocks", make_recording)):
             (folder / name).mkdir()
             make_inputs(folder / name)
         tracked = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
         assert tracked.returncode == 0, tracked.stderr
         sequence = root / "Simulated_Data" / "S01_D2_A"
+        simulated = psotrack(root, *CORNERS.split(), "--out", folder / "corners")
+        assert simulated.returncode == 0, simulated.stderr
         packed = psotrack(root, "pack", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack")
         assert packed.returncode == 0, packed.stderr
         grid_file(folder, [2, 3]).rename(folder / "grid.toml")
@@ -129,6 +133,11 @@ TRACK = (
     "track {root}/Simulated_Data/S01_D2_A --particles 8 --iterations 2 --swarm joint --score hard --init truth "
     "--drone-size 0.5,0.5,0.2 --reduction 2 --jobs 1 --force --quiet"
 )
+#: A sequence that has all that `as-real` uses.
+CORNERS = (
+    "simulate S02_D4_A --set cameras=laboratory_corners --set markers=false --frames 12 --scale 0.1 --jobs 1 "
+    "--no-masks --no-onboard --quiet"
+)
 #: Outputs, which belong together -> words of the command that writes them.
 COMMANDS = {
     ("tracks.csv", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.csv",
@@ -136,6 +145,9 @@ COMMANDS = {
     (
         "flight.psotrack",
     ): "pack {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --out flight.psotrack --force",
+    (
+        "videos.psotrack",
+    ): "pack {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
     ("folder",): "unpack {inputs}/packed.psotrack --out folder",
     (
         "rig.toml",
@@ -144,6 +156,13 @@ COMMANDS = {
     (
         "rig.yml",
     ): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.yml --force",
+    (
+        "lens.toml",
+    ): "calibrate intrinsics {inputs}/board.avi --squares 7x5 --square 0.04 --marker 0.03 --lens 4 "
+    "--out lens.toml --force --quiet",
+    ("better.csv",): "calibrate adjust {inputs}/boxes --tracks {inputs}/boxes/tracks.csv --out better.csv "
+    "--force --quiet",
+    ("Real_Data/R02_D4",): "as-real {inputs}/corners/Simulated_Data/S02_D4_A --out . --quiet",
     ("camera.csv",): "localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
     "--out camera.csv --force --frames 8 --quiet",
     ("corners.csv",): "map-markers {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
@@ -171,6 +190,7 @@ def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, mon
             for name in names:
                 Path(name).write_bytes(OLDER)
 
+    parents = {str(parent) for name in names for parent in Path(name).parents}
     empty = disk.used()
     undisturbed = run_psotrack(*words)
     assert undisturbed.code == 0, undisturbed.err
@@ -184,7 +204,9 @@ def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, mon
         assert result.code == 2, (room, result)
         assert result.err.count("\n") == 1, (room, result.err)
         assert any(name in result.err for name in names), (room, result.err)
-        assert content_of(disk.place) == older, room
+        # Folders in which the outputs are to be may have been made.
+        left = {path: content for path, content in content_of(disk.place).items() if path not in parents}
+        assert left == older, room
     assert run_psotrack(*words).code == 0
     assert content_of(disk.place) == whole
 
@@ -251,6 +273,37 @@ def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
     )
     assert len(expected.columns) > 0
     pd.testing.assert_frame_equal(found, expected)
+
+
+@pytest.mark.slow
+def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
+    """Found: after a full disk, the next call refused the sequence that the first one had simulated."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("psotrack.demo.NUM_FRAMES", 6)
+    words = ["demo", "--out", "demo", "--jobs", "1", "--quiet"]
+    assert run_psotrack(*words).code == 0
+
+    def simulated():
+        return {path: path.stat().st_mtime_ns for path in Path("demo/Simulated_Data").rglob("*")}
+
+    whole, made = content_of(disk.place), simulated()
+    results = [Path("demo/tracks.csv"), Path("demo/demo.png")]
+    for pages in (0, 2, results[0].stat().st_size // PAGE_BYTES + 2):
+        for path in results:
+            path.unlink(missing_ok=True)
+        with disk.room_for(pages=pages):
+            result = run_psotrack(*words)
+        assert (result.code, result.err.count("\n")) == (2, 1), (pages, result)
+        assert not any(path.exists() for path in results), pages
+        assert ".partial" not in "".join(content_of(disk.place)), pages
+    assert run_psotrack(*words).code == 0
+    assert content_of(disk.place) == whole
+    assert simulated() == made
+    for path in results:
+        path.unlink()
+    other = run_psotrack(*words, "--seed", 2)
+    assert other.code == 2
+    assert "S02_D4_A: expected a path that does not exist yet" in other.err
 
 
 #: Commands with an output on a disk that cannot be written, at `out`.

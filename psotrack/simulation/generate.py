@@ -40,7 +40,7 @@ from psotrack.simulation.labels.mocap import mocap_markers_m
 from psotrack.simulation.scenarios import FlightFromFile, Imaging, Mesh, Scenario, Surroundings
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
-from psotrack.simulation.unfinished import Unfinished, unfinished
+from psotrack.simulation.unfinished import Unfinished, is_made, unfinished
 from psotrack.support import Report, map_in_processes, no_progress
 
 #: Pieces of work per process. Few, because each piece first draws a camera's backdrop; more than one, so that all
@@ -79,6 +79,7 @@ def simulate(
     settings: SimulationSettings | None = None,
     *,
     force: bool = False,
+    keep: bool = False,
     jobs: int | None = None,
     report: Report = no_progress,
 ) -> Path:
@@ -97,6 +98,7 @@ def simulate(
         root: root folder of the data.
         settings: number of frames, scale, seed and parts of the sequence; None: the defaults.
         force: whether to replace an existing sequence.
+        keep: whether an existing sequence of this scenario and these settings is the result.
         jobs: number of drawing processes; None: one per processor.
         report: shows the progress in frames of all videos.
 
@@ -106,7 +108,8 @@ def simulate(
     Raises:
         SettingsError: the scenario does not exist, or a setting is out of its range.
         InputError: a mesh or a recorded flight of the scenario cannot be used.
-        OutputError: the sequence exists and `force` is not set, another call is making it, or it cannot be written.
+        OutputError: the sequence exists and is neither replaced nor kept, another call is making it, or it cannot be
+            written.
     """
     recipe = scenarios.scenario(scenario) if isinstance(scenario, str) else scenario
     settings = settings or SimulationSettings()
@@ -119,7 +122,10 @@ def simulate(
     if settings.onboard:
         # On-board images have their own size. Check here, not after hours of drawing, that the scale fits it.
         intrinsics(scene)
-    with unfinished(folder, _record(scene, settings), force) as growing:
+    record = _record(scene, settings)
+    if keep and is_made(folder, record):
+        return folder
+    with unfinished(folder, record, force) as growing:
         if not growing.complete:
             _write_streams(scene, growing, frames, settings, jobs or os.cpu_count() or 1, report)
             _write_tables(scene, growing.folder, frames)

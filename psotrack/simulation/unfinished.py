@@ -66,6 +66,11 @@ class Unfinished:
             shutil.rmtree(old, ignore_errors=True)
 
 
+def is_made(target: Path, record: bytes) -> bool:
+    """Whether the sequence exists and was made with this record."""
+    return _holds(target / RECORD, record)
+
+
 @contextlib.contextmanager
 def unfinished(target: Path, record: bytes, force: bool) -> Iterator[Unfinished]:
     """Folder for a sequence that is being made: empty, or with the parts that an earlier call made for the same record.
