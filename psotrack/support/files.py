@@ -229,12 +229,10 @@ def _errors_of(outputs: Sequence[_Output]) -> Iterator[None]:
     except OSError as error:
         named = [output for output in outputs if str(error.filename) == str(output.temporary)]
         output = (named or outputs)[-1]
-        place = "" if output.temporary == output.path else f" ({output.temporary.name})"
-        reason = f"{error.strerror or error}{place}"
         raise OutputError(
             output.path,
             expected="a path that can be written",
-            found=reason,
+            found=error.strerror or str(error),
             remedy="earlier results are unchanged",
         ) from error
     except OutputError as error:
