@@ -253,8 +253,10 @@ def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
     words = ["sweep", inputs / "grid.toml", "--data", root, "--quiet", "--out"]
     assert run_psotrack(*words, "whole").code == 0
-    # The last one is enough for the first cell.
-    for room in [{"files": n} for n in range(4)] + [{"pages": n} for n in (0, 1, 22)]:
+    # Until the disk takes the first cell.
+    rooms = [{"files": n} for n in range(4)] + [{"pages": n} for n in range(0, 100, 3)]
+    while not stamps(Path("results")):
+        room = rooms.pop(0)
         with disk.room_for(**room):
             result = run_psotrack(*words, "results")
         assert result.code == 2, (room, result)
@@ -273,6 +275,33 @@ def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
     )
     assert len(expected.columns) > 0
     pd.testing.assert_frame_equal(found, expected)
+
+
+@pytest.mark.slow
+def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
+    words = [
+        "sweep",
+        inputs / "grid.toml",
+        "--data",
+        root,
+        "--quiet",
+        "--cluster",
+        "local",
+        "--out",
+        "results",
+    ]
+    # Until a worker meets the full disk, and not the command, which writes the manifest.
+    pages, said = 0, ""
+    while "results/cells" not in said:
+        pages += 1
+        with disk.room_for(pages=pages):
+            result = psotrack(root, *words)
+        said = result.stderr
+        assert (result.returncode, said.count("\n")) == (2, 1), said
+    assert [path.name for path in disk.place.rglob("*") if path.is_file()] == ["_manifest.json"]
+    result = psotrack(root, *words)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert len(stamps(Path("results"))) == 2
 
 
 @pytest.mark.slow
