@@ -69,8 +69,7 @@ def list_command(cache: Path | None, quiet: bool, force: bool, json_path: Path |
 def check(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) -> None:
     """Check every byte of the silhouettes and of the stored programs, and name what is damaged.
 
-    The exit code is 2 if an entry is damaged. A run makes a damaged entry anew by itself. Programs in JAX's own cache
-    have no digest and are not checked.
+    The exit code is 2 if an entry is damaged. The next run that needs a damaged entry makes it anew.
 
     \b
     Examples:
@@ -87,6 +86,7 @@ def check(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) 
         print_line(quiet, json_path, f"damaged: {path}")
     print_line(quiet, json_path, f"{folder}: {_counted(entries)}, {len(damaged)} damaged")
     if damaged:
+        print_line(quiet, json_path, "the next run that needs a damaged entry makes it anew")
         sys.exit(2)
 
 
