@@ -60,7 +60,7 @@ class VideoEncoder:
                 settings,
             )
         if not self._writer.isOpened():
-            raise OSError(f"that FFmpeg cannot open {file.name}")
+            raise OSError("a video that FFmpeg cannot open")
 
     def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
         """Append one frame, (height, width, 3)."""
