@@ -1,8 +1,11 @@
 """Settings of the test session: types and shapes are checked, JAX is strict, compiled programs are shared."""
 
+import contextlib
 import importlib
 import os
 import pkgutil
+import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -84,6 +87,29 @@ def run_psotrack(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[s
         return Output(code, *capfd.readouterr())
 
     return call
+
+
+@pytest.fixture
+def start_python() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts Python with some arguments, in a session of its own, which ends with the test."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: object, env: dict[str, str] | None = None) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env=env,
+        )
+        processes.append(process)
+        return process
+
+    yield start
+    for process in processes:
+        with process, contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

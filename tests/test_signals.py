@@ -1,6 +1,5 @@
 """Ctrl-C and SIGTERM: each command ends within two seconds with one line, a code that shells know, and nothing left."""
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -72,28 +71,6 @@ def flight(tmp_path_factory):
     return make_once(tmp_path_factory, "recording_of_signals", make_sequence)
 
 
-@pytest.fixture
-def start():
-    """A function that starts Python with arguments, in a session of its own, which ends with the test."""
-    processes = []
-
-    def start(*arguments):
-        process = subprocess.Popen(
-            [sys.executable, *map(str, arguments)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        processes.append(process)
-        return process
-
-    yield start
-    for process in processes:
-        with process, contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-
-
 def end(process, number):
     """Send a signal; gives stderr and the seconds until the end."""
     began_s = time.monotonic()
@@ -117,9 +94,9 @@ def assert_nothing_left(process, wait_s=5.0):
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
 @pytest.mark.parametrize("wait_s", [0.3, 1.5])
-def test_a_command_ends_with_one_line(start, flight, tmp_path, number, wait_s):
+def test_a_command_ends_with_one_line(start_python, flight, tmp_path, number, wait_s):
     out = tmp_path / "silhouettes"
-    process = start(
+    process = start_python(
         "-c", AT_A_TERMINAL, "track", flight, "--out", out / "tracks.csv", "--cache", tmp_path / "cache"
     )
     time.sleep(wait_s)
@@ -133,8 +110,8 @@ def test_a_command_ends_with_one_line(start, flight, tmp_path, number, wait_s):
 
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
-def test_a_computation_that_answers_no_signal_is_ended(start, tmp_path, number):
-    process = start("-c", IN_A_LONG_COMPUTATION, tmp_path / "out.txt")
+def test_a_computation_that_answers_no_signal_is_ended(start_python, tmp_path, number):
+    process = start_python("-c", IN_A_LONG_COMPUTATION, tmp_path / "out.txt")
     assert process.stdout.readline() == "computes\n"
     time.sleep(0.5)
     err, took_s = end(process, number)
@@ -147,10 +124,10 @@ def test_a_computation_that_answers_no_signal_is_ended(start, tmp_path, number):
 
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
-def test_workers_end_without_a_word(start, tmp_path, number):
+def test_workers_end_without_a_word(start_python, tmp_path, number):
     """Found: warnings of zarr, in workers that were ended while they made an array."""
     (tmp_path / "noisy.py").write_text(WITH_NOISY_WORKERS)
-    process = start(tmp_path / "noisy.py")
+    process = start_python(tmp_path / "noisy.py")
     assert [process.stdout.readline() for _ in range(2)] == ["works\n"] * 2
     err, _ = end(process, number)
     code, word = CODES[number]
@@ -159,9 +136,9 @@ def test_workers_end_without_a_word(start, tmp_path, number):
     assert_nothing_left(process)
 
 
-def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(start, flight, tmp_path):
+def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(start_python, flight, tmp_path):
     program = AT_A_TERMINAL.replace("signal.default_int_handler", "signal.SIG_IGN")
-    process = start(
+    process = start_python(
         "-c", program, "track", flight, "--out", tmp_path / "tracks.csv", "--cache", tmp_path / "cache"
     )
     time.sleep(0.3)

@@ -67,23 +67,20 @@ def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_local_cluster_listens_on_the_loopback_only_and_ctrl_c_ends_it_with_one_line(
-    tmp_path_factory, tmp_path
+    start_python, tmp_path_factory, tmp_path
 ):
     root, results = small_sequence(tmp_path_factory), tmp_path / "results"
     # A cell of minutes, so that Ctrl-C comes while a worker computes.
     grid = grid_file(tmp_path, [100_000], runs=100)
     words = ("sweep", grid, "--data", root, "--out", results, "--cluster", "local", "--workers", 2)
-    process = test_signals.start(test_signals.AT_A_TERMINAL, *words, env=environment(root))
-    try:
-        line = process.stderr.readline()
-        end_s = time.monotonic() + 120
-        while not list(results.glob("cells/*.lock")) and time.monotonic() < end_s:
-            time.sleep(0.1)
-        time.sleep(1.0)  # The worker is in the computation.
-        addresses = listening_at(process.pid)
-        err, took_s = test_signals.end(process, signal.SIGINT)
-    finally:
-        process.kill()
+    process = start_python("-c", test_signals.AT_A_TERMINAL, *words, env=environment(root))
+    line = process.stderr.readline()
+    end_s = time.monotonic() + 120
+    while not list(results.glob("cells/*.lock")) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    time.sleep(1.0)  # The worker is in the computation.
+    addresses = listening_at(process.pid)
+    err, took_s = test_signals.end(process, signal.SIGINT)
     listens = r"the cluster listens at tcp://127\.0\.0\.1:\d+, for programs on this computer only\n"
     assert re.fullmatch(listens, line)
     assert addresses == {"127.0.0.1"}
