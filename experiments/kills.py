@@ -205,6 +205,23 @@ def make_place(folder: Path, given: Path, *, with_programs: bool) -> None:
         shutil.copytree(given / "cache" / "compiled", folder / "cache" / "compiled")
 
 
+@dataclass(frozen=True)
+class Strike:
+    """How a command is killed.
+
+    Attributes:
+        number: the signal.
+        victim: "one" of the processes, "all" of them, or a "worker" of the first one.
+        moment_s: time from the command's start, seconds.
+        writing: whether to wait longer, until a file is being written.
+    """
+
+    number: signal.Signals
+    victim: str
+    moment_s: float
+    writing: bool
+
+
 def kill(
     command: Command,
     choice: random.Random,
@@ -216,54 +233,95 @@ def kill(
     """Kill a command once, run the command again, and say what is wrong."""
     # Compiling takes longer than all other work; one kill in five meets a compiler.
     make_place(folder, given, with_programs=choice.random() < 0.8)
-    number = choice.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
-    victim = choice.choice(("one", "all")) if command.processes > 1 else "one"
-    if command.has_workers and choice.random() < 0.3:
-        number, victim = signal.SIGKILL, "worker"
-    writing = choice.random() < 0.5
-    moment_s = choice.uniform(0, usual_s)
+    strike = planned(command, choice, usual_s)
     processes = [command.start(given, folder) for _ in range(command.processes)]
-    # Until its first lines run, Python answers signals in its own way.
-    while not all(map(answers, processes)):
-        time.sleep(0.002)
-    began_s = time.monotonic()
-    while time.monotonic() - began_s < moment_s and processes[0].poll() is None:
-        time.sleep(0.002)
-    while writing and processes[0].poll() is None and not partial(folder):
-        time.sleep(0.002)
-    phase = "over" if processes[0].poll() is not None else "writing" if partial(folder) else "other"
+    phase = wait_for(strike, processes, folder)
     faults: list[str] = []
-    killed = processes if victim == "all" else processes[:1]
-    sent_s = time.monotonic()
-    if victim == "worker":
-        kill_worker(processes[0], choice)
-        # The sweep goes on with another worker.
-        killed = []
-    for process in killed:
-        process.send_signal(number)
-    codes = {process.pid: (ended(process, faults), process.returncode) for process in killed}
-    took_s = time.monotonic() - sent_s if killed else 0.0
-    if phase != "over" and number in CODES:
-        for said, code in codes.values():
-            # A command may have just finished when the signal came.
-            right = code == 0 and not said
-            right |= code == CODES[number][0] and said.startswith(f"psotrack: {CODES[number][1]}; ")
-            if not right or said.count("\n") > 1:
-                faults.append(f"code {code}: {said[-200:]!r}")
-        if took_s > LONGEST_S:
-            faults.append(f"{took_s:.1f} s to the end")
+    killed, took_s = send(strike, processes, phase, choice, faults)
     for process in processes:
         if process not in killed and (said := ended(process, faults)) and process.returncode != 0:
             faults.append(f"the other: code {process.returncode}: {said[-200:]!r}")
-    if number != signal.SIGKILL and (left := partial(folder)):
+    if strike.number != signal.SIGKILL and (left := partial(folder)):
         faults.append(f"left {left[0].name}")
     before = stamps(command.units, folder)
     again = command.start(given, folder)
     said = ended(again, faults)
     # What had just finished is not made again.
-    had_finished = any(code == 0 for _, code in codes.values())
+    had_finished = any(process.returncode == 0 for process in killed)
     if again.returncode != 0 and not (had_finished and "--force" in said):
         faults.append(f"again: code {again.returncode}: {said[-200:]!r}")
+    faults += faults_after_all(command, folder, before, expected)
+    faults += faults_of_processes([*processes, again])
+    return {
+        "signal": strike.number.name,
+        "victim": strike.victim,
+        "phase": phase,
+        "seconds_to_end": round(took_s, 2),
+        "kept": len(before),
+        "failure": "; ".join(faults),
+    }
+
+
+def planned(command: Command, choice: random.Random, usual_s: float) -> Strike:
+    """Choose how the command is killed."""
+    number = choice.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
+    victim = choice.choice(("one", "all")) if command.processes > 1 else "one"
+    if command.has_workers and choice.random() < 0.3:
+        number, victim = signal.SIGKILL, "worker"
+    writing = choice.random() < 0.5
+    return Strike(number, victim, choice.uniform(0, usual_s), writing)
+
+
+def wait_for(strike: Strike, processes: list[subprocess.Popen[str]], folder: Path) -> str:
+    """Wait for the moment; says whether the first process is "over", "writing" a file, or doing "other" work."""
+    # Until its first lines run, Python answers signals in its own way.
+    while not all(map(answers, processes)):
+        time.sleep(0.002)
+    began_s = time.monotonic()
+    while time.monotonic() - began_s < strike.moment_s and processes[0].poll() is None:
+        time.sleep(0.002)
+    while strike.writing and processes[0].poll() is None and not partial(folder):
+        time.sleep(0.002)
+    return "over" if processes[0].poll() is not None else "writing" if partial(folder) else "other"
+
+
+def send(
+    strike: Strike,
+    processes: list[subprocess.Popen[str]],
+    phase: str,
+    choice: random.Random,
+    faults: list[str],
+) -> tuple[list[subprocess.Popen[str]], float]:
+    """Send the signal, and judge how the processes end; gives those processes, and the seconds until their end."""
+    if strike.victim == "worker":
+        kill_worker(processes[0], choice)
+        # The sweep goes on with another worker.
+        return [], 0.0
+    killed = processes if strike.victim == "all" else processes[:1]
+    sent_s = time.monotonic()
+    for process in killed:
+        process.send_signal(strike.number)
+    said = [ended(process, faults) for process in killed]
+    took_s = time.monotonic() - sent_s
+    if phase == "over" or strike.number not in CODES:
+        return killed, took_s
+    expected, word = CODES[strike.number]
+    for process, line in zip(killed, said, strict=True):
+        # A command may have just finished when the signal came.
+        right = process.returncode == 0 and not line
+        right |= process.returncode == expected and line.startswith(f"psotrack: {word}; ")
+        if not right or line.count("\n") > 1:
+            faults.append(f"code {process.returncode}: {line[-200:]!r}")
+    if took_s > LONGEST_S:
+        faults.append(f"{took_s:.1f} s to the end")
+    return killed, took_s
+
+
+def faults_after_all(
+    command: Command, folder: Path, before: dict[str, tuple[int, int]], expected: dict[str, str]
+) -> list[str]:
+    """Units that were made once more, other results than undisturbed, and temporary files that are left."""
+    faults = []
     after = stamps(command.units, folder)
     if made_again := [name for name, stamp in before.items() if after.get(name) != stamp]:
         faults.append(f"made once more: {made_again[0]}")
@@ -272,19 +330,15 @@ def kill(
         faults.append(f"other results: {names[0][0]}")
     if left := partial(folder):
         faults.append(f"left after all {left[0].name}")
+    return faults
+
+
+def faults_of_processes(processes: list[subprocess.Popen[str]]) -> list[str]:
+    """Processes that the commands have started, and that still run after ten seconds."""
     end_s = time.monotonic() + 10
-    while (alive := group_of([*processes, again])) and time.monotonic() < end_s:
+    while (alive := group_of(processes)) and time.monotonic() < end_s:
         time.sleep(0.1)
-    if alive:
-        faults.append(f"{len(alive)} processes left")
-    return {
-        "signal": number.name,
-        "victim": victim,
-        "phase": phase,
-        "seconds_to_end": round(took_s, 2),
-        "kept": len(before),
-        "failure": "; ".join(faults),
-    }
+    return [f"{len(alive)} processes left"] if alive else []
 
 
 def answers(process: subprocess.Popen[str]) -> bool:
