@@ -290,8 +290,8 @@ def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
         "--out",
         "results",
     ]
-    # Until a worker meets the full disk, and not the command, which writes the manifest.
-    pages, said = 0, ""
+    # Until a worker meets the full disk, and not the command, whose manifest takes more than two pages.
+    pages, said = 2, ""
     while "results/cells" not in said:
         pages += 1
         with disk.room_for(pages=pages):
