@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.c3d_format import BLOCK_BYTES, Header, Parameters, Processor, read_layout
+from psotrack.recordings.timing import check_rate
 from psotrack.support import atomic_write, short_repr
 
 _logger = logging.getLogger(__name__)
@@ -94,8 +95,7 @@ def read_c3d(path: Path | str) -> Markers:
         found = f"{np.abs(position_m[frame, marker]).max():.3g} m for marker {marker + 1} in frame {frame}"
         raise InputError(path, expected=f"positions of at most {_FARTHEST_M:g} m", found=found)
     rate_hz = parameters.number("POINT:RATE") or header.rate_hz
-    if not 0 < rate_hz < np.inf:
-        raise InputError(path, expected="a rate above 0 Hz", found=f"{rate_hz:g}")
+    check_rate(path, rate_hz)
     return Markers(_labels(parameters, data.num_points), position_m, rate_hz)
 
 

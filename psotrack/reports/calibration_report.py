@@ -117,6 +117,10 @@ def _read(path: Path) -> CalibrationRecord:
     for name, camera in record.cameras.items():
         if len({len(line) for line in camera.coverage}) > 1:
             raise wrong(f"cameras.{name}.coverage", "lines of equal length", "different ones", "")
+        cells = [count for line in camera.coverage for count in line]
+        if wrong_cells := [count for count in cells if not 0 <= count <= _MOST]:
+            expected = f"numbers from 0 to {_MOST}"
+            raise wrong(f"cameras.{name}.coverage", expected, f"{wrong_cells[0]}", "")
         for field in ("views", "corners", "shared"):
             if not 0 <= (count := getattr(camera, field)) <= _MOST:
                 raise wrong(f"cameras.{name}.{field}", f"a number from 0 to {_MOST}", f"{count}", "")
