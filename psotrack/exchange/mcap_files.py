@@ -34,7 +34,7 @@ from psotrack.exchange.camera_boxes import CameraFrames, camera_frames
 from psotrack.exchange.formats import Footage
 from psotrack.exchange.timed_paths import TimedPath
 from psotrack.recordings import read_frames
-from psotrack.support import Advance, Report, short_repr
+from psotrack.support import LARGEST, MODERATE, Advance, Report, short_repr
 from psotrack.trajectories import Trajectories
 
 WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
@@ -182,6 +182,9 @@ class _Rows:
             )
         covariance = np.array(self.covariance)[order].reshape(-1, 6, 6)
         orientation = np.array(self.wxyz)[order]
+        if (far := np.abs(orientation) > LARGEST).any():
+            found = f"{orientation[far][0]:g} in an orientation"
+            raise InputError(f"{where}, topic {topic}", expected=MODERATE, found=found)
         length = np.linalg.norm(orientation, axis=1, keepdims=True)
         unknown = (covariance[:, [3, 4, 5], [3, 4, 5]] >= ros.UNKNOWN_RAD2).any(axis=1) | (length[:, 0] == 0)
         orientation = np.where(unknown[:, None], np.nan, orientation / np.where(length == 0, 1, length))

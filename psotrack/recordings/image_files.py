@@ -20,6 +20,8 @@ from psotrack.recordings.opencv_messages import decode_image
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 #: Largest number of pixels of an image, ten times that of a large camera.
 MOST_PIXELS = 2**28
+#: Longest side of an image, pixels: OpenCV warps no larger ones.
+MOST_SIDE = 2**15 - 2
 #: Least size of a part of a PNG: length, name and checksum.
 _PNG_PART = 12
 #: Numbers of bits that cameras use.
@@ -146,9 +148,9 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
 
 
 def check_pixels(where: object, width: int, height: int) -> None:
-    """Raise `InputError` for an image, or the images of a video, that would take gigabytes."""
-    if width * height > MOST_PIXELS:
-        expected = f"images of at most {MOST_PIXELS} pixels"
+    """Raise `InputError` for images, also of a video, that would take gigabytes or that OpenCV cannot warp."""
+    if width * height > MOST_PIXELS or max(width, height) > MOST_SIDE:
+        expected = f"images of at most {MOST_PIXELS} pixels, and of {MOST_SIDE} along a side"
         raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
 
 
