@@ -116,6 +116,15 @@ def test_an_image_that_claims_to_be_huge(make, size_wh, tmp_path, little_memory)
         read_image(path)
 
 
+@pytest.mark.parametrize("make", FORMATS)
+def test_an_image_that_is_longer_than_opencv_warps(make, tmp_path):
+    """Found: a traceback of `cv2.remap`, in the detection of markers."""
+    path = tmp_path / "a.png"
+    path.write_bytes(make(100, 40_000))
+    with pytest.raises(InputError, match=r"images of at most 32766 pixels a side, found 100 x 40000 pixels"):
+        read_image(path)
+
+
 @pytest.mark.parametrize("make", [png, bmp, tiff, big_tiff, webp, pnm])
 def test_sides_of_more_than_16_bits(make, tmp_path, little_memory):
     path = tmp_path / "a.png"

@@ -149,9 +149,13 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
 
 def check_pixels(where: object, width: int, height: int) -> None:
     """Raise `InputError` for images, also of a video, that would take gigabytes or that OpenCV cannot warp."""
-    if width * height > MOST_PIXELS or max(width, height) > MOST_SIDE:
-        expected = f"images of at most {MOST_PIXELS} pixels, and of {MOST_SIDE} along a side"
-        raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
+    if width * height > MOST_PIXELS:
+        expected = f"images of at most {MOST_PIXELS} pixels"
+    elif max(width, height) > MOST_SIDE:
+        expected = f"images of at most {MOST_SIDE} pixels a side"
+    else:
+        return
+    raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
 
 
 def _is_whole_png(data: bytes) -> bool:
