@@ -150,7 +150,7 @@ def test_paths_in_a_scenario_file_are_relative_to_its_folder(tmp_path, monkeypat
     ("old", "new", "sentence"),
     [
         ("period_s = 7.4", "period_s = -7.4",
-         "drones[0].flight.terms[0].period_s: expected a number above 0, found -7.4"),
+         "drones[0].flight.terms[0].period_s: expected a number of at least 0.001, found -7.4"),
         ("period_s = 7.4", "periods = 7.4",
          "drones[0].flight.terms[0].periods: expected one of amplitude_m, period_s, phase_deg, found periods; "
          "did you mean period_s?"),

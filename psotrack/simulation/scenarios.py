@@ -20,6 +20,9 @@ _PRESETS = resources.files("psotrack.simulation.presets")
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+#: Seconds, and m/s: what is divided by smaller ones overflows.
+Period = Annotated[float, msgspec.Meta(ge=1e-3)]
+Speed = Annotated[float, msgspec.Meta(ge=1e-3)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 GreyLevels = Annotated[float, msgspec.Meta(ge=0, le=255)]
@@ -45,7 +48,7 @@ class Harmonic(_Record, frozen=True, kw_only=True):
     """
 
     amplitude_m: Vector
-    period_s: Positive
+    period_s: Period
     phase_deg: Vector = (0.0, 0.0, 0.0)
 
 
@@ -77,11 +80,11 @@ class Orbit(_Record, frozen=True, kw_only=True, tag_field="kind", tag="orbit"):
 
     centre_m: Vector
     radius_m: tuple[NotNegative, NotNegative]
-    period_s: Positive
+    period_s: Period
     phase_deg: float = 0.0
     clockwise: bool = False
     rise_m: float = 0.0
-    rise_period_s: Positive = 5.0
+    rise_period_s: Period = 5.0
     rise_phase_deg: float = 0.0
 
 
@@ -97,7 +100,7 @@ class Crossing(_Record, frozen=True, kw_only=True, tag_field="kind", tag="crossi
 
     start_m: Vector
     end_m: Vector
-    period_s: Positive
+    period_s: Period
     phase_deg: float = 0.0
 
 
@@ -142,7 +145,7 @@ class NearPass(_Record, frozen=True, kw_only=True, tag_field="kind", tag="near_p
     distance_m: Positive
     side: Vector
     swing_m: Vector
-    period_s: Positive
+    period_s: Period
     phase_deg: float = 0.0
 
 
@@ -156,7 +159,7 @@ class Waypoints(_Record, frozen=True, kw_only=True, tag_field="kind", tag="waypo
     """
 
     points_m: Annotated[tuple[Vector, ...], msgspec.Meta(min_length=2)]
-    speed_m_s: Positive
+    speed_m_s: Speed
     hover_s: NotNegative = 1.0
 
 
@@ -230,7 +233,7 @@ class Drone(_Record, frozen=True, kw_only=True):
     group: str = ""
     yaw_deg: float = 0.0
     yaw_sway_deg: NotNegative = 40.0
-    yaw_period_s: Positive = 9.0
+    yaw_period_s: Period = 9.0
 
 
 # --- cameras and what they see
@@ -296,7 +299,7 @@ class OnboardCamera(_Record, frozen=True, kw_only=True):
     line_time_s: NotNegative = 0.0
     distortion: tuple[float, ...] = ()
     exposure: tuple[Positive, Positive] = (1.0, 1.0)
-    exposure_period_s: Positive = 4.0
+    exposure_period_s: Period = 4.0
 
 
 class Imaging(_Record, frozen=True, kw_only=True):
@@ -331,7 +334,7 @@ class Imaging(_Record, frozen=True, kw_only=True):
     reflections: Share = 0.04
     exposure_drift: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.01
     exposure: tuple[Positive, Positive] = (1.0, 1.0)
-    exposure_period_s: Positive = 7.0
+    exposure_period_s: Period = 7.0
     white_balance_drift: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.005
     flicker: Share = 0.1
     mains_hz: Positive = 50.02
@@ -363,7 +366,7 @@ class Surroundings(_Record, frozen=True, kw_only=True):
     screen: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.0
     foliage: Annotated[float, msgspec.Meta(ge=0, le=0.9)] = 0.0
     person: Share = 0.0
-    person_period_s: Positive = 8.0
+    person_period_s: Period = 8.0
     clouds: Share = 0.0
 
 
