@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.exchange.number_lines import read_numbers
 from psotrack.exchange.timed_paths import TimedPath, known_orientations
-from psotrack.support import check_file_name
+from psotrack.support import check_file_name, first_repeat
 from psotrack.trajectories import Trajectories
 
 POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
@@ -85,12 +85,12 @@ def _times(
             raise InputError(
                 beside, expected=f"{count} times, as many as {file.name} has poses", found=f"{len(time_s)}"
             )
-        if (np.diff(time_s) <= 0).any():
-            line = int(np.argmax(np.diff(time_s) <= 0)) + 2
+        again = first_repeat(time_s)
+        if again is not None:
             raise InputError(
-                f"{beside}, line {line}",
+                f"{beside}, line {again + 1}",
                 expected="times that increase from line to line",
-                found=f"{time_s[line - 1]:g} s",
+                found=f"{time_s[again]:g} s",
             )
         return time_s
     if instant_s is None:

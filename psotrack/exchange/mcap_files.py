@@ -34,7 +34,7 @@ from psotrack.exchange.camera_boxes import CameraFrames, camera_frames
 from psotrack.exchange.formats import Footage
 from psotrack.exchange.timed_paths import TimedPath
 from psotrack.recordings import read_frames
-from psotrack.support import LARGEST, MODERATE, Advance, Report, short_repr
+from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat, short_repr
 from psotrack.trajectories import Trajectories
 
 WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
@@ -175,11 +175,10 @@ class _Rows:
     def path(self, where: Path, topic: str, name: str) -> TimedPath:
         order = np.argsort(self.time_s, kind="stable")
         time_s = np.array(self.time_s)[order]
-        if (np.diff(time_s) <= 0).any():
-            again = time_s[int(np.argmax(np.diff(time_s) <= 0))]
-            raise InputError(
-                f"{where}, topic {topic}", expected="one pose per time", found=f"two at {again:g} s"
-            )
+        again = first_repeat(time_s)
+        if again is not None:
+            found = f"two at {time_s[again]:g} s"
+            raise InputError(f"{where}, topic {topic}", expected="one pose per time", found=found)
         covariance = np.array(self.covariance)[order].reshape(-1, 6, 6)
         orientation = np.array(self.wxyz)[order]
         if (far := np.abs(orientation) > LARGEST).any():

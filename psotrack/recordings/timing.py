@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.support import short_repr
+from psotrack.support import first_repeat, short_repr
 
 #: Largest distance of a frame from an instant at which the frame is shown, in intervals of the frame's camera: half an
 #: interval, and a tenth for times that jitter.
@@ -90,15 +90,14 @@ class FrameTimes:
         if not np.isfinite(time_s).all():
             frame = int(np.flatnonzero(~np.isfinite(time_s))[0])
             raise InputError(where, expected="finite times", found=f"{time_s[frame]} s for frame {frame}")
-        interval_s = np.diff(time_s)
-        if (interval_s <= 0).any():
-            frame = int(np.flatnonzero(interval_s <= 0)[0]) + 1
+        again = first_repeat(time_s)
+        if again is not None:
             raise InputError(
                 where,
                 expected="times that increase from frame to frame",
-                found=f"{time_s[frame]:g} s for frame {frame} after {time_s[frame - 1]:g} s",
+                found=f"{time_s[again]:g} s for frame {again} after {time_s[again - 1]:g} s",
             )
-        fps = float(1 / np.median(interval_s))
+        fps = float(1 / np.median(np.diff(time_s)))
         check_rate(where, fps, "are the times in seconds?")
         return cls(len(time_s), fps, float(time_s[0]), tuple(time_s.tolist()))
 

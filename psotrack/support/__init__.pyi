@@ -17,7 +17,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_paths, html_table
-from .numbers import LARGEST, MODERATE, is_moderate, whole_number
+from .numbers import LARGEST, LEAST_STEP_S, MODERATE, first_repeat, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .program_seals import is_whole_program
@@ -31,6 +31,7 @@ __all__ = [
     "ARCHIVE_SUFFIX",
     "COLOURS",
     "LARGEST",
+    "LEAST_STEP_S",
     "MODERATE",
     "Advance",
     "Column",
@@ -52,6 +53,7 @@ __all__ = [
     "drone_colour",
     "drop_programs_if_many",
     "end_of_links",
+    "first_repeat",
     "html_block",
     "html_lines",
     "html_paths",

@@ -32,7 +32,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import LARGEST, convert
+from psotrack.support import LARGEST, MODERATE, convert
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.older_folders import rename_columns, rename_manifest
 from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
@@ -324,6 +324,10 @@ def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -
         if name not in table or not _fits(name, table[name]):
             found = "others" if name in table else "none"
             raise DamagedError(path, expected=f"values in the column {name}", found=found, remedy=remedy)
+    size = table.select_dtypes("number").abs().max()
+    for column, largest in size[size > LARGEST].items():
+        found = f"{largest:g} in the column {column}"
+        raise DamagedError(path, expected=MODERATE, found=found, remedy=remedy)
     return table
 
 

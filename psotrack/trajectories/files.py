@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import LARGEST, atomic_write, check_no_nul, refuse_to_overwrite
+from psotrack.support import LARGEST, atomic_write, check_no_nul, first_repeat, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Status, Trajectories
 
 if TYPE_CHECKING:
@@ -459,11 +459,10 @@ def _times(
         row = int(known[np.argmax(differs)])
         expected = f"{time_s[frame_index[row]]:g} s as in another row of this frame"
         raise table.error(row, expected=expected, found=f"{given_s[row]:g} s")
-    back = np.flatnonzero(np.diff(time_s) <= 0)
-    if len(back):
-        after = back[0] + 1
+    after = first_repeat(time_s)
+    if after is not None:
         row = int(np.argmax(frame_index == after))
-        expected = f"a time after {time_s[back[0]]:g} s, that of frame {frame[back[0]]}"
+        expected = f"a time after {time_s[after - 1]:g} s, that of frame {frame[after - 1]}"
         raise table.error(row, expected=expected, found=f"{time_s[after]:g} s")
     if np.isnan(time_s).any():
         row = int(np.argmax(np.isnan(time_s)[frame_index]))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import atomic_write, check_file_name, is_moderate, refuse_to_overwrite
+from psotrack.support import LEAST_STEP_S, atomic_write, check_file_name, is_moderate, refuse_to_overwrite
 from psotrack.trajectories.trajectories import Trajectories
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
@@ -94,7 +94,7 @@ def read_tum_path(path: Path | str) -> Trajectories:
     lines = _read_lines(path)
     poses: list[list[float]] = []
     for place, values in _poses(path, lines):
-        if poses and values[0] <= poses[-1][0]:
+        if poses and values[0] - poses[-1][0] < LEAST_STEP_S:
             expected = "times that increase from line to line"
             raise InputError(place, expected=expected, found=f"{values[0]} s after {poses[-1][0]} s")
         poses.append(values)

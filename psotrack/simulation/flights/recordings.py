@@ -17,7 +17,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.simulation.flights.motion import Flight, Heading
 from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
 from psotrack.simulation.scenarios import FlightFromFile
-from psotrack.support import Column, Table, TextRow, read_rows, read_table, write_rows
+from psotrack.support import Column, Table, TextRow, first_repeat, read_rows, read_table, write_rows
 
 #: Largest time before the first and after the last sample that a flight is extrapolated to. It is longer than half an
 #: exposure, because the exposures of the first and last frame reach beyond the samples.
@@ -143,9 +143,9 @@ def _from_table(table: Table) -> _Samples:
     position = [table.column(name) for name in _POSITION]
     quaternion = [table.column(name) for name in _QUATERNION] if table.find(_QUATERNION[0]) else []
     time_s = np.array([row.number(time) for row in table.rows])
-    stuck = np.flatnonzero(np.diff(time_s) <= 0)
-    if len(stuck):
-        before, row = (table.rows[stuck[0] + step] for step in (0, 1))
+    again = first_repeat(time_s)
+    if again is not None:
+        before, row = table.rows[again - 1 : again + 1]
         raise row.error(
             time, f"a time above {before.text(time)}, the time in line {before.line}", row.text(time)
         )
