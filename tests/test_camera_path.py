@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -119,5 +120,35 @@ def test_invalid_values_are_refused_with_their_line(
     path = tmp_path / "path.csv"
     write_camera_path(path, example_path(), "dron2")
     path.write_text(path.read_text().replace(before, after, 1))
+    with pytest.raises(InputError, match=message):
+        read_camera_path(path)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("qw", "1e-320", r"line 2, column qw: expected a unit quaternion in qw to qz, found length 0"),
+        ("qx", "3", r"line 2, column qw: expected a unit quaternion in qw to qz, found length 3"),
+        (
+            "cov_zz",
+            "-9e18",
+            r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found an indef",
+        ),
+        (
+            "cov_xa",
+            "1e9",
+            r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found an indef",
+        ),
+        ("time_s", "0.04", r"path.csv, camera_path.frame: expected increasing frames and times"),
+    ],
+)
+def test_poses_that_cannot_be_are_refused(tmp_path: Path, column: str, value: str, message: str) -> None:
+    path = tmp_path / "path.csv"
+    write_camera_path(path, example_path(), "dron2")
+    table = pd.read_csv(path, dtype=str)
+    if column.startswith("q"):
+        table.loc[0, ["qw", "qx", "qy", "qz"]] = "0"
+    table.loc[0, column] = value
+    table.to_csv(path, index=False)
     with pytest.raises(InputError, match=message):
         read_camera_path(path)

@@ -73,8 +73,11 @@ class TestRoundTrip:
             values[0, 0] = draw(known)
             return values
 
-        def symmetric(values):
-            return np.where(np.tri(3, dtype=bool), np.swapaxes(values, -1, -2), values)
+        def covariance(root):
+            # Products of larger numbers overflow in float32.
+            root = np.clip(root, -1e18, 1e18).astype(np.float64)
+            product = np.einsum("...ij,...kj->...ik", root, root)
+            return np.where(np.tri(3, dtype=bool), np.swapaxes(product, -1, -2), product).astype(dtype)
 
         def integers(top):
             return draw(hnp.arrays(np.int64, (frames, drones), elements=st.integers(0, top)))
@@ -89,7 +92,7 @@ class TestRoundTrip:
             "fitness": floats(),
             "num_cameras": integers(8),
             "status": integers(2),
-            "covariance_m2": draw(st.none()) or symmetric(floats(3, 3)),
+            "covariance_m2": draw(st.none()) or covariance(floats(3, 3)),
         }
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -254,7 +257,11 @@ class TestBadFiles:
         [
             ("1,0.04,a,1,1", "line 3: expected 8 fields as in the first line, found 5"),
             ("1,0.04,a,1,one,1,tracked,8", "line 3: expected a number in y_m, found 'one'"),
-            ("1,0.04,a,1,inf,1,tracked,8", "line 3: expected a finite number, or nothing in y_m, found inf"),
+            (
+                "1,0.04,a,1,inf,1,tracked,8",
+                "line 3: expected a number of at most 1e+60 in size, or nothing in y_m, found inf",
+            ),
+            ("1,1e-320,a,1,1,1,tracked,8", "line 3: expected a time after 0 s, that of frame 0, found 9.99"),
             ("nan,0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found nan"),
             (",0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found nan"),
             ("inf,0.04,a,1,1,1,tracked,8", "line 3: expected a whole number from 0 in frame, found inf"),
@@ -291,6 +298,15 @@ class TestBadFiles:
             read_trajectories(path)
         assert str(error_info.value).startswith(str(path))
         assert message in str(error_info.value)
+
+    @pytest.mark.parametrize("prefix", ["", "rel_"])
+    @pytest.mark.parametrize("cells", ["1,2,0,1,0,1", "-1,0,0,1,0,1", "1,0,0,1,0,-1e50"])
+    def test_a_covariance_with_a_negative_eigenvalue(self, tmp_path, prefix, cells):
+        names = ",".join(f"{prefix}cov_{axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
+        header = f"frame,time_s,drone,x_m,y_m,z_m,{names}"
+        rows = "0,0,a,1,1,1,1,2,0,4,0,1", "1,0.04,a,1,1,1,,,,,,", f"2,0.08,a,1,1,1,{cells}"
+        with pytest.raises(InputError, match=rf"line 4: expected a covariance in {names.replace(',', ', ')}"):
+            read_trajectories(csv_file(tmp_path, *rows, header=header))
 
     def test_messages_name_the_line_of_the_file(self, tmp_path):
         with pytest.raises(InputError, match="line 5: expected a whole number"):

@@ -18,7 +18,15 @@ from jaxtyping import Bool, Float, Int, Shaped
 from psotrack.errors import InputError, errors_name
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.frame_motion import FrameMotion
-from psotrack.support import Table, TextRow, read_table, refuse_to_overwrite, short_repr, write_rows
+from psotrack.support import (
+    Table,
+    TextRow,
+    is_indefinite,
+    read_table,
+    refuse_to_overwrite,
+    short_repr,
+    write_rows,
+)
 from psotrack.trajectories import Status, Trajectories
 
 #: Axes of the covariance: the world's axes, in metres, then small turns about the camera's axes, in radians.
@@ -221,13 +229,15 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
     covariance = np.zeros((len(table.rows), 6, 6))
     covariance[:, *_UPPER] = _numbers(table, *(f"cov_{axes}" for axes in _COVARIANCE))
     covariance += np.triu(covariance, 1).swapaxes(-1, -2)
+    orientation_wxyz = _numbers(table, *_QUATERNION)
+    _check_poses(table, orientation_wxyz, covariance)
     velocity_m_s = _numbers(table, *_VELOCITY)
     with errors_name(path):
         camera_path = CameraPath(
             frame=_counts(table, "frame"),
             time_s=_numbers(table, "time_s")[:, 0],
             position_m=_numbers(table, *_POSITION),
-            orientation_wxyz=_numbers(table, *_QUATERNION),
+            orientation_wxyz=orientation_wxyz,
             covariance=covariance,
             num_markers=_counts(table, "num_markers"),
             reprojection_px=_numbers(table, "reprojection_px")[:, 0],
@@ -237,6 +247,19 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
             velocity_m_s=velocity_m_s if np.isfinite(velocity_m_s).any() else None,
         )
     return camera_path, names.pop()
+
+
+def _check_poses(
+    table: Table, orientation_wxyz: Float[np.ndarray, "rows 4"], covariance: Float[np.ndarray, "rows 6 6"]
+) -> None:
+    length = np.linalg.norm(orientation_wxyz, axis=1)
+    # The tolerance is far above the rounding of a few digits, and far below a mistake.
+    for row in np.flatnonzero(np.abs(length - 1) > 1e-2):
+        expected, found = "a unit quaternion in qw to qz", f"length {length[row]:g}"
+        raise table.rows[row].error(table.column("qw"), expected, found)
+    for row in np.flatnonzero(is_indefinite(covariance)):
+        expected, found = "a covariance in cov_xx to cov_cc", "an indefinite matrix"
+        raise table.rows[row].error(table.column("cov_xx"), expected, found)
 
 
 def _split(names: tuple[str, ...] | list[str], values: Float[np.ndarray, "frames columns"]) -> Mapping:

@@ -1,4 +1,5 @@
 from .compiled import drop_programs_if_many, keep_compiled
+from .covariances import is_indefinite
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, drone_colour, save_figure
@@ -17,7 +18,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_paths, html_table
-from .numbers import LARGEST, LEAST_STEP_S, MODERATE, first_repeat, is_moderate, whole_number
+from .numbers import LARGEST, MODERATE, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .program_seals import is_whole_program
@@ -26,6 +27,7 @@ from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
 from .stored_programs import load_ahead, stored_jit
+from .times import LEAST_STEP_S, first_repeat
 
 __all__ = [
     "ARCHIVE_SUFFIX",
@@ -59,6 +61,7 @@ __all__ = [
     "html_paths",
     "html_table",
     "identify",
+    "is_indefinite",
     "is_moderate",
     "is_whole_program",
     "joined",

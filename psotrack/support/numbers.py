@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Float
-
 #: Largest size of a number. Nothing that is measured is larger, and sums of products of five such numbers are finite.
 LARGEST = 1e60
 #: What is expected, for messages.
 MODERATE = f"a number of at most {LARGEST:g} in size"
-#: Shortest time between two samples, seconds. Times in files are whole nanoseconds at the finest, and a change divided
-#: by a much shorter time overflows.
-LEAST_STEP_S = 0.5e-9
 #: Largest number of digits of a whole number: such a number is exact as a float, too.
 _MOST_DIGITS = 15
 
@@ -25,13 +19,3 @@ def whole_number(word: str) -> int | None:
 def is_moderate(value: float) -> bool:
     """Whether a number is finite and not so large that computing with it overflows."""
     return abs(value) <= LARGEST
-
-
-def first_repeat(time_s: Float[np.ndarray, "samples"]) -> int | None:
-    """Index of the first time that is not at least `LEAST_STEP_S` after the time before it; None if there is none.
-
-    Args:
-        time_s: (samples,), seconds. Steps from or to NaN are not judged.
-    """
-    repeats = np.flatnonzero(np.diff(time_s) < LEAST_STEP_S)
-    return int(repeats[0]) + 1 if len(repeats) else None

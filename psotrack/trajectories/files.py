@@ -19,7 +19,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
-from psotrack.support import LARGEST, atomic_write, check_no_nul, first_repeat, refuse_to_overwrite
+from psotrack.support import (
+    LARGEST,
+    MODERATE,
+    atomic_write,
+    check_no_nul,
+    first_repeat,
+    is_indefinite,
+    refuse_to_overwrite,
+)
 from psotrack.trajectories.trajectories import Status, Trajectories
 
 if TYPE_CHECKING:
@@ -423,9 +431,7 @@ def _check_values(table: _Table) -> None:
         elif name == "num_cameras":
             wrong, expected = ~(_whole(values) | np.isnan(values)), "a whole number from 0, or nothing"
         else:
-            # Curves through positions have no larger numbers.
-            most = LARGEST if name in ("time_s", "x_m", "y_m", "z_m") else np.finfo(float).max
-            wrong, expected = np.abs(values) > most, "a finite number, or nothing"
+            wrong, expected = np.abs(values) > LARGEST, f"{MODERATE}, or nothing"
         if wrong.any():
             row = int(np.argmax(wrong))
             raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
@@ -437,6 +443,16 @@ def _check_values(table: _Table) -> None:
             row = int(np.argmax(wrong))
             names = ", ".join(ORIENTATION_COLUMNS)
             raise table.error(row, expected=f"a unit quaternion in {names}", found=f"length {length[row]:g}")
+    for of_matrix in (COVARIANCE_COLUMNS, RELATIVE_COLUMNS):
+        if all(name in table.columns for name in of_matrix):
+            upper = np.stack([table.columns[name] for name in of_matrix], axis=-1)
+            wrong = is_indefinite(upper[:, _PLACES])
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                expected = f"a covariance in {', '.join(of_matrix)}"
+                raise table.error(
+                    row, expected=expected, found=f"{upper[row].tolist()}, an indefinite matrix"
+                )
 
 
 def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
