@@ -139,6 +139,7 @@ def test_invalid_values_are_refused_with_their_line(
             "1e9",
             r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found an indef",
         ),
+        ("time_s", "", r"line 2, column time_s: expected a value, found nothing"),
         ("time_s", "0.04", r"path.csv, camera_path.frame: expected increasing frames and times"),
     ],
 )

@@ -494,8 +494,8 @@ def test_sources_without_common_frames() -> None:
     assert (fused.source[60:] == [0, 2]).all()
 
 
-@pytest.mark.parametrize("value", [np.inf, np.nan])
-def test_frames_with_infinite_uncertainty_change_nothing(value) -> None:
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e7])
+def test_frames_without_information_change_nothing(value) -> None:
     paths, outside, _ = recording(17)
     rows = slice(50, 90)
     covariance = paths["dron1"].covariance.copy()
@@ -505,6 +505,17 @@ def test_frames_with_infinite_uncertainty_change_nothing(value) -> None:
     status[rows] = Status.COASTING
     expected = fuse({"dron1": replace(paths["dron1"], status=status)}, outside)
     np.testing.assert_array_equal(vague.trajectories.position_m, expected.trajectories.position_m)
+
+
+def test_orientations_are_at_most_as_uncertain_as_unknown_ones() -> None:
+    paths, outside, _ = recording(17)
+    rows, fused = slice(50, 90), []
+    for variance_rad2 in (3.0, 1e30):
+        covariance = paths["dron1"].covariance.copy()
+        covariance[rows, 3:, 3:] = variance_rad2 * np.eye(3)
+        fused.append(fuse({"dron1": replace(paths["dron1"], covariance=covariance)}, outside))
+    np.testing.assert_array_equal(fused[0].trajectories.position_m, fused[1].trajectories.position_m)
+    assert np.isfinite(fused[0].trajectories.position_m).all()
 
 
 def test_tracks_with_unknown_uncertainty_leave_a_path_unchanged() -> None:

@@ -112,10 +112,9 @@ class CameraPath:
             if found != (len(self.frame), *shape):
                 expected = f"shape {(len(self.frame), *shape)}"
                 raise InputError(f"camera_path.{name}", expected=expected, found=f"{found}")
-        if np.any(np.diff(self.frame) <= 0) or np.any(np.diff(self.time_s) <= 0):
-            raise InputError(
-                "camera_path.frame", expected="increasing frames and times", found="repeats or steps back"
-            )
+        if not ((np.diff(self.frame) > 0).all() and (np.diff(self.time_s) > 0).all()):
+            found = "repeats, steps back or no numbers"
+            raise InputError("camera_path.frame", expected="increasing frames and times", found=found)
 
     @property
     def num_frames(self) -> int:
@@ -235,7 +234,7 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
     with errors_name(path):
         camera_path = CameraPath(
             frame=_counts(table, "frame"),
-            time_s=_numbers(table, "time_s")[:, 0],
+            time_s=np.array([row.number(table.column("time_s")) for row in table.rows]),
             position_m=_numbers(table, *_POSITION),
             orientation_wxyz=orientation_wxyz,
             covariance=covariance,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.inside_out.fusing.resampling import is_informative
 from psotrack.trajectories import UNASSIGNED, Status, Trajectories
 
 #: Standard deviation along each axis of tracks without covariances, metres; the fusion estimates its scale.
@@ -61,14 +62,14 @@ def align_tracks(outside: Trajectories, also_s: Iterable[Float[np.ndarray, "_"]]
     position_m, covariance_m2 = at_frames(outside.position_m, 3), at_frames(outside.covariance_m2, 3, 3)
     if outside.covariance_m2 is None:
         covariance_m2[:] = _UNSTATED_M**2 * np.eye(3)
-    # Positions with infinite uncertainty carry no information.
-    status[~np.isfinite(covariance_m2).all(axis=(2, 3)) | ~np.isfinite(position_m).all(axis=2)] = Status.LOST
+    informative = is_informative(covariance_m2)
+    status[~informative | ~np.isfinite(position_m).all(axis=2)] = Status.LOST
     return OutsideTracks(
         frame=frame,
         time_s=time_s,
         position_m=position_m,
         velocity_m_s=at_frames(outside.velocity_m_s, 3),
-        covariance_m2=np.where(np.isfinite(covariance_m2), covariance_m2, np.nan),
+        covariance_m2=np.where(informative[..., None, None], covariance_m2, np.nan),
         status=status,
     )
 

@@ -22,6 +22,9 @@ from psotrack.trajectories import Status
 _FAR = 4.0
 #: Standard deviation of an unknown orientation about each axis, radians.
 _LARGEST_TURN_RAD = np.pi / 2
+#: Largest standard deviation of a position along an axis, metres. A position that is uncertain by a kilometre says
+#: nothing about a drone that cameras see, and sums with larger covariances lose the smaller ones to rounding.
+_LARGEST_STD_M = 1e3
 #: Difference below which two times are equal, seconds, and two lengths are, metres.
 _SAME_S = 1e-6
 
@@ -74,8 +77,7 @@ def resample_path(
         & (coasting | (path.status == Status.TRACKED))
         & np.isfinite(path.orientation_wxyz).all(axis=-1)
     )
-    # Poses with infinite uncertainty carry no information.
-    tracked &= np.isfinite(path.covariance).all(axis=(1, 2))
+    tracked &= is_informative(path.covariance[:, :3, :3]) & np.isfinite(path.covariance).all(axis=(1, 2))
     posed = path.seen & np.isfinite(path.orientation_wxyz).all(axis=-1)
     wanted_s = time_s + offset_s
     step_s = max(_step(path.time_s), _step(time_s))
@@ -96,6 +98,12 @@ def resample_path(
         turn_covariance_rad2=turn_covariance_rad2,
         has_orientation=has_orientation,
     )
+
+
+def is_informative(covariance_m2: Float[np.ndarray, "*rows 3 3"]) -> Bool[np.ndarray, "*rows"]:
+    """Say which covariances of positions are known, and not so large that the position is as good as unknown."""
+    variance_m2 = np.diagonal(covariance_m2, axis1=-2, axis2=-1)
+    return np.isfinite(covariance_m2).all(axis=(-2, -1)) & (variance_m2 <= _LARGEST_STD_M**2).all(axis=-1)
 
 
 def estimate_arm(
@@ -180,9 +188,8 @@ def _orientations(
     rate_rad_s = _turn_rate_rad_s(rotations, known_s, step_s)
     own_rad2 = path.covariance[rows[nearer], 3:, 3:]
     own_rad2 = np.where(np.isfinite(own_rad2), own_rad2, 0.0)
-    extra_rad2 = (rate_rad_s * bridged_s) ** 2
-    covariance_rad2 = own_rad2 + extra_rad2[:, None, None] * np.eye(3)
-    far = extra_rad2 > _LARGEST_TURN_RAD**2
+    covariance_rad2 = own_rad2 + (rate_rad_s * bridged_s)[:, None, None] ** 2 * np.eye(3)
+    far = np.linalg.eigvalsh(covariance_rad2)[:, -1] > _LARGEST_TURN_RAD**2
     return matrices, np.where(far[:, None, None], unknown_rad2, covariance_rad2), bridged_s == 0
 
 
