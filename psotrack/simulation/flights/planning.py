@@ -17,7 +17,7 @@ from psotrack.simulation.scenarios import FlightFromFile, Scenario, scenario_err
 
 #: Largest number of random variations that are tried until one keeps the limits.
 NUM_ATTEMPTS = 400
-#: Step between the frames that are checked first, frames. Most variations that violate a limit do so at these frames.
+#: Step of a check before the check of all frames, frames. Most variations that violate a limit do so at these frames.
 _STRIDE = 6
 
 
@@ -38,18 +38,17 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
     flying_order(scenario)
     time_s = frame_times_s(scenario, scenario.num_frames)
     recorded = _recorded(scenario, time_s)
-    few_s = time_s[::_STRIDE]
+    # Other variations often violate a limit at the same frames, so these frames are checked first.
+    violated_s = time_s[:1]
     excesses: list[Excess] = []
     for attempt in range(NUM_ATTEMPTS):
         rng = np.random.default_rng([seed, attempt])
         flights = make(scenario, draws(scenario, rng), recorded)
-        found = excess(flights, scenario, few_s)
-        if not found:
-            found = excess(flights, scenario, time_s)
-            if not found:
-                return flights
-            # Other variations often violate a limit at the same frame, so check this frame early.
-            few_s = np.append(few_s, found.time_s)
+        checks = (excess(flights, scenario, some_s) for some_s in (violated_s, time_s[::_STRIDE], time_s))
+        found = next(filter(None, checks), None)
+        if found is None:
+            return flights
+        violated_s = np.union1d(violated_s, found.time_s)
         excesses.append(found)
     raise _refusal(
         scenario, excess(make(scenario, zero_draws(scenario), recorded), scenario, time_s), excesses
