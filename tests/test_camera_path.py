@@ -132,12 +132,12 @@ def test_invalid_values_are_refused_with_their_line(
         (
             "cov_zz",
             "-9e18",
-            r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found an indef",
+            r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found a matrix",
         ),
         (
             "cov_xa",
             "1e9",
-            r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found an indef",
+            r"line 2, column cov_xx: expected a covariance in cov_xx to cov_cc, found a matrix",
         ),
         ("time_s", "", r"line 2, column time_s: expected a value, found nothing"),
         ("time_s", "0.04", r"path.csv, camera_path.frame: expected increasing frames and times"),

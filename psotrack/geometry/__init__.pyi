@@ -18,7 +18,7 @@ from .cameras import (
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
 from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
 from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
-from .rotations import cross_matrices, rotation_matrices
+from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
 from .triangulation import (
     MAX_CONDITION,
@@ -32,6 +32,7 @@ from .triangulation import (
 
 __all__ = [
     "FISHEYE_COEFFICIENTS",
+    "LENGTH_TOLERANCE",
     "MAX_CONDITION",
     "NEAR_M",
     "PINHOLE_COEFFICIENTS",

@@ -6,6 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+#: Largest difference between 1 and the length of a quaternion in a file: far above the rounding of a few digits, far
+#: below a mistake.
+LENGTH_TOLERANCE = 1e-2
+
 
 def rotation_matrices(orientation_wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), w first; NaN for a quaternion with NaN."""

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, errors_name
-from psotrack.geometry import rotation_matrices
+from psotrack.geometry import LENGTH_TOLERANCE, rotation_matrices
 from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.support import (
     Table,
     TextRow,
-    is_indefinite,
+    has_negative_eigenvalue,
     read_table,
     refuse_to_overwrite,
     short_repr,
@@ -252,12 +252,11 @@ def _check_poses(
     table: Table, orientation_wxyz: Float[np.ndarray, "rows 4"], covariance: Float[np.ndarray, "rows 6 6"]
 ) -> None:
     length = np.linalg.norm(orientation_wxyz, axis=1)
-    # The tolerance is far above the rounding of a few digits, and far below a mistake.
-    for row in np.flatnonzero(np.abs(length - 1) > 1e-2):
+    for row in np.flatnonzero(np.abs(length - 1) > LENGTH_TOLERANCE):
         expected, found = "a unit quaternion in qw to qz", f"length {length[row]:g}"
         raise table.rows[row].error(table.column("qw"), expected, found)
-    for row in np.flatnonzero(is_indefinite(covariance)):
-        expected, found = "a covariance in cov_xx to cov_cc", "an indefinite matrix"
+    for row in np.flatnonzero(has_negative_eigenvalue(covariance)):
+        expected, found = "a covariance in cov_xx to cov_cc", "a matrix with a negative eigenvalue"
         raise table.rows[row].error(table.column("cov_xx"), expected, found)
 
 

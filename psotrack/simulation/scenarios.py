@@ -20,7 +20,7 @@ _PRESETS = resources.files("psotrack.simulation.presets")
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
-#: Seconds, and m/s: what is divided by smaller ones overflows.
+#: Seconds, and m/s. Smaller values are far below those of any flight or lamp, and a division by them may overflow.
 Period = Annotated[float, msgspec.Meta(ge=1e-3)]
 Speed = Annotated[float, msgspec.Meta(ge=1e-3)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]

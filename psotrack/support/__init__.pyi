@@ -1,5 +1,5 @@
 from .compiled import drop_programs_if_many, keep_compiled
-from .covariances import is_indefinite
+from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, drone_colour, save_figure
@@ -56,12 +56,12 @@ __all__ = [
     "drop_programs_if_many",
     "end_of_links",
     "first_repeat",
+    "has_negative_eigenvalue",
     "html_block",
     "html_lines",
     "html_paths",
     "html_table",
     "identify",
-    "is_indefinite",
     "is_moderate",
     "is_whole_program",
     "joined",

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 _ROUNDING = 1e-5
 
 
-def is_indefinite(covariance: Float[np.ndarray, "*rows n n"]) -> Bool[np.ndarray, "*rows"]:
-    """Say which matrices are no covariances, because an eigenvalue is below zero by more than a rounding error.
+def has_negative_eigenvalue(covariance: Float[np.ndarray, "*rows n n"]) -> Bool[np.ndarray, "*rows"]:
+    """Say which matrices are no covariances, because an eigenvalue is further below zero than rounding explains.
 
     Args:
         covariance: (*rows, n, n), symmetric. A matrix with NaN is unknown, and is not judged.

@@ -19,13 +19,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, check_positive
+from psotrack.geometry import LENGTH_TOLERANCE
 from psotrack.support import (
     LARGEST,
     MODERATE,
     atomic_write,
     check_no_nul,
     first_repeat,
-    is_indefinite,
+    has_negative_eigenvalue,
     refuse_to_overwrite,
 )
 from psotrack.trajectories.trajectories import Status, Trajectories
@@ -435,24 +436,30 @@ def _check_values(table: _Table) -> None:
         if wrong.any():
             row = int(np.argmax(wrong))
             raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
+    _check_orientations(table)
+    for names in (COVARIANCE_COLUMNS, RELATIVE_COLUMNS):
+        _check_covariances(table, list(names))
+
+
+def _check_orientations(table: _Table) -> None:
     if all(name in table.columns for name in ORIENTATION_COLUMNS):
         length = np.linalg.norm([table.columns[name] for name in ORIENTATION_COLUMNS], axis=0)
-        # Far above the rounding of a few digits, far below a mistake.
-        wrong = np.abs(length - 1) > 1e-2
+        wrong = np.abs(length - 1) > LENGTH_TOLERANCE
         if wrong.any():
             row = int(np.argmax(wrong))
             names = ", ".join(ORIENTATION_COLUMNS)
             raise table.error(row, expected=f"a unit quaternion in {names}", found=f"length {length[row]:g}")
-    for of_matrix in (COVARIANCE_COLUMNS, RELATIVE_COLUMNS):
-        if all(name in table.columns for name in of_matrix):
-            upper = np.stack([table.columns[name] for name in of_matrix], axis=-1)
-            wrong = is_indefinite(upper[:, _PLACES])
-            if wrong.any():
-                row = int(np.argmax(wrong))
-                expected = f"a covariance in {', '.join(of_matrix)}"
-                raise table.error(
-                    row, expected=expected, found=f"{upper[row].tolist()}, an indefinite matrix"
-                )
+
+
+def _check_covariances(table: _Table, names: list[str]) -> None:
+    if not all(name in table.columns for name in names):
+        return
+    upper = np.stack([table.columns[name] for name in names], axis=-1)
+    wrong = has_negative_eigenvalue(upper[:, _PLACES])
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        found = f"a matrix with a negative eigenvalue, {upper[row].tolist()}"
+        raise table.error(row, expected=f"a covariance in {', '.join(names)}", found=found)
 
 
 def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:

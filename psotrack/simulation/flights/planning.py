@@ -17,7 +17,7 @@ from psotrack.simulation.scenarios import FlightFromFile, Scenario, scenario_err
 
 #: Largest number of random variations that are tried until one keeps the limits.
 NUM_ATTEMPTS = 400
-#: Step of a check before the check of all frames, frames. Most variations that violate a limit do so at these frames.
+#: Step between the frames of a first check. Most variations that violate a limit do so at these frames.
 _STRIDE = 6
 
 
