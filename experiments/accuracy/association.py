@@ -25,14 +25,12 @@ from typing import Any
 import _runs
 import numpy as np
 import stone_soup
-from bat_flights import RealFlight, read_flight
+from bat_flights import RealFlight, read_flight, write_recording
 from formula_flights import FPS, SCENES, make_flight
 from jaxtyping import Float
 
 from psotrack.correspondence import Sightings, from_detections
 from psotrack.initiation import FlightVolume, flight_volume, moving_detections
-from psotrack.recordings import write_detections
-from psotrack.rig_files import write_rig
 from psotrack.trajectories import read_trajectories
 from psotrack.trajectories.association import GATE_M, identity_switches, partners_per_frame
 
@@ -71,15 +69,7 @@ def score(
 
 def by_psotrack(flight: RealFlight, folder: Path) -> Float[np.ndarray, "frames tracks 3"]:
     """Tracks of the command with its defaults."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_rig(folder / "rig.toml", flight.rig, force=True)
-    lines = ["version = 1", 'calibration = "rig.toml"']
-    for index, name in enumerate(flight.rig.names):
-        write_detections(folder / f"{name}.csv", flight.detections[name])
-        width, height = flight.rig.cameras.image_size_wh[index].astype(int).tolist()
-        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', f"size = [{width}, {height}]"]
-        lines.append(f"fps = {flight.fps!r}")
-    (folder / "recording.toml").write_text("\n".join(lines) + "\n")
+    write_recording(flight, folder)
     words = ["track", str(folder), "--out", str(folder / "tracks.csv"), "--method", "projection-lines"]
     subprocess.run([sys.executable, "-m", "psotrack", *words, "--force", "--quiet"], check=True)
     found = read_trajectories(folder / "tracks.csv", fps=flight.fps)

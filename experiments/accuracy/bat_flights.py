@@ -18,7 +18,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import Rig, make_camera, make_rig
-from psotrack.recordings import Detections
+from psotrack.recordings import Detections, write_detections
+from psotrack.rig_files import write_rig
 from psotrack.trajectories import Trajectories
 
 REPOSITORY = Path("christofhapp/batflight3D_publication")
@@ -69,6 +70,19 @@ def read_flight(data: Path, name: str, first: int, num_frames: int) -> RealFligh
     inside = (row >= 0) & (row < num_frames)
     truth_m[row[inside], 0] = place_m[inside]
     return RealFlight(rig, detections, Trajectories(frame, frame / fps, ("drone",), truth_m), float(fps))
+
+
+def write_recording(flight: RealFlight, folder: Path) -> None:
+    """Write rig and detections of a flight, and a `recording.toml` that names them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_rig(folder / "rig.toml", flight.rig, force=True)
+    lines = ["version = 1", 'calibration = "rig.toml"']
+    for index, name in enumerate(flight.rig.names):
+        write_detections(folder / f"{name}.csv", flight.detections[name])
+        width, height = flight.rig.cameras.image_size_wh[index].astype(int).tolist()
+        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', f"size = [{width}, {height}]"]
+        lines.append(f"fps = {flight.fps!r}")
+    (folder / "recording.toml").write_text("\n".join(lines) + "\n")
 
 
 def _east_north_up(degrees: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:

@@ -106,15 +106,15 @@ def track(sequence: Path, out: Path, cache: Path, background: str) -> dict[str, 
     return cost | {"note": said.strip().splitlines()[-1]} if process.returncode else cost
 
 
-def false_tracks(found: Trajectories, truth: Trajectories) -> dict[str, Any]:
-    """Tracks that are mostly away from all drones, and the time that tracks are away, seconds."""
+def false_tracks(found: Trajectories, truth: Trajectories, gate_m: float = GATE_M) -> dict[str, Any]:
+    """Tracks that are mostly away from all drones, by the gate or more, and the time that tracks are away, seconds."""
     tracked = found.status == Status.TRACKED
     index = np.searchsorted(truth.frame, found.frame)
     seen = np.isin(found.frame, truth.frame)
     apart_m = found.position_m[seen][:, :, None] - truth.position_m[index[seen]][:, None]
     distance_m = np.nan_to_num(np.linalg.norm(apart_m, axis=-1), nan=np.inf).min(axis=-1)
     # The dataset's reference begins at frame 1: no distance is known before.
-    false = (distance_m > GATE_M) & np.isfinite(distance_m) & tracked[seen]
+    false = (distance_m > gate_m) & np.isfinite(distance_m) & tracked[seen]
     mostly = false.sum(axis=0) > 0.5 * np.maximum(tracked[seen].sum(axis=0), 1)
     return {
         "false_tracks": int(mostly.sum()),
