@@ -18,7 +18,7 @@ oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python 
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow fuzz kills lint format bench bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
+.PHONY: help demo test test-slow fuzz kills lint format size bench bench-batch bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -57,6 +57,9 @@ format: $(VENV)/.installed  ## let ruff mend and format
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
+size:  ## lines of code per room, and their budgets
+	@$(PYTHON) experiments/size.py
+
 bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
 	@$(call install,bench)
 	@$(BIN)/python experiments/benchmarks/track_stage.py
@@ -70,8 +73,11 @@ bench-live: $(VENV)/.installed  ## live: delay of the rows, memory over an hour,
 	@$(BIN)/python experiments/benchmarks/live.py memory $(if $(DATA),--data $(DATA))
 	@$(BIN)/python experiments/benchmarks/live.py stops $(if $(DATA),--data $(DATA))
 
+bench-batch: $(VENV)/.installed  ## 64 runs of 250 frames beside one run: seconds of the swarm, and of all that is not the swarm
+	@$(BIN)/python experiments/benchmarks/many_runs.py batch $(if $(DATA),--data $(DATA))
+
 bench-gpu: $(VENV)/.installed  ## a GPU against two cores: Table 5's grid, 64 runs at once, equal tracks; JAX for it: pip install -e '.[cuda]'
-	@$(BIN)/python experiments/benchmarks/gpu.py $(if $(DATA),--data $(DATA))
+	@$(BIN)/python experiments/benchmarks/many_runs.py gpu $(if $(DATA),--data $(DATA))
 
 bench-scaling: $(VENV)/.installed  ## cost per frame against cameras, drones, particles, image size; what breaks first; ten minutes
 	@$(BIN)/python experiments/benchmarks/scaling.py

@@ -33,8 +33,7 @@ from IPython.display import Image
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 from psotrack.datasets.dpjait import read_sequence
-from psotrack.initiation import room_bounds
-from psotrack.initiation.initialisation import find_drones
+from psotrack.initiation import first_drones, room_bounds
 from psotrack.reports import PointCloud, Scene3D
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import compute, summed_area_table
@@ -76,13 +75,13 @@ if not folder.exists():  # the same recording as in the quickstart
 recording = read_sequence(folder).usable()
 settings = TrackSettings(silhouettes=SILHOUETTES)
 silhouettes = compute(recording, SILHOUETTES, cache=DATA / "silhouettes")
-start = find_drones(
-    recording.rig.cameras,
-    silhouettes.read(0, 10),
-    reduction=SILHOUETTES.reduction,
+start = first_drones(
+    recording.rig,
+    silhouettes,
     fps=recording.fps,
     bounds_m=room_bounds(recording.rig),
     max_speed_m_s=settings.motion.speed_limit_m_s,
+    drones=settings.drones,
 )
 predicted_m = jnp.asarray(start.position_m + start.velocity_m_s * FRAME / recording.fps, jnp.float32)
 truth_m = recording.truth.position_m[FRAME, DRONE]

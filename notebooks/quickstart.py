@@ -87,9 +87,8 @@ plt.show()
 # %% [markdown]
 # ## Track
 #
-# One call makes silhouettes from the videos (in several processes; they are kept in `cache`), finds the drones in the
-# first frames, and follows them. The call does not say how many drones there are, where they start or how large they
-# are.
+# One call makes silhouettes from the videos (in several processes; they are kept in `cache`), finds the drones when they
+# come, and follows them. The call does not say how many drones there are, where they start or how large they are.
 
 # %%
 tracked = track_recording(

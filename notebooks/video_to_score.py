@@ -32,9 +32,9 @@ from matplotlib.patches import Rectangle
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.geometry import make_extents, project_boxes
-from psotrack.initiation import room_bounds
-from psotrack.initiation.initialisation import find_drones
+from psotrack.initiation import first_drones, room_bounds
 from psotrack.recordings import read_frames
+from psotrack.settings import DroneSettings
 from psotrack.silhouettes import compute, scaled_settings, summed_area_table
 from psotrack.silhouettes.computation import SilhouetteSettings
 from psotrack.silhouettes.first_look import look_first
@@ -96,18 +96,18 @@ for camera, mask in zip(CAMERAS, masks, strict=True):  # just so they are made
 # %% [markdown]
 # ## A point → a box in every camera
 #
-# The sizes of the drones are learned from the first frames. An ellipsoid of that size at a point has a box in each
+# The sizes of the drones are those of their blobs in the first frames. An ellipsoid of that size at a point has a box in each
 # camera. The score compares three concentric boxes, its *windows*, with the silhouette; a larger *ring* shows
 # foreground beside the windows.
 
 # %%
-start = find_drones(
-    recording.rig.cameras,
-    silhouettes.read(0, 10),
-    reduction=SILHOUETTES.reduction,
+start = first_drones(
+    recording.rig,
+    silhouettes,
     fps=recording.fps,
     bounds_m=room_bounds(recording.rig),
     max_speed_m_s=6.0,
+    drones=DroneSettings(),
 )
 # Of the found drones, the drone nearest to the initial position of the shown drone is used.
 path_m = recording.truth.position_m[1:10, DRONE].mean(axis=0)
@@ -294,7 +294,7 @@ plt.show()
 # *What to see: one narrow bright hill in a dark plain. The drone is at this hill. At the faint patches, foreground in
 # a few cameras agrees by chance: rays from cameras to the other drones, which are higher or lower, cross there. In
 # most of the room the score has no slope towards the hill. A swarm finds the hill because it starts at the position
-# that the motion model predicts. In the first frame positions are found in another way, from blobs that agree between
-# cameras (`psotrack.initiation.initialisation`).*
+# that the motion model predicts. New drones are found in another way, from blobs that agree between cameras for several
+# frames (`psotrack.initiation.births`).*
 #
 # Next: [how the swarm moves](how_the_swarm_moves.ipynb) in this landscape.

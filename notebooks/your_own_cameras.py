@@ -179,5 +179,5 @@ plt.show()
 # | false drones | silhouettes, as above | people, vehicles, small things that move: an `ignore` image, `bounds_m`, `--drone-px` |
 # | boxes beside the drones in one camera | `psotrack doctor` | the camera was moved after the calibration, or the video has another size or crop |
 # | boxes beside the drones that swing with their speed | `psotrack track --clocks auto` | the videos do not begin at the same moment |
-# | boxes right, but too large or small | `size_m` in `tracks.json` | shadows in the silhouettes; state the size with `--size` |
+# | boxes right, but too large or small | `size_m` in `tracks.json` | shadows in the silhouettes; state the size with `--drone-size` |
 # | two drones change names | `tracks.ambiguity.csv` | they passed each other; look at their distance and at the number of viewpoints |

@@ -1,4 +1,4 @@
-"""The methods: from the inputs of a run to tracks, by the swarm, by projection lines, or by both.
+"""The methods: from the inputs of runs to tracks, by the swarm, by projection lines, by both, or by a plugin.
 
 `Method` is the interface of further methods, given to `psotrack.track(..., method=...)`, or by name as plugins (see
 `psotrack.support.plugins`).
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.camera_errors import (
+    CameraViews,
     TrackErrors,
     views_of_middles,
     views_of_sightings,
@@ -27,12 +28,12 @@ from psotrack.errors import InputError
 from psotrack.fusion import fuse_tracks, fused_errors
 from psotrack.geometry import Rig
 from psotrack.initiation import InitialState
-from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
+from psotrack.projection_lines import LineSettings, track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, digest_file, no_progress
-from psotrack.tracking import FoundDrones, RunInputs, middles_in_cameras, track_silhouettes
+from psotrack.tracking import RunInputs, track_recording
 from psotrack.trajectories import Status, Tracks
 
 
@@ -61,7 +62,6 @@ class MethodResult:
     Attributes:
         tracks: tracks of all frames.
         points: for each drone the point that its track follows.
-        initial: state of the drones at frame 0.
         input_keys: digests of the inputs, by camera.
         seconds: seconds of each stage; "track" and "compile" at least; "finish" so far.
         errors: errors of the tracks that come from the cameras; None where the method states all errors itself.
@@ -69,7 +69,6 @@ class MethodResult:
 
     tracks: Tracks
     points: tuple[TrackedPoint, ...]
-    initial: InitialState
     input_keys: Mapping[str, str]
     seconds: Mapping[str, float]
     errors: TrackErrors | None = None
@@ -236,51 +235,73 @@ def track_by_swarm(
     rig: Rig,
     silhouettes: Silhouettes,
     runs: Sequence[RunInputs],
+    settings: Sequence[TrackSettings],
     fps: float,
     report: Report = no_progress,
 ) -> list[MethodResult]:
-    """Track one or more runs by the swarm, all runs together.
+    """Track one or more runs by the swarm, all runs together; covariances hold for the errors that silhouettes show.
 
     The seconds of a run are its share of the time of all runs.
+
+    Args:
+        rig: the cameras.
+        silhouettes: silhouettes of all cameras.
+        runs: inputs of each run.
+        settings: settings of each run.
+        fps: instants per second.
+        report: shows the progress in frames.
     """
+    if not runs:
+        return []
     began = time.perf_counter()
-    tracked = track_silhouettes(rig, silhouettes, runs, fps=fps, report=report)
-    compile_s = sum(seconds for _, seconds in tracked)
+    tracked, compile_s = track_recording(rig, silhouettes, runs, fps=fps, report=report)
     seconds = {
         **silhouettes.seconds,
         "compile": compile_s / len(runs),
         "track": (time.perf_counter() - began - compile_s) / len(runs),
     }
-    return [
-        MethodResult(tracks, _points(tracks, "silhouette"), run.initial, silhouettes.keys, seconds)
-        for (tracks, _), run in zip(tracked, runs, strict=True)
-    ]
+    results = []
+    for (tracks, places), chosen in zip(tracked, settings, strict=True):
+        result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
+        if tracks.num_drones:
+            began = time.perf_counter()
+            views = views_of_middles(rig.cameras, silhouettes.exposures, places, *_found(tracks))
+            result = _with_errors(result, views, chosen, fps, began)
+        results.append(result)
+    return results
 
 
 def track_by_projection_lines(
     rig: Rig,
     detections: DetectionInputs,
-    settings: LineSettings,
+    settings: TrackSettings,
     *,
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
     known: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None,
     report: Report = no_progress,
 ) -> MethodResult:
-    """Track one run by projection lines (see `psotrack.projection_lines.track_detections`)."""
+    """Track one run by projection lines (see `psotrack.projection_lines.track_detections`).
+
+    The covariances hold for the errors that the detections show.
+    """
     began = time.perf_counter()
     tracks = track_detections(
         rig.cameras,
         detections.sightings,
-        settings,
+        LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m),
         fps=fps,
         bounds_m=bounds_m,
         known=known,
         report=report,
     )
     seconds = {"compile": 0.0, "track": detections.seconds + time.perf_counter() - began}
-    initial = state_at_first_frame(tracks)
-    return MethodResult(tracks, _points(tracks, "box"), initial, detections.keys, seconds)
+    result = MethodResult(tracks, _points(tracks, "box"), detections.keys, seconds)
+    if not tracks.num_drones:
+        return result
+    began = time.perf_counter()
+    views = views_of_sightings(rig.cameras, detections.sightings, *_found(tracks))
+    return _with_errors(result, views, settings, fps, began)
 
 
 def fuse_methods(
@@ -299,63 +320,27 @@ def fuse_methods(
     tracks, errors, offset = fusion.tracks, None, fusion.offset
     if swarm.errors is not None or lines.errors is not None:
         tracks, errors = fused_errors(fusion, swarm.errors, lines.errors, settings.motion, fps)
+    both = ("finish", "compile", "track")
     seconds = {
         **swarm.seconds,
-        "finish": swarm.seconds.get("finish", 0.0) + lines.seconds.get("finish", 0.0),
-        "compile": swarm.seconds["compile"] + lines.seconds["compile"],
-        "track": swarm.seconds["track"] + lines.seconds["track"] + time.perf_counter() - began,
+        **{name: swarm.seconds.get(name, 0.0) + lines.seconds.get(name, 0.0) for name in both},
     }
+    seconds["track"] += time.perf_counter() - began
     keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
     points = tuple(
         TrackedPoint(drone, "silhouette" if drone < len(swarm.points) else "box", *known)
         for drone, known in enumerate(zip(_or_none(offset.offset_m), _or_none(offset.std_m), strict=True))
     )
-    return MethodResult(tracks, points, swarm.initial, keys, seconds, errors)
+    return MethodResult(tracks, points, keys, seconds, errors)
 
 
-def add_errors_of_silhouettes(
-    results: Sequence[MethodResult],
-    rig: Rig,
-    silhouettes: Silhouettes,
-    settings: Sequence[TrackSettings],
-    fps: float,
-) -> list[MethodResult]:
-    """The results of the swarm, with covariances that hold for the errors that the silhouettes show.
-
-    The silhouettes are read once for all runs. On a CPU each result has the same bits as from the run alone.
-
-    Args:
-        results: the results of one or more runs; each has drones.
-        rig: the cameras.
-        silhouettes: silhouettes of all cameras.
-        settings: settings of each run.
-        fps: frames per second.
-    """
+def track_by_plugin(method: Method, inputs: MethodInputs, report: Report = no_progress) -> MethodResult:
+    """Track one run by a method that another package or the caller brings."""
     began = time.perf_counter()
-    drones = [
-        FoundDrones(np.asarray(result.tracks.sizes.size_m, np.float64), *_found(result.tracks))
-        for result in results
-    ]
-    middles = middles_in_cameras(rig.cameras, silhouettes, drones)
-    found = []
-    for result, of_run, seen, chosen in zip(results, drones, middles, settings, strict=True):
-        views = views_of_middles(rig.cameras, silhouettes.exposures, seen, of_run)
-        found.append(with_camera_errors(result.tracks, views, chosen.motion, chosen.errors, fps))
-    share_s = (time.perf_counter() - began) / len(results)
-    return [
-        _with_errors(result, tracks, errors, share_s)
-        for result, (tracks, errors) in zip(results, found, strict=True)
-    ]
-
-
-def add_errors_of_detections(
-    result: MethodResult, rig: Rig, detections: DetectionInputs, settings: TrackSettings, fps: float
-) -> MethodResult:
-    """The result of the projection lines, with covariances that hold for the errors that the detections show."""
-    began = time.perf_counter()
-    views = views_of_sightings(rig.cameras, detections.sightings, *_found(result.tracks))
-    corrected, errors = with_camera_errors(result.tracks, views, settings.motion, settings.errors, fps)
-    return _with_errors(result, corrected, errors, time.perf_counter() - began)
+    tracks = method(inputs, report)
+    keys = {} if inputs.silhouettes is None else dict(inputs.silhouettes.keys)
+    seconds = {"compile": 0.0, "track": time.perf_counter() - began}
+    return MethodResult(tracks, _points(tracks, "silhouette"), keys, seconds)
 
 
 def _found(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
@@ -368,18 +353,13 @@ def _found(tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
     return position_m, velocity_m_s
 
 
-def _with_errors(result: MethodResult, tracks: Tracks, errors: TrackErrors, taken_s: float) -> MethodResult:
-    seconds = {**result.seconds, "finish": result.seconds.get("finish", 0.0) + taken_s}
+def _with_errors(
+    result: MethodResult, views: CameraViews, settings: TrackSettings, fps: float, began: float
+) -> MethodResult:
+    """The result with covariances that hold for the errors of the cameras that the views show."""
+    tracks, errors = with_camera_errors(result.tracks, views, settings.motion, settings.errors, fps)
+    seconds = {**result.seconds, "finish": time.perf_counter() - began}
     return replace(result, tracks=tracks, errors=errors, seconds=seconds)
-
-
-def track_by_plugin(method: Method, inputs: MethodInputs, report: Report = no_progress) -> MethodResult:
-    """Track one run by a method that another package or the caller brings."""
-    began = time.perf_counter()
-    tracks = method(inputs, report)
-    keys = {} if inputs.silhouettes is None else dict(inputs.silhouettes.keys)
-    seconds = {"compile": 0.0, "track": time.perf_counter() - began}
-    return MethodResult(tracks, _points(tracks, "silhouette"), inputs.initial, keys, seconds)
 
 
 def _points(tracks: Tracks, middle_of: Literal["silhouette", "box"]) -> tuple[TrackedPoint, ...]:

@@ -8,14 +8,15 @@ fast.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, ClassVar, Literal, get_args
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 import msgspec
+from msgspec import Meta
 
-from psotrack.errors import SettingsError, check_positive
+from psotrack.errors import SettingsError
 from psotrack.silhouettes import SilhouetteSettings
-from psotrack.support import check_types, nearest, plain
+from psotrack.support import NotNegative, Positive, Share, check_types, nearest, plain
 
 SwarmKind = Literal["joint", "per-drone"]
 Clocks = Literal["given", "auto"]
@@ -27,102 +28,17 @@ YOLO, BLOBS = "yolo", "blobs"
 #: Largest speed of a drone where neither the settings nor the data say more, m/s.
 USUAL_SPEED_M_S = 6.0
 
-#: Names of settings until version 0.1, and their names today; "" where a setting is gone.
-RENAMED = {
-    "particles": "swarm.particles",
-    "iterations": "swarm.iterations",
-    "refinements": "",
-    "swarm": "swarm.kind",
-    "spread_m": "swarm.spread_m",
-    "inertia": "swarm.inertia",
-    "cognitive": "swarm.cognitive",
-    "social": "swarm.social",
-    "score": "score.kind",
-    "windows": "score.windows",
-    "claims": "score.occlusion",
-    "vertex": "score.vertex",
-    "drones": "drones.count",
-    "drone_size_m": "drones.size_m",
-    "learn_sizes": "drones.learn_sizes",
-    "body_offset_m": "drones.body_offset_m",
-    "max_speed_m_s": "motion.max_speed_m_s",
-    "jerk_density_m2_s5": "motion.jerk_density_m2_s5",
-    "velocity_std_m_s": "motion.velocity_std_m_s",
-    "acceleration_std_m_s2": "motion.acceleration_std_m_s2",
-    "error_share": "motion.error_share",
-    "error_time_s": "motion.error_time_s",
-    "min_fitness": "status.min_fitness",
-    "min_cameras": "status.min_cameras",
-    "max_coasting_s": "status.max_coasting_s",
-    "encounter_m": "identity.encounter_m",
-    "mend": "identity.resolve_swaps",
-}
-
-
-def renamed(name: str) -> str:
-    """What to do about a setting's old name, as the remedy of an error message; "" where the name is no old name."""
-    if name not in RENAMED:
-        return ""
-    return (
-        f"it is called {RENAMED[name]} today" if RENAMED[name] else "this setting is gone: it gained nothing"
-    )
-
-
 #: Largest numbers of what takes memory and time. Memory for scores grows by half a kilobyte or more per particle and
 #: drone; the paper has 100 particles and 70 iterations.
-_MOST_PARTICLES, _MOST_ITERATIONS, _MOST_DRONES = 100_000, 100_000, 1000
-#: Largest seed of JAX and NumPy.
-_MOST_SEED = 2**63 - 1
-
-
-def _check_count(name: str, value: int, least: int, most: int) -> None:
-    if not least <= value <= most:
-        raise SettingsError(name, expected=f"a number from {least} to {most}", found=f"{value}")
-
-
-def _check_least(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise SettingsError(name, expected=f"at least {least}", found=f"{value}")
-
-
-def _check_finite(name: str, values: Iterable[float]) -> None:
-    if not all(map(math.isfinite, values)):
-        raise SettingsError(name, expected="finite numbers", found=f"{values}")
-
-
-def _check_range(name: str, value: float | int, low: float, high: float = float("inf")) -> None:
-    """Raise `SettingsError` unless low <= value <= high and the value is finite."""
-    if not (low <= value <= high and value < float("inf")):
-        expected = (
-            f"a number from {low:g} to {high:g}" if high < float("inf") else f"a number of at least {low:g}"
-        )
-        raise SettingsError(name, expected=expected, found=f"{value:g}")
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise SettingsError(name, expected=f"one of {', '.join(choices)}", found=value)
-
-
-class _AnswersOldNames(msgspec.StructMeta):
-    """Answers old names of settings with the new ones, where a record is made in Python."""
-
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:  # noqa: N805
-        for name, value in kwargs.items():
-            # `swarm`, `score` and `drones` are parts today; their old values were no records.
-            is_part = name in cls.__struct_fields__
-            if name in RENAMED and not (is_part and isinstance(value, msgspec.Struct)):
-                raise SettingsError(
-                    name,
-                    expected="a part of the settings" if is_part else "the name of a setting",
-                    found=f"{value!r}" if is_part else name,
-                    remedy=renamed(name),
-                )
-        return super().__call__(*args, **kwargs)
+Particles = Annotated[int, Meta(ge=2, le=100_000)]
+Iterations = Annotated[int, Meta(ge=0, le=100_000)]
+DroneCount = Annotated[int, Meta(ge=1, le=1000)]
+#: The seeds of JAX and NumPy.
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
 class _Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the records: the types of all values are checked.
+    """Base of the records: all values must have the annotated types, lie in their ranges and be finite.
 
     Attributes:
         prefix: beginning of the dotted names of the record's settings.
@@ -132,6 +48,14 @@ class _Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     def __post_init__(self) -> None:
         check_types(self, self.prefix)
+        for field in msgspec.structs.fields(self):
+            name, value = f"{self.prefix}{field.name}", plain(getattr(self, field.name))
+            choices = get_args(field.type) if get_origin(field.type) is Literal else ()
+            if choices and value not in choices:
+                raise SettingsError(name, expected=f"one of {', '.join(choices)}", found=value)
+            numbers = value if isinstance(value, list | tuple) else (value,)
+            if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
+                raise SettingsError(name, expected="finite numbers", found=f"{value}")
 
 
 class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -152,19 +76,12 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     prefix: ClassVar[str] = "swarm."
     search: str = "pso"
     kind: SwarmKind = "per-drone"
-    particles: int = 30
-    iterations: int = 30
-    spread_m: float = 0.05
+    particles: Particles = 30
+    iterations: Iterations = 30
+    spread_m: Positive = 0.05
     inertia: float = 0.6
     cognitive: float = 1.5
     social: float = 1.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_choice("swarm.kind", self.kind, get_args(SwarmKind))
-        _check_count("swarm.particles", self.particles, 2, _MOST_PARTICLES)
-        _check_count("swarm.iterations", self.iterations, 0, _MOST_ITERATIONS)
-        check_positive("swarm.spread_m", self.spread_m)
 
 
 class ScoreSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -184,16 +101,9 @@ class ScoreSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
     prefix: ClassVar[str] = "score."
     kind: str = "soft"
-    windows: tuple[float, ...] = (0.4, 0.7, 1.0)
+    windows: Annotated[tuple[Positive, ...], Meta(min_length=1)] = (0.4, 0.7, 1.0)
     occlusion: bool = True
     vertex: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.windows:
-            raise SettingsError("score.windows", expected="at least one scale", found="none")
-        for scale in self.windows:
-            check_positive("score.windows", scale)
 
 
 class MotionSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -213,25 +123,12 @@ class MotionSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
     """
 
     prefix: ClassVar[str] = "motion."
-    max_speed_m_s: float | None = None
-    jerk_density_m2_s5: float | None = None
-    velocity_std_m_s: float = 1.0
-    acceleration_std_m_s2: float = 3.0
-    error_share: float = 0.7
-    error_time_s: float = 0.4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in (
-            "max_speed_m_s",
-            "jerk_density_m2_s5",
-            "velocity_std_m_s",
-            "acceleration_std_m_s2",
-            "error_time_s",
-        ):
-            if getattr(self, name) is not None:
-                check_positive(f"motion.{name}", getattr(self, name))
-        _check_range("motion.error_share", self.error_share, 0.0, 1.0)
+    max_speed_m_s: Positive | None = None
+    jerk_density_m2_s5: Positive | None = None
+    velocity_std_m_s: Positive = 1.0
+    acceleration_std_m_s2: Positive = 3.0
+    error_share: Share = 0.7
+    error_time_s: Positive = 0.4
 
     @property
     def speed_limit_m_s(self) -> float:
@@ -265,18 +162,10 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     prefix: ClassVar[str] = "drones."
-    count: int | None = None
-    size_m: tuple[float, float, float] | None = None
+    count: DroneCount | None = None
+    size_m: tuple[Positive, Positive, Positive] | None = None
     learn_sizes: bool = True
     body_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.count is not None:
-            _check_count("drones.count", self.count, 1, _MOST_DRONES)
-        for length_m in self.size_m or ():
-            check_positive("drones.size_m", length_m)
-        _check_finite("drones.body_offset_m", self.body_offset_m)
 
 
 class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -297,20 +186,11 @@ class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
     """
 
     prefix: ClassVar[str] = "status."
-    min_fitness: float = 0.1
-    min_cameras: int = 2
-    min_cameras_to_begin: int | None = None
-    max_coasting_s: float = 0.5
-    max_coasting_std_m: float = 0.5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_least("status.min_cameras", self.min_cameras, 1)
-        if self.min_cameras_to_begin is not None:
-            _check_least("status.min_cameras_to_begin", self.min_cameras_to_begin, 2)
-        _check_range("status.min_fitness", self.min_fitness, 0.0, 1.0)
-        _check_range("status.max_coasting_s", self.max_coasting_s, 0.0)
-        check_positive("status.max_coasting_std_m", self.max_coasting_std_m)
+    min_fitness: Share = 0.1
+    min_cameras: Annotated[int, Meta(ge=1)] = 2
+    min_cameras_to_begin: Annotated[int, Meta(ge=2)] | None = None
+    max_coasting_s: NotNegative = 0.5
+    max_coasting_std_m: Positive = 0.5
 
 
 class IdentitySettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -325,12 +205,8 @@ class IdentitySettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fiel
     """
 
     prefix: ClassVar[str] = "identity."
-    encounter_m: float = 0.6
+    encounter_m: NotNegative = 0.6
     resolve_swaps: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_range("identity.encounter_m", self.encounter_m, 0.0)
 
 
 class ErrorSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -346,18 +222,11 @@ class ErrorSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     prefix: ClassVar[str] = "errors."
-    rig_deg: float = 0.0
-    pixel_px: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("rig_deg", "pixel_px"):
-            _check_range(f"errors.{name}", getattr(self, name), 0.0)
+    rig_deg: NotNegative = 0.0
+    pixel_px: NotNegative = 0.0
 
 
-class TrackSettings(
-    _Settings, frozen=True, kw_only=True, forbid_unknown_fields=True, metaclass=_AnswersOldNames
-):
+class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a sequence is tracked.
 
     Attributes:
@@ -384,16 +253,16 @@ class TrackSettings(
         silhouettes: how silhouettes are made.
 
     Raises:
-        SettingsError: a value is not allowed, or a name is an old one.
+        SettingsError: a value is not allowed.
     """
 
     method: str = "swarm"
     detections: str = YOLO
-    seed: int = 0
+    seed: Seed = 0
     init: str = "auto"
     bounds_m: tuple[float, float, float, float, float, float] | None = None
     smooth: bool = False
-    rate_hz: float | None = None
+    rate_hz: Positive | None = None
     clocks: Clocks = "given"
     swarm: SwarmSettings = SwarmSettings()
     score: ScoreSettings = ScoreSettings()
@@ -406,12 +275,6 @@ class TrackSettings(
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_count("seed", self.seed, 0, _MOST_SEED)
-        _check_choice("clocks", self.clocks, get_args(Clocks))
-        if self.rate_hz is not None:
-            check_positive("rate_hz", self.rate_hz)
-        if self.bounds_m is not None:
-            _check_finite("bounds_m", self.bounds_m)
         if self.bounds_m is not None and any(
             low >= high for low, high in zip(self.bounds_m[::2], self.bounds_m[1::2], strict=True)
         ):
@@ -439,7 +302,7 @@ class TrackSettings(
             values: dotted names -> values, such as {"swarm.particles": 50}.
 
         Raises:
-            SettingsError: a name is unknown or old, or a value is not allowed.
+            SettingsError: a name is unknown, or a value is not allowed.
 
         >>> TrackSettings().changed({"swarm.particles": 50, "smooth": True}).swarm.particles
         50
@@ -449,7 +312,7 @@ class TrackSettings(
         for name, value in values.items():
             if name not in setting_names():
                 near = nearest(name, setting_names())
-                remedy = renamed(name) or (f"did you mean {near}?" if near else "")
+                remedy = f"did you mean {near}?" if near else ""
                 raise SettingsError(name, expected="the name of a setting", found=name, remedy=remedy)
             value = plain(value)
             part, dot, field = name.partition(".")

@@ -43,9 +43,6 @@ from helpers import Output
 # Rank promotion stays allowed: the package broadcasts particles x drones x cameras against cameras on purpose.
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Two devices, because batches of runs are divided between devices.
-jax.config.update("jax_num_cpu_devices", 2)
-
 # The same examples in every run, so that a failure can be repeated. No deadline, because the first example of a
 # compiled function includes the compilation.
 settings.register_profile(

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+from psotrack.cli.options import setting_name
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
-from psotrack.settings import RENAMED, TrackSettings
+from psotrack.settings import TrackSettings
+from psotrack.silhouettes import Silhouettes
 
 #: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
 LENSES = {
@@ -191,6 +193,23 @@ def draw_coverage(rig: Rig, position_m, size_m, reduction):
     return np.round(255 * cells.mean(axis=(2, 4))).astype(np.uint8)
 
 
+def drawn_silhouettes(rig: Rig, position_m, size_m, reduction) -> Silhouettes:
+    """Silhouettes of ellipsoids at positions (frames, drones, 3), NaN where a drone is not there; sizes (drones, 3)."""
+    there = np.isfinite(position_m).all(axis=-1)
+    images = [
+        draw_coverage(rig, places[visible], size_m[visible], reduction)
+        for places, visible in zip(position_m, there, strict=True)
+    ]
+    return silhouettes_in_memory(rig, np.array(images), reduction)
+
+
+def silhouettes_in_memory(rig: Rig, coverage, reduction) -> Silhouettes:
+    """Silhouettes from their coverage, (frames, cameras, height, width)."""
+    arrays = tuple(np.moveaxis(coverage, 1, 0))
+    drawn = dict.fromkeys(rig.names, "drawn")
+    return Silhouettes(rig.names, drawn, reduction, len(coverage), coverage.shape[2:], {}, arrays)
+
+
 def track_settings(**options):
     """Tracking settings; options have the names of the command line, such as `particles`, or dotted names."""
-    return TrackSettings().changed({RENAMED.get(name, name): value for name, value in options.items()})
+    return TrackSettings().changed({setting_name(name): value for name, value in options.items()})

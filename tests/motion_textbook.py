@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from psotrack.motion import MotionParams
+from psotrack.motion import Measurements, MotionParams
 
 DT_S = 1 / 25
 
@@ -165,8 +165,7 @@ class SimulatedFlight:
 
     @property
     def measurements(self):
-        """Arguments of `smooth` and `estimate_jerk_density`, except the params."""
-        return self.time_s, self.measured_m, self.covariance_m2, self.was_measured
+        return Measurements(self.time_s, self.measured_m, self.covariance_m2, self.was_measured)
 
     @property
     def params(self):
@@ -174,7 +173,8 @@ class SimulatedFlight:
 
     def textbook_arguments(self, drone, first=0):
         """Arguments of the textbook functions for one drone, from frame `first` on."""
-        return self.model, self.time_s[first:], *(part[first:, drone] for part in self.measurements[1:])
+        by_drone = (self.measured_m, self.covariance_m2, self.was_measured)
+        return self.model, self.time_s[first:], *(part[first:, drone] for part in by_drone)
 
 
 def simulate_flight(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers):

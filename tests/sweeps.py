@@ -1,6 +1,5 @@
 """Shared by the tests of sweeps: a very small sequence, whose program is compiled once, and ways to run psotrack."""
 
-import json
 import os
 import subprocess
 import sys
@@ -70,80 +69,6 @@ def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert swept.returncode == 0, swept.stderr
 
     return make_once(tmp_path_factory, "small_sequence", make)
-
-
-#: Names of settings that version 0.1 stored in columns and manifests, by today's name. `silhouettes.reduction` and
-#: others are called the same.
-OLDER_NAMES = {
-    "swarm.particles": "particles",
-    "swarm.iterations": "iterations",
-    "swarm.kind": "swarm",
-    "swarm.spread_m": "spread_m",
-    "swarm.inertia": "inertia",
-    "swarm.cognitive": "cognitive",
-    "swarm.social": "social",
-    "score.kind": "score",
-    "score.windows": "windows",
-    "score.occlusion": "claims",
-    "score.vertex": "vertex",
-    "drones.count": "drones",
-    "drones.size_m": "drone_size_m",
-    "drones.learn_sizes": "learn_sizes",
-    "drones.body_offset_m": "body_offset_m",
-    "motion.max_speed_m_s": "max_speed_m_s",
-    "motion.jerk_density_m2_s5": "jerk_density_m2_s5",
-    "motion.velocity_std_m_s": "velocity_std_m_s",
-    "motion.acceleration_std_m_s2": "acceleration_std_m_s2",
-    "motion.error_share": "error_share",
-    "motion.error_time_s": "error_time_s",
-    "status.min_fitness": "min_fitness",
-    "status.min_cameras": "min_cameras",
-    "status.max_coasting_s": "max_coasting_s",
-    "identity.encounter_m": "encounter_m",
-    "identity.resolve_swaps": "mend",
-}
-
-
-#: Settings that version 0.1 lacked.
-NEW_NAMES = (
-    "swarm.search",
-    "status.min_cameras_to_begin",
-    "status.max_coasting_std_m",
-    "rate_hz",
-    "silhouettes.background",
-    "silhouettes.drone_px",
-    "clocks",
-    "errors.rig_deg",
-    "errors.pixel_px",
-)
-
-
-def make_older(results: Path, older_keys: dict[str, str]) -> None:
-    """Turn a folder of results into a folder as version 0.1 wrote it.
-
-    Args:
-        results: the folder.
-        older_keys: today's keys of all finished cells -> keys of the same cells in version 0.1.
-    """
-    columns = {f"settings.{today}": f"settings.{older}" for today, older in OLDER_NAMES.items()}
-    (results / "errors").mkdir()
-    for key, older_key in older_keys.items():
-        rows = pd.read_parquet(results / "cells" / f"{key}.parquet")
-        rows = rows.drop(columns=[f"settings.{name}" for name in NEW_NAMES])
-        rows = rows.rename(columns=columns).assign(**{"settings.refinements": 0, "cell": older_key})
-        rows.to_parquet(results / "cells" / f"{older_key}.parquet", index=False)
-        (results / "cells" / f"{key}.parquet").unlink()
-        (results / "_errors" / f"{key}.parquet").rename(results / "errors" / f"{older_key}.parquet")
-    (results / "_errors").rmdir()
-    manifest = json.loads((results / "_manifest.json").read_text())
-    # Version 0.1 wrote no digest.
-    manifest.pop("digest", None)
-    for run in manifest["runs"]:
-        for part in ("settings", "axes"):
-            values = run["grid"][part]
-            run["grid"][part] = {OLDER_NAMES.get(name, name): value for name, value in values.items()}
-    (results / "manifest.json").write_text(json.dumps(manifest))
-    (results / "_manifest.json").unlink()
 
 
 def all_rows(results: Path) -> pd.DataFrame:

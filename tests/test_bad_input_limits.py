@@ -371,7 +371,9 @@ def test_junk_in_the_manifest_of_a_sweep(junk, sweep_folder):
 
 
 @pytest.mark.parametrize("place", ["../secret.bin", "secret.bin", "{folder}/secret.bin"])
-@pytest.mark.parametrize("inside", ["initializer", "attribute"])
+@pytest.mark.parametrize(
+    "inside", ["initializer", "attribute", "attribute, a length with a superfluous zero"]
+)
 def test_a_network_that_reads_another_file(place, inside, tmp_path, monkeypatch):
     """OpenCV reads every file that a tensor names; here it is not asked to."""
     values = np.full((1, 3, 64, 64), 7, np.float32)
@@ -380,6 +382,8 @@ def test_a_network_that_reads_another_file(place, inside, tmp_path, monkeypatch)
         (folder / "secret.bin").write_bytes(values.tobytes())
     message, path = onnx_models._message, tmp_path / "in" / "net.onnx"
     location = message((1, "location"), (2, place.format(folder=tmp_path)))
+    if "zero" in inside:
+        location = location.replace(b"\x08location", b"\x88\x00location")
     shape = [(1, side) for side in values.shape]
     tensor = message(*shape, (2, 1), (8, "secret"), (13, location), (14, 1))
     if inside == "initializer":

@@ -31,7 +31,7 @@ from psotrack.correspondence import Sightings
 from psotrack.errors import SettingsError
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project, reconstruct
-from psotrack.motion import MotionParams, filter_measurements
+from psotrack.motion import Measurements, MotionParams, filter_measurements
 from psotrack.settings import ErrorSettings, TrackSettings
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 
@@ -472,13 +472,13 @@ class TestFilteredVariance:
         params = MotionParams(
             np.full(drones, 1.0), np.array(1.0), np.array(3.0), np.array(0.7), np.array(0.4)
         )
-        filtered = filter_measurements(
+        measured = Measurements(
             dt_s * np.arange(frames),
             position_m + error_m,
             np.tile(4e-4 * np.eye(3), (frames, drones, 1, 1)),
             np.ones((frames, drones), bool),
-            params,
         )
+        filtered = filter_measurements(measured, params)
         assert filtered.covariance_m2[-1, 0, 0, 0] == pytest.approx(stated, rel=0.01)
         late = slice(150, None)
         assert np.square(filtered.position_m - position_m)[late].mean() == pytest.approx(real, rel=0.15)

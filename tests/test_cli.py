@@ -364,15 +364,15 @@ def test_help_has_an_example(run: Run, command: str) -> None:
 
 
 def test_command_line_defaults_are_the_defaults_of_the_settings() -> None:
-    """Options have the names of the settings in version 0.1; `RENAMED` has the settings' names of today."""
-    from psotrack.settings import RENAMED, TrackSettings
+    from psotrack.cli.options import setting_name
+    from psotrack.settings import TrackSettings, setting_names
 
     defaults = {option.name: option.default for option in cli.cli.commands["track"].params}
-    compared = [name for name in (*RENAMED, *TrackSettings.__struct_fields__) if name in defaults]
-    assert len(compared) > 12
-    for name in compared:
+    compared = {name: setting_name(name) for name in defaults if setting_name(name) in setting_names()}
+    assert len(compared) > 25
+    for name, dotted in compared.items():
         default = TrackSettings()
-        for part in RENAMED.get(name, name).split("."):
+        for part in dotted.split("."):
             default = getattr(default, part)
         # An option without a default leaves the setting's default.
         assert defaults[name] == default or default is None, name
@@ -441,7 +441,7 @@ class TestBadInput:
         fails(sequence, "dron2_pos_25.csv", "line 6", "nan")
 
     def test_no_drones(self, fails: Callable[..., None], sequence: Path) -> None:
-        fails(sequence, "drones", "from 1 to 1000", "found 0", more=("--drones", 0))
+        fails(sequence, "drones", "at least 1", "found 0", more=("--drones", 0))
 
     def test_initial_positions_from_a_missing_file(self, fails: Callable[..., None], sequence: Path) -> None:
         fails(sequence, "start.csv", more=("--init", "start.csv"))

@@ -150,7 +150,7 @@ class TestInvalidModels:
         assert capfd.readouterr() == ("", "")
 
     def test_an_output_of_unknown_layout(self, models):
-        with pytest.raises(InputError, match=r"none.onnx: .* as YOLOv8, found \(1, 1, 13, 13\)"):
+        with pytest.raises(InputError, match=r"none.onnx: .* layout of YOLO, found \(1, 1, 13, 13\)"):
             detector(models, "none").boxes(black(128))
 
     def test_scores_outside_0_to_1(self, models):

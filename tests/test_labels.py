@@ -12,7 +12,7 @@ import pytest
 import trimesh
 import yaml
 from click.testing import CliRunner
-from helpers import far_camera, make_unnamed_rig, ring_rig
+from helpers import far_camera, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.cli.labels import labels
 from psotrack.datasets import open_recording
 from psotrack.datasets.dpjait import read_masks, read_sequence
-from psotrack.detection import FrameSelection, LabelSettings, write_data_set
-from psotrack.detection.labels import box_corners, label_boxes
+from psotrack.detection import LabelSettings, box_corners, label_boxes, write_data_set
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.recordings import VideoWriter, read_frames
@@ -32,7 +31,7 @@ from psotrack.trajectories import Trajectories
 from psotrack.trajectories.tum import write_tum
 
 #: A distant camera at y = -1000 m with 100 x 80 pixels and 10 pixels per metre; x is to the right, z is up.
-FAR = make_unnamed_rig(far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)).cameras
+FAR = far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)
 CUBE = LabelSettings(drone_size_m=(2.0, 2.0, 2.0))
 SIZE_M = (0.6, 0.4, 0.3)
 
@@ -47,11 +46,17 @@ def make_reference(position_m, orientation_wxyz=None):
     return Trajectories(frame, frame / 25, names, position_m, orientation_wxyz=orientation_wxyz)
 
 
-def compute_labels(*position_m, cameras=FAR, settings=CUBE, orientation_wxyz=None):
-    """Return the label boxes of the first camera, (drones, 4), pixels."""
+def compute_labels(*position_m, camera=FAR, settings=CUBE, orientation_wxyz=None):
+    """Return the label boxes in an image, (drones, 4), pixels."""
     truth = make_reference([position_m], None if orientation_wxyz is None else [orientation_wxyz])
-    corners_m = box_corners(truth, np.array(settings.drone_size_m), np.array(settings.offset_m))
-    return label_boxes(cameras, corners_m, settings)[0, :, 0]
+    return label_boxes(camera, box_corners(truth, settings), settings)[0]
+
+
+def labels_in_rig(rig, truth, settings):
+    """Return the label boxes of all cameras, (frames, drones, cameras, 4), pixels."""
+    corners_m = box_corners(truth, settings)
+    boxes = [label_boxes(rig.cameras[index], corners_m, settings) for index in range(len(rig))]
+    return np.stack(boxes, axis=2)
 
 
 def iou(first, second):
@@ -93,34 +98,27 @@ def test_missing_orientations():
     """A drone without any orientation has a level box; a drone with gaps has no box in the gaps."""
     truth = make_reference(np.zeros((2, 2, 3)), np.full((2, 2, 4), np.nan))
     truth.orientation_wxyz[0, 1] = (1, 0, 0, 0)
-    corners_m = box_corners(truth, np.ones(3), np.zeros(3))
+    corners_m = box_corners(truth, CUBE)
     assert np.isfinite(corners_m[:, 0]).all()
     assert np.isfinite(corners_m[0, 1]).all()
     assert np.isnan(corners_m[1, 1]).all()
 
 
-def test_a_size_and_an_offset_for_each_drone():
-    truth = make_reference([[(0, 0, 0), (0, 0, 0)]])
-    corners_m = box_corners(truth, np.array([[1.0, 1, 1], [2, 4, 6]]), np.array([[0.0, 0, 0], [1, 0, 0]]))
-    assert np.ptp(corners_m[0], axis=1).tolist() == [[1, 1, 1], [2, 4, 6]]
-    assert corners_m[0].mean(axis=1).tolist() == [[0, 0, 0], [1, 0, 0]]
-
-
 @pytest.mark.parametrize(("min_inside", "expected"), [(0.7, [85, 30, 100, 50]), (0.8, [np.nan] * 4)])
 def test_a_box_is_cut_at_the_image_border(min_inside, expected):
     """The box reaches from 85 to 105 in an image of 100 pixels: three quarters are inside."""
-    settings = replace(CUBE, min_inside=min_inside)
+    settings = msgspec.structs.replace(CUBE, min_inside=min_inside)
     np.testing.assert_allclose(compute_labels((4.5, 0.0, 0.0), settings=settings), [expected], atol=0.06)
 
 
 def test_a_box_outside_the_image_has_no_label_even_with_min_inside_0():
-    settings = replace(CUBE, min_inside=0.0)
+    settings = msgspec.structs.replace(CUBE, min_inside=0.0)
     assert np.isnan(compute_labels((7.0, 0, 0), (0, 0, -6.0), settings=settings)).all()
 
 
 def test_a_drone_behind_the_camera_has_no_label():
     """The three drones are behind the camera, around the camera, and with one corner behind the camera."""
-    settings = replace(CUBE, min_inside=0.0)
+    settings = msgspec.structs.replace(CUBE, min_inside=0.0)
     assert np.isnan(compute_labels((0, -2000.0, 0), (0, -1000.0, 0), (0, -999.5, 0), settings=settings)).all()
 
 
@@ -129,7 +127,7 @@ def test_a_drone_behind_the_camera_has_no_label():
 )
 def test_a_nearer_drone_hides_a_farther_one(max_hidden, hidden):
     """The nearer drone is shifted by half a metre of two metres: three quarters are covered."""
-    settings = replace(CUBE, max_hidden=max_hidden)
+    settings = msgspec.structs.replace(CUBE, max_hidden=max_hidden)
     far, near = compute_labels((0.0, 5.0, 0.0), (0.5, 0.0, 0.0), settings=settings)
     assert np.isnan(far).all() == hidden
     np.testing.assert_allclose(near, [45, 30, 65, 50], atol=0.03)
@@ -138,12 +136,14 @@ def test_a_nearer_drone_hides_a_farther_one(max_hidden, hidden):
 def test_a_drone_without_pose_hides_no_other_drone():
     for hidden_drone in [(0.0, -1500.0, 0.0), (math.nan, math.nan, math.nan)]:
         assert np.isfinite(
-            compute_labels((0.0, 0.0, 0.0), hidden_drone, settings=replace(CUBE, max_hidden=0.0))[0]
+            compute_labels(
+                (0.0, 0.0, 0.0), hidden_drone, settings=msgspec.structs.replace(CUBE, max_hidden=0.0)
+            )[0]
         ).all()
 
 
 def test_no_drones():
-    assert label_boxes(FAR, np.empty((3, 0, 8, 3)), CUBE).shape == (3, 0, 1, 4)
+    assert label_boxes(FAR, np.empty((3, 0, 8, 3)), CUBE).shape == (3, 0, 4)
 
 
 @pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
@@ -153,11 +153,8 @@ def test_boxes_agree_with_corners_projected_by_opencv(coefficients):
     position_m = rng.uniform((-1, -1, 0.8), (1, 1, 1.8), (7, 1, 3))
     wxyz = Rotation.random(7, rng=1).as_quat(scalar_first=True)[:, None]
     size_m, offset_m = np.array([0.5, 0.3, 0.2]), np.array([0.05, -0.1, 0.02])
-    found = label_boxes(
-        rig.cameras,
-        box_corners(make_reference(position_m, wxyz), size_m, offset_m),
-        LabelSettings(tuple(size_m)),
-    )
+    chosen = LabelSettings(tuple(size_m.tolist()), tuple(offset_m.tolist()))
+    found = labels_in_rig(rig, make_reference(position_m, wxyz), chosen)
     signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     for f in range(7):
         orientation = Rotation.from_quat(wxyz[f, 0], scalar_first=True)
@@ -184,11 +181,10 @@ def test_points_far_outside_are_not_mapped_into_the_image():
     assert (pixel > 0).all()
     assert (pixel < (1924, 1082)).all()
     small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
-    cameras = make_unnamed_rig(bent).cameras
-    assert np.isnan(compute_labels(far_outside_m, cameras=cameras, settings=small)).all()
+    assert np.isnan(compute_labels(far_outside_m, camera=bent, settings=small)).all()
     # A drone in the corner of the image has a label.
     corner = np.array([1.0, -0.8, 0.4]) * 4
-    assert np.isfinite(compute_labels(tuple(corner), cameras=cameras, settings=small)).all()
+    assert np.isfinite(compute_labels(tuple(corner), camera=bent, settings=small)).all()
 
 
 @settings(max_examples=25)
@@ -201,8 +197,7 @@ def test_labels_are_inside_the_image_and_do_not_depend_on_the_order(seed):
     order = rng.permutation(5)
 
     def compute_boxes(position_m):
-        corners_m = box_corners(make_reference(position_m), np.array(chosen.drone_size_m), np.zeros(3))
-        return label_boxes(rig.cameras, corners_m, chosen)
+        return labels_in_rig(rig, make_reference(position_m), chosen)
 
     found = compute_boxes(position_m)
     np.testing.assert_array_equal(compute_boxes(position_m[:, order]), found[:, order])
@@ -215,14 +210,15 @@ def test_labels_are_inside_the_image_and_do_not_depend_on_the_order(seed):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"drone_size_m": (0.4, 0.0, 0.2)}, "drone_size_m: expected a number above 0, found 0"),
-        ({"min_inside": 1.5}, "min_inside: expected a share, 0 to 1, found 1.5"),
-        ({"max_hidden": math.nan}, "max_hidden: expected a share, 0 to 1, found nan"),
+        ({"drone_size_m": (0.4, 0.0, 0.2)}, "drone_size_m: expected a number above 0, found .*0.0"),
+        ({"min_inside": 1.5}, "min_inside: expected a number of at most 1, found 1.5"),
+        ({"max_hidden": math.nan}, "max_hidden: expected a number of at least 0, found NaN"),
+        ({"every": 0}, "every: expected a whole number of at least 1, found 0"),
     ],
 )
 def test_invalid_settings(change, message):
     with pytest.raises(SettingsError, match=message):
-        replace(CUBE, **change)
+        msgspec.structs.replace(CUBE, **change)
 
 
 # --- simulated sequences, in which drones are boxes
@@ -268,8 +264,7 @@ def refusal_message(error, *arguments):
 @pytest.mark.slow
 def test_labels_are_the_boxes_of_the_masks(data):
     recording = read_sequence(data / "S01_D2_A")
-    corners_m = box_corners(recording.truth, np.array(SIZE_M), np.zeros(3))
-    found = label_boxes(recording.rig.cameras, corners_m, LabelSettings(SIZE_M))
+    found = labels_in_rig(recording.rig, recording.truth, LabelSettings(SIZE_M))
     overlaps = []
     with read_masks(recording.folder) as masks:
         for frame in range(1, recording.num_frames):
@@ -326,8 +321,7 @@ def test_the_data_set_can_be_loaded_by_a_trainer(data, written_data_set):
         assert counts[part] == {"images": frames * cameras, "labels": sum(map(len, rows))}
         assert len(rows) == frames * cameras
         recording = read_sequence(data / name)
-        corners_m = box_corners(recording.truth, np.array(SIZE_M), np.zeros(3))
-        boxes = label_boxes(recording.rig.cameras, corners_m, LabelSettings(SIZE_M))
+        boxes = labels_in_rig(recording.rig, recording.truth, LabelSettings(SIZE_M))
         for index, camera_name in enumerate(recording.rig.names):
             for frame, shown in enumerate(read_frames(recording.videos[camera_name])):
                 image = out / "images" / part / f"{name}_{camera_name}_{frame:06d}.jpg"
@@ -378,15 +372,17 @@ def test_sequences_for_validation_can_be_chosen(data, tmp_path):
 
 def test_sequences_that_cannot_be_split(data, tmp_path):
     first, second, out = data / "S01_D2_A", data / "S12_D3", tmp_path / "set"
-    assert "sequences: expected at least two" in refusal_message(SettingsError, first, "--out", out)
-    assert "one sequence for training" in refusal_message(
-        SettingsError, first, second, "--out", out, "--validation", "S12_D3,S01_D2_A"
-    )
-    assert "found S99" in refusal_message(SettingsError, first, second, "--out", out, "--validation", "S99")
-    assert "S01_D2_A more than once" in refusal_message(SettingsError, first, first, "--out", out)
+    for sequences, validation, found in (
+        ([first], [], "found S01_D2_A, of which S01_D2_A for validation"),
+        ([first, second], ["S12_D3,S01_D2_A"], "found S01_D2_A, S12_D3, of which S01_D2_A, S12_D3 for"),
+        ([first, second], ["S99"], "found S01_D2_A, S12_D3, of which S99 for validation"),
+        ([first, first], [], "found S01_D2_A, S01_D2_A, of which S01_D2_A for validation"),
+    ):
+        options = ["--validation", *validation] if validation else []
+        message = refusal_message(SettingsError, *sequences, "--out", out, *options)
+        assert "sequences: expected different names, some for training and others for validation" in message
+        assert found in message
     assert run_labels(first, second, "--out", out, "--every", 0).exit_code == 2
-    with pytest.raises(SettingsError, match="every: expected 1 or more, found 0"):
-        FrameSelection(every=0)
     assert not out.exists()
 
 
@@ -397,7 +393,7 @@ def test_only_a_data_set_is_replaced_and_only_with_force(data, written_data_set,
     precious = tmp_path / "home"
     precious.mkdir()
     (precious / "thesis.tex").write_text("x")
-    assert "only a data set can be replaced" in refusal_message(
+    assert "only a folder with a data.yaml can be replaced" in refusal_message(
         OutputError, *both, "--out", precious, "--force"
     )
     assert (precious / "thesis.tex").exists()
@@ -425,10 +421,20 @@ def test_without_a_reference(data, tmp_path):
     with pytest.raises(InputError, match=r"S01_D2_A: expected a reference .*, found none"):
         write_data_set([replace(first, truth=None), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
     unknown = replace(first.truth, position_m=np.full_like(first.truth.position_m, np.nan))
-    with pytest.raises(InputError, match="no such frame among the 4 used frames"):
+    with pytest.raises(InputError, match="expected a frame in which the poses of all drones are known"):
         write_data_set(
             [replace(first, truth=unknown), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
         )
+
+
+def test_a_gap_of_one_frame_in_the_reference_is_bridged(data, tmp_path):
+    first, second = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
+    position_m = first.truth.position_m.copy()
+    position_m[2] = np.nan
+    gap = replace(first, truth=replace(first.truth, position_m=position_m))
+    counts = write_data_set([gap, second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+    # Frame 0 has no pose, and there is none before it.
+    assert counts["train"]["images"] == 3 * len(first.rig)
 
 
 def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
@@ -455,7 +461,6 @@ def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
         [open_recording(folder) for folder in flights],
         tmp_path / "set",
         LabelSettings(drone_size_m=(0.1, 0.1, 0.1)),
-        selection=FrameSelection(every=1),
     )
     for name, start_s in starts_s.items():
         files = sorted((tmp_path / "set" / "labels").glob(f"*/*_{name}_*.txt"))

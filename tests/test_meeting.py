@@ -112,6 +112,19 @@ def test_an_instant_waits_for_a_frame_that_is_in_work() -> None:
     assert [_number(image) for image in instant.coverage] == [0, 0]
 
 
+def test_nobody_waits_for_a_frame_of_a_camera_that_has_ended() -> None:
+    """A camera whose frame fails in work ends: its instant waited for ever."""
+    meeting = _meeting(2)
+    _put(meeting, 0, 0, 0.0, 0.0)
+    meeting.announce(1, 0.0, 0.0)
+    assert meeting.has_work
+    meeting.end(1)
+    assert not meeting.has_work
+    instant = meeting.take(0.0)
+    assert instant is not None
+    assert [_number(image) for image in instant.coverage] == [0, -1]
+
+
 def test_a_frame_that_is_left_out_is_missing() -> None:
     meeting = _meeting(2)
     _put(meeting, 0, 0, 0.0, 0.0)

@@ -37,10 +37,9 @@ def random_positions(seed):
     return drones_m, np.concatenate([near, far]).astype(np.float32)
 
 
-@pytest.mark.parametrize("kind", ["PlainFitness", "TunedFitness"])
 @pytest.mark.parametrize("min_cameras", [2, 4])
 @pytest.mark.slow
-def test_the_numpy_fitness_is_the_tracker_s(peers, kind, min_cameras):
+def test_the_numpy_fitness_is_the_tracker_s(peers, min_cameras):
     drones_m, position_m = random_positions(0)
     images = draw_coverage(RIG, drones_m, SIZE_M, REDUCTION)
     score = SoftIoU(min_cameras=min_cameras)
@@ -48,7 +47,7 @@ def test_the_numpy_fitness_is_the_tracker_s(peers, kind, min_cameras):
         *float32((RIG.cameras, SIZE_M)), summed_area_table(images), score, reduction=REDUCTION
     )
     expected = np.asarray(joint_fitness(inputs, position_m))
-    peer = getattr(peers, kind)(RIG.cameras, SIZE_M, score, REDUCTION)
+    peer = peers.NumpyFitness(RIG.cameras, SIZE_M, score, REDUCTION)
     found = peer(peer.tables(images), position_m)
     # The draw has drones that too few cameras see, and drones that all cameras see.
     assert (expected == 0).any()

@@ -62,6 +62,8 @@ def test_foreground_that_neighbours_cover_is_occluded_except_in_the_core(occludi
         np.testing.assert_array_equal(window, np.where(occluded, 0, free[drone, camera]))
         np.testing.assert_array_equal(found[drone, camera], occluded & (free[drone, camera] >= 128))
         own = ellipse2(drone, camera, patches, CLOSE_M[drone], 1.0) < 1
+        if own[[0, -1]].any() or own[:, [0, -1]].any() or not own.any():
+            continue  # The image, and the window with it, ends in the drone.
         # The share comes from 128 points of the ellipse, and here from at least 157 pixels: measured 0.015, limit 0.03.
         assert patches.clear[drone, camera] == pytest.approx(1 - (own & covered).sum() / own.sum(), abs=0.03)
         kept_in_core += (covered & core).any()

@@ -7,7 +7,8 @@ from helpers import ROOM_M, ring_rig
 from psotrack.correspondence import CameraSightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import make_rig, project
-from psotrack.projection_lines import LineSettings, state_at_first_frame, track_detections
+from psotrack.initiation import state_at_first_frame
+from psotrack.projection_lines import LineSettings, track_detections
 from psotrack.projection_lines.single_views import find_single_views
 from psotrack.recordings import Detections
 from psotrack.settings import DroneSettings, MotionSettings, StatusSettings

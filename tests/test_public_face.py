@@ -98,28 +98,6 @@ def test_an_unknown_plugin_is_one_line(settings):
         tracker_settings(pt.TrackSettings().changed(settings))
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"swarm.particles": "50"}, 'swarm.particles: expected a whole number, found "50"'),
-        ({"swarm.partikles": 50}, "found swarm.partikles; did you mean swarm.particles?"),
-        ({"motion.error_share": 1.5}, "motion.error_share: expected a number from 0 to 1, found 1.5"),
-        (
-            {"motion.error_share": float("nan")},
-            "motion.error_share: expected a number from 0 to 1, found nan",
-        ),
-        ({"score.windows": ()}, "score.windows: expected at least one scale, found none"),
-        ({"bounds_m": (0, 1)}, "bounds_m: expected a list of length 6"),
-        ({"smooth": "yes"}, 'smooth: expected true or false, found "yes"'),
-        ({"silhouettes.reduction": "4"}, 'reduction: expected a whole number, found "4"'),
-        ({"status.max_coasting_s": -1}, "status.max_coasting_s: expected a number of at least 0, found -1"),
-    ],
-)
-def test_wrong_settings_are_one_line(values, message):
-    with pytest.raises(SettingsError, match=re.escape(message)):
-        pt.TrackSettings().changed(values)
-
-
 def test_settings_may_be_numbers_and_arrays_of_numpy_and_paths():
     values = {"swarm.particles": np.int64(50), "bounds_m": np.arange(6.0), "init": Path("tracks.csv")}
     changed = pt.TrackSettings().changed(values)

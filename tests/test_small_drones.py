@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import ROOM_M, draw_coverage, ring_rig
+from helpers import ROOM_M, draw_coverage, ring_rig, silhouettes_in_memory, track_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.geometry import Rig
-from psotrack.initiation import KnownDrones, find_candidates
-from psotrack.initiation.initialisation import find_drones
-from psotrack.silhouettes import find_blobs, stack_blobs
+from psotrack.silhouettes import find_blobs
+from psotrack.tracking import RunInputs, track_recording, tracker_settings
 
 pytestmark = pytest.mark.slow
 
@@ -47,29 +46,12 @@ def magnify(rig: Rig, times: int) -> Rig:
     )
 
 
-def find_initial_state(coverage, rig=SMALL, reduction=REDUCTION):
-    return find_drones(
-        rig.cameras, coverage, reduction=reduction, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0
-    )
-
-
-def candidates_in(coverage, *known_m, rig=SMALL, reduction=REDUCTION):
-    known = np.stack(known_m, axis=1) if known_m else np.empty((len(coverage), 0, 3))
-    return find_candidates(
-        rig.cameras,
-        coverage,
-        KnownDrones(known, np.ones(known.shape[:2], bool), np.broadcast_to(SIZE_M, (len(known_m), 3))),
-        reduction=reduction,
-        fps=FPS,
-        bounds_m=ROOM_M,
-        max_speed_m_s=6.0,
-    )
-
-
-def assert_found(position_m, *truth_m, atol):
-    assert len(position_m) == len(truth_m)
-    distance = np.linalg.norm(np.asarray(position_m)[:, None] - np.stack(truth_m), axis=-1)
-    assert distance.min(axis=0).max() < atol
+def track(coverage, rig=SMALL, reduction=REDUCTION):
+    """The tracks of drones that the tracker finds itself."""
+    runs = [RunInputs(ROOM_M, tracker_settings(track_settings(particles=20, iterations=15)))]
+    silhouettes = silhouettes_in_memory(rig, coverage, reduction)
+    (((tracks, _),), _) = track_recording(rig, silhouettes, runs, fps=FPS)
+    return tracks
 
 
 @settings(max_examples=20)
@@ -81,9 +63,6 @@ def test_blobs_do_not_depend_on_the_pixels_per_cell(seed, times):
     one, other = find_blobs(image, 1), find_blobs(image, times)
     assert (times * one.size_px == other.size_px).all()
     assert (times * (one.centre_px + 0.5) == other.centre_px + 0.5).all()
-    assert (times * stack_blobs([[one]], 1, 1).radius_px == stack_blobs([[other]], 1, times).radius_px)[
-        np.isfinite(stack_blobs([[one]], 1, 1).radius_px)
-    ].all()
 
 
 def test_a_single_cell_is_noise():
@@ -92,30 +71,12 @@ def test_a_single_cell_is_noise():
     assert find_blobs(image, 4).size_px.tolist() == [[8, 4]]
 
 
-@pytest.mark.parametrize("times", [2, 4])
-def test_initial_states_do_not_depend_on_the_pixels_per_cell(two_drones, times):
-    one = find_initial_state(two_drones[:10])
-    other = find_initial_state(two_drones[:10], magnify(SMALL, times), times * REDUCTION)
-    # The equations are the same except for rounding in float64.
-    for name, value in vars(one).items():
-        np.testing.assert_allclose(getattr(other, name), value, atol=1e-6, err_msg=name)
-
-
-def test_drones_of_a_few_cells_are_in_the_initial_state(two_drones):
-    """Regression: blobs of ten cells were too small."""
-    start = find_initial_state(two_drones[:10])
-    assert_found(start.position_m, ONE[0], OTHER[0], atol=CELL_M / 2)
-
-
 @pytest.mark.parametrize("times", [1, 2])
-def test_drones_of_a_few_cells_become_candidates(two_drones, times):
-    """Regression: candidates were searched at half the resolution, where a small drone is one cell."""
-    found = candidates_in(two_drones, ONE, rig=magnify(SMALL, times), reduction=times * REDUCTION)
-    assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
-
-
-def test_known_drones_of_a_few_cells_explain_all_foreground(two_drones):
-    assert candidates_in(two_drones, ONE, OTHER) == ()
+def test_drones_of_a_few_cells_are_tracked(two_drones, times):
+    tracks = track(two_drones, magnify(SMALL, times), times * REDUCTION)
+    assert tracks.position_m.shape[1] == 2
+    apart_m = np.linalg.norm(tracks.position_m[:, :, None] - np.stack([ONE, OTHER], axis=1)[:, None], axis=-1)
+    assert np.median(apart_m.min(axis=1), axis=0).max() < CELL_M / 2
 
 
 def thin_out(coverage, share, seed=0):
@@ -127,9 +88,9 @@ def thin_out(coverage, share, seed=0):
 def test_a_silhouette_with_many_gaps_is_a_drone(seed):
     """Regression: a camera that showed less than a quarter of the drone did not count."""
     rig = ring_rig(6, image_size_wh=(240, 180))
-    coverage = thin_out(draw_silhouettes(OTHER, rig=rig), 0.22, seed)
-    found = candidates_in(coverage, rig=rig)
-    assert_found([one.position_m for one in found], OTHER[found[0].frame], atol=CELL_M / 2)
+    tracks = track(thin_out(draw_silhouettes(OTHER, rig=rig), 0.22, seed), rig)
+    assert tracks.position_m.shape[1] == 1
+    assert np.nanmedian(np.linalg.norm(tracks.position_m[:, 0] - OTHER, axis=-1)) < CELL_M / 2
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -137,6 +98,4 @@ def test_noise_everywhere_is_no_drone(seed):
     """A few random cells in every image: no place has more foreground than its surroundings."""
     rng = np.random.default_rng(seed)
     noise = 255 * (rng.random((25, 6, 45, 60)) < 0.03).astype(np.uint8)
-    rig = ring_rig(6, image_size_wh=(120, 90))
-    assert len(find_initial_state(noise[:10], rig).position_m) == 0
-    assert candidates_in(noise, rig=rig) == ()
+    assert track(noise, ring_rig(6, image_size_wh=(120, 90))).position_m.shape[1] == 0

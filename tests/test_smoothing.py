@@ -27,7 +27,7 @@ from psotrack.motion import estimate_jerk_density, smooth
 
 
 def smooth_flight(flown: SimulatedFlight):
-    return smooth(*flown.measurements, flown.params)
+    return smooth(flown.measurements, flown.params)
 
 
 class TestSmoothing:
@@ -65,7 +65,7 @@ class TestSmoothing:
         other = replace(flown, model=Model(error_time_s=7.0))
         for one, same in zip(*(vars(smooth_flight(each)).values() for each in (flown, other)), strict=True):
             np.testing.assert_array_equal(one, same)
-        density = [estimate_jerk_density(*flown.measurements, each.params) for each in (flown, other)]
+        density = [estimate_jerk_density(flown.measurements, each.params) for each in (flown, other)]
         np.testing.assert_array_equal(*density)
 
     def test_the_smoother_beats_the_filter_and_the_filter_the_measurements(self):
@@ -244,7 +244,7 @@ class TestJerkDensity:
             12, frames=self.FRAMES, drones=8, density=density, error_share=error_share, steady=True
         )
         flown = remove_random_measurements(flown, 13, 0.1)
-        found = estimate_jerk_density(*flown.measurements, motion_params(30.0, 8, error_share=error_share))
+        found = estimate_jerk_density(flown.measurements, motion_params(30.0, 8, error_share=error_share))
         off = np.log10(found / density)
         # 24 s have about 100 independent samples of the jerk along three axes. They give the density of one drone to
         # about a tenth of a decade, and the mean of eight drones to a third of that. Measured 0.06 and 0.01 at most.
@@ -258,7 +258,7 @@ class TestJerkDensity:
         wild[0] = False
         measured_m = flown.measured_m + wild[..., None] * rng.normal(scale=0.5, size=flown.measured_m.shape)
         found = estimate_jerk_density(
-            *replace(flown, measured_m=measured_m).measurements, motion_params(30.0, 8)
+            replace(flown, measured_m=measured_m).measurements, motion_params(30.0, 8)
         )
         # The limit is the same as for flights without outliers.
         assert np.abs(np.log10(found / 30.0)).max() < 0.3
@@ -267,7 +267,7 @@ class TestJerkDensity:
         unknown = np.zeros((30, 2), bool)
         unknown[1:, 0], unknown[:, 1] = True, True
         flown = remove_measurements(simulate_flight(16, frames=30, drones=2), unknown)
-        found = estimate_jerk_density(*flown.measurements, motion_params(70.0, 2))
+        found = estimate_jerk_density(flown.measurements, motion_params(70.0, 2))
         # The prior alone is a parabola, whose vertex is found to rounding.
         np.testing.assert_allclose(found, 70.0, rtol=1e-6)
 
@@ -280,7 +280,7 @@ class TestJerkDensity:
             covariance_m2=np.broadcast_to(1e-4 * np.eye(3), flown.covariance_m2.shape),
         )
         # The density is 300 times below the prior; it corresponds to accelerations below 1 m/s² within 24 s.
-        assert (estimate_jerk_density(*still.measurements, flown.params) < 0.1).all()
+        assert (estimate_jerk_density(still.measurements, flown.params) < 0.1).all()
 
 
 class TestRefusedInput:
@@ -296,21 +296,21 @@ class TestRefusedInput:
         [
             ({"time_s": (3, 0.01)}, "time_s: expected increasing times"),
             ({"time_s": (29, np.inf)}, "time_s: expected increasing times"),
-            ({"measured_m": ((4, 1, 2), np.nan)}, "measured_m, row 4, drone 1: expected numbers"),
+            ({"measured_m": ((4, 1, 2), np.nan)}, "position_m, row 4, drone 1: expected numbers"),
             (
                 {"covariance_m2": ((4, 1, 2), np.inf)},
-                "measured_covariance_m2, row 4, drone 1: expected numbers",
+                "covariance_m2, row 4, drone 1: expected numbers",
             ),
             (
                 {"covariance_m2": ((5, 0), np.diag([1, 1, -1]))},
-                "measured_covariance_m2, row 5, drone 0: expected a positive definite covariance",
+                "covariance_m2, row 5, drone 0: expected a positive definite covariance",
             ),
         ],
     )
     def test_the_message_names_the_first_wrong_value(self, function, changes, message):
         flown = self.changed_flight(**changes)
         with pytest.raises(InputError, match=message):
-            function(*flown.measurements, flown.params)
+            function(flown.measurements, flown.params)
 
     def test_values_without_a_measurement_are_ignored(self):
         flown = self.changed_flight(was_measured=((4, 1), False), covariance_m2=((4, 1), np.diag([1, 1, -1])))
@@ -327,8 +327,8 @@ def test_double_precision_does_not_leave_the_call():
 def test_other_values_need_no_compilation(caplog):
     def both(seed, density):
         flown = remove_random_measurements(simulate_flight(seed, frames=8, drones=2), seed)
-        smooth(*flown.measurements, motion_params(density, 2))
-        estimate_jerk_density(*flown.measurements, motion_params(density, 2))
+        smooth(flown.measurements, motion_params(density, 2))
+        estimate_jerk_density(flown.measurements, motion_params(density, 2))
         lines = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
         caplog.clear()
         return lines

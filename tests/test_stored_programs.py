@@ -17,7 +17,7 @@ SMOOTHING = """
 import hashlib, logging, os, sys, threading
 import jax
 import numpy as np
-from psotrack.motion import motion_params, smooth
+from psotrack.motion import Measurements, motion_params, smooth
 from psotrack.settings import MotionSettings
 from psotrack.support import keep_compiled, load_ahead
 logging.basicConfig(level=logging.INFO, format="%(message)s (%(threadName)s)")
@@ -34,7 +34,8 @@ frames = 12
 measured_m = np.random.default_rng(0).normal(size=(frames, 2, 3))
 covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (frames, 2, 3, 3))
 found = np.ones((frames, 2), bool)
-tracks = smooth(np.arange(frames) / 25, measured_m, covariance_m2, found, motion_params(MotionSettings(), 2))
+measured = Measurements(np.arange(frames) / 25, measured_m, covariance_m2, found)
+tracks = smooth(measured, motion_params(MotionSettings(), 2))
 print(hashlib.sha256(b"".join(part.tobytes() for part in vars(tracks).values())).hexdigest())
 """
 #: A program that calls LAPACK, which JAX makes ready when it lowers a function, and one with a class of its own.

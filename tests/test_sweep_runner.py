@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from sweeps import all_rows, grid_file, make_older, psotrack, small_sequence, stamps
+from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
 
 from psotrack.cli import main
 from psotrack.errors import InputError
@@ -26,7 +26,6 @@ from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, s
 from psotrack.sweep import grid as grid_of
 from psotrack.sweep.estimates import FRAME_S, WORK_S
 from psotrack.sweep.locks import Locks
-from psotrack.sweep.older_folders import older_cell_key
 
 SETTINGS = {
     "swarm.particles": 8,
@@ -35,12 +34,6 @@ SETTINGS = {
     "init": "truth",
     "drones.size_m": [0.5, 0.5, 0.2],
     "silhouettes.reduction": 2,
-}
-#: The defaults of version 0.1, which a cell needs to be one of that version.
-DEFAULTS_0_1 = {
-    "silhouettes.background": "mog2",
-    "silhouettes.working_reduction": 2,
-    "silhouettes.min_blob_px": 64,
 }
 METHODS = """
 [methods.usual]
@@ -106,11 +99,6 @@ def tracker(monkeypatch: pytest.MonkeyPatch) -> Tracker:
 def varied(*iterations: int, runs: int = 1, **settings: object) -> dict:
     grid = {"swarm.iterations": list(iterations)}
     return {"sequences": ["S01_D2_A"], "runs": runs, "settings": SETTINGS | settings, "grid": grid}
-
-
-def varied_0_1(*iterations: int, runs: int = 1) -> dict:
-    """A grid that version 0.1 could run as well."""
-    return varied(*iterations, runs=runs, **DEFAULTS_0_1)
 
 
 @pytest.mark.slow
@@ -304,61 +292,6 @@ def test_in_python_the_rows_are_the_rows_of_the_grid(root: Path, tracker: Tracke
     (tmp_path / "grid.toml").write_text(grid_file(tmp_path, [3], runs=3).read_text())
     assert sweep(tmp_path / "grid.toml", out, **folders)["seed"].tolist() == [0, 1, 2]
     assert tracker.runs == [(3, [0, 1]), (4, [0, 1]), (5, [0]), (3, [2])]
-
-
-@pytest.mark.slow
-def test_a_folder_of_version_0_1_is_read_and_continued(
-    root: Path, tracker: Tracker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Names of settings are today's names, finished cells are not run again, and more runs are added to them."""
-    out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
-    before = sweep(varied_0_1(3, 4, runs=2), out, **folders)
-    assert tracker.runs == [(3, [0, 1]), (4, [0, 1])]
-    inputs = Inputs(root, root / "cache")
-    cells = grid_of(varied_0_1(3, 4)).cells()
-    inputs_read = [inputs.keys_of(cell) for cell in cells]
-    older_keys = {
-        cell_key(cell, read): older_cell_key(cell, read)
-        for cell, read in zip(cells, inputs_read, strict=True)
-    }
-    make_older(out, older_keys)
-    code, lines, err = called(
-        capsys, "table", out, "--rows", "iterations", "--columns", "swarm.particles", "--value", "missed_rate"
-    )
-    assert (code, err) == (0, "")
-    assert [line.split()[:2] for line in lines[-2:]] == [["3", "1"], ["4", "1"]]
-    assert str(estimate(grid_of(varied_0_1(3, 4, runs=2)).cells(), inputs, Store(out))) == "nothing to run"
-    again = sweep(varied_0_1(3, 4, runs=2), out, **folders)
-    assert len(tracker.runs) == 2
-    pd.testing.assert_frame_equal(again[before.columns], before, check_dtype=False)
-    assert stamps(out).keys() == {f"{key}.parquet" for key in before["cell"]}
-    assert len(Store(out).errors(before["cell"][0], [0])) == 0  # The planted tracker finds no drones.
-    settings = [run["grid"]["settings"]["swarm.particles"] for run in Store(out).manifest()["runs"]]
-    assert set(settings) == {8}
-    assert len(sweep(varied_0_1(3, 5, runs=3), out, **folders)) == 6
-    assert tracker.runs[2:] == [(3, [2]), (5, [0, 1, 2])]
-    # Without an old column, no row lacks a value of today's column.
-    assert Store(out).rows()["settings.swarm.search"].tolist() == ["pso"] * 8
-    assert not {"settings.particles", "settings.refinements"} & set(Store(out).rows().columns)
-
-
-@pytest.mark.slow
-def test_an_interrupted_move_of_an_older_cell_is_continued(
-    root: Path, tracker: Tracker, tmp_path: Path
-) -> None:
-    """A process that is killed after it has written a cell's new files leaves both the new and the older files."""
-    out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
-    sweep(varied_0_1(3), out, **folders)
-    (cell,) = grid_of(varied_0_1(3)).cells()
-    keys = Inputs(root, root / "cache").keys_of(cell)
-    older_key, copy = older_cell_key(cell, keys), tmp_path / "copy"
-    shutil.copytree(out, copy)
-    make_older(out, {cell_key(cell, keys): older_key})
-    for folder, older_folder in (("cells", "cells"), ("_errors", "errors")):
-        shutil.copy(out / older_folder / f"{older_key}.parquet", copy / folder)
-    assert len(sweep(varied_0_1(3), copy, **folders)) == 1
-    assert len(Store(copy).rows()) == 1
-    assert tracker.runs == [(3, [0])]
 
 
 @pytest.mark.slow

@@ -136,24 +136,6 @@ def test_the_folder_is_a_parquet_data_set_of_the_rows(tmp_path: Path) -> None:
         pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
 
 
-def test_a_folder_of_an_older_version_stays_usable(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    add(store, KEY, rows(0, 1))
-    store.add_failure(KEY, "no such camera", {"sequence": "S01", "method": "ours"})
-    store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
-    failure = tmp_path / "cells" / f"_{KEY}.error.json"
-    for path in (tmp_path / "_errors", failure, tmp_path / "_manifest.json"):
-        path.rename(path.with_name(path.name[1:]))
-    for _ in ("as it was", "renamed"):
-        assert len(store.errors(KEY, [0])) == 2
-        assert store.failure(KEY) == "no such camera"
-        assert store.status()["failed"] == 1
-        assert store.manifest()["runs"] == [RUN]
-        store.tidy()
-    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
-    assert failure.exists()
-
-
 def test_one_runner_at_a_time_locks_a_cell(tmp_path: Path) -> None:
     store = Store(tmp_path)
     with store.lock(KEY, "S01 ours") as first:

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import draw_coverage, float32, ring_rig
+from helpers import draw_coverage, float32, make_unnamed_rig, ring_rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from psotrack.geometry import look_at, make_camera
 from psotrack.silhouettes import summed_area_table
 from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import camera_scores, score_inputs
@@ -75,6 +76,21 @@ def test_the_vertex_is_the_centre_of_an_ellipsoid():
     # A pixel of the silhouettes is 2 cm at 4 m: measured 2 mm on average, 5 mm at most.
     assert np.mean(errors_m) < 0.004
     assert np.max(errors_m) < 0.01
+
+
+def test_cameras_on_one_side_know_that_the_depth_is_uncertain():
+    """Three cameras within nine degrees. Regression: variances were limited to a ratio of 50."""
+    cameras = []
+    for angle in (-0.08, 0.0, 0.08):
+        R, t_m = look_at((4 * np.cos(angle), 4 * np.sin(angle), 1.2), (0.0, 0.0, 1.2))
+        K = np.array([[900.0, 0, 479.5], [0, 900.0, 359.5], [0, 0, 1]])
+        cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(960, 720)))
+    rig, truth = make_unnamed_rig(*cameras), np.array([[0.02, -0.03, 1.21]])
+    covariance = np.asarray(found(score_view(truth, rig=rig), truth).inverse_curvature_m2[0])
+    variance, axes = np.linalg.eigh(covariance)
+    # The worst axis is the line of sight; rays alone would give a ratio of 1 / mean of squared sines, 230.
+    assert abs(axes[0, -1]) > 0.95
+    assert variance[-1] > 80 * np.sqrt(variance[0] * variance[1])
 
 
 def test_the_vertex_stays_within_the_grid():

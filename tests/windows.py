@@ -12,7 +12,7 @@ from psotrack.silhouettes import summed_area_table
 from psotrack.silhouettes.summed_area import LOW_BITS
 from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import ScoreInputs, drone_fitness, score_inputs
-from psotrack.tracking.patches import SIDE, ExpectedDrones, cut
+from psotrack.tracking.patches import SIDE, ExpectedDrones, cut, make_pyramid
 
 RING = SoftIoU().ring
 
@@ -37,26 +37,22 @@ def middle_px(position_m, pixels_per_m):
     return SHAPE[1] / 2 + pixels_per_m * position_m[0], SHAPE[0] / 2 - pixels_per_m * position_m[2]
 
 
-def cut_at(rig, images, expected_m, size_m, *, reduction=1, **expected):
-    """Cut windows and return them as NumPy arrays; `expected` are further arguments of `expected_drones`."""
-    arrays = float32((rig.cameras, np.asarray(size_m)))
-    windows = _cut(images, *arrays, expected_drones(expected_m, **expected), reduction)
-    return jax.tree.map(np.asarray, windows)
-
-
-def expected_drones(expected_m, *, reach_m=0.1, occluding=True, floor_z_m=None):
-    """Expected drones; `reach_m` and `occluding` have one value for all drones or one value per drone."""
+def cut_at(rig, images, expected_m, size_m, *, reduction=1, reach_m=0.1, occluding=True):
+    """Cut windows, as NumPy arrays; `reach_m` and `occluding` have one value for all drones or one per drone."""
     count = len(expected_m)
-    position_m, reach_m, floor_z_m = float32(
-        (np.asarray(expected_m), np.broadcast_to(reach_m, count), floor_z_m)
+    cameras, size_m, position_m = float32((rig.cameras, np.asarray(size_m), np.asarray(expected_m)))
+    expected = ExpectedDrones(
+        position_m,
+        np.broadcast_to(np.float32(reach_m), count),
+        None if occluding is None else np.broadcast_to(occluding, count),
     )
-    occluding = None if occluding is None else np.broadcast_to(occluding, count)
-    return ExpectedDrones(position_m, reach_m, occluding, floor_z_m)
+    of_frame = jax.tree.map(lambda level: level[0], make_pyramid(images[None]))
+    return jax.tree.map(np.asarray, _cut(of_frame, cameras, size_m, expected, reduction))
 
 
 @partial(jax.jit, static_argnames="reduction")
-def _cut(images, cameras, size_m, expected, reduction):
-    return cut(images, make_extents(cameras, size_m), expected, reduction=reduction, ring=RING)
+def _cut(pyramid, cameras, size_m, expected, reduction):
+    return cut(pyramid, make_extents(cameras, size_m), expected, reduction=reduction, ring=RING)[0]
 
 
 def pixels(patches):

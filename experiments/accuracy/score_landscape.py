@@ -26,15 +26,15 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.datasets.dpjait import read_sequence
 from psotrack.geometry import Camera, make_extents
-from psotrack.initiation import room_bounds
-from psotrack.initiation.initialisation import find_drones
+from psotrack.initiation import first_drones, room_bounds
+from psotrack.settings import DroneSettings
 from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.simulation import Scenario, SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
 from psotrack.simulation.world.drones import MODELS
 from psotrack.tracking import Score, SoftIoU, on_device
 from psotrack.tracking.fitness import PAPER_SCORE, ScoreInputs, drone_fitness
-from psotrack.tracking.patches import ExpectedDrones, cut
+from psotrack.tracking.patches import ExpectedDrones, Pyramid, cut, make_pyramid
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -76,13 +76,13 @@ class Data:
     """Data of the scores; drones are in the order of the models.
 
     Attributes:
-        coverage: (frames, cameras, height, width), silhouettes.
+        pyramid: silhouettes of all frames.
         cameras: the cameras.
         truth_m: (frames, drones, 3), true positions, metres.
         size_m: (drones, 3), sizes found in the first frames, metres.
     """
 
-    coverage: np.ndarray
+    pyramid: Pyramid
     cameras: Camera
     truth_m: np.ndarray
     size_m: np.ndarray
@@ -97,24 +97,24 @@ def load(root: Path) -> Data:
     sequence = read_sequence(folder).usable()
     coverage = compute(sequence, SILHOUETTES, cache=root / "silhouettes")
     images = coverage.read(0, coverage.num_frames)
-    found = find_drones(
-        sequence.rig.cameras,
-        images[:10],
-        reduction=SILHOUETTES.reduction,
+    found = first_drones(
+        sequence.rig,
+        coverage,
         fps=sequence.fps,
         bounds_m=room_bounds(sequence.rig),
         max_speed_m_s=6.0,
+        drones=DroneSettings(),
     )
     truth = sequence.truth.position_m
     first = truth[np.isfinite(truth).all(axis=(1, 2)).argmax()]
     distance = np.linalg.norm(first[:, None] - found.position_m, axis=-1)
     size_m = found.size_m[linear_sum_assignment(distance)[1]]
-    return Data(images, on_device(sequence.rig.cameras), truth, size_m)
+    return Data(make_pyramid(images), on_device(sequence.rig.cameras), truth, size_m)
 
 
 @partial(jax.jit, static_argnames="score")
 def scores(
-    coverage: jax.Array,
+    pyramid: Pyramid,
     cameras: Camera,
     size_m: jax.Array,
     about_m: jax.Array,
@@ -124,8 +124,8 @@ def scores(
     """(places, drones), the score of every drone at its position plus each of the offsets (places, 3)."""
     seen = make_extents(cameras, size_m)
     drones = len(size_m)
-    patches = cut(
-        coverage,
+    patches, _ = cut(
+        pyramid,
         seen,
         ExpectedDrones(
             about_m,
@@ -146,7 +146,7 @@ def scores(
 def score_about(data: Data, frame: int, offset_m: np.ndarray, score: Score) -> np.ndarray:
     """(..., drones), the score of a frame at the true positions plus offsets (..., 3)."""
     found = scores(
-        data.coverage[frame],
+        jax.tree.map(lambda leaf: leaf[frame], data.pyramid),
         data.cameras,
         jnp.asarray(data.size_m, jnp.float32),
         jnp.asarray(data.truth_m[frame], jnp.float32),

@@ -15,7 +15,7 @@ from _peers import Problem
 
 from psotrack.geometry import make_extents, project_boxes
 from psotrack.tracking import SoftIoU, on_device
-from psotrack.tracking.patches import ExpectedDrones, cut
+from psotrack.tracking.patches import ExpectedDrones, cut, make_pyramid
 from psotrack.tracking.tracker import REACH_SIGMAS
 
 
@@ -28,8 +28,8 @@ class LookUps:
         self._evaluations = swarm.iterations + 1
         middle = jnp.asarray(problem.start.position_m, jnp.float32)
         extents = make_extents(on_device(problem.rig.cameras), jnp.asarray(problem.start.size_m, jnp.float32))
-        patches = cut(
-            jnp.asarray(silhouettes),
+        patches, _ = cut(
+            jax.tree.map(lambda leaf: leaf[0], make_pyramid(jnp.asarray(silhouettes)[None])),
             extents,
             ExpectedDrones(middle, reach_m=jnp.full(len(middle), REACH_SIGMAS * swarm.spread_m)),
             reduction=problem.reduction,

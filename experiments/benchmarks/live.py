@@ -116,7 +116,6 @@ def _delays(record: dict[str, Any]) -> dict[str, float]:
         "instants_left_out": record["frames_left_out"],
         "frames_left_out": sum(each["left_out"] for each in counts),
         "frames_late": sum(each["late"] for each in counts),
-        "late_searches": record["late_searches"],
         "drones": record["drones"] if isinstance(record["drones"], int) else len(record["drones"]),
     }
 

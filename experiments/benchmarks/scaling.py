@@ -10,10 +10,10 @@ One quantity changes, and the others stay as they are: 8 cameras of 960 x 540 pi
 from the reference's first frame, and prints the cost per instant, which is one frame of all cameras:
 
 - front end: decoding and foreground, the first look at the videos included, in one process, processor milliseconds;
-- start: the volume in which things move and the drones' first positions are found, processor seconds, once for a
-  recording, and measured with few cameras and drones only, because it takes minutes with many; the other parts are
-  given the volume and the reference's first positions;
-- track: the swarm and the search for new drones, milliseconds; the best of some repeats without compilation;
+- start: the volume in which things move is found, processor seconds, once for a recording, and measured with few
+  cameras and drones only, because it takes minutes with many; the other parts are given the volume and the reference's
+  first positions;
+- track: the swarm and the births of drones, milliseconds; the best of some repeats without compilation;
 - finish: errors of the cameras, identities, smoothing, milliseconds; in the same way;
 - meeting: frames of live cameras meet at an instant, milliseconds; in the same way;
 - programs: number of compiled programs, and processor seconds that they took;
@@ -55,7 +55,6 @@ from psotrack.evaluation import evaluate
 from psotrack.live import Meeting
 from psotrack.pipeline import Parts, TrackedRecording, track_runs
 from psotrack.pipeline.preparation import prepare
-from psotrack.pipeline.stages import initial_states
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
@@ -295,12 +294,11 @@ def write_recording(scene: _scene.Scene, shape: Shape, folder: Path) -> Recordin
 
 
 def start_s(recording: Recording, silhouettes: Silhouettes) -> float:
-    """Processor seconds until the volume and the drones are found, when neither is given."""
+    """Processor seconds until the volume is found, when it is not given."""
     recording = replace(recording, bounds_m=None)
     silhouettes = silhouettes.at_instants(recording.timeline())
     began = time.process_time()
-    run = prepare(recording, silhouettes, TrackSettings(), Parts(), {}, no_progress)
-    initial_states(recording, silhouettes, [run], [None])
+    prepare(recording, silhouettes, TrackSettings(), Parts(), {}, no_progress)
     return time.process_time() - began
 
 

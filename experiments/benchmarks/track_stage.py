@@ -1,7 +1,7 @@
 """Time of the track stage: psotrack, evosax's PSO on psotrack's fitness, pyswarms on the same fitness in NumPy.
 
 Beside them stand the floor, which is the time of the look-ups in the tables that the score must do and of nothing else
-(see `_look_ups`), and with `--baseline COMMIT` the tracker of an earlier commit, in a process of its own.
+(see `_look_ups`).
 
 Every method is warmed up. Then the methods are timed in turn, repeatedly, so that other load of the machine affects all
 methods equally. A timing ends when the result is on the host. `python experiments/benchmarks/track_stage.py --help`.
@@ -21,20 +21,19 @@ from typing import Any
 
 import _scene
 import click
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from _baseline import Baseline, Times
 from _look_ups import LookUps
-from _numpy_fitness import NumpyFitness, PlainFitness, TunedFitness
+from _numpy_fitness import NumpyFitness
 from _peers import Evosax, Problem, PySwarms
 
 from psotrack.initiation import InitialState
 from psotrack.settings import SwarmSettings, TrackSettings
-from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import fitness, on_device, tracker
-from psotrack.tracking.parameters import tracker_params, tracker_program, tracker_settings
+from psotrack.silhouettes import border_cells, summed_area_table
+from psotrack.tracking import RunInputs, fitness, on_device, tracker_settings
+from psotrack.tracking.block import Engine, Setting, make_block
+from psotrack.tracking.run import SwarmRun
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -49,28 +48,31 @@ Method = Callable[[np.ndarray], np.ndarray]
 
 
 class Psotrack:
-    """psotrack's own tracker: one jitted scan over the frames."""
+    """psotrack's own tracker: one block of frames, without births."""
 
     def __init__(self, problem: Problem) -> None:
-        settings = tracker_settings(problem.settings)
-        self._program = tracker_program(settings, problem.reduction)
-        self._params = tracker_params(
-            settings, problem.start.size_m, fps=problem.fps, bounds_m=problem.bounds_m
+        borders = border_cells(problem.rig.cameras.image_size_wh, problem.reduction)
+        self._setting = Setting(problem.rig, problem.reduction, borders, problem.fps)
+        self._engine = Engine(self._setting)
+        self._run = SwarmRun(
+            self._setting, RunInputs(problem.bounds_m, tracker_settings(problem.settings), problem.start)
         )
-        self._starts = tracker.no_track_starts(len(problem.start.size_m))
-        self._cameras = on_device(problem.rig.cameras)
-        position, velocity = (
-            jnp.asarray(value, jnp.float32)
-            for value in (problem.start.position_m, problem.start.velocity_m_s)
-        )
-        self._state = tracker.init(jax.random.key(problem.settings.seed), position, velocity, self._params)
+        self._starts = self._run.given_starts(problem.start, 0)
 
     def __call__(self, coverage: np.ndarray) -> np.ndarray:
         """Positions (frames, drones, 3)."""
-        _, info = tracker.track(
-            self._state, coverage, self._cameras, self._params, self._program, self._starts
-        )
-        return np.asarray(jax.block_until_ready(info).position_m)
+        block = make_block(self._setting, np.arange(len(coverage)), coverage, None)
+        ((_, rows),) = self._engine.track([self._run.job(block, self._starts)], block)
+        return np.asarray(rows.position_m)[:, : len(self._starts)]
+
+
+@dataclass(frozen=True)
+class Times:
+    """Times of one call per frame, milliseconds, and the mean error of its positions, millimetres."""
+
+    wall_ms: float
+    cpu_ms: float
+    error_mm: float
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,10 @@ class Timing:
 @click.option("--iterations", default=70, type=click.IntRange(1), help="Iterations per frame.")
 @click.option("--drones", default=4, type=click.IntRange(1), help="Drones in the room.")
 @click.option("--cameras", default=8, type=click.IntRange(2), help="Cameras of 1920 x 1080 pixels.")
-@click.option("--baseline", metavar="COMMIT", help="Time the tracker of an earlier commit too.")
 @click.option(
     "--results", type=click.Path(path_type=Path), help="Write the result and its record into this folder."
 )
-def main(repeats: int, baseline: str | None, results: Path | None, **shapes: int) -> None:
+def main(repeats: int, results: Path | None, **shapes: int) -> None:
     """Time the track stage of psotrack, evosax and pyswarms on the same silhouettes; print a table."""
     _require_peers()
     run = _results.Run("track_stage")
@@ -116,29 +117,18 @@ def main(repeats: int, baseline: str | None, results: Path | None, **shapes: int
     coverage = scene.coverage()
     joint, per_drone = (make_problem(scene, particles, iterations, kind) for kind in ("joint", "per-drone"))
     size_m, score = joint.start.size_m, joint.score
-    plain, tuned = (
-        kind(scene.rig.cameras, size_m, score, joint.reduction) for kind in (PlainFitness, TunedFitness)
-    )
-    difference = {
-        name: _check_same_fitness(numpy_fitness, joint, scene, coverage[0])
-        for name, numpy_fitness in (("plain", plain), ("tuned", tuned))
-    }
+    tuned = NumpyFitness(scene.rig.cameras, size_m, score, joint.reduction)
+    difference = {"tuned": _check_same_fitness(tuned, joint, scene, coverage[0])}
 
     look_ups = LookUps(joint, coverage[0])
     methods: dict[str, Method] = {
         "psotrack, joint swarm": Psotrack(joint),
         "psotrack, swarm per drone": Psotrack(per_drone),
         "evosax PSO, psotrack's fitness": Evosax(joint),
-        "pyswarms, NumPy fitness": PySwarms(joint, plain),
         "pyswarms, NumPy fitness tuned by hand": PySwarms(joint, tuned),
     }
     timed = {name: partial(_timed, method, coverage, scene.position_m) for name, method in methods.items()}
     timed["floor: table look-ups alone"] = partial(_timed_look_ups, look_ups, frames)
-    earlier = None
-    if baseline is not None:
-        earlier = Baseline(baseline, shapes)
-        for kind, title in (("joint", "joint swarm"), ("per-drone", "swarm per drone")):
-            timed[f"commit {baseline[:10]}, {title}"] = partial(earlier.timed, kind)
     header = _header(
         {
             **shapes,
@@ -149,11 +139,7 @@ def main(repeats: int, baseline: str | None, results: Path | None, **shapes: int
             "look_ups_per_frame": look_ups.per_frame,
         }
     )
-    try:
-        timings = _time(timed, repeats)
-    finally:
-        if earlier is not None:
-            earlier.close()
+    timings = _time(timed, repeats)
     _print(header, timings)
     if results is not None:
         run.save(results, rows=pd.DataFrame([vars(timing) for timing in timings]), figures=header["shapes"])
@@ -204,9 +190,7 @@ def _check_same_fitness(
     ours = np.asarray(fitness.joint_fitness(view, jnp.asarray(position)))
     difference = float(np.abs(ours - numpy_fitness(numpy_fitness.tables(silhouettes), position)).max())
     if not difference <= TOLERANCE:
-        raise click.ClickException(
-            f"{type(numpy_fitness).__name__} differs by {difference:g}, more than {TOLERANCE:g}"
-        )
+        raise click.ClickException(f"the NumPy fitness differs by {difference:g}, more than {TOLERANCE:g}")
     return difference
 
 
@@ -279,10 +263,8 @@ def _print(header: dict[str, Any], timings: list[Timing]) -> None:
         f"{cameras} cameras of {width * reduction} x {height * reduction} pixels at reduction {reduction}, "
         f"{frames} frames, {shapes['repeats']} repeats"
     )
-    difference = shapes["fitness_difference"]
     print(
-        f"largest difference from psotrack's fitness: NumPy {difference['plain']:.1e}, "
-        f"NumPy tuned by hand {difference['tuned']:.1e}"
+        f"largest difference of the NumPy fitness from psotrack's: {shapes['fitness_difference']['tuned']:.1e}"
     )
     print(f"the score reads {shapes['look_ups_per_frame'] / 1e6:.1f} million table entries per frame\n")
 

@@ -105,9 +105,8 @@ def at_hand(data: Path) -> list[str]:
 
 def tracked(cells: dict, out: Path, data: Path) -> pd.DataFrame:
     """One row per sequence and method; cells that are finished in `out` are not run again."""
-    from psotrack.support import keep_compiled, share_processors
+    from psotrack.support import keep_compiled
 
-    share_processors()
     keep_compiled(out / "cache" / "compiled")
     return sweep(grid(cells), out, data=data, cache=out / "cache", report=progress_bar)
 

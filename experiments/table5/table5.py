@@ -87,9 +87,8 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
 
 def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
     """One row per cell and run; cells that are finished in `out` are not run again."""
-    from psotrack.support import keep_compiled, share_processors
+    from psotrack.support import keep_compiled
 
-    share_processors()
     keep_compiled(out / "cache" / "compiled")
     return sweep(grid, out, data=data, cache=out / "cache", report=progress_bar)
 

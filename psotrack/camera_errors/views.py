@@ -19,7 +19,7 @@ from psotrack.geometry import (
     to_camera,
 )
 from psotrack.silhouettes import Exposures, moved_by
-from psotrack.tracking import CameraMiddles, FoundDrones
+from psotrack.tracking import Places
 
 #: A detection is of a drone if it is at most this many standard deviations from the drone's projection.
 _GATE = 5.0
@@ -254,18 +254,19 @@ def _without_outliers(views: CameraViews) -> CameraViews:
 def views_of_middles(
     cameras: Camera,
     exposures: Exposures | None,
-    middles: CameraMiddles,
-    drones: FoundDrones,
+    middles: Places,
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
 ) -> CameraViews:
     """The views, from the middles of the foreground.
 
     Args:
         cameras: cameras with one leading axis.
         exposures: exposures of the silhouettes; None where all cameras' frames were exposed at the instant.
-        middles: the middles (see `psotrack.tracking.middles_in_cameras`).
-        drones: the drones of the run.
+        middles: where the cameras show the drones.
+        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where a drone is not found.
     """
     # The score changes with a shift relative to the box, so a view counts by the square of this share.
     weight = np.nan_to_num(np.square(1 / np.asarray(middles.half_px, np.float64)))
     middle_px = np.asarray(middles.middle_px, np.float64)
-    return views_of_places(cameras, middle_px, weight, drones.position_m, drones.velocity_m_s, exposures)
+    return views_of_places(cameras, middle_px, weight, position_m, velocity_m_s, exposures)

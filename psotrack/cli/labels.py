@@ -93,13 +93,13 @@ def labels(
       psotrack labels R01_D2 R12_D4 --out yolo --drone-size 0.4,0.4,0.2 --offset 0,0,-0.117 --validation R12_D4
     """
     from psotrack.datasets import open_recording
-    from psotrack.detection import DATA_SET, FrameSelection, LabelSettings, write_data_set
+    from psotrack.detection import DATA_SET, LabelSettings, write_data_set
 
     counts = write_data_set(
         [open_recording(sequence) for sequence in sequences],
         out,
-        LabelSettings(drone_size_m, offset_m, min_inside, max_hidden),
-        selection=FrameSelection(validation.split(",") if validation else (), every),
+        LabelSettings(drone_size_m, offset_m, min_inside, max_hidden, every),
+        validation=validation.split(",") if validation else (),
         force=force,
         jobs=jobs,
         report=report_to(quiet),

@@ -216,7 +216,7 @@ def live(
     warn_of_missing_drones(chosen, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
     if server is not None:
-        report["websocket"] = {"clients": server.num_clients, "messages_left_out": server.left_out}
+        report["websocket"] = {"clients": server.num_clients, "too_slow": server.num_too_slow}
     report = with_real_time(report, time.perf_counter() - started, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)
@@ -260,7 +260,7 @@ def _record(result: LiveResult) -> dict[str, Any]:
         "live": True,
         "frames": result.instants,
         "frames_left_out": result.left_out,
-        "late_searches": result.late_searches,
+        "late_searches": None,
         "cameras": list(result.counts),
         "camera_frames": {name: dict(vars(counts)) for name, counts in result.counts.items()},
         "recorded": {name: dict(vars(counts)) for name, counts in result.recorded.items()},

@@ -14,7 +14,7 @@ import platformdirs
 from psotrack.cli.log_file import LogFile
 from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
 from psotrack.errors import InputError, SettingsError
-from psotrack.settings import RENAMED, ErrorSettings, TrackSettings
+from psotrack.settings import TrackSettings, setting_names
 from psotrack.silhouettes import Shadows, SilhouetteSettings
 from psotrack.support import ARCHIVE_SUFFIX, refuse_files, whole_number
 
@@ -338,15 +338,19 @@ def silhouette_options(command: Command) -> Command:
     return command
 
 
+#: Options whose settings have other names.
+_SETTINGS = {
+    "swarm": "swarm.kind",
+    "score": "score.kind",
+    "drones": "drones.count",
+    "drone_size_m": "drones.size_m",
+}
+
+
 def setting_name(option: str) -> str:
-    """Dotted name of the setting of `TrackSettings` that an option sets."""
-    if option in SilhouetteSettings.__struct_fields__:
-        return f"silhouettes.{option}"
-    if option in ErrorSettings.__struct_fields__:
-        return f"errors.{option}"
-    if option == "min_cameras_to_begin":
-        return "status.min_cameras_to_begin"
-    return "swarm.search" if option == "search" else RENAMED.get(option, option)
+    """Dotted name of the setting of `TrackSettings` that an option sets; the option's own name where there is none."""
+    named = [name for name in setting_names() if name.rpartition(".")[2] == option]
+    return _SETTINGS.get(option) or (named[0] if named else option)
 
 
 def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:

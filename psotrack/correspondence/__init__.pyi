@@ -1,6 +1,8 @@
 from .assignment import SEPARATION_M
+from .crossings import Crossings, Expected, crossings
 from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
+from .instants import moved_to_instant
 from .matching import Matches, match, wide_bounds
 from .sightings import (
     BORDER_PX,
@@ -23,11 +25,15 @@ __all__ = [
     "SHARED_COST",
     "UNEXPLAINED_COST",
     "CameraSightings",
+    "Crossings",
+    "Expected",
     "Matches",
     "Sightings",
+    "crossings",
     "epipolar_distance",
     "from_detections",
     "from_silhouettes",
     "match",
+    "moved_to_instant",
     "wide_bounds",
 ]

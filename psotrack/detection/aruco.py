@@ -13,9 +13,8 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     Raises:
         SettingsError: OpenCV has no dictionary with this name.
     """
-    known = {key.lower(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    key = known.get(f"dict_{name.lower().removeprefix('dict_')}")
-    if key is None:
-        names = ", ".join(name.removeprefix("dict_") for name in known)
-        raise SettingsError("dictionary", expected=f"one of {names}", found=name)
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, key))
+    known = {key[5:].lower(): number for key, number in vars(cv2.aruco).items() if key.startswith("DICT_")}
+    short = name.lower().removeprefix("dict_")
+    if short not in known:
+        raise SettingsError("dictionary", expected=f"one of {', '.join(sorted(known))}", found=name)
+    return cv2.aruco.getPredefinedDictionary(known[short])

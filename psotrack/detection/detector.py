@@ -14,22 +14,25 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import cv2
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
+from msgspec import Meta
 
-from psotrack.detection.onnx_files import names_other_files
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import Detections, VideoInfo, read_frames
-from psotrack.support import Report, digest_file, make_plugin, no_progress
+from psotrack.recordings import Detections, VideoInfo, read_frames, silence_opencv
+from psotrack.support import Report, check_types, digest_file, make_plugin, no_progress
+
+#: Boxes (found, 4) and confidences (found,), as `Detector` describes them.
+FoundBoxes = tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]
 
 #: Colour of YOLO's own letterbox borders.
 _GREY = (114, 114, 114)
@@ -39,8 +42,7 @@ _V10_SHAPE = (300, 6)
 _ROUNDING = 1e-3
 
 
-@dataclass(frozen=True)
-class DetectorSettings:
+class DetectorSettings(msgspec.Struct, frozen=True):
     """Settings of the detection.
 
     Attributes:
@@ -53,17 +55,12 @@ class DetectorSettings:
         SettingsError: a value is out of range.
     """
 
-    confidence: float = 0.25
-    nms: float = 0.45
-    size: int = 640
+    confidence: Annotated[float, Meta(gt=0, le=1)] = 0.25
+    nms: Annotated[float, Meta(gt=0, le=1)] = 0.45
+    size: Annotated[int, Meta(ge=1)] = 640
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "nms"):
-            value = getattr(self, name)
-            if not 0 < value <= 1:
-                raise SettingsError(name, expected="a number above 0, at most 1", found=f"{value:g}")
-        if self.size < 1:
-            raise SettingsError("size", expected="1 pixel or more", found=f"{self.size}")
+        check_types(self)
 
 
 @runtime_checkable
@@ -80,9 +77,7 @@ class Detector(Protocol):
     @property
     def key(self) -> Mapping[str, Any]: ...  # noqa: D102
 
-    def boxes(
-        self, bgr: UInt8[np.ndarray, "height width 3"]
-    ) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
+    def boxes(self, bgr: UInt8[np.ndarray, "height width 3"]) -> FoundBoxes:
         """Find the drones in an image.
 
         Args:
@@ -107,13 +102,10 @@ class OnnxDetector:
     """
 
     def __init__(self, model: Path | str, settings: DetectorSettings) -> None:
-        model = Path(model)
-        if not model.is_file():
-            raise InputError(model, expected="an ONNX model", found="no such file")
-        self.model = model
+        self.model = model = Path(model)
         self.settings = settings
         _check_own_numbers(model)
-        _check_survives(model, settings.size)
+        _check_survives(model, settings.size, model.stat().st_mtime_ns)
         with self._opencv_errors("an ONNX model that OpenCV can read"):
             self._network = cv2.dnn.readNetFromONNX(str(model))
 
@@ -122,9 +114,7 @@ class OnnxDetector:
         """See `Detector`."""
         return {"model": digest_file(self.model), "settings": msgspec.to_builtins(self.settings)}
 
-    def boxes(
-        self, bgr: UInt8[np.ndarray, "height width 3"]
-    ) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
+    def boxes(self, bgr: UInt8[np.ndarray, "height width 3"]) -> FoundBoxes:
         """Detect drones in an image.
 
         Args:
@@ -142,64 +132,49 @@ class OnnxDetector:
         with self._opencv_errors(f"a network for images of {size} x {size} pixels", "pass its own --size"):
             self._network.setInput(cv2.dnn.blobFromImage(image, 1 / 255, swapRB=True))
             output = self._network.forward()
-        xyxy, score = self._decode(np.asarray(output, np.float64))
-        confident = score >= self.settings.confidence
-        xyxy, score = (
-            (xyxy[confident] - np.tile(start, 2)) / np.tile(scale, 2),
-            np.minimum(score[confident], 1.0),
-        )
-        height, width = bgr.shape[:2]
-        xyxy = np.clip(xyxy, 0, np.tile([width, height], 2))
+        in_square, score = self._decode(np.asarray(output, np.float64))
+        xyxy = (in_square - np.tile(start, 2)) / np.tile(scale, 2)
+        xyxy = np.clip(xyxy, 0, np.tile([bgr.shape[1], bgr.shape[0]], 2))
         xywh = np.hstack([xyxy[:, :2], xyxy[:, 2:] - xyxy[:, :2]])
-        inside = (xywh[:, 2:] > 0).all(axis=1)
-        xyxy, xywh, score = xyxy[inside], xywh[inside], score[inside]
+        found = (xywh[:, 2:] > 0).all(axis=1) & (score >= self.settings.confidence)
+        xyxy, xywh, score = xyxy[found], xywh[found], np.minimum(score[found], 1.0)
         # OpenCV sorts by score; for no boxes it returns an empty tuple.
         kept = cv2.dnn.NMSBoxes(xywh.tolist(), score.tolist(), self.settings.confidence, self.settings.nms)
         index = np.asarray(kept, np.int64).ravel()
         return xyxy[index], score[index]
 
-    def _decode(
-        self, output: Float[np.ndarray, "..."]
-    ) -> tuple[Float[np.ndarray, "boxes 4"], Float[np.ndarray, "boxes"]]:
+    def _decode(self, output: Float[np.ndarray, "..."]) -> FoundBoxes:
         """Boxes (xyxy in pixels of the input) and their scores from the network's output."""
-        rows, columns = output.shape[1:] if output.ndim == 3 and len(output) == 1 else (0, 0)
+        table = output[0] if output.ndim == 3 and len(output) == 1 else np.empty((0, 0))
+        rows, columns = table.shape
         if (rows, columns) == _V10_SHAPE:
-            xyxy, score = output[0, :, :4], output[0, :, 4]
+            score = table[:, 4]
         elif rows > columns > 5:
-            middle, half = output[0, :, :2], output[0, :, 2:4] / 2
-            xyxy = np.hstack([middle - half, middle + half])
-            score = output[0, :, 4] * output[0, :, 5:].max(axis=1)
+            score = table[:, 4] * table[:, 5:].max(axis=1)
         elif columns > rows > 4:
-            middle, half = output[0, :2].T, output[0, 2:4].T / 2
-            xyxy = np.hstack([middle - half, middle + half])
-            score = output[0, 4:].max(axis=0)
+            table = table.T
+            score = table[:, 4:].max(axis=1)
         else:
-            raise InputError(
-                self.model,
-                expected="an output of shape (1, boxes, 5 + classes) as YOLOv5 or (1, 4 + classes, boxes) as YOLOv8",
-                found=f"{output.shape}",
-            )
-        if not (np.isfinite(xyxy).all() and (score >= 0).all() and (score <= 1 + _ROUNDING).all()):
-            raise InputError(
-                self.model,
-                expected="finite boxes with scores from 0 to 1",
-                found=f"scores from {score.min():.3g} to {score.max():.3g}",
-                remedy="export the network with its last layers, in YOLO's own layout",
-            )
-        return xyxy, score
+            raise InputError(self.model, expected="an output in a layout of YOLO", found=f"{output.shape}")
+        if not (np.isfinite(table).all() and score.min() >= 0 and score.max() <= 1 + _ROUNDING):
+            found = f"scores from {score.min():.3g} to {score.max():.3g}"
+            remedy = "export the network with its last layers, in YOLO's own layout"
+            expected = "finite boxes with scores from 0 to 1"
+            raise InputError(self.model, expected=expected, found=found, remedy=remedy)
+        if (rows, columns) == _V10_SHAPE:
+            return table[:, :4], score
+        middle, half = table[:, :2], table[:, 2:4] / 2
+        return np.hstack([middle - half, middle + half]), score
 
     @contextlib.contextmanager
     def _opencv_errors(self, expected: str, remedy: str = "") -> Iterator[None]:
         """Turn OpenCV's errors in this block into `InputError`, and suppress OpenCV's own messages."""
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
-            yield
+            with silence_opencv():
+                yield
         except cv2.error as error:
             found = f"one that it cannot use ({' '.join((error.err or str(error)).split())})"
             raise InputError(self.model, expected=expected, found=found, remedy=remedy) from error
-        finally:
-            cv2.utils.logging.setLogLevel(level)
 
 
 #: Memory, bytes, and time, seconds, that a network may take for one image.
@@ -217,44 +192,38 @@ network.forward()
 """
 
 
+#: What names a file in an ONNX model: the key of the file's name, with its length before it. Protobuf reads a length
+#: also with superfluous zeros.
+_OTHER_FILE = re.compile(rb"(\x08|\x88\x80*\x00)location")
+
+
 def _check_own_numbers(model: Path) -> None:
-    """Raise `InputError` for a network with numbers in other files, which may be any files of the machine."""
+    """Raise `InputError` for a network that cannot be read, or has numbers in other files.
+
+    OpenCV reads any file of the machine that a network names; and a digest of the network says nothing about them.
+    """
     try:
-        elsewhere = names_other_files(model.read_bytes())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            model, expected="an ONNX model that OpenCV can read", found=f"a file with {error}"
-        ) from error
-    if elsewhere:
-        raise InputError(
-            model,
-            expected="a network with all its numbers in one file",
-            found="tensors in other files",
-            remedy="export it without external data",
-        )
-
-
-def _check_survives(model: Path, size: int) -> None:
-    """Raise `InputError` if a network ends the process that runs it, as OpenCV does for some damaged files."""
-    code = _exit_code(str(model.resolve()), model.stat().st_mtime_ns, size)
-    # An error of Python has the exit code 1.
-    if code not in (0, 1):
-        found = (
-            f"one that takes more than {_MOST_S:g} s for an image"
-            if code is None
-            else f"one that ends the process that runs it (exit code {code})"
-        )
-        raise InputError(model, expected="an ONNX model that OpenCV can run", found=found)
+        content = model.read_bytes()
+    except OSError as error:
+        found = (error.strerror or str(error)).lower()
+        raise InputError(model, expected="an ONNX model", found=found) from error
+    if _OTHER_FILE.search(content):
+        expected = "a network with all its numbers in one file, exported without external data"
+        raise InputError(model, expected=expected, found="tensors in other files")
 
 
 @functools.lru_cache(maxsize=16)
-def _exit_code(model: str, _modified_ns: int, size: int) -> int | None:
-    """Exit code of a process that runs the network once; None where it takes too long."""
-    command = [sys.executable, "-c", _RUN_ONCE, model, str(size), str(_MOST_BYTES)]
+def _check_survives(model: Path, size: int, _modified_ns: int) -> None:
+    """Raise `InputError` if a network ends the process that runs it, as OpenCV does for some damaged files."""
+    command = [sys.executable, "-c", _RUN_ONCE, str(model.resolve()), str(size), str(_MOST_BYTES)]
     try:
-        return subprocess.run(command, capture_output=True, check=False, timeout=_MOST_S).returncode
+        code = subprocess.run(command, capture_output=True, check=False, timeout=_MOST_S).returncode
+        found = f"one that ends the process that runs it (exit code {code})"
     except subprocess.TimeoutExpired:
-        return None
+        code, found = None, f"one that takes more than {_MOST_S:g} s for an image"
+    # An error of Python has the exit code 1; OpenCV's errors are met again in this process.
+    if code not in (0, 1):
+        raise InputError(model, expected="an ONNX model that OpenCV can run", found=found)
 
 
 def find_detector(name: str, settings: DetectorSettings) -> Detector:
@@ -270,10 +239,8 @@ def find_detector(name: str, settings: DetectorSettings) -> Detector:
     """
     if Path(name).suffix.lower() == ".onnx" or Path(name).exists():
         return OnnxDetector(name, settings)
-    detector: Detector = make_plugin(
-        "detector", name, settings, interface=Detector, setting="detector", built_in=["MODEL.onnx (a file)"]
-    )
-    return detector
+    built_in = ["MODEL.onnx (a file)"]
+    return make_plugin("detector", name, settings, interface=Detector, setting="detector", built_in=built_in)
 
 
 def detect_drones(
@@ -291,31 +258,18 @@ def detect_drones(
         InputError: the video ends early, or the network cannot be used.
         SettingsError: the detector yields arrays of other shapes than `Detector` says.
     """
-    frame: list[Int[np.ndarray, "_"]] = [np.empty(0, np.int64)]
-    boxes: list[Float[np.ndarray, "_ 4"]] = [np.empty((0, 4))]
-    scores: list[Float[np.ndarray, "_"]] = [np.empty(0)]
+    tables = [np.empty((0, 6))]
     with report(name, video.num_frames) as advance:
         for number, bgr in enumerate(read_frames(video)):
-            xyxy, score = _checked_boxes(detector, number, *detector.boxes(bgr))
-            frame.append(np.full(len(score), number))
-            boxes.append(xyxy)
-            scores.append(score)
+            boxes, confidence = map(np.asarray, detector.boxes(bgr))
+            if boxes.ndim != 2 or boxes.shape[1] != 4 or confidence.shape != boxes.shape[:1]:
+                where = f"detector {type(detector).__name__}, frame {number}"
+                expected = "boxes of shape (found, 4) and confidences of shape (found,)"
+                raise SettingsError(where, expected=expected, found=f"{boxes.shape} and {confidence.shape}")
+            tables.append(np.column_stack([np.full(len(boxes), number), boxes, confidence]))
             advance(1)
-    return Detections(np.concatenate(frame), np.concatenate(boxes), np.concatenate(scores))
-
-
-def _checked_boxes(
-    detector: Detector, number: int, xyxy: object, score: object
-) -> tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]:
-    """Boxes and confidences of a frame as float64, with a clear error where a detector gives other arrays."""
-    boxes, confidence = np.asarray(xyxy, np.float64), np.asarray(score, np.float64)
-    if boxes.ndim != 2 or boxes.shape[1] != 4 or confidence.shape != boxes.shape[:1]:
-        raise SettingsError(
-            f"detector {type(detector).__name__}",
-            expected="boxes of shape (found, 4) and confidences of shape (found,)",
-            found=f"{boxes.shape} and {confidence.shape} in frame {number}",
-        )
-    return boxes, confidence
+    table = np.concatenate(tables, dtype=np.float64)
+    return Detections(table[:, 0].astype(np.int64), table[:, 1:5], table[:, 5])
 
 
 def _letterboxed(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from psotrack.detection.detector import Detector, OnnxDetector, detect_drones
+from psotrack.detection.detector import Detector, detect_drones
 from psotrack.recordings import Recording, digest_video, write_detections
 from psotrack.support import Report, check_file_name, digest_record, identify, no_progress
 
@@ -31,18 +31,10 @@ def stored_detections(
         SettingsError: the detector's key is no plain data, or it yields arrays of wrong shapes.
         OutputError: a file cannot be written.
     """
-    folder = Path(cache) / "detections" / _key(detector, recording)
+    videos = {name: [video.num_frames, digest_video(video)] for name, video in recording.videos.items()}
+    folder = Path(cache) / "detections" / digest_record({"detector": identify(detector), "videos": videos})
     for name, video in recording.videos.items():
         path = folder / f"{check_file_name(name, recording.folder)}.csv"
         if not path.exists():
             write_detections(path, detect_drones(detector, name, video, report=report))
     return folder
-
-
-def _key(detector: Detector, recording: Recording) -> str:
-    """Name of the folder: 40 hexadecimal digits."""
-    made_of = {
-        **(detector.key if isinstance(detector, OnnxDetector) else identify(detector)),
-        "videos": {name: [video.num_frames, digest_video(video)] for name, video in recording.videos.items()},
-    }
-    return digest_record(made_of)

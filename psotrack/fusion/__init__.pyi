@@ -1,5 +1,4 @@
-from .errors import fused_errors
-from .fusion import Fusion, fuse_tracks
+from .fusion import Fusion, fuse_tracks, fused_errors
 
 __all__ = [
     "Fusion",

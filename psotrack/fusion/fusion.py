@@ -17,18 +17,20 @@ alone.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from psotrack.motion import GATE_999, filter_measurements, motion_params
+from psotrack.camera_errors import LastingCovariances, MeasurementErrors, TrackErrors, noise_ratios
+from psotrack.motion import GATE_999, Measurements, filter_measurements, motion_params
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
 from psotrack.trajectories import Status, Tracks, unknown_value
 
-#: Largest median distance of two tracks of one drone, metres: the offset of the two points, and noise.
+#: Distance of two tracks of one drone, metres, which more than half of their common frames do not exceed: the offset of
+#: the two points, and noise.
 SAME_M = 0.25
 #: Least number of common frames from which the offset of the two points is estimated; with fewer the offset is taken
 #: as 0.
@@ -64,13 +66,14 @@ class Fusion:
     Attributes:
         tracks: the fused tracks: the drones of the swarm under their numbers, then drones that only the lines know.
         offset: the offset between the two tracked points.
-        lines_drones: (drones,), number of each fused drone in the lines; -1 for none.
+        swarm_drones, lines_drones: (drones,), number of each fused drone in the swarm and in the lines; -1 for none.
         lines_share: (frames, drones), weight of the lines' position in the fused position, 0 to 1; NaN where neither
             method found the drone.
     """
 
     tracks: Tracks
     offset: PointOffset
+    swarm_drones: Int[np.ndarray, "drones"]
     lines_drones: Int[np.ndarray, "drones"]
     lines_share: Float[np.ndarray, "frames drones"]
 
@@ -103,21 +106,20 @@ def fuse_tracks(
     alone = np.setdiff1d(np.arange(lines.num_drones), matches)
     if same_foreground:
         alone = alone[:0]
-    # The lines' drones in the order of the swarm's drones; then the drones that only the lines know.
+    # The drones in the order of the swarm; then the drones that only the lines know.
+    swarm_drones = np.concatenate([np.arange(swarm.num_drones), np.full(len(alone), -1)])
     lines_drones = np.concatenate([matches, alone])
-    first = _of_drones(swarm, np.concatenate([np.arange(swarm.num_drones), np.full(len(alone), -1)]))
+    first = _of_drones(swarm, swarm_drones)
     second = _of_drones(lines, lines_drones)
     offset = _point_offset(first.found_m(), second.found_m())
     correlation = COMMON_CORRELATION if same_foreground else 0.0
-    measured_m, covariance_m2, lines_share = _weighted(first, second, offset, correlation)
-    was_measured = np.isfinite(lines_share)
-    time_s = np.arange(len(measured_m)) / fps
-    params = jax.tree.map(
-        lambda value: np.asarray(value, np.float64), motion_params(settings, measured_m.shape[1])
-    )
-    moving = filter_measurements(time_s, measured_m, covariance_m2, was_measured, params)
-    coasting = _frames_since_found(was_measured) <= round(max_coasting_s * fps)
-    status = np.where(was_measured, Status.TRACKED, np.where(coasting, Status.COASTING, Status.LOST))
+    frame = np.arange(swarm.num_frames)
+    measured, lines_share = _weighted(first, second, offset, correlation, frame / fps)
+    found = measured.was_measured
+    moving = filter_measurements(measured, motion_params(settings, found.shape[1]))
+    last = _last_found(found)
+    coasting = (last >= 0) & (frame[:, None] - last <= round(max_coasting_s * fps))
+    status = np.where(found, Status.TRACKED, np.where(coasting, Status.COASTING, Status.LOST))
     by_swarm = first.status == Status.TRACKED
     renumbered = {int(drone): swarm.num_drones + number for number, drone in enumerate(alone)}
     arrivals = [
@@ -129,8 +131,8 @@ def fuse_tracks(
         position_m=moving.position_m,
         velocity_m_s=moving.velocity_m_s,
         covariance_m2=moving.covariance_m2,
-        measured_m=measured_m,
-        measured_covariance_m2=covariance_m2,
+        measured_m=measured.position_m,
+        measured_covariance_m2=measured.covariance_m2,
         fitness=np.where(by_swarm, first.fitness, second.fitness),
         num_cameras=np.maximum(first.num_cameras, second.num_cameras),
         status=status,
@@ -138,22 +140,18 @@ def fuse_tracks(
         sizes=swarm.sizes.joined(lines.sizes.of_drones(alone)),
         arrivals=(*swarm.arrivals, *arrivals),
     )
-    return Fusion(fused, offset, lines_drones, lines_share)
+    return Fusion(fused, offset, swarm_drones, lines_drones, lines_share)
 
 
 def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
     """(drones of the swarm,), the number of the same drone in the lines; -1 for none."""
-    matches = np.full(swarm.num_drones, -1)
     apart_m = np.linalg.norm(swarm.found_m()[:, :, None] - lines.found_m()[:, None], axis=-1)
-    both = np.isfinite(apart_m)
-    median_m = np.full(apart_m.shape[1:], np.inf)
-    together = both.any(axis=0)
-    median_m[together] = np.nanmedian(apart_m[:, together], axis=0)
+    near, both = (apart_m < SAME_M).sum(axis=0), np.isfinite(apart_m).sum(axis=0)
     # The more frames two tracks share, the more certain it is that they are of one drone.
-    gain = np.where(median_m < SAME_M, both.sum(axis=0), 0)
-    for drone, other in zip(*linear_sum_assignment(gain, maximize=True), strict=True):
-        if gain[drone, other]:
-            matches[drone] = other
+    gain = np.where(2 * near > both, both, 0)
+    drones, others = linear_sum_assignment(gain, maximize=True)
+    matches = np.full(swarm.num_drones, -1)
+    matches[drones] = np.where(gain[drones, others] > 0, others, -1)
     return matches
 
 
@@ -187,47 +185,109 @@ def _point_offset(
 
 
 def _weighted(
-    swarm: Tracks, lines: Tracks, offset: PointOffset, correlation: float
-) -> tuple[
-    Float[np.ndarray, "frames drones 3"],
-    Float[np.ndarray, "frames drones 3 3"],
-    Float[np.ndarray, "frames drones"],
-]:
-    """Measured positions of both methods together, their covariances, and the lines' weight (`Fusion.lines_share`).
+    swarm: Tracks, lines: Tracks, offset: PointOffset, correlation: float, time_s: Float[np.ndarray, "frames"]
+) -> tuple[Measurements, Float[np.ndarray, "frames drones"]]:
+    """Measured positions of both methods together, and the lines' weight (`Fusion.lines_share`).
 
     Where the two positions disagree more than their covariances allow, one position belongs to another drone or to no
     drone. Then the swarm's position counts, because the swarm sees all of the foreground.
     """
-    first_m, second_m = swarm.found_m(), lines.found_m()
+    first_m, second_m = swarm.found_m(), lines.found_m() - np.nan_to_num(offset.offset_m)
     first_m2 = np.asarray(swarm.measured_covariance_m2, np.float64)
-    second_m2 = np.array(lines.measured_covariance_m2, np.float64)
-    second_m -= np.nan_to_num(offset.offset_m)
-    second_m2 += np.nan_to_num(offset.std_m)[..., None] ** 2 * np.eye(3)
-    both = np.isfinite(first_m).all(axis=-1) & np.isfinite(second_m).all(axis=-1)
-    off_m = np.where(both[..., None], second_m - first_m, 0.0)
-    one_m2, other_m2 = (np.where(both[..., None, None], value, np.eye(3)) for value in (first_m2, second_m2))
-    solved = np.linalg.solve(one_m2 + other_m2, off_m[..., None])
-    agree = both & ((off_m[..., None, :] @ solved)[..., 0, 0] < GATE_999)
+    second_m2 = np.asarray(lines.measured_covariance_m2, np.float64)
+    second_m2 = second_m2 + np.nan_to_num(offset.std_m)[..., None] ** 2 * np.eye(3)
+    by_swarm, by_lines = (np.isfinite(each_m).all(axis=-1) for each_m in (first_m, second_m))
+    position_m = np.where(by_swarm[..., None], first_m, second_m)
+    covariance_m2 = np.where(by_swarm[..., None, None], first_m2, second_m2)
+    share = np.where(by_swarm, 0.0, np.where(by_lines, 1.0, np.nan))
+
+    both = by_swarm & by_lines
+    off_m, one_m2, other_m2 = (second_m - first_m)[both], first_m2[both], second_m2[both]
     # With the cross-covariance P12 the gain is (P1 - P12) (P1 + P2 - P12 - P21)^-1; it is P1 (P1 + P2)^-1 without.
-    cross_m2 = correlation * np.linalg.cholesky(one_m2) @ np.linalg.cholesky(other_m2).swapaxes(-1, -2)
-    crossed_m2 = cross_m2.swapaxes(-1, -2)
-    gain = (one_m2 - cross_m2) @ np.linalg.inv(one_m2 + other_m2 - cross_m2 - crossed_m2)
-    together_m = first_m + (gain @ off_m[..., None])[..., 0]
-    together_m2 = one_m2 - gain @ (one_m2 - crossed_m2)
-    by_swarm = np.isfinite(first_m).all(axis=-1)
-    measured_m = np.where(agree[..., None], together_m, np.where(by_swarm[..., None], first_m, second_m))
-    covariance_m2 = np.where(
-        agree[..., None, None], together_m2, np.where(by_swarm[..., None, None], first_m2, second_m2)
-    )
-    covariance_m2 = (covariance_m2 + covariance_m2.swapaxes(-1, -2)) / 2
+    cross_m2 = correlation * np.linalg.cholesky(one_m2) @ np.linalg.cholesky(other_m2).mT
+    gain = (one_m2 - cross_m2) @ np.linalg.inv(one_m2 + other_m2 - cross_m2 - cross_m2.mT)
+    distance = np.vecdot(off_m, np.linalg.solve(one_m2 + other_m2, off_m[..., None])[..., 0])
+    gain[distance >= GATE_999] = 0.0
+    position_m[both] += np.matvec(gain, off_m)
+    covariance_m2[both] -= gain @ (one_m2 - cross_m2.mT)
     # Correlated errors can give one method a weight below 0.
-    share = np.clip(np.trace(gain, axis1=-2, axis2=-1) / 3, 0.0, 1.0)
-    share = np.where(agree, share, np.where(by_swarm, 0.0, 1.0))
-    return measured_m, covariance_m2, np.where(np.isfinite(measured_m).all(axis=-1), share, np.nan)
+    share[both] = np.clip(np.trace(gain, axis1=-2, axis2=-1) / 3, 0.0, 1.0)
+    symmetric_m2 = (covariance_m2 + covariance_m2.mT) / 2
+    return Measurements(time_s, position_m, symmetric_m2, by_swarm | by_lines), share
 
 
-def _frames_since_found(was_measured: Bool[np.ndarray, "frames drones"]) -> Int[np.ndarray, "frames drones"]:
-    """Frames since each drone was last measured; before the first measurement at least the number of all frames."""
-    frame = np.arange(len(was_measured))[:, None]
-    last = np.maximum.accumulate(np.where(was_measured, frame, -len(was_measured)), axis=0)
-    return frame - last
+def _last_found(found: Bool[np.ndarray, "frames drones"]) -> Int[np.ndarray, "frames drones"]:
+    """Last frame, up to each frame, in which a drone was found; -1 before the first."""
+    frame = np.arange(len(found))[:, None]
+    return np.maximum.accumulate(np.where(found, frame, -1), axis=0)
+
+
+def fused_errors(
+    fusion: Fusion,
+    swarm: TrackErrors | None,
+    lines: TrackErrors | None,
+    motion: MotionSettings,
+    fps: float,
+) -> tuple[Tracks, TrackErrors]:
+    """Fused tracks with the errors of both methods.
+
+    Errors that last have the same causes in both methods, the turned cameras and the late clocks, and do not average
+    out. A weighted mean of two errors has at most the weighted mean of their squares, whatever their correlation: that
+    is the covariance of the fused errors that last.
+
+    Args:
+        fusion: the fused tracks; their measured covariances are those of the noise that was found.
+        swarm, lines: errors of both methods; None for a method that found no drone. The noise of the first that found
+            one fades as that of the fused positions.
+        motion: settings of the motion model that the fusion used.
+        fps: frames per second.
+    """
+    known = [each.cameras for each in (swarm, lines) if each is not None]
+
+    def mean_square(name: str) -> Any:
+        return np.sqrt(np.mean([np.square(getattr(each, name)) for each in known], axis=0))
+
+    errors = replace(
+        known[0],
+        noise_px=np.full_like(known[0].noise_px, np.nan),
+        lasting_px=mean_square("lasting_px"),
+        turn_rad=float(mean_square("turn_rad")),
+        clock_s=float(mean_square("clock_s")),
+        constant_covariance=np.mean([each.constant_covariance for each in known], axis=0),
+    )
+    tracks = fusion.tracks
+    measured_m2 = np.asarray(tracks.measured_covariance_m2, np.float64)
+    _, filtered = noise_ratios(
+        measured_m2,
+        measured_m2,
+        errors,
+        MeasurementErrors(1.0, motion.error_share, motion.error_time_s),
+        dt_s=1 / fps,
+        jerk_density_m2_s5=motion.jerk_density,
+    )
+    corrected = replace(tracks, covariance_m2=tracks.covariance_m2 * filtered[..., None, None])
+    return corrected, TrackErrors(errors, _fused_lasting(fusion, swarm, lines))
+
+
+def _fused_lasting(
+    fusion: Fusion, swarm: TrackErrors | None, lines: TrackErrors | None
+) -> LastingCovariances:
+    """Covariances of the fused positions by errors that last: the weighted means of both methods' covariances."""
+    # A drone that is not found keeps the weights of the frame in which it was last found, or first will be.
+    found = np.isfinite(fusion.lines_share)
+    last = _last_found(found)
+    nearest = np.where(last < 0, found.argmax(axis=0), last)
+    share = np.nan_to_num(np.take_along_axis(fusion.lines_share, nearest, axis=0))[..., None, None]
+
+    def of_drones(errors: TrackErrors | None, name: str, drones: Int[np.ndarray, "drones"]) -> np.ndarray:
+        if errors is None:
+            return np.zeros((*found.shape, 3, 3))
+        # Drone -1 has the column of zeros.
+        return np.pad(getattr(errors.lasting, name), [(0, 0), (0, 1), (0, 0), (0, 0)])[:, drones]
+
+    absolute_m2, relative_m2 = (
+        (1 - share) * of_drones(swarm, name, fusion.swarm_drones)
+        + share * of_drones(lines, name, fusion.lines_drones)
+        for name in ("absolute_m2", "relative_m2")
+    )
+    return LastingCovariances(absolute_m2, relative_m2)

@@ -22,11 +22,8 @@ from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
 from .triangulation import (
     MAX_CONDITION,
-    match_views,
     projection_equations,
-    triangulate_candidates,
     triangulate_linearly,
-    triangulate_paths,
     viewpoints,
 )
 
@@ -54,7 +51,6 @@ __all__ = [
     "make_camera",
     "make_extents",
     "make_rig",
-    "match_views",
     "moved_extents",
     "project",
     "project_boxes",
@@ -69,9 +65,7 @@ __all__ = [
     "to_pixels",
     "to_pixels_with_jacobian",
     "triangulate",
-    "triangulate_candidates",
     "triangulate_linearly",
-    "triangulate_paths",
     "undistort",
     "undistort_approximately",
     "undistortion_stretch",

@@ -1,4 +1,4 @@
-"""Parameters and results of the resolution of identity swaps."""
+"""Results of the resolution of identity swaps."""
 
 from __future__ import annotations
 
@@ -8,39 +8,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.errors import SettingsError, check_positive
 from psotrack.support import short_repr
-
-
-@dataclass(frozen=True)
-class IdentityParams:
-    """Parameters that decide when labels are uncertain and when they are settled.
-
-    Attributes:
-        encounter_m: drones nearer than this may be confused: about twice a drone's size, because their silhouettes then
-            touch in some views.
-        decision_probability: smallest probability of a swap that is undone. It is high, because trackers swap drones
-            less often than the even odds that are assumed here.
-        patience_s: time after the last near frame after which undecided labels are kept, seconds: the motion before the
-            encounter says nothing more by then.
-
-    Raises:
-        SettingsError: a value is out of range.
-    """
-
-    encounter_m: float = 0.6
-    decision_probability: float = 0.99
-    patience_s: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_positive("encounter_m", self.encounter_m)
-        check_positive("patience_s", self.patience_s)
-        if not 0.5 < self.decision_probability < 1:
-            raise SettingsError(
-                "decision_probability",
-                expected="more than 0.5 and less than 1",
-                found=f"{self.decision_probability:g}",
-            )
 
 
 class LabelOutcome(StrEnum):
@@ -60,7 +28,7 @@ class Encounter:
 
     Attributes:
         drones: labels of the two drones, the lower label first.
-        first_frame: first frame of the group of drones that contains the two.
+        first_frame: first frame in which the two drones are near.
         closest_frame, distance_m: frame of the smallest distance, and this distance, metres.
         last_frame: frame of the decision; the recording's last frame if there was none.
         log_odds: natural logarithm of the odds of a swap, in the last frame.
@@ -83,8 +51,8 @@ class Identities:
     Attributes:
         order: (frames, drones), index of each drone's track; `relabelled` applies it.
         pairs: (pairs, 2), labels of two drones, the lower label first.
-        ambiguity: (frames, pairs), probability that `order` confuses the two drones, given all frames up to this frame;
-            0 outside encounters.
+        ambiguity: (frames, pairs), probability that `order` exchanges the two drones, given all frames up to this
+            frame; 0 outside encounters.
         encounters: encounters in the order of their decisions.
     """
 

@@ -1,61 +1,68 @@
-from .candidate_search import CandidateSearch, DroneSearch, FoundCandidates, SeenFrame
+from .births import (
+    SPEED_SHARE,
+    TRUSTED_VIEWPOINTS,
+    WINDOW_FRAMES,
+    Births,
+    KnownDrones,
+    Measurement,
+    TrackCandidate,
+    state_at,
+)
 from .common_sightings import CommonSightings, count_common
 from .cut_off import find_cut_off, find_outside
 from .initial_state import (
+    InitialState,
     StartSource,
-    complete_initial_state,
-    find_initial_state,
+    first_drones,
+    given_state,
     known_motion,
     room_bounds,
     start_source,
+    state_at_first_frame,
 )
-from .initialisation import FLOOR_CLEARANCE_M, InitialState
 from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
-from .new_tracks import FollowedCandidate, KnownDrones, Sighted, TrackCandidate, find_candidates
 from .reidentification import (
     NEW,
-    SPEED_SHARE,
+    STAYED_SPANS,
     LostTracks,
-    PlannedStarts,
     find_false_tracks,
     find_lost_tracks,
-    plan_starts,
     reidentify,
 )
+from .residual import FrameBlobs, unexplained
 
 __all__ = [
-    "FLOOR_CLEARANCE_M",
     "NEW",
     "SPEED_SHARE",
-    "CandidateSearch",
+    "STAYED_SPANS",
+    "TRUSTED_VIEWPOINTS",
+    "WINDOW_FRAMES",
+    "Births",
     "CommonSightings",
-    "DroneSearch",
     "FlightVolume",
-    "FollowedCandidate",
-    "FoundCandidates",
+    "FrameBlobs",
     "InitialState",
     "KnownDrones",
     "LostTracks",
+    "Measurement",
     "MovingPoints",
-    "PlannedStarts",
-    "SeenFrame",
-    "Sighted",
     "StartSource",
     "TrackCandidate",
-    "complete_initial_state",
     "count_common",
-    "find_candidates",
     "find_cut_off",
     "find_false_tracks",
-    "find_initial_state",
     "find_lost_tracks",
     "find_outside",
+    "first_drones",
     "flight_volume",
+    "given_state",
     "known_motion",
     "moving_blobs",
     "moving_detections",
-    "plan_starts",
     "reidentify",
     "room_bounds",
     "start_source",
+    "state_at",
+    "state_at_first_frame",
+    "unexplained",
 ]

@@ -1,35 +1,47 @@
-"""The initial state: positions, velocities and sizes of the drones at frame 0, found in the first frames or given."""
+"""The region where drones are looked for, and first positions that are given instead of found."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.correspondence import Sightings, from_silhouettes
 from psotrack.errors import InputError
-from psotrack.geometry import Rig, looking_depths_m
-from psotrack.initiation.initialisation import InitialState, all_blobs, find_drones_in_blobs
+from psotrack.geometry import Rig, looking_depths_m, project_visible, sizes_m, to_camera
+from psotrack.initiation.births import NO_DRONES, WINDOW_FRAMES, Births, state_at
 from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
 from psotrack.silhouettes import Silhouettes
-from psotrack.trajectories import Trajectories, read_trajectories
+from psotrack.trajectories import Tracks, Trajectories, read_trajectories
 
-logger = logging.getLogger(__name__)
+#: Number of first frames from which the sizes of drones at given positions are taken, and in which drones are found
+#: for a method that is plugged in.
+_START_FRAMES, _FRAMES = 10, 40
 
-#: Number of first frames in which the drones are found. Over more frames their paths are no straight lines.
-START_FRAMES = 10
-#: Two initial positions nearer than this are of one drone, metres: the middles of box and silhouette differ.
-SAME_M = 0.3
-#: A given position takes the size of a found drone that is nearer than this, metres.
-SAME_DRONE_M = 0.5
+
+@dataclass(frozen=True)
+class InitialState:
+    """Positions, velocities and sizes of the drones at frame 0.
+
+    Attributes:
+        position_m: (drones, 3), positions in the world, metres.
+        velocity_m_s: (drones, 3), velocities, metres per second.
+        size_m: (drones, 3), full lengths along the world's axes, metres.
+        num_cameras: (drones,), number of cameras that show the drone.
+    """
+
+    position_m: Float[np.ndarray, "drones 3"]
+    velocity_m_s: Float[np.ndarray, "drones 3"]
+    size_m: Float[np.ndarray, "drones 3"]
+    num_cameras: Float[np.ndarray, "drones"]
 
 
 @dataclass(frozen=True)
 class StartSource:
-    """Where the initial state comes from.
+    """Where the first positions come from.
 
     Attributes:
         init: "auto", "truth" or the name of a file of tracks (see `TrackSettings.init`).
@@ -43,7 +55,7 @@ class StartSource:
 
 
 def start_source(recording: Recording, init: str) -> StartSource:
-    """Where the initial state comes from, with the given trajectories read.
+    """Where the first positions come from, with the given trajectories read.
 
     Raises:
         InputError: there is no reference, or the file cannot be read.
@@ -86,144 +98,150 @@ def room_bounds(
     return np.stack([low, high])
 
 
-def find_initial_state(
-    rig: Rig,
-    silhouettes: Silhouettes,
-    source: StartSource,
-    drones: DroneSettings,
-    *,
-    fps: float,
-    bounds_m: Float[np.ndarray, "2 3"],
-    max_speed_m_s: float,
-) -> InitialState:
-    """Positions of the silhouettes' middles, velocities and sizes of the drones at frame 0.
-
-    Drones that are not found may still come later, so the state may have no drones.
-
-    Args:
-        rig: the cameras.
-        silhouettes: silhouettes of all cameras of the rig.
-        source: given trajectories, or none.
-        drones: number, sizes and body offset where they are known.
-        fps: frames per second.
-        bounds_m: (2, 3), lowest and highest corner of the room, metres.
-        max_speed_m_s: largest speed of a drone, m/s.
-
-    Raises:
-        InputError: the given trajectories have too few drones, or the size of a drone cannot be found.
-    """
-    count, exposures = min(START_FRAMES, silhouettes.num_frames), silhouettes.exposures
-    state = find_drones_in_blobs(
-        rig.cameras,
-        all_blobs(
-            silhouettes.read(0, count),
-            silhouettes.reduction,
-            None if exposures is None else exposures[:count],
-            silhouettes.borders,
-        ),
-        fps=fps,
-        bounds_m=bounds_m,
-        max_speed_m_s=max_speed_m_s,
-        drones=drones.count,
-    )
-    if source.given is not None:
-        state = _with_sizes(source.given, state, fps, np.array(drones.body_offset_m))
-        wanted = drones.count or 1
-        if len(state.position_m) < wanted:
-            raise InputError(
-                source.path,
-                expected=f"{wanted} drone{'s' * (wanted > 1)} (--init {source.init})",
-                found=f"{len(state.position_m)}",
-                remedy="say how many there are with --drones",
-            )
-    return state
-
-
-def complete_initial_state(
-    state: InitialState, detected: InitialState | None, drones: DroneSettings, source: StartSource
-) -> InitialState:
-    """The initial state with drones that only detections show, limited to the known number, with known sizes.
-
-    Args:
-        state: initial state, found in silhouettes or given.
-        detected: drones that detections show at frame 0; None where no detections are read. These drones are added
-            unless the positions are given: a drone that hovers may be part of the learned background.
-        drones: number and sizes where they are known.
-        source: where the state comes from.
-
-    Raises:
-        InputError: the size of a drone is not known.
-    """
-    if detected is not None and source.given is None:
-        state = _with_others(state, detected)
-    state = InitialState(*(value[: drones.count] for value in vars(state).values()))
-    if len(state.position_m) < (drones.count or 0):
-        logger.warning("frame 0: %d of %d drones found", len(state.position_m), drones.count)
-    if drones.size_m is not None:
-        size_m = np.broadcast_to(np.array(drones.size_m), state.position_m.shape)
-        state = InitialState(state.position_m, state.velocity_m_s, size_m, state.num_cameras)
-    if not np.isfinite(state.size_m).all():
-        raise InputError(
-            source.path,
-            expected="a size for every drone",
-            found="drones whose size no camera shows",
-            remedy="pass --drone-size X,Y,Z",
-        )
-    return state
-
-
 def known_motion(
     source: StartSource, drones: DroneSettings, fps: float
 ) -> tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None:
     """Given positions of the silhouettes' middles, (known, 3), metres, and velocities, (known, 3), m/s, at frame 0.
 
     None where nothing is given.
+
+    Raises:
+        InputError: fewer drones are given than there are.
     """
     if source.given is None:
         return None
-    none_found = InitialState(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    state = _with_sizes(source.given, none_found, fps, np.array(drones.body_offset_m))
-    return state.position_m[: drones.count], state.velocity_m_s[: drones.count]
-
-
-def _with_others(found: InitialState, detected: InitialState) -> InitialState:
-    """The found drones, and after them the detected drones that are not among the found ones."""
-    apart_m = np.linalg.norm(detected.position_m[:, None] - found.position_m[None], axis=-1)
-    others = apart_m.min(axis=1, initial=np.inf) > SAME_M
-    return InitialState(
-        *(np.concatenate([value, getattr(detected, name)[others]]) for name, value in vars(found).items())
-    )
-
-
-def _with_sizes(
-    given: Trajectories, found: InitialState, fps: float, body_offset_m: Float[np.ndarray, "3"]
-) -> InitialState:
-    """Given trajectories at frame 0, with the sizes of the drones that were found there."""
+    given = source.given
     there = np.isfinite(given.position_m).all(axis=-1)
-    positions, velocities, sizes, cameras = [], [], [], []
+    positions, velocities = [], []
     for drone in np.flatnonzero(there.any(axis=0)):
         rows = np.flatnonzero(there[:, drone])[:2]
-        point = given.position_m[rows, drone]
-        frames = given.frame[rows]
+        point, frames = given.position_m[rows, drone], given.frame[rows]
         if given.velocity_m_s is not None:
             velocity = given.velocity_m_s[rows[0], drone]
         elif len(rows) == 2:
             velocity = (point[1] - point[0]) * fps / (frames[1] - frames[0])
         else:
             velocity = np.zeros(3)
-        position = point[0] - velocity * frames[0] / fps + body_offset_m
-        distance = np.linalg.norm(found.position_m - position, axis=-1)
-        nearest = distance.argmin() if len(distance) and distance.min() < SAME_DRONE_M else None
-        positions.append(position)
+        positions.append(point[0] - velocity * frames[0] / fps + np.array(drones.body_offset_m))
         velocities.append(velocity)
-        sizes.append(np.full(3, np.nan) if nearest is None else found.size_m[nearest])
-        cameras.append(0.0 if nearest is None else found.num_cameras[nearest])
-    size = np.array(sizes).reshape(-1, 3)
-    # A drone that was not found there gets the median size of the drones that were found.
-    usual = np.nanmedian(size, axis=0) if np.isfinite(size).any() else np.full(3, np.nan)
-    return InitialState(
-        position_m=np.array(positions).reshape(-1, 3),
-        velocity_m_s=np.array(velocities).reshape(-1, 3),
-        size_m=np.where(np.isfinite(size), size, usual),
-        num_cameras=np.array(cameras),
+    if len(positions) < (wanted := drones.count or 1):
+        raise InputError(
+            source.path,
+            expected=f"{wanted} drone{'s' * (wanted > 1)} (--init {source.init})",
+            found=f"{len(positions)}",
+            remedy="say how many there are with --drones",
+        )
+    return np.array(positions)[: drones.count], np.array(velocities)[: drones.count]
+
+
+def given_state(
+    rig: Rig, silhouettes: Silhouettes, source: StartSource, drones: DroneSettings, fps: float
+) -> InitialState | None:
+    """The drones at given positions, with sizes from the blobs there; None where no positions are given.
+
+    Raises:
+        InputError: fewer drones are given than there are, or no camera shows the size of a drone.
+    """
+    known = known_motion(source, drones, fps)
+    if known is None:
+        return None
+    position_m, velocity_m_s = known
+    sizes = (
+        np.full((len(position_m), 3), np.nan)
+        if drones.size_m is None
+        else np.tile(drones.size_m, (len(position_m), 1))
     )
+    size_m, num_cameras = _sizes_at(rig, silhouettes, position_m, velocity_m_s / fps)
+    size_m = np.where(np.isfinite(sizes), sizes, size_m)
+    there = np.isfinite(size_m).all(axis=-1)
+    if not there.any():
+        raise InputError(
+            source.path,
+            expected="a size for every drone",
+            found="drones whose size no camera shows",
+            remedy="pass --drone-size X,Y,Z",
+        )
+    # A drone that no camera shows alone gets the median size of the others.
+    size_m = np.where(there[:, None], size_m, np.median(size_m[there], axis=0))
+    return InitialState(position_m, velocity_m_s, size_m, num_cameras)
+
+
+def state_at_first_frame(tracks: Tracks) -> InitialState:
+    """The drones that were there at frame 0, as an initial state."""
+    there = np.flatnonzero(np.isfinite(tracks.position_m[0]).all(axis=-1))
+    position_m, velocity_m_s = (
+        np.asarray(value[0], np.float64)[there] for value in (tracks.position_m, tracks.velocity_m_s)
+    )
+    size_m = np.asarray(tracks.sizes.size_m, np.float64)[there]
+    return InitialState(position_m, velocity_m_s, size_m, np.asarray(tracks.num_cameras[0], float)[there])
+
+
+def first_drones(
+    rig: Rig,
+    shown: Silhouettes | Sightings,
+    *,
+    fps: float,
+    bounds_m: Float[np.ndarray, "2 3"],
+    max_speed_m_s: float,
+    drones: DroneSettings,
+) -> InitialState:
+    """The drones of the first frames, for a method that is plugged in.
+
+    Args:
+        rig: the cameras.
+        shown: silhouettes, or detections.
+        fps: instants per second.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        max_speed_m_s: largest speed of a drone, m/s.
+        drones: number and sizes where they are known.
+    """
+    count = min(_FRAMES, shown.num_frames)
+    sightings = shown if isinstance(shown, Sightings) else from_silhouettes(shown, stop=count)
+    births = Births(
+        rig.cameras,
+        fps=fps,
+        bounds_m=bounds_m,
+        max_speed_m_s=max_speed_m_s,
+        min_viewpoints=None,
+        min_share=0.5,
+    )
+    for frame in range(count):
+        births.step(frame, sightings.at(frame), NO_DRONES)
+    found = [each for each in births.candidates() if each.instant < WINDOW_FRAMES][: drones.count]
+    states = [state_at(each.path, 0, fps, max_speed_m_s) for each in found]
+    sizes = [each.size_m if drones.size_m is None else np.array(drones.size_m) for each in found]
+    return InitialState(
+        np.array([position for position, _ in states]).reshape(-1, 3),
+        np.array([velocity for _, velocity in states]).reshape(-1, 3),
+        np.array(sizes).reshape(-1, 3),
+        np.array([each.num_cameras for each in found], float),
+    )
+
+
+def _sizes_at(
+    rig: Rig,
+    silhouettes: Silhouettes,
+    position_m: Float[np.ndarray, "drones 3"],
+    step_m: Float[np.ndarray, "drones 3"],
+) -> tuple[Float[np.ndarray, "drones 3"], Float[np.ndarray, "drones"]]:
+    """Sizes of drones from the blobs that hold one of them alone in the first frames; and mean numbers of cameras."""
+    count = min(_START_FRAMES, silhouettes.num_frames)
+    seen = from_silhouettes(silhouettes, stop=count)
+    spans, numbers = [], []
+    for frame in range(count):
+        at_m = position_m + frame * step_m
+        pixels, depth = project_visible(rig.cameras, at_m[:, None])
+        off = np.abs(pixels[:, :, None] - seen.centre_px[frame]) < seen.size_px[frame] / 2
+        holds = off.all(axis=-1) & (depth > 0)[..., None]
+        numbers.append(holds.any(axis=-1).sum(axis=-1))
+        alone = holds & (holds.sum(axis=0) == 1)
+        box = alone.argmax(axis=-1)
+        size_px = seen.size_px[frame][np.arange(len(rig)), box]
+        span_m = sizes_m(rig.cameras, np.asarray(to_camera(rig.cameras, at_m[:, None])), size_px)
+        spans.append(np.where(alone.any(axis=-1)[..., None], span_m, np.nan))
+    flat = np.concatenate(spans, axis=1)
+    known = np.isfinite(flat).all(axis=-1)
+    size_m = np.full((len(position_m), 3), np.nan)
+    for drone in np.flatnonzero(known.any(axis=1)).tolist():
+        size_m[drone] = np.median(flat[drone, known[drone]], axis=0)[[0, 0, 1]]
+    return size_m, np.mean(numbers, axis=0)

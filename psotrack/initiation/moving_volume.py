@@ -1,10 +1,7 @@
 """The volume in which drones fly and their largest speed, from the cameras and from what moves before them.
 
 Cameras alone do not say where drones fly: cameras on the ground look up at drones of any height. In some short windows
-of frames, points are therefore triangulated from detections or blobs that agree in three views, or in two where no
-third camera has the place in view; and from the detections that are left, in any two views, because something may hide
-a drone from the third camera. A point moves if it goes on through its window at a constant velocity. Chance
-crossings of rays do not.
+of frames, drones are therefore looked for in a region so wide that no drone is outside, and of any speed.
 """
 
 from __future__ import annotations
@@ -16,18 +13,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.correspondence import Sightings, from_silhouettes, match, wide_bounds
-from psotrack.geometry import Rig, reconstruct, viewpoints
+from psotrack.correspondence import Sightings, from_silhouettes, wide_bounds
+from psotrack.geometry import Rig, viewpoints
+from psotrack.initiation.births import NO_DRONES, Births, TrackCandidate
 from psotrack.initiation.initial_state import room_bounds
 from psotrack.settings import USUAL_SPEED_M_S
 from psotrack.silhouettes import Silhouettes
 
-#: Number of windows, frames of a window, and frames of it in which a point must be found.
-WINDOWS, WINDOW_FRAMES, MIN_FOUND = 40, 6, 5
+#: Number of windows, and frames of a window: enough for a drone to be born before two cameras.
+WINDOWS, WINDOW_FRAMES = 12, 16
 #: Time between two frames of a window, seconds; at lower rates, one frame.
 STEP_S = 0.04
-#: Largest speed that is looked for, m/s, and largest acceleration, m/s².
-FASTEST_M_S, LARGEST_ACCELERATION_M_S2 = 60.0, 15.0
+#: Largest speed that is looked for, m/s.
+FASTEST_M_S = 60.0
+#: Least share of the cameras with a place in view that see a drone there; detectors miss drones.
+LEAST_SHARE = 0.4
 #: Largest number of sightings per image: of noisy silhouettes the largest blobs count.
 MOST_SIGHTINGS = 12
 #: A point counts if its standard deviation is below this share of its distance from the cameras.
@@ -53,14 +53,12 @@ class MovingPoints:
     """Points that move on through a window of frames.
 
     Attributes:
-        position_m: (points, 3), positions in the first frame of each window, metres.
-        std_m: (points,), standard deviations of the positions, root of the sum over the axes, metres.
+        position_m: (points, 3), positions where they were first found, metres.
         speed_m_s: (points,), speeds.
         speed_std_m_s: (points,), standard deviations of the speeds.
     """
 
     position_m: Float[np.ndarray, "points 3"]
-    std_m: Float[np.ndarray, "points"]
     speed_m_s: Float[np.ndarray, "points"]
     speed_std_m_s: Float[np.ndarray, "points"]
 
@@ -165,8 +163,8 @@ def moving_detections(rig: Rig, sightings: Sightings, fps: float) -> MovingPoint
     viewpoint = viewpoints(rig.cameras)
     by_viewpoint = np.stack([seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)], axis=-1)
     frames = np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2)
-    several = by_viewpoint.shape[1] > 2
-    return _find(rig, sightings.in_frames, frames, fps, passes=(None, 2) if several else (None,))
+    # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
+    return _find(rig, sightings.in_frames, frames, fps, min_viewpoints=2)
 
 
 def moving_blobs(rig: Rig, silhouettes: Silhouettes, fps: float) -> MovingPoints:
@@ -184,9 +182,9 @@ def _find(
     read: Callable[[Int[np.ndarray, "chosen"]], Sightings],
     frames: Int[np.ndarray, "frames"],
     fps: float,
-    passes: tuple[int | None, ...] = (None,),
+    min_viewpoints: int | None = None,
 ) -> MovingPoints:
-    """Points that move, in windows that are spread over the frames.
+    """Points that move, in windows that are spread over the frames: drones that are born there.
 
     Args:
         rig: the cameras.
@@ -194,131 +192,39 @@ def _find(
         frames: (frames,), numbers of the frames from which windows may begin, ascending; the last window ends at the
             last of them.
         fps: frames per second.
-        passes: smallest numbers of viewpoints (see `match`), each for the sightings that the ones before left.
+        min_viewpoints: as in `Births`.
     """
     step = max(1, round(STEP_S * fps))
-    reach = step * (WINDOW_FRAMES - 1)
-    starts = frames[frames <= frames[-1] - reach] if len(frames) else frames
-    if not len(starts):
-        return _joined([])
-    chosen = np.unique(starts[np.linspace(0, len(starts) - 1, min(WINDOWS, len(starts))).round().astype(int)])
-    found = []
-    for first in chosen.tolist():
-        sightings = read(first + step * np.arange(WINDOW_FRAMES))
-        found.append(_moving_in_window(_triangulated(rig, sightings, passes), step / fps))
-    return _joined(found)
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Points of one frame: positions (points, 3), metres, and standard deviations (points,), metres."""
-
-    position_m: Float[np.ndarray, "points 3"]
-    std_m: Float[np.ndarray, "points"]
-
-
-def _triangulated(rig: Rig, sightings: Sightings, passes: tuple[int | None, ...]) -> list[_Points]:
-    """The points of each frame in which detections of enough cameras agree."""
-    wide_m = wide_bounds(rig)
+    last = 0 if not len(frames) else int(frames[-1])
+    starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
+    chosen = np.linspace(0, len(starts) - 1, min(WINDOWS, len(starts))).round().astype(int)
     points = []
-    for frame in range(sightings.num_frames):
-        view = sightings.at(frame).largest(MOST_SIGHTINGS)
-        centre_px, noise_px = view.found(view.centre_px), view.found(view.noise_px)
-        found = []
-        for min_views in passes:
-            groups = match(rig.cameras, centre_px, noise_px, bounds_m=wide_m, min_views=min_views)
-            found.append(_reconstructed(rig, groups.detection, centre_px, noise_px))
-            for camera, used in enumerate(groups.detection.T):
-                # A row that is not finite is no detection; the others keep their numbers.
-                centre_px[camera] = centre_px[camera].copy()
-                centre_px[camera][used[used >= 0]] = np.nan
-        points.append(
-            _Points(
-                np.concatenate([each.position_m for each in found]),
-                np.concatenate([each.std_m for each in found]),
-            )
+    for first in starts[np.unique(chosen)].tolist():
+        sightings = read(np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step))
+        births = Births(
+            rig.cameras,
+            fps=fps / step,
+            bounds_m=wide_bounds(rig),
+            max_speed_m_s=FASTEST_M_S,
+            min_viewpoints=min_viewpoints,
+            min_share=LEAST_SHARE,
         )
-    return points
+        for number in range(sightings.num_frames):
+            births.step(number, sightings.at(number).largest(MOST_SIGHTINGS), NO_DRONES)
+        points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]
+    table = np.array([point for point in points if point is not None]).reshape(-1, 5)
+    return MovingPoints(table[:, :3], table[:, 3], table[:, 4])
 
 
-def _reconstructed(
-    rig: Rig,
-    detection: Int[np.ndarray, "groups cameras"],
-    centre_px: list[Float[np.ndarray, "_ 2"]],
-    noise_px: list[Float[np.ndarray, "_"]],
-) -> _Points:
-    """The points of groups of detections that are not too vague."""
-    seen = detection >= 0
-    of_group = np.full((*detection.shape, 2), np.nan)
-    noise = np.ones(detection.shape)
-    for camera, used in enumerate(detection.T):
-        of_group[seen[:, camera], camera] = centre_px[camera][used[seen[:, camera]]]
-        noise[seen[:, camera], camera] = noise_px[camera][used[seen[:, camera]]]
-    lines = reconstruct(rig.cameras, of_group, noise_px=noise)
-    std_m = np.sqrt(np.trace(lines.covariance_m2, axis1=-2, axis2=-1))
-    distance_m = np.linalg.norm(lines.position_m[:, None] - rig.cameras.centre_world, axis=-1).min(
-        axis=-1, initial=np.inf
-    )
-    kept = std_m < MOST_VAGUE * distance_m
-    return _Points(lines.position_m[kept], std_m[kept])
-
-
-def _moving_in_window(window: list[_Points], step_s: float) -> MovingPoints:
-    """Points that begin in the first or second frame and go on at a constant velocity."""
-    found = []
-    for first in range(WINDOW_FRAMES - MIN_FOUND + 1):
-        for begin_m, begin_std_m in zip(window[first].position_m, window[first].std_m, strict=True):
-            for second in range(first + 1, first + 2 + WINDOW_FRAMES - MIN_FOUND - first):
-                moving = _follow(window, first, begin_m, float(begin_std_m), second, step_s)
-                found += [] if moving is None else [moving]
-    return _joined(found)
-
-
-def _follow(
-    window: list[_Points],
-    first: int,
-    begin_m: Float[np.ndarray, "3"],
-    begin_std_m: float,
-    second: int,
-    step_s: float,
-) -> MovingPoints | None:
-    """The point that goes on from `begin_m` to the nearest point of frame `second` and further; None if it does not."""
-    near = _nearest(window[second], begin_m, FASTEST_M_S * step_s * (second - first) + 3 * begin_std_m)
-    if near is None:
+def _point(rig: Rig, candidate: TrackCandidate, step_s: float) -> tuple[float, ...] | None:
+    """Position, speed and its standard deviation; None where the position is too vague to say anything."""
+    place_m, variance_m2 = candidate.position_m, np.trace(candidate.path[candidate.instant].covariance_m2)
+    nearest_m = np.linalg.norm(place_m - rig.cameras.centre_world, axis=-1).min()
+    if np.sqrt(variance_m2) > MOST_VAGUE * nearest_m:
         return None
-    frames, places, stds = [first, second], [begin_m, window[second].position_m[near]], [begin_std_m]
-    stds.append(float(window[second].std_m[near]))
-    for frame in range(second + 1, WINDOW_FRAMES):
-        rate = (places[-1] - places[0]) / (frames[-1] - frames[0])
-        expected_m = places[0] + rate * (frame - frames[0])
-        share = (frame - frames[0]) / (frames[-1] - frames[0])
-        off_m = 0.5 * LARGEST_ACCELERATION_M_S2 * (step_s * (frame - frames[0])) ** 2 + 3 * share * max(stds)
-        near = _nearest(window[frame], expected_m, off_m)
-        if near is not None:
-            frames.append(frame)
-            places.append(window[frame].position_m[near])
-            stds.append(float(window[frame].std_m[near]))
-    if len(frames) < MIN_FOUND:
-        return None
-    time_s = step_s * (np.array(frames) - np.mean(frames))
-    velocity = time_s @ np.array(places) / (time_s @ time_s)
-    speed_std = float(np.median(stds) / np.sqrt(time_s @ time_s))
-    speed = float(np.linalg.norm(velocity))
-    return MovingPoints(begin_m[None], np.array([begin_std_m]), np.array([speed]), np.array([speed_std]))
-
-
-def _nearest(points: _Points, place_m: Float[np.ndarray, "3"], within_m: float) -> int | None:
-    """Index of the nearest point within a distance; None if there is none."""
-    distance_m = np.linalg.norm(points.position_m - place_m, axis=-1)
-    return int(distance_m.argmin()) if distance_m.min(initial=np.inf) <= within_m else None
-
-
-def _joined(parts: list[MovingPoints]) -> MovingPoints:
-    """All points of the parts."""
-    return MovingPoints(
-        np.concatenate([part.position_m for part in parts] or [np.empty((0, 3))]),
-        *(
-            np.concatenate([getattr(part, name) for part in parts] or [np.empty(0)])
-            for name in ("std_m", "speed_m_s", "speed_std_m_s")
-        ),
-    )
+    time_s = step_s * np.array([*candidate.path])
+    places_m = np.array([one.position_m for one in candidate.path.values()])
+    (velocity, _), residual = np.polyfit(time_s, places_m, 1), time_s - time_s.mean()
+    std_m = np.sqrt(np.median([np.trace(one.covariance_m2) for one in candidate.path.values()]))
+    speed_std_m_s = std_m / np.sqrt((residual**2).sum())
+    return (*place_m.tolist(), float(np.linalg.norm(velocity)), float(speed_std_m_s))

@@ -1,4 +1,4 @@
-"""Re-identification: assign track candidates to lost drones, and plan where the tracker starts their tracks.
+"""Re-identification: assign track candidates to lost drones.
 
 A candidate is a lost drone if time, motion and size agree, and else a new drone. A drone that stood still when it was
 lost is most probably still there: it has landed, or the background model has learned it. When such a drone departs, its
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from psotrack.initiation.new_tracks import TrackCandidate
+from psotrack.initiation.births import SPANS_M, SPEED_SHARE, TrackCandidate
 from psotrack.initiation.ornstein_uhlenbeck import POSITION_STD_M, log_normal, log_transition
 
 #: Value of an assignment: the candidate is a new drone.
@@ -22,10 +22,8 @@ NEW = -1
 #: Value of an assignment: the candidate is no drone, or nothing shows that it is one.
 NO_DRONE = -2
 
-#: Standard deviation of a drone's velocity along each axis, as a share of the largest speed.
-SPEED_SHARE = 1 / 3
-#: Standard deviation of the logarithm of a measured span, and smallest and largest span of a drone.
-SPAN_STD, SPANS_M = 0.2, (0.1, 1.5)
+#: Standard deviation of the logarithm of a measured span.
+SPAN_STD = 0.2
 #: A drone that was slower than this when it was lost stood still. It stayed there with this probability, because a
 #: drone that departs in front of the cameras would be foreground.
 STILL_M_S, STAYED_PROBABILITY = 0.2, 0.99
@@ -52,12 +50,12 @@ _UNREACHABLE, _NEW_NOT_ALLOWED, _IMPOSSIBLE = -1e6, -1e7, -1e9
 
 @dataclass(frozen=True)
 class LostTracks:
-    """Drones that may be found again, in their last state before the end of a chunk.
+    """Drones that may be found again, in their last state.
 
     Attributes:
         drone: (lost,), index of the drone.
         position_m, velocity_m_s: (lost, 3), state when last seen; for a drone that stood still, its place and 0.
-        seconds: (lost,), time from then to the chunk's first frame; negative if the drone was lost within the chunk.
+        instant: (lost,), the instant when last seen.
         size_m: (lost, 3), full lengths along the world's axes.
         doubtful: (lost,), whether the drone is tracked again, but only at the place where it was lost, without moving
             since. This track may follow a ghost. Such a drone is only assigned to a candidate that departs from there.
@@ -67,26 +65,10 @@ class LostTracks:
     drone: Int[np.ndarray, "lost"]
     position_m: Float[np.ndarray, "lost 3"]
     velocity_m_s: Float[np.ndarray, "lost 3"]
-    seconds: Float[np.ndarray, "lost"]
+    instant: Int[np.ndarray, "lost"]
     size_m: Float[np.ndarray, "lost 3"]
     doubtful: Bool[np.ndarray, "lost"]
     left_m: Float[np.ndarray, "places 3"]
-
-
-@dataclass(frozen=True)
-class PlannedStarts:
-    """Initial states of tracks that start in a chunk; new drones come after the known drones.
-
-    Attributes:
-        begin_frame: (drones,), frame of the chunk in which the track starts; -1 where a track continues.
-        begin_position_m, begin_velocity_m_s: (drones, 3), state in this frame; 0 where a track continues.
-        born_size_m: (born, 3), full lengths of the new drones.
-    """
-
-    begin_frame: Int[np.ndarray, "drones"]
-    begin_position_m: Float[np.ndarray, "drones 3"]
-    begin_velocity_m_s: Float[np.ndarray, "drones 3"]
-    born_size_m: Float[np.ndarray, "born 3"]
 
 
 def find_false_tracks(
@@ -124,18 +106,17 @@ def find_lost_tracks(
     velocity_m_s: Float[np.ndarray, "frames drones 3"],
     tracked: Bool[np.ndarray, "frames drones"],
     size_m: Float[np.ndarray, "drones 3"],
-    *,
-    chunk_frames: int,
+    instant: Int[np.ndarray, "frames"],
     fps: float,
 ) -> LostTracks:
-    """Find the drones that are lost at the end of a chunk and may be found again; false tracks are left out.
+    """Find the drones that are lost in the last frame, or were, and may be found again; false tracks are left out.
 
     Args:
-        position_m, velocity_m_s: (frames, drones, 3), states from the video's first frame to the chunk's last.
+        position_m, velocity_m_s: (frames, drones, 3), states in all frames so far.
         tracked: (frames, drones), whether the drone was found, and not only predicted.
         size_m: (drones, 3), full lengths along the world's axes.
-        chunk_frames: number of frames of the chunk, which are the last of the frames.
-        fps: frames per second.
+        instant: (frames,), the frames' instants.
+        fps: instants per second.
     """
     drones, last, places, velocities, doubtful, left = [], [], [], [], [], []
     for drone in np.flatnonzero(
@@ -145,7 +126,9 @@ def find_lost_tracks(
         losses = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
         if not len(losses):
             continue
-        standing = [_standing_place(position_m[:, drone], seen[seen <= end], fps) for end in losses.tolist()]
+        standing = [
+            _standing_place(position_m[:, drone], seen[seen <= end], instant / fps) for end in losses.tolist()
+        ]
         left += [place for place in standing if place is not None]
         stayed = _stayed(position_m[seen[seen >= losses[-1]], drone], size_m[drone])
         tracked_now = bool(tracked[-1, drone])
@@ -160,7 +143,7 @@ def find_lost_tracks(
         drone=columns,
         position_m=np.array(places).reshape(-1, 3),
         velocity_m_s=np.array(velocities).reshape(-1, 3),
-        seconds=(len(tracked) - chunk_frames - np.array(last, int)) / fps,
+        instant=instant[np.array(last, int)],
         size_m=size_m[columns],
         doubtful=np.array(doubtful, bool),
         left_m=np.array(left).reshape(-1, 3),
@@ -168,13 +151,15 @@ def find_lost_tracks(
 
 
 def _standing_place(
-    position_m: Float[np.ndarray, "frames 3"], seen: Int[np.ndarray, "seen"], fps: float
+    position_m: Float[np.ndarray, "frames 3"],
+    seen: Int[np.ndarray, "seen"],
+    time_s: Float[np.ndarray, "frames"],
 ) -> Float[np.ndarray, "3"] | None:
     """Place of a drone that stood still when it was last seen; None if it moved."""
     for seconds in STILL_S:
-        recent = seen[seen >= seen[-1] - seconds * fps]
+        recent = seen[time_s[seen] >= time_s[seen[-1]] - seconds]
         moved_m = float(np.linalg.norm(np.ptp(position_m[recent], axis=0)))
-        if moved_m < STILL_M_S * np.ptp(recent) / fps:
+        if moved_m < STILL_M_S * np.ptp(time_s[recent]):
             return np.median(position_m[recent], axis=0)
     return None
 
@@ -195,24 +180,25 @@ def reidentify(
     alternative is a new drone anywhere in the room.
 
     Args:
-        candidates: candidates of a chunk.
-        lost: drones that may be found again, from the same chunk.
-        fps: frames per second.
+        candidates: the candidates.
+        lost: drones that may be found again.
+        fps: instants per second.
         bounds_m: (2, 3), corners of the room.
         max_speed_m_s: largest speed of a drone.
         max_births: largest number of new drones; None for any number. If it is 0, a candidate that moves is assigned to
             a lost drone even if that is unlikely.
 
     Returns:
-        (candidates,), a row of `lost`, or `NEW`, or `NO_DRONE`. A candidate that does not move is never new; neither is
-        a slow candidate at a place where a drone stood still.
+        (candidates,), a row of `lost`, or `NEW`, or `NO_DRONE`. Never new are a candidate that is not sure, one that
+        does not move, and a slow one at a place where a drone stood still.
     """
     count = len(lost.drone)
     log_volume = float(np.log(np.prod(bounds_m[1] - bounds_m[0])))
     is_ghost = [any(_departs_from(other, one) for other in candidates) for one in candidates]
+    is_dying = [_is_dying_ghost(one, lost, fps) for one in candidates]
     may_be_new = [
-        one.moves and not ghost and not _is_dying_ghost(one, lost)
-        for one, ghost in zip(candidates, is_ghost, strict=True)
+        one.moves and one.is_sure and not ghost and not dying
+        for one, ghost, dying in zip(candidates, is_ghost, is_dying, strict=True)
     ]
     scores = np.full((len(candidates), count + len(candidates)), _IMPOSSIBLE)
     for row, candidate in enumerate(candidates):
@@ -221,9 +207,11 @@ def reidentify(
         log_new = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
         scores[row, count + row] = _NEW_NOT_ALLOWED if candidate.moves and max_births == 0 else log_new
         for column in range(0 if is_ghost[row] else count):
-            scores[row, column] = _log_likelihood(
-                candidate, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
-            )
+            # What may be a ghost is no drone that was lost elsewhere.
+            if not is_dying[row] or _may_have_stayed(candidate, lost, column):
+                scores[row, column] = _log_likelihood(
+                    candidate, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
+                )
     chosen = np.full(len(candidates), NO_DRONE)
     births = 0
     for row, column in zip(
@@ -235,31 +223,6 @@ def reidentify(
             chosen[row] = NEW
             births += 1
     return chosen
-
-
-def plan_starts(
-    candidates: tuple[TrackCandidate, ...],
-    assignment: Int[np.ndarray, "candidates"],
-    lost: LostTracks,
-    num_drones: int,
-) -> PlannedStarts:
-    """Plan where the tracker starts the tracks of a chunk's candidates.
-
-    Args:
-        candidates: candidates of the chunk.
-        assignment: (candidates,), from `reidentify`.
-        lost: the lost drones to which the assignment refers.
-        num_drones: number of drones that the tracker has so far.
-    """
-    again, born = np.flatnonzero(assignment >= 0), np.flatnonzero(assignment == NEW)
-    drones = np.concatenate([lost.drone[assignment[again]], num_drones + np.arange(len(born))])
-    begin_frame = np.full(num_drones + len(born), -1)
-    position, velocity = np.zeros((2, num_drones + len(born), 3))
-    for drone, row in zip(drones.tolist(), [*again.tolist(), *born.tolist()], strict=True):
-        begin_frame[drone] = candidates[row].frame
-        position[drone], velocity[drone] = candidates[row].position_m, candidates[row].velocity_m_s
-    sizes = np.array([candidates[row].size_m for row in born.tolist()]).reshape(-1, 3)
-    return PlannedStarts(begin_frame, position, velocity, sizes)
 
 
 def _log_likelihood(
@@ -278,12 +241,12 @@ def _log_likelihood(
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
     still = float(np.linalg.norm(velocity)) < STILL_M_S
-    if still and _smallest_distance(candidate, place) < near_m:
+    if _may_have_stayed(candidate, lost, row):
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
         log_stayed += log_normal(candidate.velocity_m_s, variance)
     if lost.doubtful[row]:
         return log_stayed + log_span if candidate.moves and log_stayed > -np.inf else _IMPOSSIBLE
-    gap_s = candidate.frame / fps + float(lost.seconds[row])
+    gap_s = (candidate.instant - int(lost.instant[row])) / fps
     if gap_s < -MAX_OVERLAP_S:
         return _IMPOSSIBLE
     gap_s = max(gap_s, 0.0)
@@ -297,6 +260,13 @@ def _log_likelihood(
     return max(log_stayed, log_flown) + log_span
 
 
+def _may_have_stayed(candidate: TrackCandidate, lost: LostTracks, row: int) -> bool:
+    """Whether a lost drone stood still where the candidate is, or where it comes from."""
+    still = float(np.linalg.norm(lost.velocity_m_s[row])) < STILL_M_S
+    near_m = STAYED_SPANS * float(lost.size_m[row].max())
+    return still and _smallest_distance(candidate, lost.position_m[row]) < near_m
+
+
 def _departs_from(candidate: TrackCandidate, ghost: TrackCandidate) -> bool:
     """Whether a candidate departs from another candidate that stands still, or creeps while the drone overlaps it."""
     near_m = STAYED_SPANS * float(ghost.size_m.max())
@@ -305,11 +275,20 @@ def _departs_from(candidate: TrackCandidate, ghost: TrackCandidate) -> bool:
     return faster and _smallest_distance(candidate, ghost.position_m) < near_m
 
 
-def _is_dying_ghost(candidate: TrackCandidate, lost: LostTracks) -> bool:
+def _is_dying_ghost(candidate: TrackCandidate, lost: LostTracks, fps: float) -> bool:
     """Whether a candidate is slow and at a place where a drone stood still, as a ghost that the background absorbs."""
     near_m = STAYED_SPANS * float(candidate.size_m.max())
-    creeps = float(np.linalg.norm(candidate.velocity_m_s)) < STILL_M_S
+    creeps = _speed_m_s(candidate, fps) < STILL_M_S
     return creeps and bool((np.linalg.norm(lost.left_m - candidate.position_m, axis=-1) < near_m).any())
+
+
+def _speed_m_s(candidate: TrackCandidate, fps: float) -> float:
+    """Speed on the whole way: a ghost's velocity is noisy, while the drone that departs hides a part of it."""
+    if len(candidate.path) < 2:
+        return float(np.linalg.norm(candidate.velocity_m_s))
+    first, last = min(candidate.path), max(candidate.path)
+    way_m = candidate.path[last].position_m - candidate.path[first].position_m
+    return float(np.linalg.norm(way_m)) * fps / (last - first)
 
 
 def _smallest_distance(candidate: TrackCandidate, place_m: Float[np.ndarray, "3"]) -> float:

@@ -1,8 +1,10 @@
+from .cameras import LiveCamera, live_cameras
 from .meeting import CameraCounts, Instant, Meeting
-from .messages import JsonLines, UdpLines
+from .messages import JsonLines, UdpLines, lines_of
 from .recorder import CameraRecorder, RecordedCounts, RecordingFolder
-from .session import WAIT_S, LiveCamera, LiveResult, LiveSession, live_cameras
-from .sources import CameraStream, LiveSource, ReplayedVideo
+from .session import WAIT_S, LiveResult, LiveSession
+from .sources import CameraStream, LiveSource, ReplayedVideo, SourceFrame
+from .stream_clock import StreamClock
 from .websocket import WebSocketLines
 
 __all__ = [
@@ -20,7 +22,10 @@ __all__ = [
     "RecordedCounts",
     "RecordingFolder",
     "ReplayedVideo",
+    "SourceFrame",
+    "StreamClock",
     "UdpLines",
     "WebSocketLines",
+    "lines_of",
     "live_cameras",
 ]

@@ -1,295 +1,264 @@
-"""The front end of a session: worker processes that turn the cameras' frames into silhouettes.
+"""The front end of a session: a thread for each camera turns frames into silhouettes, which meet at instants.
 
-A worker has a thread for each of its cameras. It sends messages to the session. The session sends two: the time at
-which the recording's clock shows 0, and None when the worker shall end. A worker ends also when the session's process
-dies.
+OpenCV does not hold Python's lock while it works, so the threads use all processors. What they share is changed under
+one lock.
 """
 
 from __future__ import annotations
 
 import contextlib
-import gc
+import itertools
+import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from psotrack.live.packed_image import PackedImage
-from psotrack.live.recorder import CLOSE_S, CameraRecorder, RecordedCounts
-from psotrack.live.sources import LiveSource
+from psotrack.live.addresses import ANSWER_S
+from psotrack.live.cameras import LiveCamera
+from psotrack.live.meeting import CameraCounts, Instant, Meeting
+from psotrack.live.recorder import CLOSE_S, RecordedCounts
+from psotrack.live.sources import SourceFrame
 from psotrack.silhouettes import LivingBackground, ScaledSettings, coverage, ignored_pixels, reduce_frame
-from psotrack.support import with_traceback
 
+logger = logging.getLogger(__name__)
+
+#: Largest number of complete instants that wait for the tracker: more are left out, so that the delay does not grow.
+_MOST_WAITING = 3
 #: Longest time that a camera waits for the silhouettes of others before it learns, seconds.
 _LONGEST_TURN_S = 0.02
-#: Time that the cameras' threads have to end, seconds.
-_END_S = 0.5
+#: Longest time for which the session waits for frames before it looks whether it is to end, seconds.
+_LOOK_S = 0.1
+#: Time from the start of the sources to the recording's time 0, seconds.
+_LEAD_S = 0.2
+#: Longest time that the threads have to end, seconds: OpenCV waits 10 s for a device that does not answer.
+_END_S = 10.0 + ANSWER_S + CLOSE_S
 
 
-@dataclass(frozen=True)
-class FilmTask:
-    """One camera of a worker.
+class FrontEnd:
+    """Cameras that film, as a context manager: `begin` lets them, and `instants` are what they show.
 
-    Attributes:
-        index: number of the camera in the session.
-        source: source of its frames.
+    Args:
+        cameras: the cameras.
         settings: settings of the silhouettes.
-        ignore: image that is white where nothing counts as foreground; None for no such image.
-        most_behind_s: a frame that has waited for longer is left out, so that the delay does not grow, seconds.
-        recorder: keeps the frames; None where they are not kept.
-    """
-
-    index: int
-    source: LiveSource
-    settings: ScaledSettings
-    ignore: Path | None
-    most_behind_s: float
-    recorder: CameraRecorder | None = None
-
-
-@dataclass(frozen=True)
-class Ready:
-    """A worker waits for the time at which the recording's clock shows 0."""
-
-
-@dataclass(frozen=True)
-class Arrived:
-    """A frame has come, and is in work.
+        rate_hz: instants per second.
+        first_s: time of the first instant on the recording's clock, seconds.
+        wait_s: how long an instant waits for cameras, seconds. A frame that has waited for longer is left out, so that
+            the delay does not grow.
 
     Attributes:
-        camera: number of the camera.
-        time_s: when the frame was filmed, on the recording's clock, seconds.
+        counts: counts of each camera, after `begin`.
+        errors: errors that have ended cameras.
+        num_able: number of cameras that film, or have filmed and may come back.
+        recorded: what happened to the frames that are kept, by the camera's name; complete at the end.
     """
 
-    camera: int
-    time_s: float
-
-
-@dataclass(frozen=True)
-class CameraSilhouette:
-    """The silhouette of the frame that has come.
-
-    Attributes:
-        camera: number of the camera.
-        time_s: when the frame was filmed, on the recording's clock, seconds.
-        arrived_s: when the frame came, `time.monotonic`.
-        coverage: the silhouette; None for a frame that was left out, because the program is behind.
-    """
-
-    camera: int
-    time_s: float
-    arrived_s: float
-    coverage: PackedImage | None
-
-
-@dataclass(frozen=True)
-class Notice:
-    """A line of text about a camera, such as that the stream has broken off.
-
-    Attributes:
-        camera: number of the camera.
-        line: the text.
-    """
-
-    camera: int
-    line: str
-
-
-@dataclass(frozen=True)
-class Ended:
-    """A camera has ended for good.
-
-    Attributes:
-        camera: number of the camera.
-        error: why; None where the source has no more frames.
-    """
-
-    camera: int
-    error: BaseException | None
-
-
-@dataclass(frozen=True)
-class RecordingNotice:
-    """A line of text about the recording of the frames.
-
-    Attributes:
-        line: the text.
-    """
-
-    line: str
-
-
-@dataclass(frozen=True)
-class FilesFinished:
-    """The files of a camera's recording are finished.
-
-    Attributes:
-        camera: number of the camera.
-        counts: what happened to its frames.
-    """
-
-    camera: int
-    counts: RecordedCounts
-
-
-Message = Ready | Arrived | CameraSilhouette | Notice | Ended | RecordingNotice | FilesFinished
-
-
-def film(tasks: Sequence[FilmTask], connection: Connection) -> None:
-    """Run a worker: send `Ready`, receive the time of the clock's 0, and send the messages of all cameras."""
-    sending, stopped = threading.Lock(), threading.Event()
-
-    def send(message: Message) -> None:
-        try:
-            with sending:
-                connection.send(message)
-        except OSError:  # the session has ended
-            stopped.set()
-
-    turns, start = _Turns(), _Start(len(tasks))
-    threads = [
-        threading.Thread(target=_film_one, args=(task, start, stopped, send, turns), daemon=True)
-        for task in tasks
-    ]
-    for thread in threads:
-        thread.start()
-    start.wait_for_sources()
-    # What was imported and made so far is not searched for garbage again and again.
-    gc.freeze()
-    send(Ready())
-    with contextlib.suppress(EOFError, OSError):  # the session's process has died
-        start.give(connection.recv())
-        connection.recv()
-    stopped.set()
-    start.give(0.0)
-    end_s = time.monotonic() + _END_S
-    for thread in threads:
-        thread.join(max(0.0, end_s - time.monotonic()))
-    recorders = {task.index: task.recorder for task in tasks if task.recorder is not None}
-    for recorder in recorders.values():
-        recorder.finish()
-    end_s = time.monotonic() + CLOSE_S
-    for index, recorder in recorders.items():
-        send(FilesFinished(index, recorder.close(max(0.0, end_s - time.monotonic()))))
-        if recorder.loss is not None:
-            send(RecordingNotice(recorder.loss))
-
-
-def _film_one(
-    task: FilmTask,
-    start: _Start,
-    stopped: threading.Event,
-    send: Callable[[Message], None],
-    turns: _Turns,
-) -> None:
-    """The thread of a camera: frames to silhouettes."""
-    error: BaseException | None = None
-    try:
-        _Silhouettes(task.settings, None).warm_up()
-        silhouettes = _Silhouettes(task.settings, task.ignore)
-        with contextlib.closing(task.source.frames(start.begin, stopped.is_set)) as frames:
-            for frame in frames:
-                if isinstance(frame, str):
-                    send(Notice(task.index, frame))
-                    continue
-                send(Arrived(task.index, frame.time_s))
-                image = frame.image
-                if image is None or time.monotonic() - frame.arrived_s > task.most_behind_s:
-                    silhouettes.leave_out()
-                    send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, None))
-                else:
-                    with turns.of_frame():
-                        silhouette = PackedImage.of(silhouettes.look(image))
-                        send(CameraSilhouette(task.index, frame.time_s, frame.arrived_s, silhouette))
-                    # What the tracker does not wait for.
-                    turns.wait()
-                    silhouettes.learn()
-                if task.recorder is not None and (line := task.recorder.write(image, frame.time_s)):
-                    send(RecordingNotice(line))
-    except Exception as failed:
-        error = with_traceback(failed)
-    finally:
-        send(Ended(task.index, error))
-        start.leave()
-
-
-class _Start:
-    """The cameras of a worker begin together, when all of them are ready."""
-
-    def __init__(self, num_sources: int) -> None:
-        self._ready = threading.Semaphore(0)
-        self._num_sources = num_sources
-        self._given = threading.Event()
-        self._began_s = 0.0
-        self._of_thread = threading.local()
-
-    def begin(self) -> float:
-        """The source is ready; wait for the time at which the recording's clock showed 0."""
-        self.leave()
-        self._given.wait()
-        return self._began_s
-
-    def leave(self) -> None:
-        """Do not wait for the source of this thread any more."""
-        if not getattr(self._of_thread, "has_left", False):
-            self._of_thread.has_left = True
-            self._ready.release()
-
-    def wait_for_sources(self) -> None:
-        """Wait until all sources are ready or have ended."""
-        for _ in range(self._num_sources):
-            self._ready.acquire()
-
-    def give(self, began_s: float) -> None:
-        """Let the sources begin."""
-        if not self._given.is_set():
-            self._began_s = began_s
-            self._given.set()
-
-
-class _Turns:
-    """The cameras of a worker: no camera learns while another one's silhouette is in work."""
-
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        cameras: Sequence[LiveCamera],
+        settings: ScaledSettings,
+        rate_hz: float,
+        *,
+        first_s: float,
+        wait_s: float,
+    ) -> None:
+        self._cameras, self._settings, self._wait_s = cameras, settings, wait_s
+        self._new_meeting = partial(
+            Meeting, [each.fps for each in cameras], rate_hz, wait_s=wait_s, first_s=first_s
+        )
         self._changed = threading.Condition()
-        self._num_in_work = 0
+        # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
+        self._is_stopped = False
+        self._began_s: float | None = None
+        self._ready: set[int] = set()
+        self._ended: set[int] = set()
+        #: Cameras that have never filmed, as they say, or will not film again.
+        self._missing: set[int] = set()
+        self._said = [""] * len(cameras)
+        self.errors: list[Exception] = []
+        self.recorded: dict[str, RecordedCounts] = {}
 
-    @contextlib.contextmanager
-    def of_frame(self) -> Iterator[None]:
-        """A silhouette is in work."""
+    def __enter__(self) -> FrontEnd:
+        # As many threads as cameras: more for each of them would only wait.
+        self._num_opencv_threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+        self._threads = [
+            threading.Thread(target=self._film, args=(index, camera), daemon=True)
+            for index, camera in enumerate(self._cameras)
+        ]
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.stop()
         with self._changed:
-            self._num_in_work += 1
+            self._changed.notify_all()
+        ends_s = time.monotonic() + _END_S
+        for thread in self._threads:
+            thread.join(max(0.0, ends_s - time.monotonic()))
+        cv2.setNumThreads(self._num_opencv_threads)
+
+    def stop(self) -> None:
+        """Let the cameras end; from any thread or signal handler."""
+        self._is_stopped = True
+
+    def begin(self, longest_s: float) -> float:
+        """Wait until all sources are ready, and let the cameras film.
+
+        Args:
+            longest_s: time after which there are no more instants, seconds.
+
+        Returns:
+            The time at which the recording's clock shows 0, `time.monotonic`.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._ready) == len(self._cameras))
+            began_s = time.monotonic() + _LEAD_S
+            self._ends_s = began_s + longest_s
+            self._meeting = self._new_meeting(began_s=began_s)
+            for index in self._ended:
+                self._meeting.end(index)
+            self._began_s = began_s
+            self._changed.notify_all()
+        return began_s
+
+    @property
+    def counts(self) -> dict[str, CameraCounts]:
+        """Counts of each camera, by name."""
+        names = (camera.name for camera in self._cameras)
+        return dict(zip(names, self._meeting.counts, strict=True))
+
+    @property
+    def films(self) -> list[bool]:
+        """Whether each camera films."""
+        return self._meeting.films
+
+    @property
+    def num_able(self) -> int:
+        """Number of cameras that film, or have filmed and may come back."""
+        return len(self._cameras) - len(self._missing)
+
+    def instants(self) -> Iterator[tuple[Instant, int]]:
+        """Yield instants that are complete, and how many were left out before each."""
+        while not self._is_stopped and self.num_able >= 2 and time.monotonic() < self._ends_s:
+            ready: list[Instant] = []
+            with self._changed:
+                now_s = time.monotonic()
+                self._tell_stopped(now_s)
+                while (instant := self._meeting.take(now_s)) is not None:
+                    ready.append(instant)
+                if not ready:
+                    if self._meeting.has_ended:
+                        return
+                    deadline_s = self._meeting.deadline_s()
+                    left_s = _LOOK_S if deadline_s is None else max(0.001, deadline_s - now_s)
+                    self._changed.wait(min(left_s, _LOOK_S))
+            num_left_out = max(0, len(ready) - _MOST_WAITING)
+            for instant in ready[num_left_out:]:
+                yield instant, num_left_out
+                num_left_out = 0
+
+    def _tell_stopped(self, now_s: float) -> None:
+        for index in self._meeting.stopped(now_s):
+            name = self._cameras[index].name
+            if self._meeting.have_filmed[index]:
+                logger.warning("camera %s has stopped", name)
+            elif not self._said[index]:  # else it is said already why
+                logger.warning("camera %s: no frame came so far", name)
+
+    # The thread of a camera
+
+    def _film(self, index: int, camera: LiveCamera) -> None:
+        """Frames to silhouettes."""
         try:
-            yield
+            CameraSilhouettes(self._settings, camera.name, None).warm_up()
+            silhouettes = CameraSilhouettes(self._settings, camera.name, camera.ignore)
+            begin, stopped = partial(self._wait_to_begin, index), lambda: self._is_stopped
+            with contextlib.closing(camera.source.frames(begin, stopped)) as frames:
+                for frame in itertools.takewhile(lambda _: not self._is_stopped, frames):
+                    if isinstance(frame, str):
+                        self._say(index, frame)
+                    else:
+                        self._take(index, frame, silhouettes)
+        except Exception as error:
+            logger.warning("camera %s: %s", camera.name, error)
+            self.errors.append(error)
+            self._missing.add(index)
         finally:
             with self._changed:
-                self._num_in_work -= 1
+                self._ready.add(index)
+                self._ended.add(index)
+                if self._began_s is not None:
+                    self._meeting.end(index)
                 self._changed.notify_all()
+            if camera.recorder is not None:
+                self.recorded[camera.name] = camera.recorder.close()
 
-    def wait(self) -> None:
-        """Wait until no silhouette is in work, but not for long: the next frame comes."""
+    def _wait_to_begin(self, index: int) -> float:
         with self._changed:
-            self._changed.wait_for(lambda: not self._num_in_work, _LONGEST_TURN_S)
+            self._ready.add(index)
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._began_s is not None or self._is_stopped)
+        return self._began_s or 0.0
+
+    def _say(self, index: int, line: str) -> None:
+        with self._changed:
+            if line != self._said[index]:
+                logger.warning("camera %s: %s", self._cameras[index].name, line)
+            self._said[index] = line
+            if not self._meeting.have_filmed[index]:
+                self._missing.add(index)
+
+    def _take(self, index: int, frame: SourceFrame, silhouettes: CameraSilhouettes) -> None:
+        """A frame: what the tracker waits for comes first."""
+        camera = self._cameras[index]
+        with self._changed:
+            self._said[index] = ""
+            self._missing.discard(index)
+            again = " again" if self._meeting.have_filmed[index] else ""
+            if self._meeting.announce(index, frame.time_s, time.monotonic()):
+                logger.warning("camera %s films%s", camera.name, again)
+        if time.monotonic() - frame.arrived_s > self._wait_s:
+            silhouettes.leave_out()
+            with self._changed:
+                self._meeting.leave_out(index)
+                self._changed.notify_all()
+        else:
+            image = silhouettes.look(frame.image)
+            with self._changed:
+                self._meeting.put(index, frame.time_s, image, frame.arrived_s)
+                self._changed.notify_all()
+                # Silhouettes of other cameras come first, which the tracker waits for.
+                self._changed.wait_for(lambda: not self._meeting.has_work, _LONGEST_TURN_S)
+            silhouettes.learn()
+        if camera.recorder is not None:
+            camera.recorder.write(frame.image, frame.time_s)
 
 
-class _Silhouettes:
-    """Silhouettes of one camera's frames, whose background is learned as they come."""
+class CameraSilhouettes:
+    """Silhouettes of one camera's frames, whose background is learned as they come.
 
-    def __init__(self, settings: ScaledSettings, ignore: Path | None) -> None:
-        self._settings = settings
-        self._ignore = ignore
+    Args:
+        settings: settings of the silhouettes.
+        name: name of the camera, for messages.
+        ignore: image that is white where nothing counts as foreground; None for no such image.
+    """
+
+    def __init__(self, settings: ScaledSettings, name: str, ignore: Path | None) -> None:
+        self._settings, self._name, self._ignore = settings, name, ignore
         self._ignored: Bool[np.ndarray, "rows columns"] | None = None
         self._background: LivingBackground | None = None
-        self._num_left_out = 0
+        self._num_frames = 1
 
     def leave_out(self) -> None:
         """The next frame is not seen."""
-        self._num_left_out += 1
+        self._num_frames += 1
 
     def look(self, frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns"]:
         """The silhouette of the next frame; `learn` is to be called before the frame after it."""
@@ -297,25 +266,23 @@ class _Silhouettes:
         if self._background is None:
             self._background = LivingBackground(self._settings, image)
             if self._ignore is not None:
+                size_wh = frame.shape[1], frame.shape[0]
                 self._ignored = ignored_pixels(
-                    self._ignore,
-                    "the camera",
-                    (frame.shape[1], frame.shape[0]),
-                    self._settings.working_reduction,
+                    self._ignore, self._name, size_wh, self._settings.working_reduction
                 )
-        mask = self._background.look(image, num_frames=1 + self._num_left_out)
-        self._num_left_out = 0
+        mask = self._background.look(image, num_frames=self._num_frames)
+        self._num_frames = 1
         if self._ignored is not None:
             mask = np.where(self._ignored, np.uint8(0), mask)
         return coverage(mask, self._settings.reduction // self._settings.working_reduction)
+
+    def learn(self) -> None:
+        """Learn from the last frame."""
+        assert self._background is not None
+        self._background.learn()
 
     def warm_up(self) -> None:
         """Do once what is slow the first time."""
         for level in (0, 9):
             self.look(np.full((270, 480, 3), level, np.uint8))
             self.learn()
-
-    def learn(self) -> None:
-        """Learn from the last frame."""
-        assert self._background is not None
-        self._background.learn()

@@ -119,6 +119,11 @@ class Meeting:
         """Whether each camera has filmed."""
         return [camera.has_filmed for camera in self._cameras]
 
+    @property
+    def has_work(self) -> bool:
+        """Whether a frame of a camera is in work."""
+        return any(camera.in_work_s is not None for camera in self._cameras)
+
     def announce(self, index: int, time_s: float, now_s: float) -> bool:
         """A frame of a camera has come, and is in work: its instant waits for `put` or `leave_out`.
 
@@ -165,7 +170,7 @@ class Meeting:
     def end(self, index: int) -> None:
         """A camera has ended for good: it is not waited for."""
         camera = self._cameras[index]
-        camera.films, camera.has_ended = False, True
+        camera.films, camera.has_ended, camera.in_work_s = False, True, None
 
     def stopped(self, now_s: float) -> list[int]:
         """Cameras that have just stopped, or have not begun in time; they are not waited for until they film."""

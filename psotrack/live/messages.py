@@ -25,13 +25,35 @@ def lines_of(rows: Trajectories) -> list[str]:
             "frame": int(rows.frame[0]),
             "time_s": float(rows.time_s[0]),
             "drone": drone,
-            "position_m": rows.position_m[0, index].tolist(),
-            "velocity_m_s": rows.velocity_m_s[0, index].tolist(),
-            "covariance_m2": rows.covariance_m2[0, index].tolist(),
-            "status": Status(int(rows.status[0, index])).label,
         }
+        for name in ("position_m", "velocity_m_s", "covariance_m2"):
+            content[name] = getattr(rows, name)[0, index].tolist()
+        content["status"] = Status(int(rows.status[0, index])).label
         lines.append(json.dumps(content))
     return lines
+
+
+def host_and_port(option: str, address: str, *, usual_host: str | None = None) -> tuple[str, int]:
+    """Host and port of an address HOST:PORT.
+
+    Args:
+        option: the option that has the address, for messages.
+        address: HOST:PORT, or PORT where there is a usual host.
+        usual_host: the host of an address without one.
+
+    Raises:
+        SettingsError: the address is none.
+    """
+    host, _, port = address.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]") or usual_host or ""
+    if not host or not 0 < (whole_number(port) or 0) < 65536:
+        expected = (
+            "PORT or HOST:PORT, such as 9000 or 0.0.0.0:9000"
+            if usual_host
+            else "HOST:PORT, such as 127.0.0.1:9000"
+        )
+        raise SettingsError(option, expected=expected, found=address)
+    return host, int(port)
 
 
 class JsonLines:
@@ -54,9 +76,8 @@ class JsonLines:
         except BrokenPipeError:
             raise
         except OSError as error:
-            raise OutputError(
-                "--lines", expected="to write rows", found=(error.strerror or f"{error}").lower()
-            ) from error
+            found = f"{error.strerror or error}".lower()
+            raise OutputError("--lines", expected="to write rows", found=found) from error
 
 
 class UdpLines:
@@ -70,29 +91,31 @@ class UdpLines:
     """
 
     def __init__(self, address: str) -> None:
-        host, _, port = address.rpartition(":")
-        if not host or not 0 < (whole_number(port) or 0) < 65536:
-            raise SettingsError("--udp", expected="HOST:PORT, such as 127.0.0.1:9000", found=address)
+        host, port = host_and_port("--udp", address)
         try:
-            family, _, _, _, target = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)[0]
+            family, _, _, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:
             raise SettingsError("--udp", expected="a host that is known", found=host) from error
         self._address = address
         self._target = target
+        self._said = ""
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
 
     def write(self, rows: Trajectories) -> None:
-        """Send the rows of an instant; where the network refuses them, say so and go on: it may come back."""
+        """Send the rows of an instant; where the network refuses them, say so once and go on: it may come back."""
         try:
             for line in lines_of(rows):
                 self._socket.sendto(line.encode(), self._target)
         except ConnectionRefusedError:
             return  # nobody listens on this machine yet
         except OSError as error:
-            found = (error.strerror or f"{error}").lower()
-            logger.warning(
-                "--udp %s: expected to send rows, found %s; tracking goes on", self._address, found
-            )
+            found = f"{error.strerror or error}".lower()
+            if found != self._said:
+                text = "--udp %s: expected to send rows, found %s; tracking goes on"
+                logger.warning(text, self._address, found)
+            self._said = found
+        else:
+            self._said = ""
 
     def close(self) -> None:
         """Close the socket."""

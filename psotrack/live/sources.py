@@ -1,14 +1,17 @@
 """Sources of frames: a device, the address of a stream, or a video that is played at its own rate.
 
-A source yields frames with their times on the recording's clock. The frames of a stream are timed when they arrive. A
-stream that breaks off is opened again, once per second.
+A source yields frames with their times on the recording's clock. The frames of a stream are timed by the stream's own
+times, or else when they arrive. A stream that breaks off is opened again, once per second.
 """
 
 from __future__ import annotations
 
 import itertools
+import logging
+import queue
+import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -18,12 +21,16 @@ from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError
 from psotrack.live.addresses import ANSWER_S, device_of, shown_address, why_silent
+from psotrack.live.stream_clock import StreamClock
 from psotrack.recordings import VideoInfo, read_frames, silence_opencv
+
+logger = logging.getLogger(__name__)
 
 #: How long a stream is left alone after it broke off, seconds.
 _AGAIN_S = 1.0
-#: A frame that is read in less time was waiting: the program is behind the camera, seconds.
-_WAITING_S = 0.002
+_BY_ARRIVAL = (
+    "frames are timed when they arrive: the stream has no times that agree with this computer's clock"
+)
 
 
 @dataclass(frozen=True)
@@ -32,12 +39,12 @@ class SourceFrame:
 
     Attributes:
         time_s: when it was filmed, on the recording's clock, seconds.
-        image: BGR; None for a frame that was left out, because the program is behind.
+        image: BGR.
         arrived_s: when it arrived, `time.monotonic`.
     """
 
     time_s: float
-    image: UInt8[np.ndarray, "height width 3"] | None
+    image: UInt8[np.ndarray, "height width 3"]
     arrived_s: float
 
 
@@ -109,8 +116,33 @@ class CameraStream:
     image_size_wh: tuple[int, int]
 
     def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
-        """See `LiveSource`: frames are timed when they arrive."""
+        """See `LiveSource`: frames are read when they arrive, by a thread of its own, and wait until they are taken."""
         began_s = begin()
+        is_over = threading.Event()
+        waiting: queue.SimpleQueue[SourceFrame | str | Exception | None] = queue.SimpleQueue()
+
+        def read() -> None:
+            try:
+                for frame in self._read(began_s, lambda: is_over.is_set() or stopped()):
+                    waiting.put(frame)
+            except Exception as error:
+                waiting.put(error)
+            waiting.put(None)
+
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        try:
+            while (frame := waiting.get()) is not None:
+                if isinstance(frame, Exception):
+                    raise frame
+                yield frame
+        finally:
+            is_over.set()
+            reader.join()
+
+    def _read(self, began_s: float, stopped: Callable[[], bool]) -> Iterator[SourceFrame | str]:
+        """The frames as they arrive, from one connection after the other."""
+        said: set[bool] = set()
         while not stopped():
             asked_s = time.monotonic()
             capture = self._opened()
@@ -119,7 +151,7 @@ class CameraStream:
                 yield f"expected frames of {shown_address(self.address)}, found {why}; it is tried again every second"
             else:
                 try:
-                    yield from self._read(capture, began_s, stopped)
+                    yield from self._read_from(capture, began_s, stopped, said)
                 finally:
                     capture.release()
                 if not stopped():
@@ -128,44 +160,39 @@ class CameraStream:
                 if not stopped():
                     time.sleep(_AGAIN_S / 10)
 
+    def _read_from(
+        self, capture: cv2.VideoCapture, began_s: float, stopped: Callable[[], bool], said: set[bool]
+    ) -> Iterator[SourceFrame | str]:
+        clock = StreamClock()
+        while not stopped() and capture.grab():
+            arrived_s = time.monotonic()
+            filmed_s = clock.time_s(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, arrived_s)
+            there, image = capture.retrieve()
+            if not there:
+                continue
+            if image.shape[1::-1] != self.image_size_wh:
+                expected = "images of {} x {} pixels, as the rig says".format(*self.image_size_wh)
+                found = f"{image.shape[1]} x {image.shape[0]}"
+                remedy = "let the camera send this size, or calibrate the camera at the size that it sends"
+                raise InputError(shown_address(self.address), expected=expected, found=found, remedy=remedy)
+            yield SourceFrame(filmed_s - began_s, image, arrived_s)
+            if clock.is_used is not None and clock.is_used not in said:
+                said.add(clock.is_used)
+                if clock.is_used:
+                    logger.info("%s: frames are timed by the stream", shown_address(self.address))
+                else:
+                    yield _BY_ARRIVAL
+
     def _opened(self) -> cv2.VideoCapture:
-        milliseconds = round(1000 * ANSWER_S)
-        timeouts = [
-            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
-            milliseconds,
-            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
-            milliseconds,
-        ]
         with silence_opencv():
             if (device := device_of(self.address)) is not None:
                 return cv2.VideoCapture(device)
             if self.address.startswith("gstreamer://"):
                 if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
-                    raise InputError(
-                        self.address,
-                        expected="a build of OpenCV with GStreamer",
-                        found="OpenCV without GStreamer",
-                        remedy="build OpenCV from source with GStreamer, or take an address of RTSP or HTTP",
-                    )
+                    expected, found = "a build of OpenCV with GStreamer", "OpenCV without GStreamer"
+                    remedy = "build OpenCV from source with GStreamer, or take an address of RTSP or HTTP"
+                    raise InputError(self.address, expected=expected, found=found, remedy=remedy)
                 return cv2.VideoCapture(self.address.removeprefix("gstreamer://"), cv2.CAP_GSTREAMER)
-            return cv2.VideoCapture(self.address, cv2.CAP_FFMPEG, timeouts)
-
-    def _read(
-        self, capture: cv2.VideoCapture, began_s: float, stopped: Callable[[], bool]
-    ) -> Generator[SourceFrame]:
-        while not stopped():
-            asked_s = time.monotonic()
-            if not capture.grab():
-                return
-            arrived_s = time.monotonic()
-            is_behind = arrived_s - asked_s < _WAITING_S
-            there, image = (False, None) if is_behind else capture.retrieve()
-            if there and image is not None and image.shape[1::-1] != self.image_size_wh:
-                width, height = self.image_size_wh
-                raise InputError(
-                    shown_address(self.address),
-                    expected=f"images of {width} x {height} pixels, as the rig says",
-                    found=f"{image.shape[1]} x {image.shape[0]}",
-                    remedy="let the camera send this size, or calibrate the camera at the size that it sends",
-                )
-            yield SourceFrame(arrived_s - began_s, image if there else None, arrived_s)
+            limit_ms = round(1000 * ANSWER_S)
+            limits = cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms
+            return cv2.VideoCapture(self.address, cv2.CAP_FFMPEG, limits)

@@ -1,8 +1,8 @@
 """The motion of drones: a Kalman filter with white jerk and lasting measurement errors, and its smoother.
 
 In: measured positions with covariances. Out: filtered (`kalman`) and smoothed (`smoothing`) states with covariances.
-The functions of `kalman` are pure and run inside the tracker's compiled scan. `white_jerk` is the process noise that
-other filters of the package use too. Other rooms may use every name in `__init__.pyi`, and the module `kalman`.
+The functions of `kalman` are pure and run inside the tracker's compiled scan; other filters of the package use its
+process noise of white jerk too. Other rooms may use every name in `__init__.pyi`, and the module `kalman`.
 """
 
 import lazy_loader

@@ -1,16 +1,23 @@
-from .kalman import GATE_999, Covariances, MotionParams, MotionState
-from .params import motion_params
-from .smoothing import check_measurements, estimate_jerk_density, filter_measurements, smooth
-from .white_jerk import white_jerk_noise
+from .kalman import GATE_999, Covariances, MotionParams, MotionState, motion_params, white_jerk_noise
+from .smoothing import (
+    Measurements,
+    Smoothed,
+    estimate_jerk_density,
+    filter_measurements,
+    last_state,
+    smooth,
+)
 
 __all__ = [
     "GATE_999",
     "Covariances",
+    "Measurements",
     "MotionParams",
     "MotionState",
-    "check_measurements",
+    "Smoothed",
     "estimate_jerk_density",
     "filter_measurements",
+    "last_state",
     "motion_params",
     "smooth",
     "white_jerk_noise",

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack._typing import Array, Positions
-from psotrack.motion.white_jerk import white_jerk_noise
+from psotrack.settings import MotionSettings
 
 #: The chi-square distribution with 3 degrees of freedom is below this with probability 0.999.
 GATE_999 = 16.266236196238
@@ -62,6 +62,17 @@ class MotionParams:
     acceleration_std_m_s2: Float[Array, ""]
     error_share: Float[Array, ""]
     error_time_s: Float[Array, ""]
+
+
+def motion_params(settings: MotionSettings, num_drones: int) -> MotionParams:
+    """Parameters of the motion model for `num_drones` drones, as float32 arrays."""
+    return MotionParams(
+        jerk_density_m2_s5=jnp.full(num_drones, settings.jerk_density, jnp.float32),
+        velocity_std_m_s=jnp.float32(settings.velocity_std_m_s),
+        acceleration_std_m_s2=jnp.float32(settings.acceleration_std_m_s2),
+        error_share=jnp.float32(settings.error_share),
+        error_time_s=jnp.float32(settings.error_time_s),
+    )
 
 
 @jax.tree_util.register_dataclass
@@ -177,6 +188,19 @@ def process_noise(
     # The lasting error is a part of the apparent position too.
     both = jnp.array([1.0, 0.0, 0.0, 1.0])
     return jnp.pad(jerk, ((0, 0), (0, 3), (0, 3))) + jnp.kron(jnp.outer(both, both), new_error)
+
+
+def white_jerk_noise(dt_s: float | Float[Array, ""]) -> Float[Array, "3 3"]:
+    """(3, 3), covariance of position, velocity and acceleration along one axis after `dt_s` of unit white jerk.
+
+    The integral over s from 0 to dt of g gᵀ with g = (s² / 2, s, 1): Bar-Shalom et al. 2001, section 6.2.3. Its lower
+    right (2, 2) block is the noise of an angle and its rate under unit white angular acceleration.
+    """
+    xp = np if isinstance(dt_s, float | np.ndarray) else jnp
+    one, two, three, four, five = (dt_s**power / divisor for power, divisor in enumerate((1, 2, 6, 8, 20), 1))
+    return xp.stack(
+        [xp.stack([five, four, three]), xp.stack([four, 2 * three, two]), xp.stack([three, two, one])]
+    )
 
 
 def update(

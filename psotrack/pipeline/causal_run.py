@@ -17,13 +17,13 @@ from jaxtyping import UInt8
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig
-from psotrack.initiation import DroneSearch, flight_volume
+from psotrack.initiation import flight_volume
 from psotrack.pipeline.results import environment, warn_of_missing_drones
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures, compute, exposures_of
 from psotrack.support import Report, no_progress
-from psotrack.tracking import CausalRow, CausalTracker, tracker_settings
+from psotrack.tracking import DroneRow, StepwiseTracker, tracker_settings
 from psotrack.trajectories import Status, Trajectories
 
 #: Number of frames whose silhouettes are read together.
@@ -81,7 +81,7 @@ class CausalRun:
         settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
         self.volume = volume.record
         self._offset_m = np.asarray(settings.drones.body_offset_m)
-        self._tracker = CausalTracker(
+        self._tracker = StepwiseTracker(
             rig,
             tracker_settings(settings),
             fps=fps,
@@ -91,24 +91,9 @@ class CausalRun:
             most_drones=most_drones,
         )
 
-    @property
-    def search(self) -> DroneSearch:
-        """The search for new drones; may be replaced before the first frame."""
-        return self._tracker.search
-
-    @search.setter
-    def search(self, search: DroneSearch) -> None:
-        self._tracker.search = search
-
-    @property
-    def num_late_searches(self) -> int:
-        """Number of searches whose result came too late for the frame in which the tracks were to begin."""
-        return self._tracker.num_late
-
     def compile(self) -> None:
         """Compile what no frame should wait for."""
         self._tracker.compile()
-        self._tracker.search.compile()
 
     def step(
         self,
@@ -135,7 +120,7 @@ class CausalRun:
         """What need not be done before the rows of a frame are passed on; to be called after each `step`."""
         self._tracker.look_ahead()
 
-    def _as_trajectories(self, frame: int, time_s: float, rows: list[CausalRow]) -> Trajectories:
+    def _as_trajectories(self, frame: int, time_s: float, rows: list[DroneRow]) -> Trajectories:
         def stacked(name: str, shape: tuple[int, ...]) -> np.ndarray:
             return np.array([getattr(row, name) for row in rows], np.float32).reshape(1, len(rows), *shape)
 

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float
-
 from psotrack.initiation import (
     FlightVolume,
     MovingPoints,
@@ -30,7 +27,7 @@ class PreparedRun:
 
     Attributes:
         settings: settings of the run, with the speed limit that was found.
-        source: source of the initial state.
+        source: source of the first positions.
         volume: bounds of the room, and where they come from.
         plugin: the method that the caller brings or that an entry point names; None for the methods of this package.
         detections: detections of all cameras; None where the method reads none.
@@ -41,11 +38,6 @@ class PreparedRun:
     volume: FlightVolume
     plugin: Method | None
     detections: DetectionInputs | None
-
-    @property
-    def bounds_m(self) -> Float[np.ndarray, "2 3"]:
-        """(2, 3), lowest and highest corner of the room, metres."""
-        return self.volume.bounds_m
 
 
 def prepare(

@@ -20,7 +20,7 @@ from psotrack.camera_errors import TrackErrors
 from psotrack.clocks import CameraClocks
 from psotrack.errors import InputError
 from psotrack.identity import Identities, postprocess
-from psotrack.initiation import count_common, find_cut_off, find_outside
+from psotrack.initiation import count_common, find_cut_off, find_outside, state_at_first_frame
 from psotrack.methods import MethodResult
 from psotrack.pipeline.parts import Parts
 from psotrack.pipeline.preparation import PreparedRun
@@ -152,8 +152,8 @@ def finish(
         "settings": msgspec.to_builtins(settings),
         **({"parts": parts.record} if parts.record else {}),
         "seed": settings.seed,
-        "start": {name: value.tolist() for name, value in vars(result.initial).items()},
-        "bounds_m": run.bounds_m.tolist(),
+        "start": {name: value.tolist() for name, value in vars(state_at_first_frame(tracks)).items()},
+        "bounds_m": run.volume.bounds_m.tolist(),
         "volume": run.volume.record,
         "drones": _sizes_record(tracks.sizes),
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
@@ -262,7 +262,7 @@ def _sizes_record(sizes: DroneSizes) -> list[dict[str, Any]]:
             "size_m": sizes.size_m[drone].tolist(),
             "size_std_m": or_none(sizes.std_m[drone]),
             "size_frames": sizes.num_frames[drone].tolist(),
-            "fill": or_none(sizes.fill[drone]),
+            "fill": or_none(sizes.fill[drone]) or None,
         }
         for drone in range(len(sizes.size_m))
     ]

@@ -20,25 +20,30 @@ import msgspec
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import views_meet
-from psotrack.initiation import MovingPoints, start_source
-from psotrack.methods import MethodResult, usable_for
+from psotrack.initiation import MovingPoints, first_drones, given_state, known_motion, start_source
+from psotrack.methods import (
+    MethodInputs,
+    MethodResult,
+    fuse_methods,
+    track_by_plugin,
+    track_by_projection_lines,
+    track_by_swarm,
+    usable_for,
+)
 from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
-from psotrack.pipeline.parts import Parts, check_detector_is_used, tracks_silhouettes, with_background
+from psotrack.pipeline.parts import (
+    Parts,
+    check_detector_is_used,
+    tracks_silhouettes,
+    with_background,
+)
 from psotrack.pipeline.preparation import PreparedRun, prepare
 from psotrack.pipeline.results import TrackedRecording, finish, with_real_time
-from psotrack.pipeline.stages import (
-    initial_states,
-    track_detections,
-    track_silhouettes,
-    track_with_plugin,
-    with_errors_of_detections,
-    with_errors_of_silhouettes,
-)
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import Report, load_ahead, no_progress
-from psotrack.tracking import tracker_settings
+from psotrack.tracking import RunInputs, tracker_settings
 
 
 def track_recording(
@@ -171,15 +176,75 @@ def _track_at_instants(
     """Each run and the result of its method; the silhouettes are those at the recording's instants."""
     points: dict[str, MovingPoints] = {}
     runs = [prepare(recording, silhouettes, each, parts, points, report) for each in settings]
-    by_lines = [track_detections(recording, run, report) for run in runs]
-    initial = initial_states(recording, silhouettes, runs, by_lines)
-    by_swarm = track_silhouettes(recording, silhouettes, runs, initial, parts, report)
-    by_swarm = with_errors_of_silhouettes(recording, silhouettes, runs, by_swarm)
-    by_plugin = [
-        track_with_plugin(recording, silhouettes, run, state, report)
-        for run, state in zip(runs, initial, strict=True)
+    in_silhouettes = [run for run in runs if tracks_silhouettes(run.settings, run.plugin)]
+    by_swarm = iter(_track_silhouettes(recording, silhouettes, in_silhouettes, parts, report))
+    results = []
+    for run in runs:
+        if run.plugin is not None:
+            results.append((run, _track_by_plugin(recording, silhouettes, run, report)))
+            continue
+        swarm = next(by_swarm) if tracks_silhouettes(run.settings, run.plugin) else None
+        result = swarm
+        if run.detections is not None:
+            lines = track_by_projection_lines(
+                recording.rig,
+                run.detections,
+                run.settings,
+                fps=recording.fps,
+                bounds_m=run.volume.bounds_m,
+                known=known_motion(run.source, run.settings.drones, recording.fps),
+                report=report,
+            )
+            result = lines if swarm is None else fuse_methods(swarm, lines, run.settings, recording.fps)
+        assert result is not None, "each method of the package uses the swarm, projection lines, or both"
+        results.append((run, result))
+    return results
+
+
+def _track_silhouettes(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    runs: Sequence[PreparedRun],
+    parts: Parts,
+    report: Report,
+) -> list[MethodResult]:
+    """The results of the swarm, for all its runs together."""
+    if not runs:
+        return []
+    assert silhouettes is not None
+    inputs = [
+        RunInputs(
+            run.volume.bounds_m,
+            tracker_settings(run.settings, search=parts.search, score=parts.score),
+            given_state(recording.rig, silhouettes, run.source, run.settings.drones, recording.fps),
+        )
+        for run in runs
     ]
-    return [
-        (run, plugin or with_errors_of_detections(recording, run, swarm, lines))
-        for run, lines, swarm, plugin in zip(runs, by_lines, by_swarm, by_plugin, strict=True)
-    ]
+    settings = [run.settings for run in runs]
+    return track_by_swarm(recording.rig, silhouettes, inputs, settings, recording.fps, report)
+
+
+def _track_by_plugin(
+    recording: Recording, silhouettes: Silhouettes | None, run: PreparedRun, report: Report
+) -> MethodResult:
+    """The result of the method that is plugged in, which is given the drones of the first frames."""
+    assert run.plugin is not None
+    sightings = None if run.detections is None else run.detections.sightings
+    initial = None
+    if silhouettes is not None:
+        initial = given_state(recording.rig, silhouettes, run.source, run.settings.drones, recording.fps)
+    if initial is None:
+        shown = sightings if silhouettes is None else silhouettes
+        assert shown is not None
+        initial = first_drones(
+            recording.rig,
+            shown,
+            fps=recording.fps,
+            bounds_m=run.volume.bounds_m,
+            max_speed_m_s=run.settings.motion.speed_limit_m_s,
+            drones=run.settings.drones,
+        )
+    inputs = MethodInputs(
+        recording.rig, silhouettes, sightings, initial, run.volume.bounds_m, recording.fps, run.settings
+    )
+    return track_by_plugin(run.plugin, inputs, report)

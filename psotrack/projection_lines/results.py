@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.initiation import InitialState
 from psotrack.projection_lines.tracks import Track, TrackRow
 from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks
 
@@ -22,7 +21,6 @@ def as_tracks(tracks: list[Track], num_frames: int, max_coasting_std_m: float) -
     arrivals: list[Arrival] = []
     by_start = sorted(tracks, key=lambda track: track.rows[0].frame)
     for track in by_start:
-        assert track.drone is not None
         if track.rows[0].frame > 0:
             arrivals.append(Arrival(track.rows[0].frame, track.drone, again=track.drone in size_m))
         size_m[track.drone] = track.size_m
@@ -46,22 +44,11 @@ def as_tracks(tracks: list[Track], num_frames: int, max_coasting_std_m: float) -
         arrivals=tuple(arrivals),
     )
     for track in by_start:
-        assert track.drone is not None
         for row in track.rows:
             if row.is_vague(max_coasting_std_m):
                 continue
             _write(arrays, row, (row.frame, track.drone))
     return arrays
-
-
-def state_at_first_frame(tracks: Tracks) -> InitialState:
-    """The drones that were there at frame 0, as an initial state."""
-    there = np.flatnonzero(np.isfinite(tracks.position_m[0]).all(axis=-1))
-    position_m, velocity_m_s = (
-        np.asarray(value[0], np.float64)[there] for value in (tracks.position_m, tracks.velocity_m_s)
-    )
-    size_m = np.asarray(tracks.sizes.size_m, np.float64)[there]
-    return InitialState(position_m, velocity_m_s, size_m, np.asarray(tracks.num_cameras[0], float)[there])
 
 
 def _write(tracks: Tracks, row: TrackRow, at: tuple[int, int]) -> None:

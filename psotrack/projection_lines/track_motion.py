@@ -7,9 +7,10 @@ from dataclasses import dataclass, fields, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from psotrack._typing import Array
+from psotrack.initiation import Measurement
 from psotrack.motion import MotionParams, MotionState, kalman, motion_params
 from psotrack.settings import MotionSettings
 
@@ -67,15 +68,34 @@ class TrackMotion:
         """Go on to the next frame."""
         self.state = _on_host(_predict(self.state, self._limits.dt_s, self._params))
 
+    def take(self, slot: int, other: TrackMotion, other_slot: int) -> None:
+        """Take over a track from another motion model."""
+        for each in fields(MotionState):
+            getattr(self.state, each.name)[slot] = getattr(other.state, each.name)[other_slot]
+
     def correct(
         self,
-        measured_m: Float[np.ndarray, "slots 3"],
-        covariance_m2: Float[np.ndarray, "slots 3 3"],
-        was_measured: Bool[np.ndarray, "slots"],
-        unseen: Bool[np.ndarray, "slots"],
+        measured: dict[int, Measurement],
+        seen_by_one: Int[np.ndarray, "seen"],
         lost: Bool[np.ndarray, "slots"],
     ) -> None:
-        """Correct by the measured positions, within the room and the largest speed; lost tracks are at rest."""
+        """Correct by the measured positions, within the room and the largest speed; lost tracks are at rest.
+
+        Args:
+            measured: measurements by slot.
+            seen_by_one: (seen,), slots of tracks that one camera alone sees.
+            lost: (slots,), tracks that are lost.
+        """
+        measured_m, covariance_m2 = np.zeros((len(self), 3)), np.tile(np.eye(3), (len(self), 1, 1))
+        was_measured = np.zeros(len(self), bool)
+        for slot, one in measured.items():
+            measured_m[slot], covariance_m2[slot], was_measured[slot] = (
+                one.position_m,
+                one.covariance_m2,
+                True,
+            )
+        unseen = ~was_measured
+        unseen[seen_by_one] = False
         measurements = (measured_m, covariance_m2, was_measured)
         self.state = _on_host(_correct(self.state, measurements, (unseen, lost), self._limits, self._params))
 

@@ -1,6 +1,6 @@
 from .background_models import find_background
 from .blob_boxes import blob_detections
-from .blobs import LEAST_RADIUS_CELLS, ViewBlobs, border_cells, find_blobs, stack_blobs
+from .blobs import border_cells, find_blobs
 from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
 from .computation import (
     Silhouettes,
@@ -23,7 +23,6 @@ from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
 __all__ = [
-    "LEAST_RADIUS_CELLS",
     "SEAL_FILE",
     "BackgroundModel",
     "CacheEntry",
@@ -38,7 +37,6 @@ __all__ = [
     "SilhouetteSettings",
     "Silhouettes",
     "Task",
-    "ViewBlobs",
     "blob_detections",
     "border_cells",
     "box_sum",
@@ -68,7 +66,6 @@ __all__ = [
     "remove_entry",
     "scaled_settings",
     "silhouette_keys",
-    "stack_blobs",
     "stored_silhouettes",
     "summed_area_table",
     "tasks_of",

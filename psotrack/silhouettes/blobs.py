@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack._typing import Array
-from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.settings import MIN_COVERAGE
 
-#: Smallest uncertainty of a blob's middle, cells.
-LEAST_RADIUS_CELLS = 1.5
 #: Neighbours of a cell that close a gap.
 _CLOSING = np.ones((3, 3), np.uint8)
 
@@ -31,40 +28,6 @@ class Blobs:
     centre_px: Float[np.ndarray, "blobs 2"]
     size_px: Float[np.ndarray, "blobs 2"]
     whole: Bool[np.ndarray, "blobs"]
-
-
-@dataclass(frozen=True)
-class ViewBlobs:
-    """Blobs of all frames and cameras. The length of the blobs axis is the largest number of blobs in an image.
-
-    Attributes:
-        centre_px, half_px: (frames, cameras, blobs, 2), middles and half sizes of the boxes; NaN where there is no
-            blob.
-        whole: (frames, cameras, blobs), whether there is a blob, and it does not touch the image's border.
-        least_radius_px: smallest uncertainty of a blob's middle, pixels.
-        exposures: when the frames were exposed; None where all cameras' frames were exposed together.
-    """
-
-    centre_px: Float[np.ndarray, "frames cameras blobs 2"]
-    half_px: Float[np.ndarray, "frames cameras blobs 2"]
-    whole: Bool[np.ndarray, "frames cameras blobs"]
-    least_radius_px: float
-    exposures: Exposures | None = None
-
-    def __getitem__(self, frames: Bool[np.ndarray, "frames"]) -> ViewBlobs:
-        """Select the blobs of some frames."""
-        return replace(
-            self,
-            centre_px=self.centre_px[frames],
-            half_px=self.half_px[frames],
-            whole=self.whole[frames],
-            exposures=None if self.exposures is None else self.exposures[frames],
-        )
-
-    @property
-    def radius_px(self) -> Float[np.ndarray, "frames cameras blobs"]:
-        """Half of the smaller side: an upper limit of the distance from the blob's middle to the drone's projection."""
-        return np.maximum(self.half_px.min(axis=-1), self.least_radius_px)
 
 
 def border_cells(image_size_wh: Float[Array, "*cameras 2"], reduction: int) -> Int[np.ndarray, "*cameras 2"]:
@@ -114,19 +77,3 @@ def find_blobs(
     end = coverage.shape[::-1] if border is None else border
     whole = ((corner > 0) & (corner + size < end)).all(axis=-1)
     return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)
-
-
-def stack_blobs(images: list[list[Blobs]], num_cameras: int, reduction: int) -> ViewBlobs:
-    """Put the blobs of frames and cameras into arrays, with space for at least one blob."""
-    most = max([1, *(len(blobs.whole) for frame in images for blobs in frame)])
-    shape = (len(images), num_cameras, most)
-    centre_px, half_px, whole = (
-        np.full((*shape, 2), np.nan),
-        np.full((*shape, 2), np.nan),
-        np.zeros(shape, bool),
-    )
-    for frame, views in enumerate(images):
-        for camera, blobs in enumerate(views):
-            of = (frame, camera, slice(len(blobs.whole)))
-            centre_px[of], half_px[of], whole[of] = blobs.centre_px, blobs.size_px / 2, blobs.whole
-    return ViewBlobs(centre_px, half_px, whole, LEAST_RADIUS_CELLS * reduction)

@@ -18,7 +18,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_paths, html_table
-from .numbers import LARGEST, MODERATE, is_moderate, whole_number
+from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .program_seals import is_whole_program
@@ -38,8 +38,11 @@ __all__ = [
     "Advance",
     "Column",
     "Device",
+    "NotNegative",
     "PluginKind",
+    "Positive",
     "Report",
+    "Share",
     "Table",
     "TextRow",
     "assign",

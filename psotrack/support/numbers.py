@@ -1,6 +1,15 @@
-"""Numbers in files of others."""
+"""Numbers in files of others and in records of settings: their limits."""
 
 from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Meta
+
+#: Types of numbers in records, whose limits `convert` and `check_types` check.
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 
 #: Largest size of a number. Nothing that is measured is larger, and sums of products of five such numbers are finite.
 LARGEST = 1e60

@@ -99,18 +99,6 @@ def cell_key(cell: Cell, input_keys: Mapping[str, str]) -> str:
         cell: the cell.
         input_keys: digests of everything that the cell reads, by name (see `Inputs.keys_of`).
     """
-    settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
-    return digest_cell(cell, settings, input_keys)
-
-
-def digest_cell(cell: Cell, settings: Mapping[str, Any], input_keys: Mapping[str, str]) -> str:
-    """Digest of a cell's input and settings: 40 hexadecimal digits.
-
-    Args:
-        cell: the cell.
-        settings: the cell's settings, as nested tables.
-        input_keys: digests of everything that the cell reads.
-    """
     made_of = {
         "schema": SCHEMA,
         "sequence": Path(cell.sequence).name,
@@ -118,7 +106,7 @@ def digest_cell(cell: Cell, settings: Mapping[str, Any], input_keys: Mapping[str
         "cameras": cell.cameras,
         "frames": cell.frames,
         "perturbation": msgspec.to_builtins(cell.perturbation),
-        "settings": settings,
+        "settings": msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0)),
         "input": dict(input_keys),
     }
     return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()

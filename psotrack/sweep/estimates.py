@@ -14,7 +14,6 @@ from psotrack.silhouettes import open_stored, reduced_shape, scaled_settings
 from psotrack.sweep.cells import Cell, cell_key
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance
-from psotrack.sweep.older_folders import older_cell_key
 from psotrack.sweep.store import Store
 
 #: Rule of thumb, measured on two cores of an AMD EPYC, seconds: per frame of a run; per frame, particle, iteration,
@@ -118,10 +117,8 @@ def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Esti
 
 
 def _finished_seeds(cell: Cell, inputs: Inputs, store: Store) -> set[int]:
-    """Seeds of a cell's finished runs, of this version or of version 0.1."""
-    input_keys = inputs.keys_of(cell)
-    keys = (cell_key(cell, input_keys), older_cell_key(cell, input_keys))
-    return set().union(*(store.finished_seeds(key) for key in keys if key is not None))
+    """Seeds of a cell's finished runs."""
+    return store.finished_seeds(cell_key(cell, inputs.keys_of(cell)))
 
 
 def _in_words(seconds: float) -> str:

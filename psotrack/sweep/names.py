@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from psotrack.errors import SettingsError
-from psotrack.settings import renamed, setting_names
+from psotrack.settings import setting_names
 from psotrack.support import nearest
 from psotrack.sweep.cells import Perturbation
 
@@ -52,10 +52,6 @@ def check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
     """
     if name in names:
         return
-    if renamed(name):
-        raise SettingsError(
-            f"{prefix}{name}", expected="the name of a setting", found=name, remedy=renamed(name)
-        )
     if any(other.startswith(f"{name}.") for other in names):
         raise SettingsError(f"{prefix}{name}", expected="a table with names", found="none")
     near = nearest(name, names)

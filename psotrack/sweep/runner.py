@@ -25,7 +25,6 @@ from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.names import flatten
-from psotrack.sweep.older_folders import older_cell_key, older_failure_name
 from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
@@ -157,16 +156,11 @@ def find_finished(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
     Raises:
         PsotrackError: the cell's input cannot be read.
     """
-    keys = inputs.keys_of(cell)
-    key, older_key = cell_key(cell, keys), older_cell_key(cell, keys)
-    if older_key is not None and store.finished_seeds(older_key):
-        with store.lock(key, title(cell)) as locked:
-            if locked:
-                store.adopt(older_key, key)
+    key = cell_key(cell, inputs.keys_of(cell))
     if not set(cell.seeds) <= store.finished_seeds(key):
         return None
     # The runner that finished the cell may have been killed before it removed the record of an earlier failure.
-    _remove_failure(cell, store)
+    store.remove_failure(failure_name(cell))
     return Result(cell, "left", key)
 
 
@@ -191,19 +185,12 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
                 return Result(cell, "busy", key)
             store.change_manifest(lambda manifest: note_input(manifest, cell, keys))
             store.add(key, *_run_seeds(cell, key, missing, given, input_digest(keys)))
-            _remove_failure(cell, store)
+            store.remove_failure(failure_name(cell))
         return Result(cell, "finished", key)
     except OutputError:
         raise
     except Exception as error:
         return store_failure(cell, key, error, store)
-
-
-def _remove_failure(cell: Cell, store: Store) -> None:
-    """Remove the record of a cell's earlier failure, in this version or in version 0.1."""
-    for name in (failure_name(cell), older_failure_name(cell)):
-        if name is not None:
-            store.remove_failure(name)
 
 
 def store_failure(cell: Cell, key: str | None, error: Exception, store: Store) -> Result:

@@ -7,9 +7,7 @@
     DIR/_manifest.json               what was run, with which versions, on which machine, from which input
 
 Programs that read DIR as one Parquet data set, such as `pandas.read_parquet`, skip names that begin with a dot or an
-underscore, and so read exactly the rows of the finished cells. Folders of version 0.1 lack the underscores, and their
-rows have other names of settings (see `older_folders`). Both can be read, and a sweep that continues such a folder
-renames files, and columns of the cells that it needs.
+underscore, and so read exactly the rows of the finished cells.
 
 A cell's file appears whole or not at all. KEY is made of everything that decides the cell's rows (see
 `cells.cell_key`). NAME is made of the same without the content of the input: a cell whose input cannot be read has no
@@ -34,7 +32,6 @@ import pandas as pd
 from psotrack.errors import InputError
 from psotrack.support import LARGEST, MODERATE, convert
 from psotrack.sweep.locks import Locks
-from psotrack.sweep.older_folders import rename_columns, rename_manifest
 from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
 
 logger = logging.getLogger(__name__)
@@ -92,26 +89,6 @@ class Store:
         rows = self._rows_if_whole(key)
         return set() if rows is None else set(rows["seed"].tolist())
 
-    def adopt(self, older_key: str, key: str) -> None:
-        """Move the results of a cell, if version 0.1 stored any, to the cell's key and names of today.
-
-        Nothing is lost if the process is killed: the older files are removed last, and the next call continues. The
-        caller holds the cell's lock.
-
-        Args:
-            older_key: the cell's key in version 0.1.
-            key: the cell's key.
-
-        Raises:
-            OutputError: the files cannot be written.
-        """
-        older_rows, older_errors = self._rows_path(older_key), _present(self._errors_path(older_key))
-        if older_rows.exists() and older_errors.exists():
-            rows = rename_columns(_read_table(older_rows, _remove(older_rows))).assign(cell=key)
-            self.add(key, rows, _read_table(older_errors, _remove(older_rows)))
-            older_rows.unlink()
-        older_errors.unlink(missing_ok=True)
-
     def lock(self, key: str, work: str = "") -> AbstractContextManager[bool]:
         """Try to lock a cell until the block ends; yields whether the cell is locked for this process.
 
@@ -155,7 +132,7 @@ class Store:
 
     def remove_failure(self, name: str) -> None:
         """Remove the record of a cell's earlier failure, because the cell is finished."""
-        _present(self._failure_path(name)).unlink(missing_ok=True)
+        self._failure_path(name).unlink(missing_ok=True)
 
     def failure(self, name: str) -> str | None:
         """Why a cell failed at the last attempt; None if it did not fail."""
@@ -195,7 +172,7 @@ class Store:
             raise InputError(self._errors_path(key), expected="errors of a finished cell", found="no file")
         wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
         if wanted.empty and not errors.empty:
-            path = _present(self._errors_path(key))
+            path = self._errors_path(key)
             expected = f"errors of seeds {', '.join(map(str, seeds))}"
             raise InputError(path, expected=expected, found="none", remedy=_remove(self._rows_path(key)))
         return wanted
@@ -225,9 +202,7 @@ class Store:
     def manifest(self) -> dict[str, Any]:
         """Content of the manifest: runs and inputs; both are empty before the first run."""
         content = _read_if_present(self.folder / "_manifest.json", _Manifest)
-        if content is None:
-            return {"runs": [], "inputs": {}}
-        return rename_manifest(content)
+        return {"runs": [], "inputs": {}} if content is None else content
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
         """Change the manifest while no other runner does.
@@ -247,18 +222,12 @@ class Store:
                 write_json(path, manifest)
 
     def tidy(self) -> None:
-        """Remove half-written files of runners that were killed, and rename files that an older version wrote."""
+        """Remove half-written files of runners that were killed."""
         for folder in (self.folder, self.folder / "cells", self.folder / "_errors"):
             for path in (*folder.glob(".*.partial.*"), *folder.glob(".*.lock.[br]*")):
                 with contextlib.suppress(OSError):
                     if time.time() - path.stat().st_mtime > _LEFT_BEHIND_S:
                         path.unlink()
-        with self._locks.wait(self.folder / ".manifest.lock"):
-            failures = (self.folder / "cells").glob("*.error.json")
-            names = ("_manifest.json", "_errors", *(f"cells/_{path.name.lstrip('_')}" for path in failures))
-            for path in (self.folder / name for name in names):
-                if _present(path) != path:
-                    _present(path).rename(path)
 
     def _rows_if_whole(self, key: str) -> pd.DataFrame | None:
         """Rows of a cell as they are stored; None without such a file, and with a warning for a damaged file."""
@@ -272,7 +241,7 @@ class Store:
             return None
 
     def _errors_if_present(self, key: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame | None:
-        path = _present(self._errors_path(key))
+        path = self._errors_path(key)
         try:
             return _read_table(path, _remove(self._rows_path(key)), columns)
         except FileNotFoundError:
@@ -293,21 +262,12 @@ class Store:
         return sorted(path for path in files if not path.name.startswith("."))
 
 
-def _present(path: Path) -> Path:
-    """The path, or the path without underscores that an older version used, if only that path exists."""
-    older = path.with_name(path.name.removeprefix("_"))
-    if path.parent.name == "_errors":
-        older = path.parent.with_name("errors") / path.name
-    return older if older.exists() and not path.exists() else path
-
-
 def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
-    """Rows of each cell, with today's names of settings; files that do not exist are left out."""
+    """Rows of each cell; files that do not exist are left out."""
     parts = []
     for path in paths:
-        # Another process may remove the file of a cell that version 0.1 stored (see `Store.adopt`).
         with contextlib.suppress(FileNotFoundError):
-            parts.append(rename_columns(_read_table(path, _RUN_AGAIN)))
+            parts.append(_read_table(path, _RUN_AGAIN))
     return parts
 
 
@@ -347,7 +307,6 @@ def _read_if_present(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any] |
     Raises:
         DamagedError: the file is damaged.
     """
-    path = _present(path)
     try:
         content = read_json(path, _remove(path))
     except FileNotFoundError:

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import SettingsError
-from psotrack.settings import renamed
 from psotrack.support import nearest, whole_number
 
 logger = logging.getLogger(__name__)
@@ -90,12 +89,10 @@ def _find_column(where: str, name: str, names: list[str]) -> str:
     ]
     if len(ends) == 1:
         return ends[0]
-    near, today = nearest(name, names), renamed(name.removeprefix("settings."))
+    near = nearest(name, names)
     begin = [other for other in names if name and other.rpartition(".")[2].startswith(name)]
     if ends:
         remedy = f"it may be {' or '.join(ends)}"
-    elif today:
-        remedy = today
     elif near:
         remedy = f"did you mean {near}?"
     else:

@@ -1,6 +1,4 @@
-from .camera_middles import CameraMiddles, FoundDrones, middles_in_cameras
-from .causal import CausalRow, CausalTracker
-from .chunks import RunInputs, on_device, track_silhouettes
+from .block import on_device
 from .fitness import (
     PAPER_SCORE,
     Score,
@@ -11,32 +9,33 @@ from .fitness import (
     foreground_and_area,
 )
 from .parameters import TrackerSettings, find_score, find_search, tracker_settings
+from .recording import Places, track_recording
+from .run import RunInputs
 from .search import ParticleSwarm, Search, SearchRegion, particle_swarm
+from .stepwise import DroneRow, StepwiseTracker
 from .tracker import DISPERSION_FRAMES
 
 __all__ = [
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
-    "CameraMiddles",
-    "CausalRow",
-    "CausalTracker",
-    "FoundDrones",
+    "DroneRow",
     "ParticleSwarm",
+    "Places",
     "RunInputs",
     "Score",
     "ScoreInputs",
     "Search",
     "SearchRegion",
     "SoftIoU",
+    "StepwiseTracker",
     "TrackerSettings",
     "camera_scores",
     "camera_weights",
     "find_score",
     "find_search",
     "foreground_and_area",
-    "middles_in_cameras",
     "on_device",
     "particle_swarm",
-    "track_silhouettes",
+    "track_recording",
     "tracker_settings",
 ]

@@ -24,7 +24,7 @@ from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack._typing import Array, Tables
 from psotrack.geometry import Boxes, Camera, Extents, make_extents, project_boxes
@@ -219,9 +219,22 @@ def drone_fitness(
     return jnp.where(enough, mean, jnp.nan)
 
 
-def joint_fitness(inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch"]:
-    """Mean fitness over all drones, as in the paper. A drone without fitness counts 0: losing a drone gains nothing."""
-    return jnp.nan_to_num(drone_fitness(inputs, position_m)).mean(axis=-1)
+def joint_fitness(
+    inputs: ScoreInputs,
+    position_m: Float[Array, "*batch drones 3"],
+    present: Bool[Array, "drones"] | None = None,
+) -> Float[Array, "*batch"]:
+    """Mean fitness over all drones, as in the paper. A drone without fitness counts 0: losing a drone gains nothing.
+
+    Args:
+        inputs: silhouettes and extents of one frame.
+        position_m: (..., drones, 3), positions of the drones, world, metres.
+        present: (drones,), the drones that count; None counts all.
+    """
+    fitness = jnp.nan_to_num(drone_fitness(inputs, position_m))
+    if present is None:
+        return fitness.mean(axis=-1)
+    return jnp.where(present, fitness, 0.0).sum(axis=-1) / jnp.maximum(present.sum().astype(jnp.float32), 1.0)
 
 
 def _foreground_and_area(

@@ -44,13 +44,20 @@ class Occluders:
 
     def cover(
         self, x_px: Float[Array, "drones cameras *#points"], y_px: Float[Array, "drones cameras *#points"]
-    ) -> Bool[Array, "ranks drones cameras *points"]:
-        """Which image points, several per drone and camera, lie in each of the ellipses."""
-        inner = (slice(None),) * 3 + (None,) * (x_px.ndim - 2)
-        distance2 = ellipse_distance2(
-            x_px, y_px, self.x_middle[inner], self.y_middle[inner], self.x_half[inner], self.y_half[inner]
-        )
-        return (distance2 < 1) & self.exists[inner]
+    ) -> Bool[Array, "drones cameras *points"]:
+        """Which image points, several per drone and camera, lie in one of the ellipses."""
+        inner = (slice(None),) * 2 + (None,) * (x_px.ndim - 2)
+        covered: Array = jnp.zeros(np.broadcast_shapes(x_px.shape, y_px.shape), bool)
+        # One rank after the other: XLA on a CPU computes a reduction over ranks number by number.
+        for rank in range(len(self.exists)):
+            ellipse = (
+                of[rank][inner]
+                for of in (self.x_middle, self.y_middle, 1 / self.x_half, 1 / self.y_half, self.exists)
+            )
+            x_middle, y_middle, x_per_half, y_per_half, exists = ellipse
+            across, along = (x_px - x_middle) * x_per_half, (y_px - y_middle) * y_per_half
+            covered |= exists & (jnp.square(across) + jnp.square(along) < 1)
+        return covered
 
 
 def ellipse_distance2(
@@ -97,7 +104,7 @@ def unoccluded_share(occluders: Occluders, boxes: Boxes) -> Float[Array, "drones
             (boxes.y_middle, boxes.y_half, radius * np.sin(angle)),
         )
     )
-    covered = jnp.any(occluders.cover(x_px, y_px), axis=0)
+    covered = occluders.cover(x_px, y_px)
     return 1 - jnp.sum(covered, axis=-1, dtype=jnp.float32) / _NUM_POINTS
 
 

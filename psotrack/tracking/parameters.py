@@ -97,51 +97,48 @@ def find_score(settings: ScoreSettings) -> Score:
     )
 
 
-def tracker_program(settings: TrackerSettings, reduction: int) -> tracker.Program:
+def tracker_program(settings: TrackerSettings, reduction: int, *, on_cpu: bool = True) -> tracker.Program:
     """What is compiled in: runs whose programs are equal can be one batch.
 
     Args:
         settings: the tracker's parts of the settings.
         reduction: image pixels per silhouette pixel, along each side.
+        on_cpu: whether a CPU computes: there, the number of iterations needs no compilation of its own.
     """
     # The paper's score has neither occlusion nor a slope from which a vertex could be found.
     hard = settings.camera_score == PAPER_SCORE
     return tracker.Program(
         num_particles=settings.swarm.particles,
+        num_iterations=None if on_cpu else settings.swarm.iterations,
         joint=settings.swarm.kind == "joint",
         occlusion=settings.score.occlusion and not hard,
         vertex=settings.score.vertex and not hard,
         score=settings.camera_score,
-        windows=PAPER_SCORE.windows if hard else settings.score.windows,
         reduction=reduction,
     )
 
 
 def tracker_params(
-    settings: TrackerSettings,
-    size_m: Float[np.ndarray, "drones 3"],
-    *,
-    fps: float,
-    bounds_m: Float[np.ndarray, "2 3"],
+    settings: TrackerSettings, num_slots: int, *, fps: float, bounds_m: Float[np.ndarray, "2 3"]
 ) -> tracker.TrackerParams:
     """The numbers with which the tracker is called.
 
     Args:
         settings: the tracker's parts of the settings.
-        size_m: (drones, 3), initial full lengths of the drones, metres.
-        fps: frames per second.
+        num_slots: number of slots for drones.
+        fps: instants per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
     """
     return tracker.TrackerParams(
         num_iterations=jnp.int32(settings.swarm.iterations),
-        size_m=jnp.asarray(size_m, jnp.float32),
         bounds_m=jnp.asarray(bounds_m, jnp.float32),
         dt_s=jnp.float32(1 / fps),
         max_speed_m_s=jnp.float32(settings.motion.speed_limit_m_s),
         spread_m=jnp.float32(settings.swarm.spread_m),
         search=settings.search,
-        motion=motion_params(settings.motion, len(size_m)),
+        motion=motion_params(settings.motion, num_slots),
         min_fitness=jnp.float32(settings.status.min_fitness),
         min_cameras=jnp.int32(settings.status.min_cameras),
         max_coasting_frames=jnp.int32(round(settings.status.max_coasting_s * fps)),
+        learns_sizes=jnp.bool_(settings.drones.learn_sizes and settings.drones.size_m is None),
     )

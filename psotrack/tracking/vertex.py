@@ -27,8 +27,9 @@ from psotrack.tracking.fitness import ScoreInputs, camera_scores
 
 #: Half width of the grid, as a share of the drone's size. From 0.12 to 0.3 the errors differ by less than a tenth.
 SPAN = 0.2
-#: Least curvature, as a share of the largest one: smaller and negative curvatures are replaced by this one.
-FLATTEST = 0.02
+#: Least curvature, as a share of the largest one: smaller and negative curvatures are replaced by this one. For the
+#: covariance the limit is lower: cameras on one side know the depth of a drone thirty times worse than its direction.
+FLATTEST, FLATTEST_OF_COVARIANCE = 0.02, 0.001
 
 #: Corners, edges, faces and the middle of a cube of side 2.
 _CUBE = np.stack(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -90,7 +91,7 @@ def find_vertex(
     share = weight / jnp.maximum(weight.sum(axis=-1, keepdims=True), 1e-6)
     slope = jnp.einsum("ik,kdc,dc->dci", jnp.asarray(_SLOPE, score.dtype), score, share)
     curvature = -jnp.einsum("ijk,kdc,dc->dcij", jnp.asarray(_CURVATURE, score.dtype), score, share)
-    inverse = _inverse(curvature.sum(axis=1))
+    inverse = _inverse(curvature.sum(axis=1), FLATTEST)
     to_vertex = jnp.clip(jnp.einsum("dij,dj->di", inverse, slope.sum(axis=1)), -1.0, 1.0)
     # Slopes of the single cameras at the common vertex.
     slope = slope - jnp.einsum("dcij,dj->dci", curvature, to_vertex)
@@ -99,7 +100,8 @@ def find_vertex(
     cameras = jnp.square(share.sum(axis=-1)) / jnp.maximum(jnp.square(share).sum(axis=-1), 1e-6)
     spread = spread * cameras / jnp.maximum(cameras - 1.5, 0.1)
     if information is not None:
-        inverse = _inverse((information[:, None, None] * curvature).sum(axis=1))
+        curvature = jnp.asarray(information)[:, None, None] * curvature
+    inverse = _inverse(curvature.sum(axis=1), FLATTEST_OF_COVARIANCE)
     return Vertex(
         position_m=position_m + span_m * to_vertex,
         inverse_curvature_m2=span_m[:, :, None] * inverse * span_m[:, None, :],
@@ -108,8 +110,8 @@ def find_vertex(
     )
 
 
-def _inverse(curvature: Float[Array, "drones 3 3"]) -> Float[Array, "drones 3 3"]:
+def _inverse(curvature: Float[Array, "drones 3 3"], flattest: float) -> Float[Array, "drones 3 3"]:
     """Inverses of curvatures, of which small and negative eigenvalues are raised."""
     bent, axes = jnp.linalg.eigh(curvature)
-    bent = jnp.maximum(bent, FLATTEST * jnp.maximum(bent[:, -1:], 1e-6))
+    bent = jnp.maximum(bent, flattest * jnp.maximum(bent[:, -1:], 1e-6))
     return jnp.einsum("dik,dk,djk->dij", axes, 1 / bent, axes)

@@ -4,10 +4,11 @@ from .resampling import resample
 from .row_streams import RowStream
 from .showing import drones_html
 from .summaries import DroneSummary, summarise, summary_columns
-from .tracks import Arrival, DroneSizes, Tracks, unknown_value
+from .tracks import ARRAYS, Arrival, DroneSizes, Tracks, unknown_value
 from .trajectories import Status, Trajectories
 
 __all__ = [
+    "ARRAYS",
     "GATE_M",
     "UNASSIGNED",
     "Arrival",

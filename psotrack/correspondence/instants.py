@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence import CameraSightings
+from psotrack.correspondence.sightings import CameraSightings
 from psotrack.geometry import NEAR_M, Camera, project
 
 #: A detection is moved with the drone whose expected box, this many times larger, holds its middle.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import CUT_SHARE, CameraSightings, match
+from psotrack.correspondence.matching import match
+from psotrack.correspondence.sightings import CUT_SHARE, CameraSightings
 from psotrack.geometry import Camera, reconstruct, sizes_m, to_camera
 
 #: Least standard deviation of a detection's middle, pixels, however well the cameras agree.
@@ -15,6 +16,9 @@ LEAST_NOISE_PX = 0.1
 #: Additional standard deviation of a middle, as a share of the box's sides, where several drones share the box: all but
 #: one are hidden. The value is that of boxes that the image's border cuts.
 SHARED_SHARE = CUT_SHARE
+#: A box whose longer side is larger by this factor than those of the drone's other boxes holds something else too. A
+#: square drone is 1.41 times as wide across its corners.
+SEVERAL_SIZE = 1.5
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class Crossings:
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
         span_m: (crossings, 2), width and height of the detections at that distance, median of the cameras, metres.
+        ambiguity: (crossings,), likelihood of another assignment of the detections (see `Matches`).
     """
 
     expected: Int[np.ndarray, "crossings"]
@@ -39,29 +44,43 @@ class Crossings:
     box: Int[np.ndarray, "crossings cameras"]
     disagreement: Float[np.ndarray, "crossings"]
     span_m: Float[np.ndarray, "crossings 2"]
+    ambiguity: Float[np.ndarray, "crossings"]
 
-    def joined(self, other: Crossings, num_expected: int) -> Crossings:
-        """The crossings of both.
+    def numbered(self, drones: Int[np.ndarray, "expected"]) -> Crossings:
+        """The crossings with other numbers for the expected drones."""
+        expected = np.append(drones, -1)[self.expected]
+        return replace(self, expected=expected)
 
-        Args:
-            other: crossings of other expected drones.
-            num_expected: number of the drones that were expected here; those of the other follow them.
-        """
-        values = {
+    def joined(self, other: Crossings) -> Crossings:
+        """The crossings of both."""
+        both = {
             each.name: np.concatenate([getattr(self, each.name), getattr(other, each.name)])
             for each in fields(self)
         }
-        known = np.where(other.expected >= 0, other.expected + num_expected, -1)
-        return Crossings(**values | {"expected": np.concatenate([self.expected, known])})
+        return Crossings(**both)
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Where drones are expected.
+
+    Attributes:
+        position_m, covariance_m2: (drones, 3) and (drones, 3, 3), positions and their covariances, metres.
+        dispersion: (drones,), ratio of the variance of each drone's detections so far and the stated variance.
+        usual_dispersion: the ratio where no drone is expected.
+    """
+
+    position_m: Float[np.ndarray, "drones 3"]
+    covariance_m2: Float[np.ndarray, "drones 3 3"]
+    dispersion: Float[np.ndarray, "drones"]
+    usual_dispersion: float = 1.0
 
 
 def crossings(
     cameras: Camera,
     view: CameraSightings,
     bounds_m: Float[np.ndarray, "2 3"],
-    expected_m: Float[np.ndarray, "drones 3"],
-    expected_covariance_m2: Float[np.ndarray, "drones 3 3"],
-    dispersion: Float[np.ndarray, "drones"],
+    drones: Expected,
     min_views: int | None = None,
 ) -> Crossings:
     """Match the detections of all cameras, and triangulate each group without the views that disagree.
@@ -70,12 +89,12 @@ def crossings(
         cameras: cameras with one leading axis.
         view: detections of the frame.
         bounds_m: (2, 3), corners of the room, metres.
-        expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), expected positions and their covariances.
-        dispersion: (drones,), ratio of the variance of each drone's detections so far and `view.noise_px`².
+        drones: where drones are expected.
         min_views: smallest number of viewpoints of a drone that was not expected (see `match`).
     """
     # Detections of an unexpected drone have the same noise as detections of known drones.
-    dispersion = np.append(dispersion, np.median(dispersion) if len(dispersion) else 1.0)
+    usual = float(np.median(drones.dispersion)) if len(drones.dispersion) else drones.usual_dispersion
+    dispersion = np.append(drones.dispersion, usual)
     # At least the stated noise is used for matching: the groups are judged after they are triangulated.
     scale = np.sqrt(max(1.0, dispersion[-1]))
     groups = match(
@@ -84,8 +103,8 @@ def crossings(
         [scale * noise_px for noise_px in view.found(view.noise_px)],
         bounds_m=bounds_m,
         min_views=min_views,
-        expected_m=expected_m,
-        expected_covariance_m2=expected_covariance_m2,
+        expected_m=drones.position_m,
+        expected_covariance_m2=drones.covariance_m2,
     )
     centre_px, size_px, noise_px = (
         view.grouped(values, groups.detection) for values in (view.centre_px, view.size_px, view.noise_px)
@@ -94,12 +113,16 @@ def crossings(
     hidden_px = np.where(several, SHARED_SHARE * np.sqrt(size_px.prod(axis=-1)), 0.0)
     noise_px = np.hypot(noise_px, hidden_px)
     # The dispersion of a drone alone in its box says nothing about a box that it shares.
-    usual = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
-    known_px = np.maximum(noise_px * usual, LEAST_NOISE_PX)
+    scale = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
+    known_px = np.maximum(noise_px * scale, LEAST_NOISE_PX)
     if view.exposures is not None:
         # A frame that several instants show counts once in all of them together.
         known_px = known_px / np.sqrt(np.maximum(view.exposures.share, 1e-6))
     lines = reconstruct(cameras, centre_px, noise_px=np.nan_to_num(known_px, nan=1.0))
+    surplus_px = _surplus_px(cameras, lines.position_m, size_px)
+    if surplus_px.any():
+        noise_px, known_px = np.hypot(noise_px, surplus_px), np.hypot(known_px, surplus_px)
+        lines = reconstruct(cameras, centre_px, noise_px=np.nan_to_num(known_px, nan=1.0))
     kept = lines.used.any(axis=-1)
     position_m, seen = lines.position_m[kept], lines.used[kept]
     squared = np.where(seen, lines.reprojection_px[kept] / noise_px[kept], 0.0) ** 2
@@ -113,7 +136,25 @@ def crossings(
         box=_boxes(view, groups.detection[kept]),
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
+        ambiguity=groups.ambiguity[kept],
     )
+
+
+def _surplus_px(
+    cameras: Camera,
+    position_m: Float[np.ndarray, "groups 3"],
+    size_px: Float[np.ndarray, "groups cameras 2"],
+) -> Float[np.ndarray, "groups cameras"]:
+    """By how much the middle of a box may be off that holds more than the drone; 0 for boxes of usual size.
+
+    A box that is much larger than the drone's other boxes is that of several drones in one blob.
+    """
+    points_cam = np.asarray(to_camera(cameras, position_m[:, None]))
+    span_m = sizes_m(cameras, points_cam, size_px).max(axis=-1)
+    there = np.isfinite(span_m).any(axis=-1)
+    ratio = np.ones_like(span_m)
+    ratio[there] = span_m[there] / np.nanmedian(span_m[there], axis=-1, keepdims=True)
+    return np.where(ratio > SEVERAL_SIZE, size_px.max(axis=-1) * (1 - 1 / ratio) / 2, 0.0)
 
 
 def _boxes(
