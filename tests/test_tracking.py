@@ -118,6 +118,17 @@ def test_sizes_converge_to_the_drawn_sizes(silhouettes, wrong):
     np.testing.assert_allclose(tracks.sizes.size_m, given.size_m, rtol=1e-6)
 
 
+def test_a_drone_as_large_as_the_given_one_is_found_beside_it_from_the_first_frame(optimised):
+    """What is larger than twice the known drones is no drone, and the given drone is known."""
+    size_m = np.full((2, 3), 0.8)
+    truth_m = TRUTH_M[:25].copy()
+    truth_m[:, 1] = truth_m[:, 0] + [1.6, 1.2, 0.0]
+    given = InitialState(FIRST.position_m, FIRST.velocity_m_s, size_m[:1], FIRST.num_cameras)
+    tracks, _ = track(drawn_silhouettes(RIG, truth_m, size_m, REDUCTION), given)
+    assert tracks.num_drones == 2
+    assert (tracks.status == Status.TRACKED).all()
+
+
 def test_no_track_is_added_beyond_the_number_of_drones(silhouettes):
     tracks, trajectories = track(silhouettes, FIRST, drones=1)
     assert trajectories.num_drones == 1

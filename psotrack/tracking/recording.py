@@ -82,7 +82,7 @@ def track_recording(
             begun = list(range(len(progress)))
             for attempt in range(_MOST_SEARCHES):
                 starts = {
-                    number: _planned(progress[number], block, last, tracked[number][1], again=attempt > 0)
+                    number: _planned(progress[number], block, last, *tracked[number], again=attempt > 0)
                     for number in begun
                 }
                 begun = [number for number in begun if starts[number]]
@@ -114,7 +114,9 @@ def _begin(setting: Setting, inputs: RunInputs, *, on_cpu: bool) -> _Progress:
     return _Progress(run, [] if inputs.given is None else run.given_starts(inputs.given, 0))
 
 
-def _planned(each: _Progress, block: Block, last: Block | None, rows: Rows, *, again: bool) -> list[Start]:
+def _planned(
+    each: _Progress, block: Block, last: Block | None, slots: Slots, rows: Rows, *, again: bool
+) -> list[Start]:
     """Tracks that start in the block that was just tracked, or in the one before; they are added to the run's."""
     run = each.run
     oldest = int((block if last is None else last).instant[0])
@@ -123,7 +125,7 @@ def _planned(each: _Progress, block: Block, last: Block | None, rows: Rows, *, a
         instant = max(candidate.instant, oldest)
         return instant, *state_at(candidate.path, instant, run.fps, run.max_speed_m_s)
 
-    starts = run.plan(run.search(block, rows, again=again), block, rows, begin)
+    starts = run.plan(run.search(block, rows, slots, again=again), block, rows, begin)
     for start in starts:
         if start.instant > 0 or start.again:
             each.arrivals.append(Arrival(start.instant, int(run.drone[start.slot]), start.again))

@@ -279,12 +279,15 @@ class SwarmRun:
 
     # Births
 
-    def search(self, block: Block, rows: Rows, *, again: bool = False) -> tuple[TrackCandidate, ...]:
+    def search(
+        self, block: Block, rows: Rows, slots: Slots, *, again: bool = False
+    ) -> tuple[TrackCandidate, ...]:
         """Drones without a track in a block that was tracked.
 
         Args:
             block: the block.
             rows: its rows.
+            slots: the drones after the block, among them those that began in it.
             again: whether the block was searched before, with fewer known drones: of drones whose blobs were one, the
                 others are seen once some are known.
         """
@@ -298,14 +301,13 @@ class SwarmRun:
             found, self._births = copy.deepcopy(block.births[key])
             self._searched = self._births
             return found
-        size_m = np.asarray(self.slots.size_m, np.float64)
-        size_m = np.concatenate([size_m, np.full((len(self.drone) - len(size_m), 3), np.nan)])
+        size_m = np.asarray(slots.size_m, np.float64)
         for frame, blobs in enumerate(block.blobs):
             box_px = np.asarray(rows.box_px[frame], np.float64)
             view = unexplained(blobs, box_px)
             explains = np.isfinite(box_px).all(axis=-1).any(axis=-1)
             position_m = np.where(np.asarray(explains)[:, None], rows.position_m[frame], np.nan)
-            known = KnownDrones(position_m.astype(np.float64), size_m[: len(position_m)], box_px)
+            known = KnownDrones(position_m.astype(np.float64), size_m, box_px)
             births.step(int(block.instant[frame]), view, known)
         found, self._searched = births.candidates(), births
         if is_first:

@@ -152,7 +152,7 @@ class StepwiseTracker:
             ago_s = (following - last) / run.fps
             return following, position_m + ago_s * velocity_m_s, velocity_m_s
 
-        self._starts = run.plan(run.search(block, rows), block, rows, begin)
+        self._starts = run.plan(run.search(block, rows, run.slots), block, rows, begin)
         run.forget(self._instant - round(FORGOTTEN_S * run.fps))
         if len(run.known) == self._most and not self._was_full and not self._limited:
             logger.warning("%d drones are tracked; further drones are left out (--most-drones)", self._most)
