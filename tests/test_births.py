@@ -87,14 +87,24 @@ def new_births(rig, *, max_speed_m_s=MAX_SPEED_M_S, min_viewpoints=None, ghosts_
     )
 
 
-def candidates_in(coverage, *known_m, size_m=SIZE_M, rig=RIG, reduction=REDUCTION, first=0, **options):
+def candidates_in(
+    coverage,
+    *known_m,
+    size_m=SIZE_M,
+    boxes_size_m=None,
+    rig=RIG,
+    reduction=REDUCTION,
+    first=0,
+    **options,
+):
     """Candidates after all frames; `first` is the instant of the first frame."""
     births = new_births(rig, **options)
     borders = border_cells(rig.cameras.image_size_wh, reduction)
     sizes_m = np.broadcast_to(np.array(size_m, float), (len(known_m), 3))
+    drawn_m = sizes_m if boxes_size_m is None else np.broadcast_to(boxes_size_m, sizes_m.shape)
     for frame, images in enumerate(coverage):
         position_m = np.array([one[frame] for one in known_m]).reshape(-1, 3)
-        box_px = boxes_of(rig, position_m, sizes_m) if known_m else np.empty((0, len(rig), 4))
+        box_px = boxes_of(rig, position_m, drawn_m) if known_m else np.empty((0, len(rig), 4))
         view = unexplained(FrameBlobs.of(images, reduction, borders), box_px)
         births.step(first + frame, view, KnownDrones(position_m, sizes_m, box_px))
     return births.candidates()
@@ -174,6 +184,11 @@ def test_a_drone_that_flickers_or_is_hidden_for_a_while_is_one_candidate(hidden)
     """The candidate begins at the drone's first frame; the tracker finds the drone again after the gap."""
     (found,) = candidates_in(blank(draw(OTHER), hidden))
     assert found.instant == 0
+
+
+def test_beside_a_drone_of_unknown_size_another_is_found(two_drones):
+    (found,) = candidates_in(two_drones, ONE, size_m=np.full(3, np.nan), boxes_size_m=SIZE_M)
+    assert_found([found], OTHER)
 
 
 def test_candidates_that_are_taken_are_followed_no_longer(two_drones):

@@ -107,7 +107,7 @@ class KnownDrones:
 
     Attributes:
         position_m: (drones, 3), metres; NaN where a drone is not found.
-        size_m: (drones, 3), full lengths along the world's axes, metres.
+        size_m: (drones, 3), full lengths along the world's axes, metres; NaN where they are not known yet.
         box_px: (drones, cameras, 4), middle and half lengths of their boxes; NaN where there is none; None where
             nothing is known of what they hide.
     """
@@ -364,11 +364,13 @@ class Births:
     ) -> Bool[np.ndarray, "crossings"]:
         """Which crossings look like a drone that is none of the known ones."""
         points_m, seen = crossed.position_m, crossed.seen
-        spans_m = known.size_m[np.isfinite(known.position_m).all(axis=-1)].max(axis=-1)
+        spans_m = known.size_m[np.isfinite(known.position_m + known.size_m).all(axis=-1)].max(axis=-1)
         limits = (spans_m.min() / SIZE_RATIO, spans_m.max() * SIZE_RATIO) if len(spans_m) else SPANS_M
         span_m = crossed.span_m.max(axis=-1)
         size_m = crossed.span_m[:, [0, 0, 1]]
-        off = 2 * (points_m[:, None] - known.position_m) / (size_m[:, None] + known.size_m)
+        # A known drone of unknown size is taken to be as large as the candidate.
+        known_size_m = np.where(np.isfinite(known.size_m), known.size_m, size_m[:, None])
+        off = 2 * (points_m[:, None] - known.position_m) / (size_m[:, None] + known_size_m)
         apart = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf).min(axis=1, initial=np.inf)
         pixels = np.asarray(project(self._cameras, points_m[:, None])[0])
         should_see = in_view & ~_hidden(pixels, known)
