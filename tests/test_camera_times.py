@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.clocks import clocks_of_tracks, fit_clocks, places_of_tracks
-from psotrack.correspondence import NOISE_PX, CameraSightings, Sightings, moved_to_instant
+from psotrack.correspondence import NOISE_PX, NOISE_SHARE, CameraSightings, Sightings, moved_to_instant
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_extents, project, project_boxes
 from psotrack.initiation import Births, KnownDrones
@@ -217,6 +217,20 @@ def test_a_slower_camera_is_used_at_all_instants_and_counts_once():
     synchronous_m, _ = lines_errors(alike())
     assert error_m.mean() < 1.5 * synchronous_m.mean()
     assert inside.mean() > 0.8
+
+
+def test_a_drone_that_comes_later_is_found_by_cameras_with_times_of_their_own():
+    times = exposed_later([0.1, 0.5, -0.4, 0.3, -0.2], 50)
+    shown = sightings_of(times)
+    noise_px = NOISE_PX + NOISE_SHARE * np.sqrt(shown.size_px.prod(axis=-1))
+    noise_px[:20, :, 1] = np.nan
+    timeline = make_timeline(times)
+    given = replace(shown, noise_px=noise_px).at_instants(timeline)
+    tracks = track_detections(RIG.cameras, given, LINES, fps=timeline.rate_hz, bounds_m=ROOM_M)
+    (new,) = tracks.arrivals
+    assert abs(timeline.time_s[new.frame] - 20 / FPS) <= 2 / FPS
+    # At the last instant, only some of the cameras are there.
+    assert (tracks.status[new.frame : -1] == Status.TRACKED).all()
 
 
 def test_drones_are_found_by_cameras_with_times_of_their_own():

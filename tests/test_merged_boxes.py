@@ -1,7 +1,6 @@
 """Splitting boxes of several drones: boxes with known edges, and flights in which boxes merge."""
 
 import numpy as np
-import pytest
 from helpers import ROOM_M, ring_rig
 
 from psotrack.correspondence import CameraSightings, from_detections
@@ -121,7 +120,6 @@ def merge_touching_boxes(boxes):
     return boxes
 
 
-@pytest.mark.xfail(reason="regression of the one way of birth: missed 0.0278, limit 0.02", strict=False)
 def test_drones_whose_boxes_merge_keep_their_tracks():
     """Three drones 0.3 m apart in depth: two fly towards the third, which stands between them, and pass the third."""
     rig = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))

@@ -190,6 +190,15 @@ def test_known_drones_are_tracked_from_the_first_frame_in_the_given_order():
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, truth_m[0, order], atol=2e-3)
 
 
+def test_a_drone_beside_known_drones_is_tracked_from_the_first_frame():
+    truth_m = circles(3)
+    velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
+    tracked = track(truth_m, known=(truth_m[0, :2], velocity_m_s[:2]))
+    assert tracked.arrivals == ()
+    assert (tracked.status == Status.TRACKED).all()
+    assert evaluate_tracks(tracked, truth_m)["missed_rate"] == 0
+
+
 def test_sizes_agree_with_the_boxes():
     tracked = track(circles(2))
     np.testing.assert_allclose(tracked.sizes.size_m, [[0.5, 0.5, 0.2]] * 2, rtol=0.02)

@@ -17,7 +17,7 @@ from psotrack.correspondence import (
     crossings,
     moved_to_instant,
 )
-from psotrack.geometry import Camera, in_images, viewpoints
+from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera, viewpoints
 from psotrack.initiation import (
     NEW,
     SPEED_SHARE,
@@ -189,7 +189,7 @@ class _Tracker:
         """The frame's measurements by slot, and the views by slot of drones that have none."""
         active = self._active()
         slots, tracks = [slot for slot, _ in active], [track for _, track in active]
-        view = self._at_instant(view, slots)
+        shown, view = view, self._at_instant(view, slots)
         expected = Expected(
             np.asarray(self._motion.state.apparent_m[slots]),
             np.asarray(self._motion.state.covariance[slots, :3, :3]),
@@ -227,9 +227,12 @@ class _Tracker:
             )
         rest = view.without(*_camera_and_box(crossed.box[taken]))
         there_m = np.where(np.isin(slots, [*measured])[:, None], expected.position_m, np.nan)
-        known = KnownDrones(there_m, span_m[:, [0, 0, 1]])
+        known = KnownDrones(there_m, span_m[:, [0, 0, 1]], _boxes_px(self._cameras, there_m, span_m))
         usual = float(np.median(expected.dispersion)) if tracks else 1.0
-        others = self._births.step(frame, rest, known, usual)
+        # As the cameras showed them: what is born has a motion of its own. Parts of split boxes are of known drones.
+        num_boxes = shown.noise_px.shape[1]
+        unexplained = shown.without(*np.nonzero(np.isnan(rest.noise_px[:, :num_boxes])))
+        others = self._births.step(frame, unexplained, known, usual)
         return measured, self._seen_by_one(rest, others, slots, measured)
 
     def _nearly_expected(
@@ -379,6 +382,15 @@ def _camera_and_box(
     """(used,), cameras and boxes of the detections in crossings."""
     row, camera = np.nonzero(box >= 0)
     return camera, box[row, camera]
+
+
+def _boxes_px(
+    cameras: Camera, position_m: Float[np.ndarray, "drones 3"], span_m: Float[np.ndarray, "drones 2"]
+) -> Float[np.ndarray, "drones cameras 4"]:
+    """Boxes of drones as in `KnownDrones`; NaN where a drone's place or width is not known, or has no image."""
+    pixels, _ = project_visible(cameras, position_m[:, None])
+    half_px = sizes_px(cameras, np.asarray(to_camera(cameras, position_m[:, None])), span_m[:, None]) / 2
+    return np.concatenate([pixels + 0.5, np.broadcast_to(half_px, pixels.shape)], axis=-1)
 
 
 def _surprise(crossed: Crossings, row: int, expected: Expected) -> Float[np.ndarray, "drones"]:
