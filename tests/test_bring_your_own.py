@@ -324,7 +324,7 @@ def test_masks_of_another_size_are_one_line(track):
 
 def test_models_with_equal_keys_and_different_classes_have_silhouettes_of_their_own(recording):
     video = recording.videos["cam1"]
-    settings = pt.TrackSettings().silhouettes
+    settings = ScaledSettings()
     models = (MedianBackground(), CoarseBackground(), None)
     assert len({key_of(video, settings, model) for model in models}) == 3
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,6 +36,12 @@ ERRORS = [
     *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
     "per_drone",
 ]
+#: Keys of the record beside the tracks, of every method; the contract promises more, where they have a meaning.
+RECORD = {
+    *("rate_hz", "camera_times", "settings", "seed", "versions", "device", "input_keys", "start", "volume"),
+    *("drones", "arrivals", "points", "left_out", "camera_errors", "encounters"),
+    *("seconds", "real_time_factor", "real_time_factor_running"),
+}
 NUM_FRAMES = 12
 #: Cameras of the small sequence except the last one. Drones of a dozen pixels are found only if many cameras see them.
 CAMERAS = ",".join(f"cam{i}" for i in range(1, 8))
@@ -80,6 +87,21 @@ def assert_one_line(result: Output, *words: str) -> None:
         assert word in result.err, result.err
 
 
+def assert_record_of_contract(record: dict[str, Any], num_drones: int) -> None:
+    assert set(record) >= RECORD
+    assert set(record["seconds"]) == {"decode", "foreground", "track", "compile", "finish", "total"}
+    assert [drone["drone"] for drone in record["drones"]] == [*range(num_drones)]
+    for drone in record["drones"]:
+        assert set(drone) == {"drone", "size_m", "size_std_m", "size_frames", "fill"}
+        assert len(drone["size_m"]) == len(drone["size_frames"]) == 3
+        assert (drone["size_std_m"], drone["fill"]) == ([None] * 3, None)
+    assert set(record["start"]) == {"position_m", "velocity_m_s", "size_m", "num_cameras"}
+    assert {len(values) for values in record["start"].values()} == {num_drones}
+    assert set(record["camera_errors"]) >= {"cameras", "turn_deg", "clock_s", "fading_share", "fading_time_s"}
+    assert (record["arrivals"], record["encounters"]) == ([], [])
+    assert len(record["points"]) == num_drones
+
+
 def rewrite_video(path: Path, *, frames: int | None = None, size_wh: tuple[int, int] | None = None) -> None:
     """Replace a video by a video with fewer frames or a smaller image."""
     video = probe(path)
@@ -105,7 +127,7 @@ def test_the_contract_from_videos_to_errors(run: Run, sequence: Path, tmp_path: 
     record = json.loads(tracks.with_suffix(".json").read_text())
     assert record["seed"] == 3
     assert record["settings"]["swarm"]["particles"] == 20
-    assert set(record["seconds"]) == {"decode", "foreground", "track", "compile", "finish", "total"}
+    assert_record_of_contract(record, 4)
     # All of the program's time counts, and less of it without the start and the compilation.
     total_s = NUM_FRAMES / 25 / record["real_time_factor"]
     assert total_s == pytest.approx(record["seconds"]["total"], rel=0.02)
@@ -275,9 +297,8 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     record = json.loads(tracks[0].with_suffix(".json").read_text())
     assert [point["middle_of"] for point in record["points"]] == ["box"] * 4
     assert record["settings"]["method"] == "projection-lines"
-    assert set(record["seconds"]) == {"decode", "foreground", "compile", "track", "finish", "total"}
+    assert_record_of_contract(record, 4)
     assert sorted(record["input_keys"]) == [f"cam{i}" for i in range(1, 9)]
-    assert len(record["start"]["position_m"]) == 4
     evaluated = run("evaluate", tracks[0], sequence, "--json", "-")
     errors = json.loads(evaluated.out)
     assert (errors["id_switches"], errors["missed_rate"]) == (0, 0)
