@@ -296,7 +296,7 @@ def test_a_room_exports_what_its_stub_says(room):
         ("tracking/swarm.py", "from psotrack.geometry import Camera", "must not import geometry.cameras"),
         ("tracking/fitness.py", "import psotrack.tracking.swarm", "must not import tracking.swarm"),
         (
-            "tracking/chunks.py",
+            "tracking/block.py",
             "from psotrack.evaluation import evaluate",
             "imports evaluation, a higher room",
         ),
