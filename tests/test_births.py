@@ -13,6 +13,7 @@ from psotrack.correspondence import NOISE_PX, CameraSightings
 from psotrack.geometry import Rig, make_extents, project, project_boxes
 from psotrack.initiation import (
     NEW,
+    BirthRules,
     Births,
     FrameBlobs,
     KnownDrones,
@@ -75,15 +76,13 @@ def boxes_of(rig, position_m, size_m):
     return np.stack(parts, axis=-1).astype(np.float64)
 
 
-def new_births(rig, *, max_speed_m_s=MAX_SPEED_M_S, min_viewpoints=None, ghosts_from=None):
+def new_births(rig, *, max_speed_m_s=MAX_SPEED_M_S, **rules):
     return Births(
         rig.cameras,
+        BirthRules(**rules),
         fps=FPS,
         bounds_m=ROOM_M,
         max_speed_m_s=max_speed_m_s,
-        min_viewpoints=min_viewpoints,
-        min_share=0.5,
-        ghosts_from=ghosts_from,
     )
 
 
@@ -235,6 +234,25 @@ def test_the_rim_of_a_known_drone_is_no_candidate(two_drones, off_m):
 @pytest.mark.parametrize(("blind", "count"), [([4], 1), ([1, 4], 1), ([0, 1, 2, 4], 0)])
 def test_half_of_the_cameras_must_see_a_candidate(blind, count):
     assert len(candidates_in(blank(draw(OTHER), cameras=blind))) == count
+
+
+def test_a_drone_that_fades_from_some_images_is_followed_on():
+    """Half of the cameras must see a candidate in the mean over its frames, not in each frame."""
+    coverage = draw(OTHER)[:10].copy()
+    coverage[5:, [0, 1, 2, 4]] = 0
+    assert_found(candidates_in(coverage), OTHER)
+
+
+@pytest.mark.parametrize(("num_frames", "count"), [(None, 0), (6, 1)])
+def test_in_a_short_recording_fewer_frames_are_enough(num_frames, count):
+    assert len(candidates_in(draw(OTHER)[:6], num_frames=num_frames)) == count
+
+
+def test_a_slow_drone_moves_as_soon_as_it_is_found():
+    """At 0.15 m/s, it moves by half a cell in eight frames. A track must not wait for a second."""
+    slow = path((0.6, -0.5, 1.5), (0.12, 0.09, 0.0))
+    (found,) = candidates_in(draw(slow)[:8], ghosts_from=0)
+    assert found.moves
 
 
 def test_crossing_rays_of_different_drones_are_no_candidate():

@@ -239,9 +239,7 @@ def test_drones_are_found_by_cameras_with_times_of_their_own():
     shown = sightings_of(times, noise_px=0.0).at_instants(timeline)
 
     def errors_m(sightings):
-        births = Births(
-            RIG.cameras, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0, min_viewpoints=None, min_share=0.5
-        )
+        births = Births(RIG.cameras, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0)
         for instant in range(sightings.num_frames):
             births.step(instant, sightings.at(instant), KnownDrones(np.empty((0, 3)), np.empty((0, 3))))
         found = births.candidates()

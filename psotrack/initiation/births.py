@@ -9,6 +9,7 @@ the candidate was first found; but a false track may last to the end of the vide
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -49,6 +50,10 @@ MOST_REMEMBERED = 100
 AMBIGUOUS = 0.1
 #: A position that this many viewpoints agree on is no chance crossing of lines of sight.
 TRUSTED_VIEWPOINTS = 3
+#: Least share of the cameras with a place in view, and not hidden by known drones, that see a drone there, in the mean
+#: over its frames. Obstacles hide drones, silhouettes of small drones flicker, and detectors miss drones at times: a
+#: missing sighting says much less than a sighting.
+MIN_SEEING_SHARE = 0.5
 #: Smallest height of a drone's middle above the floor, metres. What is lower is a shadow, because the middle of a drone
 #: that stands on its legs is higher.
 FLOOR_CLEARANCE_M = 0.08
@@ -67,7 +72,7 @@ MIN_DISTANCE = 0.8
 #: at first.
 MAX_GROWTH = 1.5
 #: A candidate that moves by less than this share of its span, or by less than this number of standard deviations, in
-#: the first or in the second half of its frames stands still.
+#: its first or in its last `WINDOW_FRAMES` frames stands still.
 MIN_TRAVEL, TRAVEL_SIGMAS = 0.04, 3.0
 #: A candidate moves if its last place is farther from its first than this share of its span.
 MIN_DISPLACEMENT = 0.5
@@ -156,6 +161,8 @@ class _Path:
         frames: numbers of the frames in which it was found, without those that were left out.
         agreed, trusted: number of frames in which as many viewpoints agreed as are needed to begin a track, and in
             which at least `TRUSTED_VIEWPOINTS` agreed.
+        num_seeing, num_should_see: number of cameras that saw something there, and that should see a drone there,
+            summed over the frames in which it was found.
         missed: frames since it was last found.
         dispersion: disagreement of the cameras, averaged over time.
     """
@@ -166,6 +173,8 @@ class _Path:
     frames: list[int] = field(default_factory=list)
     agreed: int = 0
     trusted: int = 0
+    num_seeing: int = 0
+    num_should_see: int = 0
     missed: int = 0
 
     @property
@@ -179,38 +188,54 @@ class _Path:
         return np.median([one.span_m for one in self.found.values()], axis=0)
 
 
+@dataclass(frozen=True)
+class BirthRules:
+    """What is asked of a drone before its track begins.
+
+    Attributes:
+        min_viewpoints: number of viewpoints that must agree; None: three where three have the place in view, else two.
+        ghosts_from: instant from which a place that stands still may be a ghost: foreground where a drone stood while
+            the background was learned; None for sightings that have no ghosts.
+        num_frames: number of frames of the recording; None for a recording without end. In a recording of fewer than
+            `WINDOW_FRAMES` frames, four fifths of them are enough.
+    """
+
+    min_viewpoints: int | None = None
+    ghosts_from: int | None = None
+    num_frames: int | None = None
+
+    @property
+    def min_found(self) -> int:
+        """Least number of frames in which a drone was found."""
+        if self.num_frames is None:
+            return MIN_FOUND
+        return min(MIN_FOUND, math.ceil(MIN_FOUND / WINDOW_FRAMES * self.num_frames))
+
+
 class Births:
     """Follows places until they are drones.
 
     Args:
         cameras: cameras with one leading axis, float64.
+        rules: what is asked of a drone.
         fps: instants per second.
         bounds_m: (2, 3), corners of the room, metres; the lowest z is the floor, on which shadows lie.
         max_speed_m_s: largest speed of a drone, m/s.
-        min_viewpoints: number of viewpoints that must agree to begin a track; None: three where three have the place
-            in view, else two.
-        ghosts_from: instant from which a place that stands still may be a ghost: foreground where a drone stood while
-            the background was learned; None for sightings that have no ghosts.
-        min_share: least share of the cameras with the place in view, and not hidden by known drones, that see a drone
-            there. Silhouettes miss a drone only where an obstacle hides it; detectors miss drones now and then.
     """
 
     def __init__(
         self,
         cameras: Camera,
+        rules: BirthRules = BirthRules(),
         *,
         fps: float,
         bounds_m: Float[np.ndarray, "2 3"],
         max_speed_m_s: float,
-        min_viewpoints: int | None,
-        min_share: float,
-        ghosts_from: int | None = None,
     ) -> None:
-        self._cameras, self._fps, self._max_speed_m_s = cameras, fps, max_speed_m_s
+        self._cameras, self._rules, self._fps, self._max_speed_m_s = cameras, rules, fps, max_speed_m_s
         self._viewpoint = viewpoints(cameras)
         self._clear_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
         self._floor_z_m = float(bounds_m[0, 2])
-        self._required, self._min_share, self._ghosts_from = min_viewpoints, min_share, ghosts_from
         self._paths: list[_Path] = []
         self._mean, self._covariance = np.empty((0, 6)), np.empty((0, 6, 6))
         self._instant = self._frame = 0
@@ -289,7 +314,10 @@ class Births:
         )
         crossed = self._crossings(view, usual_dispersion)
         in_view = in_images(self._cameras, crossed.position_m)
-        counts = self._counts(crossed, view, in_view, known)
+        num_seeing, num_should_see = self._cameras_that_see(crossed, view, in_view, known)
+        # A place that is followed may be hidden for some frames: see `_is_drone`.
+        seen_enough = (crossed.expected >= 0) | (num_seeing >= MIN_SEEING_SHARE * num_should_see)
+        counts = seen_enough & self._counts(crossed, known)
         required, num_viewpoints = self._required_viewpoints(in_view), self._num_viewpoints(crossed.seen)
         begun: list[tuple[_Path, Measurement]] = []
         # Followed places first: a new position may be a part of one of them.
@@ -321,6 +349,8 @@ class Births:
             if len(path.frames) > MOST_REMEMBERED:
                 del path.found[min(path.found)], path.frames[0]
             path.missed = 0
+            path.num_seeing += int(num_seeing[row])
+            path.num_should_see += int(num_should_see[row])
             path.agreed += int(one.num_viewpoints >= required[row])
             path.trusted += int(one.num_viewpoints >= TRUSTED_VIEWPOINTS)
             path.dispersion += (one.disagreement - path.dispersion) / _DISPERSION_FRAMES
@@ -338,7 +368,9 @@ class Births:
         Lines of two viewpoints cross by chance, where more viewpoints have the place in view. Such crossings are looked
         for among the sightings of nothing else, so that they take no sighting from a drone.
         """
-        sure = np.array([path.agreed > 0 or self._required is not None for path in self._paths], bool)
+        sure = np.array(
+            [path.agreed > 0 or self._rules.min_viewpoints is not None for path in self._paths], bool
+        )
         dispersion = np.array([path.dispersion for path in self._paths])
 
         def crossed_by(view: CameraSightings, of: Int[np.ndarray, "some"], least: int | None) -> Crossings:
@@ -348,23 +380,33 @@ class Births:
             found = crossings(self._cameras, view, self._clear_m, expected, least)
             return found.numbered(of)
 
-        first = crossed_by(view, np.flatnonzero(sure), self._required)
-        if self._required is not None:
+        first = crossed_by(view, np.flatnonzero(sure), self._rules.min_viewpoints)
+        if self._rules.min_viewpoints is not None:
             return first
         row, camera = np.nonzero(first.box >= 0)
         rest = view.without(camera, first.box[row, camera])
         return first.joined(crossed_by(rest, np.flatnonzero(~sure), 2))
 
-    def _counts(
+    def _cameras_that_see(
         self,
         crossed: Crossings,
         view: CameraSightings,
         in_view: Bool[np.ndarray, "crossings cameras"],
         known: KnownDrones,
-    ) -> Bool[np.ndarray, "crossings"]:
+    ) -> tuple[Int[np.ndarray, "crossings"], Int[np.ndarray, "crossings"]]:
+        """Number of cameras that see something at each crossing, and of those that should see a drone there."""
+        pixels = np.asarray(project(self._cameras, crossed.position_m[:, None])[0])
+        should_see = in_view & ~_hidden(pixels, known)
+        # A sighting that holds the place, of several drones for instance, shows that something is there.
+        holds = (np.abs(pixels[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1).any(axis=-1)
+        sees = crossed.seen | (holds & should_see)
+        return sees.sum(axis=-1), (should_see | crossed.seen).sum(axis=-1)
+
+    def _counts(self, crossed: Crossings, known: KnownDrones) -> Bool[np.ndarray, "crossings"]:
         """Which crossings look like a drone that is none of the known ones."""
         points_m, seen = crossed.position_m, crossed.seen
-        spans_m = known.size_m[np.isfinite(known.position_m + known.size_m).all(axis=-1)].max(axis=-1)
+        is_found = np.isfinite(known.position_m).all(axis=-1)
+        spans_m = known.size_m[is_found & np.isfinite(known.size_m).all(axis=-1)].max(axis=-1)
         limits = (spans_m.min() / SIZE_RATIO, spans_m.max() * SIZE_RATIO) if len(spans_m) else SPANS_M
         span_m = crossed.span_m.max(axis=-1)
         size_m = crossed.span_m[:, [0, 0, 1]]
@@ -372,12 +414,6 @@ class Births:
         known_size_m = np.where(np.isfinite(known.size_m), known.size_m, size_m[:, None])
         off = 2 * (points_m[:, None] - known.position_m) / (size_m[:, None] + known_size_m)
         apart = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf).min(axis=1, initial=np.inf)
-        pixels = np.asarray(project(self._cameras, points_m[:, None])[0])
-        should_see = in_view & ~_hidden(pixels, known)
-        # A sighting that holds the place, of several drones for instance, shows that something is there.
-        holds = (np.abs(pixels[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1).any(axis=-1)
-        sees = seen | (holds & should_see)
-        share = sees.sum(axis=-1) / np.maximum((should_see | seen).sum(axis=-1), 1)
         # What is left of blobs that known drones hide in part may be their rims.
         whole = (crossed.box >= 0) & self._is_whole[np.arange(len(self._viewpoint)), crossed.box]
         better = np.linalg.norm(points_m[:, None] - points_m, axis=-1) < SEPARATION_M
@@ -386,7 +422,6 @@ class Births:
             (span_m >= limits[0])
             & (span_m <= limits[1])
             & (apart >= MIN_DISTANCE)
-            & (share >= self._min_share)
             & ((self._num_viewpoints(whole) >= 2) | (len(spans_m) == 0))
             & ((crossed.ambiguity < AMBIGUOUS) | (self._num_viewpoints(seen) >= TRUSTED_VIEWPOINTS))
             & ~((crossed.expected < 0) & better.any(axis=1))
@@ -397,8 +432,8 @@ class Births:
 
     def _required_viewpoints(self, in_view: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:
         """Number of viewpoints that must agree to begin a track at places with these cameras in view."""
-        if self._required is not None:
-            return np.full(len(in_view), self._required)
+        if self._rules.min_viewpoints is not None:
+            return np.full(len(in_view), self._rules.min_viewpoints)
         return np.clip(self._num_viewpoints(in_view), 2, TRUSTED_VIEWPOINTS)
 
     def _num_viewpoints(self, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:
@@ -422,14 +457,14 @@ class Births:
         return path.missed > MOST_MISSED or too_few or is_grown
 
     def _is_drone(self, path: _Path) -> bool:
-        """Whether a place was found often enough, by enough viewpoints, and is not much faster than a drone."""
-        least = MIN_FOUND
+        """Whether a place was found often enough, by enough cameras, and is not much faster than a drone."""
+        least = self._rules.min_found
         if path.agreed < AGREED_FOUND:
             # A number of viewpoints that is asked for counts without exception.
-            least = FOUND_BY_TWO_ALONE if self._required is None else MOST_REMEMBERED + 1
+            least = FOUND_BY_TWO_ALONE if self._rules.min_viewpoints is None else MOST_REMEMBERED + 1
         elif path.trusted < AGREED_FOUND:
             least = FOUND_BY_TWO
-        if len(path.found) < least:
+        if len(path.found) < least or path.num_seeing < MIN_SEEING_SHARE * path.num_should_see:
             return False
         way_m = float(np.linalg.norm(path.places_m[-1] - path.places_m[0]))
         return way_m * self._fps <= FASTER * self._max_speed_m_s * (max(path.found) - min(path.found))
@@ -440,7 +475,7 @@ class Births:
         return is_young and len(path.found) >= RETURNED_FOUND and path.agreed >= AGREED_FOUND
 
     def _candidate(self, path: _Path, is_sure: bool) -> TrackCandidate:
-        first = next(iter(path.found.values()))
+        first, ghosts_from = next(iter(path.found.values())), self._rules.ghosts_from
         position_m, velocity_m_s = state_at(path.found, path.first, self._fps, self._max_speed_m_s)
         return TrackCandidate(
             path.first,
@@ -448,7 +483,7 @@ class Births:
             velocity_m_s,
             self._size_m(path),
             first.num_cameras,
-            self._ghosts_from is None or path.first < self._ghosts_from or _is_moving(path),
+            ghosts_from is None or path.first < ghosts_from or _is_moving(path),
             path.found,
             is_sure,
         )
@@ -502,18 +537,19 @@ def _hidden(
 
 
 def _is_moving(path: _Path) -> bool:
-    """Whether a candidate has moved far, or moves in both halves of its frames.
+    """Whether a candidate has moved far, or moves both in its first and in its last frames.
 
     A ghost seems to move, by a quarter of its span, while the drone that departs still overlaps it.
     """
     places_m, span_m = path.places_m, float(path.span_m.max())
     if float(np.linalg.norm(places_m[-1] - places_m[0])) > MIN_DISPLACEMENT * span_m:
         return True
-    std_m = np.sqrt(np.median([np.trace(one.covariance_m2) / 3 for one in path.found.values()]))
-    for half_m in np.array_split(places_m, 2):
-        count = len(half_m)
-        # Way along the straight line that fits the places best, and its standard deviation.
-        way_m = float(np.linalg.norm(np.polyfit(np.arange(count), half_m, 1)[0])) * (count - 1)
-        if way_m < max(MIN_TRAVEL * span_m, TRAVEL_SIGMAS * std_m * np.sqrt(12 / count)):
+    for end_m in (places_m[:WINDOW_FRAMES], places_m[-WINDOW_FRAMES:]):
+        frame = np.arange(len(end_m))
+        # Way along the straight line that fits the places best, and its standard deviation, from their scatter.
+        line = np.polyfit(frame, end_m, 1)
+        way_m = float(np.linalg.norm(line[0])) * frame[-1]
+        std_m = float((end_m - frame[:, None] * line[0] - line[1]).std())
+        if way_m < max(MIN_TRAVEL * span_m, TRAVEL_SIGMAS * std_m * np.sqrt(12 / len(end_m))):
             return False
     return True

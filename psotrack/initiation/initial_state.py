@@ -11,7 +11,7 @@ from jaxtyping import Float
 from psotrack.correspondence import Sightings, from_silhouettes
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, looking_depths_m, project_visible, sizes_m, to_camera
-from psotrack.initiation.births import NO_DRONES, WINDOW_FRAMES, Births, state_at
+from psotrack.initiation.births import NO_DRONES, WINDOW_FRAMES, BirthRules, Births, state_at
 from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
 from psotrack.silhouettes import Silhouettes
@@ -199,11 +199,10 @@ def first_drones(
     sightings = shown if isinstance(shown, Sightings) else from_silhouettes(shown, stop=count)
     births = Births(
         rig.cameras,
+        BirthRules(num_frames=shown.num_frames),
         fps=fps,
         bounds_m=bounds_m,
         max_speed_m_s=max_speed_m_s,
-        min_viewpoints=None,
-        min_share=0.5,
     )
     for frame in range(count):
         births.step(frame, sightings.at(frame), NO_DRONES)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from psotrack.correspondence import Sightings, from_silhouettes, wide_bounds
 from psotrack.geometry import Rig, viewpoints
-from psotrack.initiation.births import NO_DRONES, Births, TrackCandidate
+from psotrack.initiation.births import NO_DRONES, BirthRules, Births, TrackCandidate
 from psotrack.initiation.initial_state import room_bounds
 from psotrack.settings import USUAL_SPEED_M_S
 from psotrack.silhouettes import Silhouettes
@@ -26,8 +26,6 @@ WINDOWS, WINDOW_FRAMES = 12, 16
 STEP_S = 0.04
 #: Largest speed that is looked for, m/s.
 FASTEST_M_S = 60.0
-#: Least share of the cameras with a place in view that see a drone there; detectors miss drones.
-LEAST_SHARE = 0.4
 #: Largest number of sightings per image: of noisy silhouettes the largest blobs count.
 MOST_SIGHTINGS = 12
 #: A point counts if its standard deviation is below this share of its distance from the cameras.
@@ -203,11 +201,10 @@ def _find(
         sightings = read(np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step))
         births = Births(
             rig.cameras,
+            BirthRules(min_viewpoints),
             fps=fps / step,
             bounds_m=wide_bounds(rig),
             max_speed_m_s=FASTEST_M_S,
-            min_viewpoints=min_viewpoints,
-            min_share=LEAST_SHARE,
         )
         for number in range(sightings.num_frames):
             births.step(number, sightings.at(number).largest(MOST_SIGHTINGS), NO_DRONES)

@@ -22,6 +22,7 @@ from psotrack.initiation import (
     NEW,
     SPEED_SHARE,
     TRUSTED_VIEWPOINTS,
+    BirthRules,
     Births,
     KnownDrones,
     Measurement,
@@ -38,9 +39,6 @@ from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
 from psotrack.support import Report, no_progress
 from psotrack.trajectories import Tracks
 
-#: Least share of the cameras with the drone in view that must see a new drone; fewer lines of sight cross by chance.
-#: Detectors miss drones and drones hide each other: half of the cameras would be too many.
-MIN_SHARE = 0.4
 #: Squared distance from the expected position, normalised by covariance, from which on a drone is elsewhere if trusted
 #: viewpoints say so. The filter treats positions beyond its gate as outliers, which is right up to twice the gate.
 SURPRISING = 2 * GATE_999
@@ -125,11 +123,10 @@ class _Tracker:
         self._motion = TrackMotion(settings.motion, fps, bounds_m)
         self._births = Births(
             cameras,
+            BirthRules(settings.status.min_cameras_to_begin),
             fps=fps,
             bounds_m=bounds_m,
             max_speed_m_s=self._max_speed_m_s,
-            min_viewpoints=settings.status.min_cameras_to_begin,
-            min_share=MIN_SHARE,
         )
         self._max_coasting_frames = round(settings.status.max_coasting_s * fps)
         self._num_drones = 0

@@ -206,16 +206,7 @@ class Engine:
         return [one(jobs[0])] if len(jobs) == 1 else list(self._threads.map(one, jobs))
 
 
-@partial(stored_jit, static_argnames="program")
-def _one_run(
-    slots: Slots,
-    frames: Frames,
-    starts: TrackStarts,
-    cameras: Camera,
-    params: TrackerParams,
-    program: Program,
-) -> tuple[Slots, Rows]:
-    return tracker.track(slots, frames, starts, cameras, params, program)
+_one_run = stored_jit(tracker.track, static_argnames="program")
 
 
 @partial(jax.jit, static_argnames=("structure", "program"))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from psotrack.geometry import Rig
-from psotrack.initiation import WINDOW_FRAMES, TrackCandidate, state_at
+from psotrack.initiation import TrackCandidate, state_at
 from psotrack.silhouettes import Silhouettes
 from psotrack.support import Report, no_progress
 from psotrack.tracking.block import BLOCK_FRAMES, Block, Engine, Setting, make_block
@@ -74,7 +74,8 @@ def track_recording(
     """
     setting = Setting(rig, silhouettes.reduction, silhouettes.borders, fps)
     engine = Engine(setting, side_by_side=side_by_side)
-    progress = [_begin(setting, inputs, on_cpu=not engine.side_by_side) for inputs in runs]
+    on_cpu = not engine.side_by_side
+    progress = [_begin(setting, inputs, silhouettes.num_frames, on_cpu=on_cpu) for inputs in runs]
     last: Block | None = None
     with report("track", silhouettes.num_frames) as advance:
         for block in _blocks(setting, silhouettes):
@@ -109,8 +110,8 @@ def track_recording(
     return [_results(each) for each in progress], engine.compile_s
 
 
-def _begin(setting: Setting, inputs: RunInputs, *, on_cpu: bool) -> _Progress:
-    run = SwarmRun(setting, inputs, on_cpu=on_cpu, ghosts_from=WINDOW_FRAMES)
+def _begin(setting: Setting, inputs: RunInputs, num_frames: int, *, on_cpu: bool) -> _Progress:
+    run = SwarmRun(setting, inputs, on_cpu=on_cpu, num_frames=num_frames)
     return _Progress(run, [] if inputs.given is None else run.given_starts(inputs.given, 0))
 
 

@@ -18,6 +18,8 @@ from psotrack._typing import Key
 from psotrack.initiation import (
     NEW,
     STAYED_SPANS,
+    WINDOW_FRAMES,
+    BirthRules,
     Births,
     InitialState,
     KnownDrones,
@@ -35,10 +37,6 @@ from psotrack.tracking.tracker import Rows, Slots, TrackerParams, TrackStarts, e
 from psotrack.trajectories import Status
 
 logger = logging.getLogger(__name__)
-
-#: Least share of the cameras that should see a drone and do see it: silhouettes of small or dark drones flicker, so
-#: that a missing blob says much less than a blob.
-MIN_SEEING_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,7 @@ class SwarmRun:
         on_cpu: whether a CPU computes the blocks.
         most_drones: largest number of drones at one time; None for any number.
         memory_frames: number of frames that are remembered; None for all.
-        ghosts_from: see `Births`.
+        num_frames: number of frames of the recording; None for a recording without end, whose first frames have ghosts.
 
     Attributes:
         slots: the drones after the last block.
@@ -172,7 +170,7 @@ class SwarmRun:
         on_cpu: bool = True,
         most_drones: int | None = None,
         memory_frames: int | None = None,
-        ghosts_from: int = 0,
+        num_frames: int | None = None,
     ) -> None:
         settings = inputs.settings
         self._setting, self._settings, self._bounds_m = setting, settings, inputs.bounds_m
@@ -182,12 +180,15 @@ class SwarmRun:
         self._new_births = partial(
             Births,
             setting.rig.cameras,
+            BirthRules(
+                settings.status.min_cameras_to_begin,
+                # A recording's background is known from the start, that of a stream is learned from its first frames.
+                ghosts_from=0 if num_frames is None else WINDOW_FRAMES,
+                num_frames=num_frames,
+            ),
             fps=setting.fps,
             bounds_m=inputs.bounds_m,
             max_speed_m_s=settings.motion.speed_limit_m_s,
-            min_viewpoints=settings.status.min_cameras_to_begin,
-            min_share=MIN_SEEING_SHARE,
-            ghosts_from=ghosts_from,
         )
         self._births = self._searched = self._new_births()
         self._key = jax.random.key(settings.seed)
