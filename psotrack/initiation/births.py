@@ -53,7 +53,7 @@ TRUSTED_VIEWPOINTS = 3
 #: Least share of the cameras with a place in view, and not hidden by known drones, that see a drone there, in the mean
 #: over its frames. Obstacles hide drones, silhouettes of small drones flicker, and detectors miss drones at times: a
 #: missing sighting says much less than a sighting.
-MIN_SEEING_SHARE = 0.5
+MIN_SEEING_SHARE = 0.4
 #: Smallest height of a drone's middle above the floor, metres. What is lower is a shadow, because the middle of a drone
 #: that stands on its legs is higher.
 FLOOR_CLEARANCE_M = 0.08

@@ -19,7 +19,7 @@ from psotrack.support import Report, no_progress
 from psotrack.tracking.block import BLOCK_FRAMES, Block, Engine, Setting, make_block
 from psotrack.tracking.run import RunInputs, Start, SwarmRun
 from psotrack.tracking.tracker import Rows, Slots
-from psotrack.trajectories import ARRAYS, Arrival, DroneSizes, Tracks, unknown_value
+from psotrack.trajectories import ARRAYS, Arrival, DroneSizes, Tracks, padded
 
 #: Largest number of searches for new drones in a block: each time with the drones that the search before has found.
 _MOST_SEARCHES = 3
@@ -169,12 +169,7 @@ def _results(each: _Progress) -> tuple[Tracks, Places]:
     num_drones = int(each.run.drone.max(initial=-1)) + 1
 
     def joined(name: str) -> np.ndarray:
-        parts = [getattr(rows, name)[:, :num_drones] for rows in each.rows]
-        unknown = unknown_value(name, parts[0].dtype)
-        pads = [[(0, 0), (0, num_drones - part.shape[1]), *[(0, 0)] * (part.ndim - 2)] for part in parts]
-        return np.concatenate(
-            [np.pad(part, pad, constant_values=unknown) for part, pad in zip(parts, pads, strict=True)]
-        )
+        return np.concatenate([padded(name, getattr(rows, name), num_drones) for rows in each.rows])
 
     arrays = {one.name: joined(one.name) for one in fields(Rows)}
     box_px = arrays.pop("box_px")

@@ -34,7 +34,7 @@ from psotrack.support import stored_jit
 from psotrack.tracking.block import Block, Job, Setting, capacity, grown
 from psotrack.tracking.parameters import TrackerSettings, tracker_params, tracker_program
 from psotrack.tracking.tracker import Rows, Slots, TrackerParams, TrackStarts, empty_slots
-from psotrack.trajectories import Status
+from psotrack.trajectories import Status, padded
 
 logger = logging.getLogger(__name__)
 
@@ -384,10 +384,11 @@ class SwarmRun:
         for slot in gone.tolist():
             logger.info("drone %d is forgotten", self.drone[slot])
         if len(gone):
-            self._empty_slots(gone)
+            self.drone[gone] = -1
+            self._leave(gone)
 
-    def _empty_slots(self, gone: Int[np.ndarray, "gone"]) -> None:
-        self.drone[gone] = -1
+    def _leave(self, gone: Int[np.ndarray, "gone"]) -> None:
+        """Track nothing in some slots any more."""
         present = np.array(self.slots.present)
         present[gone] = False
         self.slots = replace(self.slots, present=jnp.asarray(present))
@@ -428,27 +429,19 @@ class SwarmRun:
             flights.position_m[:, known], flights.tracked[:, known], self._sizes_m()[known]
         )
         if is_false.any():
-            present = np.array(self.slots.present)
-            present[known[is_false]] = False
-            self.slots = replace(self.slots, present=jnp.asarray(present))
+            self._leave(known[is_false])
 
     # Memory
 
     def _flights(self, *latest: Flights) -> Flights:
         """The drones in all frames that are remembered, and in the latest, with as many slots as there are now."""
-        count, remembered = len(self.drone), [*self._memory, *latest]
+        remembered, count = [*self._memory, *latest], len(self.drone)
 
-        def joined(name: str, unknown: float | bool) -> np.ndarray:
-            parts = [getattr(each, name) for each in remembered]
-            missing = [[(0, 0), (0, count - part.shape[1]), *[(0, 0)] * (part.ndim - 2)] for part in parts]
-            return np.concatenate(
-                [np.pad(part, pad, constant_values=unknown) for part, pad in zip(parts, missing, strict=True)]
-            )
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([padded(name, getattr(each, name), count) for each in remembered])
 
         instant = np.concatenate([each.instant for each in remembered])
-        return Flights(
-            instant, joined("position_m", np.nan), joined("velocity_m_s", np.nan), joined("tracked", False)
-        )
+        return Flights(instant, joined("position_m"), joined("velocity_m_s"), joined("tracked"))
 
     def _clear_memory(self, slot: int) -> None:
         """What was remembered of a slot is of another drone."""

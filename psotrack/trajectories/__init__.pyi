@@ -4,7 +4,7 @@ from .resampling import resample
 from .row_streams import RowStream
 from .showing import drones_html
 from .summaries import DroneSummary, summarise, summary_columns
-from .tracks import ARRAYS, Arrival, DroneSizes, Tracks, unknown_value
+from .tracks import ARRAYS, Arrival, DroneSizes, Tracks, padded, unknown_value
 from .trajectories import Status, Trajectories
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "check_cells",
     "drones_html",
     "fixed_partner_values",
+    "padded",
     "read_trajectories",
     "resample",
     "summarise",

@@ -141,3 +141,10 @@ def unknown_value(name: str, dtype: np.dtype) -> float | int:
     if name == "status":
         return int(Status.LOST)
     return np.nan if dtype.kind == "f" else 0
+
+
+def padded(name: str, array: np.ndarray, num_drones: int) -> np.ndarray:
+    """An array of axes (frames, drones, ...) with this number of drones: the first ones, then unknown ones."""
+    missing = max(num_drones - array.shape[1], 0)
+    pads = [(0, 0), (0, missing), *[(0, 0)] * (array.ndim - 2)]
+    return np.pad(array[:, :num_drones], pads, constant_values=unknown_value(name, array.dtype))
