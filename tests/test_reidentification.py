@@ -148,6 +148,14 @@ def test_a_drone_that_stood_still_when_it_was_lost_has_stayed():
     assert assigned_drones([coming], lost_tracks(stood, flew)) == [1]
 
 
+def test_a_drone_that_was_lost_as_it_landed_takes_off_from_there():
+    """The other drone was lost in the air a moment ago, and is as large."""
+    takes_off = candidate((0.0, 0.1, 0.12), (0.0, 0.0, 0.3), is_sure=False)
+    landed = ((0.0, 0.0, 0.13), (0.0, 0.5, -0.5), 9.5)
+    flew = ((-1.3, -1.8, 3.0), (0.5, 0.5, -1.0), 2.6)
+    assert assigned_drones([takes_off], lost_tracks(flew, landed)) == [1]
+
+
 def test_a_ghost_that_seems_to_move_is_no_drone():
     """While the drone overlaps its ghost, the ghost seems to move slowly upwards; the drone is the faster candidate."""
     stood = ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 20.0)

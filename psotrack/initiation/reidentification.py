@@ -1,7 +1,7 @@
 """Re-identification: assign track candidates to lost drones.
 
 A candidate is a lost drone if time, motion and size agree, and else a new drone. A drone that stood still when it was
-lost is most probably still there: it has landed, or the background model has learned it. When such a drone departs, its
+lost, or that was at the floor, is most probably still there: it has landed, or the background model has learned it. When such a drone departs, its
 place becomes foreground that does not move, a ghost. The candidate that departs from this place is the drone, even if
 the drone's track follows the ghost by then.
 """
@@ -208,7 +208,7 @@ def reidentify(
         scores[row, count + row] = _NEW_NOT_ALLOWED if candidate.moves and max_births == 0 else log_new
         for column in range(0 if is_ghost[row] else count):
             # What may be a ghost is no drone that was lost elsewhere.
-            if not is_dying[row] or _may_have_stayed(candidate, lost, column):
+            if not is_dying[row] or _may_have_stayed(candidate, lost, column, bounds_m):
                 scores[row, column] = _log_likelihood(
                     candidate, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
                 )
@@ -240,8 +240,7 @@ def _log_likelihood(
     variance = (SPEED_SHARE * max_speed_m_s) ** 2
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
-    still = float(np.linalg.norm(velocity)) < STILL_M_S
-    if _may_have_stayed(candidate, lost, row):
+    if _may_have_stayed(candidate, lost, row, bounds_m):
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
         log_stayed += log_normal(candidate.velocity_m_s, variance)
     if lost.doubtful[row]:
@@ -256,15 +255,24 @@ def _log_likelihood(
     before = np.stack([place, velocity])
     after = np.stack([candidate.position_m, candidate.velocity_m_s])
     log_flown = max(log_transition(before, after, gap_s, variance, bounds_m), log_anywhere)
-    log_flown += np.log(1 - STAYED_PROBABILITY) if still else 0.0
+    log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, bounds_m) else 0.0
     return max(log_stayed, log_flown) + log_span
 
 
-def _may_have_stayed(candidate: TrackCandidate, lost: LostTracks, row: int) -> bool:
-    """Whether a lost drone stood still where the candidate is, or where it comes from."""
-    still = float(np.linalg.norm(lost.velocity_m_s[row])) < STILL_M_S
+def _stands(lost: LostTracks, row: int, bounds_m: Float[np.ndarray, "2 3"]) -> bool:
+    """Whether a drone stood still when it was lost, or was at the floor, where it lands."""
+    height_m = float(lost.position_m[row, 2] - bounds_m[0, 2])
+    slow = float(np.linalg.norm(lost.velocity_m_s[row])) < STILL_M_S
+    return slow or height_m < STAYED_SPANS * float(lost.size_m[row].max())
+
+
+def _may_have_stayed(
+    candidate: TrackCandidate, lost: LostTracks, row: int, bounds_m: Float[np.ndarray, "2 3"]
+) -> bool:
+    """Whether a lost drone stood where the candidate is, or where it comes from."""
     near_m = STAYED_SPANS * float(lost.size_m[row].max())
-    return still and _smallest_distance(candidate, lost.position_m[row]) < near_m
+    is_near = _smallest_distance(candidate, lost.position_m[row]) < near_m
+    return is_near and _stands(lost, row, bounds_m)
 
 
 def _departs_from(candidate: TrackCandidate, ghost: TrackCandidate) -> bool:
