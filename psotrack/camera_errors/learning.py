@@ -25,8 +25,10 @@ from psotrack.camera_errors.fading import Fading, fading_of
 from psotrack.camera_errors.variance_components import FittedPlaces, camera_variances, weighted_residuals
 from psotrack.camera_errors.views import CameraViews
 
-#: Largest number of rows (frames x drones) from which errors are learned: more rows add time and little accuracy.
-_MAX_ROWS = 6000
+#: Errors are learned from frames that are this far apart, seconds, because errors of neighbouring frames are alike; from
+#: nearer ones where there are fewer rows (frames x drones), and from fewer where there are more: more rows add time and
+#: little accuracy.
+_STEP_S, _MIN_ROWS, _MAX_ROWS = 0.1, 300, 6000
 #: Least length of a block of frames whose mean shows lasting errors, seconds, and in time constants of fading errors.
 _BLOCK_S, _BLOCK_TIMES = 1.0, 2.0
 #: Weight of the mean of all cameras in each camera's lasting variance: a camera that is seen in one part of the image
@@ -74,7 +76,8 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
     num_cameras, dt_s = views.num_cameras, 1 / fps
     found = np.concatenate([_rows(part).determined for _, part in views.parts()])
     found = found.reshape(views.shown.shape[:2])
-    step = max(1, -(-int(found.sum()) // _MAX_ROWS))
+    num_rows = int(found.sum())
+    step = max(1, min(round(_STEP_S * fps), num_rows // _MIN_ROWS), -(-num_rows // _MAX_ROWS))
     if found[::step].sum() < 2:
         none = np.zeros((num_cameras, 2))
         unknown = np.zeros((4 * num_cameras, 4 * num_cameras))
@@ -90,15 +93,16 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
     )
     # First as if there were next to no noise: the noise of residuals that contain a turn would hide the turn.
     constant = fitted(np.ones((num_cameras, 2)), _NO_NOISE, with_covariance=False)
+    total_px2 = None
     for round_number in range(_ROUNDS):
         rest = _without(views, constant)
-        total_px2 = _total_variances(rest[::step])
+        total_px2 = _total_variances(rest[::step], total_px2)
         fading = fading_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, usual)
         noise_px = np.sqrt(total_px2 * max(1 - fading.lasting_share, _LEAST_NOISE))
         inflation = fading.without_lasting().inflation(step * dt_s)
         constant = fitted(noise_px, inflation, with_covariance=round_number == _ROUNDS - 1)
     rest = _without(views, constant)
-    total_px2 = _total_variances(rest[::step])
+    total_px2 = _total_variances(rest[::step], total_px2)
     fading = fading_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, usual)
     noise = fading.without_lasting()
     length = max(1, round(max(_BLOCK_S, _BLOCK_TIMES * noise.time_s) * fps))
@@ -128,10 +132,15 @@ def _rows(views: CameraViews) -> FittedPlaces:
     )
 
 
-def _total_variances(views: CameraViews) -> Float[np.ndarray, "cameras 2"]:
-    """(cameras, 2), variances of the places in single frames; the mean of the others where a camera shows nothing."""
+def _total_variances(
+    views: CameraViews, near_px2: Float[np.ndarray, "cameras 2"] | None
+) -> Float[np.ndarray, "cameras 2"]:
+    """(cameras, 2), variances of the places in single frames; the mean of the others where a camera shows nothing.
+
+    `near_px2` are the variances of the round before.
+    """
     rows = _rows(views)
-    variance_px2 = camera_variances(rows, np.zeros(rows.residual_px.shape))
+    variance_px2 = camera_variances(rows, np.zeros(rows.residual_px.shape), near_px2)
     return np.where(np.isnan(variance_px2), np.nanmean(variance_px2), variance_px2)
 
 

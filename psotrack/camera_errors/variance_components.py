@@ -72,7 +72,9 @@ def weighted_residuals(
 
 
 def camera_variances(
-    places: FittedPlaces, known_px2: Float[np.ndarray, "rows cameras 2"]
+    places: FittedPlaces,
+    known_px2: Float[np.ndarray, "rows cameras 2"],
+    near_px2: Float[np.ndarray, "cameras 2"] | None = None,
 ) -> Float[np.ndarray, "cameras 2"]:
     """(cameras, 2), variances of each camera's places along columns and rows; NaN without residuals.
 
@@ -82,6 +84,7 @@ def camera_variances(
     Args:
         places: residuals and derivatives.
         known_px2: (rows, cameras, 2), the known part of the variances, which is not in the result, squared pixels.
+        near_px2: (cameras, 2), variances from which the steps start; None: the mean squared residual.
     """
     rows = places.determined
     places, known_px2 = places.only(rows), known_px2[rows]
@@ -92,7 +95,8 @@ def camera_variances(
     known_px2 = known_px2.reshape(len(known_px2), -1).T
     mean_px2 = np.square(parts.residual_px).sum() / max(1, 2 * places.shown.sum())
     least_px2 = _LEAST * mean_px2 + np.finfo(float).tiny
-    variance_px2 = np.full(seen.shape, mean_px2 + least_px2)
+    variance_px2 = np.full(seen.shape, mean_px2) if near_px2 is None else near_px2
+    variance_px2 = np.maximum(variance_px2, least_px2)
     for _ in range(_NUM_STEPS):
         weight = parts.shown / (known_px2 + variance_px2.reshape(-1, 1))
         found, expected = (of.reshape(seen.shape) for of in parts.squares(weight))
