@@ -25,9 +25,9 @@ from psotrack.camera_errors.fading import Fading, fading_of
 from psotrack.camera_errors.variance_components import FittedPlaces, camera_variances, weighted_residuals
 from psotrack.camera_errors.views import CameraViews
 
-#: Errors are learned from frames that are this far apart, seconds, because errors of neighbouring frames are alike; from
-#: nearer ones where there are fewer rows (frames x drones), and from fewer where there are more: more rows add time and
-#: little accuracy.
+#: Errors are learned from frames that are this far apart, seconds, because errors of neighbouring frames are alike;
+#: from nearer ones where there are fewer rows (frames x drones), and from fewer where there are more: more rows add
+#: time and little accuracy.
 _STEP_S, _MIN_ROWS, _MAX_ROWS = 0.1, 300, 6000
 #: Least length of a block of frames whose mean shows lasting errors, seconds, and in time constants of fading errors.
 _BLOCK_S, _BLOCK_TIMES = 1.0, 2.0

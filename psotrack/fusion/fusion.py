@@ -24,14 +24,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from psotrack.camera_errors import LastingCovariances, MeasurementErrors, TrackErrors, noise_ratios
+from psotrack.correspondence import SEPARATION_M
 from psotrack.motion import GATE_999, Measurements, filter_measurements, motion_params
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
 from psotrack.trajectories import Status, Tracks, unknown_value
 
-#: Distance of two tracks of one drone, metres, which more than half of their common frames do not exceed: the offset of
-#: the two points, and noise.
-SAME_M = 0.25
 #: Least number of common frames from which the offset of the two points is estimated; with fewer the offset is taken
 #: as 0.
 LEAST_FRAMES = 10
@@ -146,7 +144,8 @@ def fuse_tracks(
 def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
     """(drones of the swarm,), the number of the same drone in the lines; -1 for none."""
     apart_m = np.linalg.norm(swarm.found_m()[:, :, None] - lines.found_m()[:, None], axis=-1)
-    near, both = (apart_m < SAME_M).sum(axis=0), np.isfinite(apart_m).sum(axis=0)
+    # Of one drone if more than half of the common frames are as near as the two points' offset and noise allow.
+    near, both = (apart_m < SEPARATION_M).sum(axis=0), np.isfinite(apart_m).sum(axis=0)
     # The more frames two tracks share, the more certain it is that they are of one drone.
     gain = np.where(2 * near > both, both, 0)
     drones, others = linear_sum_assignment(gain, maximize=True)

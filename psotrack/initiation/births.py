@@ -385,6 +385,8 @@ class Births:
             return first
         row, camera = np.nonzero(first.box >= 0)
         rest = view.without(camera, first.box[row, camera])
+        if np.isfinite(rest.noise_px).any(axis=-1).sum() < 2:
+            return first
         return first.joined(crossed_by(rest, np.flatnonzero(~sure), 2))
 
     def _cameras_that_see(

@@ -1,9 +1,9 @@
 """Re-identification: assign track candidates to lost drones.
 
 A candidate is a lost drone if time, motion and size agree, and else a new drone. A drone that stood still when it was
-lost, or that was at the floor, is most probably still there: it has landed, or the background model has learned it. When such a drone departs, its
-place becomes foreground that does not move, a ghost. The candidate that departs from this place is the drone, even if
-the drone's track follows the ghost by then.
+lost, or that was at the floor, is most probably still there: it has landed, or the background model has learned it.
+When such a drone departs, its place becomes foreground that does not move, a ghost. The candidate that departs from
+this place is the drone, even if the drone's track follows the ghost by then.
 """
 
 from __future__ import annotations

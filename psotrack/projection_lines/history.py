@@ -15,7 +15,7 @@ SPAN_FRAMES = 25
 
 
 @dataclass
-class Drone:
+class TrackedDrone:
     """A drone and its track.
 
     Attributes:

@@ -30,7 +30,7 @@ from psotrack.initiation import (
     reidentify,
 )
 from psotrack.motion import GATE_999
-from psotrack.projection_lines.history import SPAN_FRAMES, Drone, History
+from psotrack.projection_lines.history import SPAN_FRAMES, History, TrackedDrone
 from psotrack.projection_lines.merged_boxes import split_merged_boxes
 from psotrack.projection_lines.single_views import SingleViews, find_single_views
 from psotrack.projection_lines.track_motion import TrackMotion
@@ -128,7 +128,7 @@ class _Tracker:
         )
         self._max_coasting_frames = round(settings.status.max_coasting_s * fps)
         self._history = History(sightings.num_frames)
-        self._drones: list[Drone] = []
+        self._drones: list[TrackedDrone] = []
 
     def start_known(
         self, position_m: Float[np.ndarray, "known 3"], velocity_m_s: Float[np.ndarray, "known 3"]
@@ -159,7 +159,7 @@ class _Tracker:
         return [number for number, drone in enumerate(self._drones) if drone.unseen <= most]
 
     def _new_drone(self) -> int:
-        self._drones.append(Drone())
+        self._drones.append(TrackedDrone())
         if len(self._drones) > len(self._motion):
             self._motion.grow()
             self._history.grow(len(self._motion))
@@ -331,7 +331,7 @@ class _Tracker:
         motion.grow()
         std_m_s = self._settings.motion.velocity_std_m_s
         motion.place(0, first.position_m, candidate.velocity_m_s, first.covariance_m2, std_m_s)
-        self._drones[number] = drone = Drone(first.disagreement)
+        self._drones[number] = drone = TrackedDrone(first.disagreement)
         self._note(candidate.instant, number, motion, 0, first)
         for instant in range(candidate.instant + 1, frame + 1):
             motion.predict()
