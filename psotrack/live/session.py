@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-import msgspec
 import numpy as np
 
 from psotrack.errors import InputError, OutputError, PsotrackError
@@ -17,7 +16,7 @@ from psotrack.live.cameras import LiveCamera
 from psotrack.live.front_end import FrontEnd
 from psotrack.live.meeting import CameraCounts, Instant
 from psotrack.live.recorder import RecordedCounts
-from psotrack.pipeline import CausalRun, causal_settings
+from psotrack.pipeline import causal_settings, causal_tracker
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures, usual_drone_px
@@ -78,7 +77,7 @@ class LiveSession:
 
     Attributes:
         result: what the session has done so far.
-        record: rate, settings, seed and volume of the run, fit for JSON.
+        record: cameras, settings, versions and volume of the run, fit for JSON.
     """
 
     def __init__(
@@ -102,7 +101,7 @@ class LiveSession:
         width, height = (-(-np.array(sizes_wh) // scaled.reduction)).max(axis=0).tolist()
         self._shape = height, width
         self._line_time_s = np.array([each.line_time_s for each in cameras], np.float32)
-        self._run = CausalRun(
+        self._tracker, self.record = causal_tracker(
             rig,
             settings,
             fps=self._rate_hz,
@@ -111,12 +110,6 @@ class LiveSession:
             shape=self._shape,
             most_drones=most_drones,
         )
-        self.record = {
-            "rate_hz": self._rate_hz,
-            "settings": msgspec.to_builtins(settings),
-            "seed": settings.seed,
-            "volume": self._run.volume,
-        }
         self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
 
     def stop(self) -> None:
@@ -145,22 +138,20 @@ class LiveSession:
         try:
             with self._front_end as front_end:
                 compiling_s = time.monotonic()
-                self._run.compile()
+                self._tracker.compile()
                 self.result.compile_s = time.monotonic() - compiling_s
                 # What was made so far is not searched for garbage again and again, which takes as long as a frame.
                 gc.collect()
                 gc.freeze()
                 began_s = front_end.begin(longest_s)
                 self.result.counts = front_end.counts
-                before = None
                 for instant, num_left_out in front_end.instants():
-                    self._track(instant, 1 if before is None else instant.number - before, outputs)
-                    before = instant.number
+                    self._track(instant, outputs)
                     self.result.left_out += num_left_out
                     self.result.seconds = time.monotonic() - began_s
                     if on_instant is not None:
                         on_instant(self.result, front_end.films)
-                    self._run.look_ahead()
+                    self._tracker.look_ahead()
         finally:
             gc.unfreeze()
         self.result.recorded = self._front_end.recorded
@@ -180,7 +171,7 @@ class LiveSession:
                 expected, found = "frames", "none until the session ended"
             raise InputError("the cameras", expected=expected, found=found, remedy=remedy)
 
-    def _track(self, instant: Instant, elapsed: int, outputs: list[RowsOutput]) -> None:
+    def _track(self, instant: Instant, outputs: list[RowsOutput]) -> None:
         images = np.zeros((len(self._cameras), *self._shape), np.uint8)
         for index, image in enumerate(instant.coverage):
             if image is not None:
@@ -189,7 +180,7 @@ class LiveSession:
         exposures = Exposures(
             instant.offset_s.astype(np.float32), is_there, is_there.astype(np.float32), self._line_time_s
         )
-        rows = self._run.step(instant.number, instant.time_s, images, exposures, num_frames=elapsed)
+        rows = self._tracker.step(instant.number, instant.time_s, images, exposures)
         for output in list(outputs):
             try:
                 output.write(rows)

@@ -1,4 +1,4 @@
-from .causal_run import CausalRecording, CausalRun, causal_settings
+from .causal import CausalRecording, causal_settings, causal_tracker
 from .parts import Parts
 from .results import (
     TrackedRecording,
@@ -12,10 +12,10 @@ from .running import track_recording, track_runs
 
 __all__ = [
     "CausalRecording",
-    "CausalRun",
     "Parts",
     "TrackedRecording",
     "causal_settings",
+    "causal_tracker",
     "changed_settings",
     "environment",
     "real_time_factors",
