@@ -53,12 +53,11 @@ import pandas as pd
 
 from psotrack.evaluation import evaluate
 from psotrack.live import Meeting
-from psotrack.pipeline import Parts, TrackedRecording, track_runs
-from psotrack.pipeline.preparation import prepare
+from psotrack.pipeline import Parts, SharedInputs, TrackedRecording, prepare, track_runs
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import COLOURS, no_progress, processors, save_figure
+from psotrack.support import COLOURS, processors, save_figure
 from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -298,7 +297,7 @@ def start_s(recording: Recording, silhouettes: Silhouettes) -> float:
     recording = replace(recording, bounds_m=None)
     silhouettes = silhouettes.at_instants(recording.timeline())
     began = time.process_time()
-    prepare(recording, silhouettes, TrackSettings(), Parts(), {}, no_progress)
+    prepare(SharedInputs(recording, silhouettes), TrackSettings(), Parts())
     return time.process_time() - began
 
 
