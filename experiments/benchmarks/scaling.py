@@ -303,7 +303,7 @@ def start_s(recording: Recording, silhouettes: Silhouettes) -> float:
 
 def meeting_ms(num_cameras: int) -> float:
     """Milliseconds in which the frames of an instant meet, without what is done with them."""
-    meeting = Meeting([_scene.FPS] * num_cameras, _scene.FPS, wait_s=0.1, began_s=0.0)
+    meeting = Meeting([_scene.FPS] * num_cameras, _scene.FPS, wait_s=0.1)
     image, taken = np.zeros((1, 1), np.uint8), 0
     began = time.perf_counter()
     for number in range(MEETINGS):

@@ -216,7 +216,7 @@ def live(
     warn_of_missing_drones(chosen, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
-        report["websocket"] = {"clients": server.num_clients, "too_slow": server.num_too_slow}
+        report["websocket"] = {"clients": server.num_clients}
     report = with_real_time(report, time.perf_counter() - started, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)
