@@ -33,7 +33,7 @@ sys.path[:0] = [str(HERE), str(ROOT)]
 import figures  # noqa: E402
 
 #: Order of the rooms in the Python reference; rooms that are not listed follow in alphabetical order.
-FIRST_ROOMS = ["settings", "pipeline", "methods", "recordings", "datasets", "trajectories", "evaluation"]
+FIRST_ROOMS = ["settings", "pipeline", "recordings", "datasets", "trajectories", "evaluation"]
 #: Parts of the package without a public Python interface.
 HIDDEN = {"__main__", "_typing", "cli", "demo"}
 #: Pictures that pages show, by folder below the repository's root.

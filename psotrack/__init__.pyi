@@ -5,8 +5,7 @@ from .evaluation import Evaluation, evaluate
 from .exchange import export_tracks, read_tracks
 from .geometry import Rig, make_camera, make_rig, project, triangulate
 from .inside_out import MarkerMap, localise_video, read_marker_map
-from .methods import Method, MethodInputs
-from .pipeline import TrackedRecording, track_runs
+from .pipeline import Method, MethodInputs, TrackedRecording, track_runs
 from .recordings import Recording, read_c3d
 from .reports import view_3d
 from .rig_files import read_rig, write_rig

@@ -12,8 +12,7 @@ from jaxtyping import UInt8
 from psotrack.datasets import open_recording
 from psotrack.detection import Detector
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
-from psotrack.methods import Method, check_detections
-from psotrack.pipeline import Parts, TrackedRecording, track_recording
+from psotrack.pipeline import Method, Parts, TrackedRecording, check_detections, track_recording
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import BackgroundModel, ForegroundSettings, Living

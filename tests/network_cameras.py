@@ -107,12 +107,18 @@ def film_on_the_network() -> Iterator[Cameras]:
 def film(processes: Cameras, video: Path, port: int) -> None:
     """Start a camera, and wait until it answers."""
     processes[port] = subprocess.Popen([sys.executable, "-c", _CAMERA, str(video), str(port)])
-    for _ in range(300):
+    wait_for_server(port, processes[port])
+
+
+def wait_for_server(port: int, process: subprocess.Popen) -> None:
+    """Wait until a process listens at a port."""
+    for _ in range(1200):
         with socket.socket() as one:
             if one.connect_ex(("127.0.0.1", port)) == 0:
                 return
+        assert process.poll() is None, process.communicate()
         time.sleep(0.1)
-    raise AssertionError(f"no camera answers at port {port}")
+    raise AssertionError(f"nobody answers at port {port}")
 
 
 def laboratory_of(folder: Path, sequence: Path, videos: Mapping[str, str | int]) -> Path:

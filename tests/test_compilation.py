@@ -63,6 +63,6 @@ def test_no_frame_waits_for_a_compilation():
     for frame in range(3):
         images = np.full((len(RIG), *SHAPE), 40 * frame, np.uint8)
         there = np.arange(len(RIG)) != frame
-        tracker.step(images, Exposures(zero, there, zero + 1, zero), num_frames=1 + frame)
+        tracker.step(2 * frame, 0.08 * frame, images, Exposures(zero, there, zero + 1, zero))
         tracker.look_ahead()
     assert compiled() == before

@@ -53,7 +53,6 @@ ROOMS = [
     "calibration",
     "doctor",
     "inside_out",
-    "methods",
     "pipeline",
     "archives",
     "live",
@@ -122,8 +121,8 @@ CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy"}
 FORBIDDEN = {
     "tracking.swarm": {"tracking.fitness", "geometry"},
     "tracking.fitness": {"tracking.swarm"},
-    "simulation": {"geometry.boxes", "tracking", "silhouettes", "pipeline", "methods"},
-    "evaluation": {"tracking", "geometry", "pipeline", "methods"},
+    "simulation": {"geometry.boxes", "tracking", "silhouettes", "pipeline"},
+    "evaluation": {"tracking", "geometry", "pipeline"},
 }
 
 

@@ -178,9 +178,8 @@ def test_names_of_cameras_in_boxes_of_motchallenge(evil_recording, tmp_path):
 
 
 def test_names_of_cameras_in_a_recording_of_a_live_session(evil_recording, tmp_path):
-    folder = RecordingFolder(tmp_path / "in" / "out", evil_recording, evil_recording.rig.names)
     with pytest.raises(InputError, match=r"found '\.\./evil'"):
-        folder.begin()
+        RecordingFolder(tmp_path / "in" / "out", evil_recording, evil_recording.rig.names).begin()
     assert not list(tmp_path.rglob("*evil*"))
 
 

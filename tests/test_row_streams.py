@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from psotrack.errors import OutputError
+from psotrack.errors import InputError, OutputError
 from psotrack.trajectories import RowStream, Trajectories, read_trajectories, write_trajectories
 
 NUM_FRAMES = 40
@@ -45,15 +45,31 @@ def _frames(flight: Trajectories) -> list[Trajectories]:
     ]
 
 
-def test_a_parquet_table_that_grew_is_the_one_that_is_written_at_once(tmp_path: Path) -> None:
-    flight = _flight()
-    write_trajectories(tmp_path / "once.parquet", flight)
-    with RowStream(tmp_path / "rows.parquet") as rows:
-        for frame in _frames(flight):
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_table_that_grew_is_the_one_that_is_written_at_once(tmp_path: Path, suffix: str) -> None:
+    flight, path = _flight(), tmp_path / f"rows{suffix}"
+    write_trajectories(tmp_path / f"once{suffix}", flight)
+    with RowStream(path) as rows:
+        for number, frame in enumerate(_frames(flight), 1):
             rows.write(frame)
-    once, grown = (pq.read_table(tmp_path / f"{name}.parquet") for name in ("once", "rows"))
-    assert grown.schema.equals(once.schema, check_metadata=True)
-    assert grown.equals(once)
+            # What was written to a CSV file can be read at once.
+            assert path.exists() == (suffix == ".csv")
+            assert suffix == ".parquet" or read_trajectories(path).num_frames == number
+    if suffix == ".csv":
+        assert path.read_bytes() == (tmp_path / "once.csv").read_bytes()
+    else:
+        once, grown = (pq.read_table(tmp_path / f"{name}.parquet") for name in ("once", "rows"))
+        assert grown.schema.equals(once.schema, check_metadata=True)
+        assert grown.equals(once)
+
+
+def test_a_table_that_exists_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "rows.csv").write_text("mine")
+    with pytest.raises(OutputError, match=r"rows\.csv"):
+        RowStream(tmp_path / "rows.csv")
+    with pytest.raises(InputError, match=r"\.csv or \.parquet"):
+        RowStream(tmp_path / "rows.txt")
+    assert (tmp_path / "rows.csv").read_text() == "mine"
 
 
 def test_an_error_leaves_the_rows_and_no_parquet_table(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import sys
@@ -97,41 +98,24 @@ def test_all_clients_get_every_row_as_a_message(port: int, server: WebSocketLine
     assert np.allclose(row["position_m"], rows_of(1).position_m[0, 0])
 
 
-def test_a_client_that_never_reads_is_disconnected_and_slows_nobody(
-    port: int, server: WebSocketLines, caplog: pytest.LogCaptureFixture
-) -> None:
-    received: list[str] = []
-
-    def read(connection) -> None:
-        for message in connection:
-            received.append(message)
-
-    deaf = deaf_client(port, server)
-    with connected(port, server) as connection:
-        reader = threading.Thread(target=read, args=(connection,))
-        reader.start()
-        longest_s, frame = 0.0, 0
-        # Until the system's buffers for the deaf client are full, some megabytes, and its buffer in the server too.
-        while not server.num_too_slow:
-            assert frame < 20_000, "the client that never reads is not disconnected"
-            for _ in range(20):
-                began_s = time.perf_counter()
-                server.write(rows_of(frame, num_drones=16))
-                longest_s = max(longest_s, time.perf_counter() - began_s)
-                frame += 1
-            wait_until(lambda: len(received) == 16 * frame, "the other client does not get its rows")  # noqa: B023
-        for _ in range(100):  # said once, and not with every row
+def test_a_client_that_never_reads_is_disconnected_and_slows_nobody(port: int) -> None:
+    server, received = WebSocketLines(f"{port}", asked_s=0.5), []
+    with contextlib.closing(server), deaf_client(port, server) as deaf, connected(port, server) as connection:
+        longest_s = 0.0
+        # More than the system's buffers for the deaf client take.
+        for frame in range(2000):
+            began_s = time.perf_counter()
             server.write(rows_of(frame, num_drones=16))
-            frame += 1
-        wait_until(lambda: len(received) == 16 * frame, "the other client gets no more rows")
-        # A blocked socket would wait for the client's pong, 20 s; a busy machine may keep a thread waiting for a while.
+            longest_s = max(longest_s, time.perf_counter() - began_s)
+            received += [connection.recv(timeout=10) for _ in range(16)]
+        # A busy machine may keep a thread waiting for a while.
         assert longest_s < 2.0
-        assert server.num_too_slow == 1
-        assert caplog.messages == ["a client of --websocket reads too slowly and is disconnected"]
-        server.close()
-        reader.join(timeout=10)
-        assert not reader.is_alive()
-    deaf.close()
+        assert received[-1] == lines_of(rows_of(1999, num_drones=16))[-1]
+        # The deaf client's connection ends after what was under way, long before all that was sent.
+        deaf.settimeout(10)
+        with contextlib.suppress(ConnectionResetError):
+            num_bytes = len(b"".join(iter(lambda: deaf.recv(2**20), b"")))
+            assert num_bytes < 0.9 * sum(map(len, received))
 
 
 def test_a_client_that_does_not_read_cannot_hold_up_the_end(port: int) -> None:
@@ -144,7 +128,6 @@ def test_a_client_that_does_not_read_cannot_hold_up_the_end(port: int) -> None:
         server.close()
         # A second for the client to close, and what a busy machine needs.
         assert time.perf_counter() - began_s < 10
-        assert server.num_too_slow == 0
 
 
 def test_clients_that_vanish_do_no_harm(port: int, server: WebSocketLines) -> None:

@@ -53,12 +53,11 @@ import pandas as pd
 
 from psotrack.evaluation import evaluate
 from psotrack.live import Meeting
-from psotrack.pipeline import Parts, TrackedRecording, track_runs
-from psotrack.pipeline.preparation import prepare
+from psotrack.pipeline import Parts, SharedInputs, TrackedRecording, prepare, track_runs
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import COLOURS, no_progress, processors, save_figure
+from psotrack.support import COLOURS, processors, save_figure
 from psotrack.trajectories import Trajectories
 
 if TYPE_CHECKING:
@@ -298,13 +297,13 @@ def start_s(recording: Recording, silhouettes: Silhouettes) -> float:
     recording = replace(recording, bounds_m=None)
     silhouettes = silhouettes.at_instants(recording.timeline())
     began = time.process_time()
-    prepare(recording, silhouettes, TrackSettings(), Parts(), {}, no_progress)
+    prepare(SharedInputs(recording, silhouettes), TrackSettings(), Parts())
     return time.process_time() - began
 
 
 def meeting_ms(num_cameras: int) -> float:
     """Milliseconds in which the frames of an instant meet, without what is done with them."""
-    meeting = Meeting([_scene.FPS] * num_cameras, _scene.FPS, wait_s=0.1, began_s=0.0)
+    meeting = Meeting([_scene.FPS] * num_cameras, _scene.FPS, wait_s=0.1)
     image, taken = np.zeros((1, 1), np.uint8), 0
     began = time.perf_counter()
     for number in range(MEETINGS):

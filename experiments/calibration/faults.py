@@ -23,7 +23,7 @@ from psotrack.correspondence import from_detections
 from psotrack.datasets.dpjait import read_detections, read_sequence
 from psotrack.doctor import Diagnosis, examine
 from psotrack.geometry import Rig
-from psotrack.methods import detection_files_of
+from psotrack.pipeline import detection_files_of
 from psotrack.recordings import Detections
 from psotrack.settings import YOLO
 from psotrack.support import save_figure

@@ -18,7 +18,7 @@ from psotrack.archives.sealed_zip import Source, write_sealed
 from psotrack.datasets import reference_files
 from psotrack.errors import InputError
 from psotrack.geometry import Camera
-from psotrack.methods import detection_files_of, usable_for
+from psotrack.pipeline import detection_files_of, usable_for
 from psotrack.recordings import (
     ARRAY_FILE,
     MADE_OF,
@@ -224,7 +224,7 @@ def _check_inputs(
     known = {name: each.key for name, each in silhouettes.items()}
     if run.settings.reads_detections:
         prefix = _DETECTIONS_OF if run.settings.needs_silhouettes else ""
-        # `methods.read_sightings` makes these keys.
+        # `pipeline` (`read_sightings`) makes these keys.
         known |= {
             f"{prefix}{name}": digest_file(path, algorithm="sha256")[:16] for name, path in detections.items()
         }

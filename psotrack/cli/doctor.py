@@ -82,7 +82,7 @@ def doctor(
     from psotrack.datasets import open_recording
     from psotrack.doctor import examine
     from psotrack.initiation import room_bounds
-    from psotrack.methods import detection_files_of
+    from psotrack.pipeline import detection_files_of
     from psotrack.recordings import read_detections
     from psotrack.settings import BLOBS
     from psotrack.silhouettes import SilhouetteSettings, compute

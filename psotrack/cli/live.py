@@ -151,7 +151,7 @@ def live(
         WebSocketLines,
         live_cameras,
     )
-    from psotrack.pipeline import environment, warn_of_missing_drones, with_real_time
+    from psotrack.pipeline import warn_of_missing_drones, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
@@ -214,9 +214,9 @@ def live(
 
         result = session.run([*rows, *outputs], show, longest_s=seconds or float("inf"))
     warn_of_missing_drones(chosen, len(result.drones))
-    report = {"sequence": recording.name, **session.record, **_record(result), **environment()}
+    report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
-        report["websocket"] = {"clients": server.num_clients, "too_slow": server.num_too_slow}
+        report["websocket"] = {"clients": server.num_clients}
     report = with_real_time(report, time.perf_counter() - started, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)
@@ -256,12 +256,10 @@ def _record(result: LiveResult) -> dict[str, Any]:
 
     delay_s = np.array(result.delay_s)
     return {
-        "causal": True,
         "live": True,
         "frames": result.instants,
         "frames_left_out": result.left_out,
         "late_searches": None,
-        "cameras": list(result.counts),
         "camera_frames": {name: dict(vars(counts)) for name, counts in result.counts.items()},
         "recorded": {name: dict(vars(counts)) for name, counts in result.recorded.items()},
         "drones": len(result.drones),

@@ -247,8 +247,7 @@ def track(
     started = click.get_current_context().obj or time.perf_counter()
     from psotrack.datasets import open_recording
     from psotrack.detection import DetectorSettings, find_detector
-    from psotrack.methods import check_detections, usable_for
-    from psotrack.pipeline import Parts, track_recording, with_real_time
+    from psotrack.pipeline import Parts, check_detections, track_recording, usable_for, with_real_time
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 

@@ -32,8 +32,8 @@ logger = logging.getLogger(__name__)
 _MOST_WAITING = 3
 #: Longest time that a camera waits for the silhouettes of others before it learns, seconds.
 _LONGEST_TURN_S = 0.02
-#: Longest time for which the session waits for frames before it looks whether it is to end, seconds.
-_LOOK_S = 0.1
+#: Longest time for which the session waits for frames before it looks what is to be done without them, seconds.
+_LOOK_S = 0.005
 #: Time from the start of the sources to the recording's time 0, seconds.
 _LEAD_S = 0.2
 #: Longest time that the threads have to end, seconds: OpenCV waits 10 s for a device that does not answer.
@@ -52,9 +52,7 @@ class FrontEnd:
             the delay does not grow.
 
     Attributes:
-        counts: counts of each camera, after `begin`.
         errors: errors that have ended cameras.
-        num_able: number of cameras that film, or have filmed and may come back.
         recorded: what happened to the frames that are kept, by the camera's name; complete at the end.
     """
 
@@ -68,15 +66,12 @@ class FrontEnd:
         wait_s: float,
     ) -> None:
         self._cameras, self._settings, self._wait_s = cameras, settings, wait_s
-        self._new_meeting = partial(
-            Meeting, [each.fps for each in cameras], rate_hz, wait_s=wait_s, first_s=first_s
-        )
+        self._meeting = Meeting([each.fps for each in cameras], rate_hz, wait_s=wait_s, first_s=first_s)
         self._changed = threading.Condition()
         # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
         self._is_stopped = False
         self._began_s: float | None = None
         self._ready: set[int] = set()
-        self._ended: set[int] = set()
         #: Cameras that have never filmed, as they say, or will not film again.
         self._missing: set[int] = set()
         self._said = [""] * len(cameras)
@@ -88,8 +83,7 @@ class FrontEnd:
         self._num_opencv_threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
         self._threads = [
-            threading.Thread(target=self._film, args=(index, camera), daemon=True)
-            for index, camera in enumerate(self._cameras)
+            threading.Thread(target=self._film, args=each, daemon=True) for each in enumerate(self._cameras)
         ]
         for thread in self._threads:
             thread.start()
@@ -119,25 +113,23 @@ class FrontEnd:
         """
         with self._changed:
             self._changed.wait_for(lambda: len(self._ready) == len(self._cameras))
-            began_s = time.monotonic() + _LEAD_S
-            self._ends_s = began_s + longest_s
-            self._meeting = self._new_meeting(began_s=began_s)
-            for index in self._ended:
-                self._meeting.end(index)
-            self._began_s = began_s
+            self._began_s = self._meeting.began_s = time.monotonic() + _LEAD_S
+            self._ends_s = self._began_s + longest_s
             self._changed.notify_all()
-        return began_s
+        return self._began_s
 
     @property
     def counts(self) -> dict[str, CameraCounts]:
         """Counts of each camera, by name."""
-        names = (camera.name for camera in self._cameras)
-        return dict(zip(names, self._meeting.counts, strict=True))
+        return {
+            camera.name: each.counts
+            for camera, each in zip(self._cameras, self._meeting.cameras, strict=True)
+        }
 
     @property
     def films(self) -> list[bool]:
         """Whether each camera films."""
-        return self._meeting.films
+        return [camera.films for camera in self._meeting.cameras]
 
     @property
     def num_able(self) -> int:
@@ -147,18 +139,14 @@ class FrontEnd:
     def instants(self) -> Iterator[tuple[Instant, int]]:
         """Yield instants that are complete, and how many were left out before each."""
         while not self._is_stopped and self.num_able >= 2 and time.monotonic() < self._ends_s:
-            ready: list[Instant] = []
             with self._changed:
                 now_s = time.monotonic()
                 self._tell_stopped(now_s)
-                while (instant := self._meeting.take(now_s)) is not None:
-                    ready.append(instant)
+                ready = list(iter(partial(self._meeting.take, now_s), None))
                 if not ready:
                     if self._meeting.has_ended:
                         return
-                    deadline_s = self._meeting.deadline_s()
-                    left_s = _LOOK_S if deadline_s is None else max(0.001, deadline_s - now_s)
-                    self._changed.wait(min(left_s, _LOOK_S))
+                    self._changed.wait(_LOOK_S)
             num_left_out = max(0, len(ready) - _MOST_WAITING)
             for instant in ready[num_left_out:]:
                 yield instant, num_left_out
@@ -167,7 +155,7 @@ class FrontEnd:
     def _tell_stopped(self, now_s: float) -> None:
         for index in self._meeting.stopped(now_s):
             name = self._cameras[index].name
-            if self._meeting.have_filmed[index]:
+            if self._meeting.cameras[index].has_filmed:
                 logger.warning("camera %s has stopped", name)
             elif not self._said[index]:  # else it is said already why
                 logger.warning("camera %s: no frame came so far", name)
@@ -193,9 +181,7 @@ class FrontEnd:
         finally:
             with self._changed:
                 self._ready.add(index)
-                self._ended.add(index)
-                if self._began_s is not None:
-                    self._meeting.end(index)
+                self._meeting.end(index)
                 self._changed.notify_all()
             if camera.recorder is not None:
                 self.recorded[camera.name] = camera.recorder.close()
@@ -212,30 +198,30 @@ class FrontEnd:
             if line != self._said[index]:
                 logger.warning("camera %s: %s", self._cameras[index].name, line)
             self._said[index] = line
-            if not self._meeting.have_filmed[index]:
+            if not self._meeting.cameras[index].has_filmed:
                 self._missing.add(index)
 
     def _take(self, index: int, frame: SourceFrame, silhouettes: CameraSilhouettes) -> None:
         """A frame: what the tracker waits for comes first."""
-        camera = self._cameras[index]
+        camera, meeting = self._cameras[index], self._meeting
         with self._changed:
             self._said[index] = ""
             self._missing.discard(index)
-            again = " again" if self._meeting.have_filmed[index] else ""
-            if self._meeting.announce(index, frame.time_s, time.monotonic()):
+            again = " again" if meeting.cameras[index].has_filmed else ""
+            if meeting.announce(index, frame.time_s, time.monotonic()):
                 logger.warning("camera %s films%s", camera.name, again)
+        image = None
         if time.monotonic() - frame.arrived_s > self._wait_s:
             silhouettes.leave_out()
-            with self._changed:
-                self._meeting.leave_out(index)
-                self._changed.notify_all()
         else:
             image = silhouettes.look(frame.image)
-            with self._changed:
-                self._meeting.put(index, frame.time_s, image, frame.arrived_s)
-                self._changed.notify_all()
+        with self._changed:
+            meeting.put(index, frame.time_s, image, frame.arrived_s)
+            self._changed.notify_all()
+            if image is not None:
                 # Silhouettes of other cameras come first, which the tracker waits for.
-                self._changed.wait_for(lambda: not self._meeting.has_work, _LONGEST_TURN_S)
+                self._changed.wait_for(lambda: not meeting.has_work, _LONGEST_TURN_S)
+        if image is not None:
             silhouettes.learn()
         if camera.recorder is not None:
             camera.recorder.write(frame.image, frame.time_s)

@@ -66,18 +66,42 @@ class Instant:
 
 
 @dataclass
-class _Camera:
-    """A camera's last frames, and its state."""
+class MeetingCamera:
+    """A camera's last frames, and its state.
+
+    Attributes:
+        interval_s: time from frame to frame, seconds.
+        counts: what happened to its frames.
+        films: whether it films, or is waited for because it may.
+        has_filmed: whether it has filmed.
+        has_ended: whether it will never film again.
+        frames: time, silhouette and arrival of the frames that later instants may show.
+        in_work_s: time of the frame that is in work; None for no frame.
+        last_time_s: time of the last frame.
+        last_came_s: when the last frame came, on the caller's clock.
+    """
 
     interval_s: float
-    frames: deque[tuple[float, UInt8[np.ndarray, "height width"], float]] = field(default_factory=deque)
-    last_time_s: float = -np.inf
-    last_came_s: float = -np.inf
-    in_work_s: float | None = None
+    counts: CameraCounts = field(default_factory=CameraCounts)
     films: bool = True
     has_filmed: bool = False
     has_ended: bool = False
-    counts: CameraCounts = field(default_factory=CameraCounts)
+    frames: deque[tuple[float, UInt8[np.ndarray, "height width"], float]] = field(default_factory=deque)
+    in_work_s: float | None = None
+    last_time_s: float = -np.inf
+    last_came_s: float = -np.inf
+
+    def near(self, at_s: float) -> list[tuple[float, UInt8[np.ndarray, "height width"], float]]:
+        """The frames that an instant may show."""
+        return [frame for frame in self.frames if self.reaches(frame[0], at_s)]
+
+    def reaches(self, time_s: float | None, at_s: float) -> bool:
+        """Whether an instant may show a frame of a time."""
+        return time_s is not None and abs(time_s - at_s) <= REACH * self.interval_s
+
+    def is_decided(self, at_s: float) -> bool:
+        """Whether no frame that is still to come can be nearer to an instant than those that came."""
+        return not self.films or self.last_time_s >= at_s - _LEAST_INTERVAL / 2 * self.interval_s
 
 
 class Meeting:
@@ -87,96 +111,71 @@ class Meeting:
         fps: frames per second of each camera.
         rate_hz: instants per second.
         wait_s: how long an instant waits for cameras, from its first frame on, seconds.
-        began_s: when the cameras began, on the caller's clock: none has stopped before.
         first_s: time of the first instant, seconds.
 
     Attributes:
-        counts: counts of each camera.
+        cameras: state of each camera.
+        began_s: when the cameras began, on the caller's clock: none has stopped before.
     """
 
-    def __init__(
-        self, fps: list[float], rate_hz: float, *, wait_s: float, began_s: float, first_s: float = 0.0
-    ) -> None:
-        self._cameras = [_Camera(1 / each) for each in fps]
-        for camera in self._cameras:
-            camera.last_came_s = began_s
-        self._rate_hz, self._period_s = rate_hz, 1 / rate_hz
-        self._wait_s, self._first_s = wait_s, first_s
+    def __init__(self, fps: list[float], rate_hz: float, *, wait_s: float, first_s: float = 0.0) -> None:
+        self.cameras = [MeetingCamera(1 / each) for each in fps]
+        self.began_s = 0.0
+        self._rate_hz, self._wait_s, self._first_s = rate_hz, wait_s, first_s
         self._next = 0
-
-    @property
-    def counts(self) -> list[CameraCounts]:
-        """Counts of each camera."""
-        return [camera.counts for camera in self._cameras]
-
-    @property
-    def films(self) -> list[bool]:
-        """Whether each camera films."""
-        return [camera.films for camera in self._cameras]
-
-    @property
-    def have_filmed(self) -> list[bool]:
-        """Whether each camera has filmed."""
-        return [camera.has_filmed for camera in self._cameras]
 
     @property
     def has_work(self) -> bool:
         """Whether a frame of a camera is in work."""
-        return any(camera.in_work_s is not None for camera in self._cameras)
+        return any(camera.in_work_s is not None for camera in self.cameras)
 
     def announce(self, index: int, time_s: float, now_s: float) -> bool:
-        """A frame of a camera has come, and is in work: its instant waits for `put` or `leave_out`.
+        """A frame of a camera has come, and is in work: its instant waits for `put`.
 
         Returns:
             Whether the camera was not waited for until now.
         """
-        camera = self._cameras[index]
+        camera = self.cameras[index]
         is_back = not camera.films and not camera.has_ended
         camera.films, camera.has_filmed = True, True
         camera.last_came_s, camera.in_work_s = now_s, time_s
         return is_back
 
-    def leave_out(self, index: int) -> None:
-        """The announced frame is not processed."""
-        camera = self._cameras[index]
-        if camera.in_work_s is not None:
-            camera.last_time_s = max(camera.last_time_s, camera.in_work_s)
-        camera.in_work_s = None
-        camera.counts.left_out += 1
-
     def put(
-        self, index: int, time_s: float, coverage: UInt8[np.ndarray, "height width"], arrived_s: float
+        self, index: int, time_s: float, coverage: UInt8[np.ndarray, "height width"] | None, arrived_s: float
     ) -> None:
         """The silhouette of a frame.
 
         Args:
             index: the camera.
             time_s: when the frame was filmed, on the recording's clock.
-            coverage: the silhouette.
+            coverage: the silhouette; None for a frame that is left out.
             arrived_s: when the frame came, on the caller's clock.
         """
-        camera = self._cameras[index]
-        camera.in_work_s = None
-        if time_s - camera.last_time_s < _DOUBLED * camera.interval_s:
-            camera.counts.doubled += 1
+        camera = self.cameras[index]
+        counts, camera.in_work_s = camera.counts, None
+        if coverage is not None and time_s - camera.last_time_s < _DOUBLED * camera.interval_s:
+            counts.doubled += 1
             return
-        camera.last_time_s = time_s
-        if time_s + REACH * camera.interval_s < self._next_s:
-            camera.counts.late += 1
-            return
-        camera.counts.frames += 1
-        camera.frames.append((time_s, coverage, arrived_s))
+        camera.last_time_s = max(camera.last_time_s, time_s)
+        if coverage is None:
+            counts.left_out += 1
+        elif time_s + REACH * camera.interval_s < self._next_s:
+            counts.late += 1
+        else:
+            counts.frames += 1
+            camera.frames.append((time_s, coverage, arrived_s))
 
     def end(self, index: int) -> None:
         """A camera has ended for good: it is not waited for."""
-        camera = self._cameras[index]
+        camera = self.cameras[index]
         camera.films, camera.has_ended, camera.in_work_s = False, True, None
 
     def stopped(self, now_s: float) -> list[int]:
         """Cameras that have just stopped, or have not begun in time; they are not waited for until they film."""
         found = []
-        for index, camera in enumerate(self._cameras):
-            if camera.films and now_s - camera.last_came_s > STOPPED_S:
+        for index, camera in enumerate(self.cameras):
+            if camera.films and now_s - max(camera.last_came_s, self.began_s) > STOPPED_S:
                 camera.films = False
                 camera.counts.stops += camera.has_filmed
                 found.append(index)
@@ -190,72 +189,47 @@ class Meeting:
     @property
     def has_ended(self) -> bool:
         """Whether all cameras have ended, and no frame waits."""
-        return all(camera.has_ended and not camera.frames for camera in self._cameras)
+        return all(camera.has_ended and not camera.frames for camera in self.cameras)
 
     def take(self, now_s: float) -> Instant | None:
         """The next instant, if it is complete or has waited long enough; instants that no camera films are passed."""
         while True:
             at_s = self._next_s
-            came_s = [
-                frame[2]
-                for camera in self._cameras
-                for frame in camera.frames
-                if abs(frame[0] - at_s) <= REACH * camera.interval_s
-            ]
-            if not came_s:
-                if not self._is_over(at_s):
-                    return None
-                self._next += 1
-                continue
-            if any(_is_in_work(camera, at_s) for camera in self._cameras):
+            came_s = [frame[2] for camera in self.cameras for frame in camera.near(at_s)]
+            if came_s:
+                break
+            if not self._is_over(at_s):
                 return None
-            undecided = [camera for camera in self._cameras if camera.films and not _is_decided(camera, at_s)]
-            if undecided and now_s - min(came_s) < self._wait_s:
-                return None
-            return self._taken(at_s)
-
-    def deadline_s(self) -> float | None:
-        """When the next instant has waited long enough; None while no frame waits."""
-        came_s = [camera.frames[0][2] for camera in self._cameras if camera.frames]
-        return min(came_s) + self._wait_s if came_s else None
+            self._next += 1
+        if any(camera.reaches(camera.in_work_s, at_s) for camera in self.cameras):
+            return None
+        is_decided = all(camera.is_decided(at_s) for camera in self.cameras)
+        return self._taken(at_s) if is_decided or now_s - min(came_s) >= self._wait_s else None
 
     def _is_over(self, at_s: float) -> bool:
         """Whether a later frame shows that an instant that no frame shows will stay without frames."""
-        later = any(camera.frames and camera.frames[0][0] > at_s for camera in self._cameras)
+        later = any(camera.frames and camera.frames[0][0] > at_s for camera in self.cameras)
         return later and all(
             not camera.films or camera.last_time_s > at_s + REACH * camera.interval_s
-            for camera in self._cameras
+            for camera in self.cameras
         )
 
     def _taken(self, at_s: float) -> Instant:
         coverage: list[UInt8[np.ndarray, "height width"] | None] = []
-        offset_s = np.zeros(len(self._cameras))
-        arrived_s = -np.inf
-        for index, camera in enumerate(self._cameras):
-            reach_s = REACH * camera.interval_s
-            near = [frame for frame in camera.frames if abs(frame[0] - at_s) <= reach_s]
-            if not near:
-                coverage.append(None)
-                camera.counts.missing += camera.films
-            else:
+        offset_s, arrived_s, period_s = np.zeros(len(self.cameras)), -np.inf, 1 / self._rate_hz
+        for index, camera in enumerate(self.cameras):
+            near = camera.near(at_s)
+            if near:
                 time_s, image, came_s = min(near, key=lambda frame: abs(frame[0] - at_s))
                 coverage.append(image)
                 off_s = time_s - at_s
-                offset_s[index] = off_s if abs(off_s) >= 1e-6 * self._period_s else 0.0
+                offset_s[index] = off_s if abs(off_s) >= 1e-6 * period_s else 0.0
                 arrived_s = max(arrived_s, came_s)
+            else:
+                coverage.append(None)
+                camera.counts.missing += camera.films
             # The next instant needs no frame that is too far before it.
-            while camera.frames and camera.frames[0][0] + reach_s < at_s + self._period_s:
+            while camera.frames and camera.frames[0][0] + REACH * camera.interval_s < at_s + period_s:
                 camera.frames.popleft()
-        instant = Instant(self._next, at_s, coverage, offset_s, float(arrived_s))
         self._next += 1
-        return instant
-
-
-def _is_decided(camera: _Camera, at_s: float) -> bool:
-    """Whether no frame that is still to come can be nearer to an instant than those that came."""
-    return camera.last_time_s >= at_s - _LEAST_INTERVAL / 2 * camera.interval_s
-
-
-def _is_in_work(camera: _Camera, at_s: float) -> bool:
-    """Whether a frame that an instant may show is in work."""
-    return camera.in_work_s is not None and abs(camera.in_work_s - at_s) <= REACH * camera.interval_s
+        return Instant(self._next - 1, at_s, coverage, offset_s, float(arrived_s))

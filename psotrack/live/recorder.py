@@ -8,6 +8,7 @@ and counted, so that tracking never waits. A video whose program is killed can b
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
 import queue
@@ -40,7 +41,8 @@ logger = logging.getLogger(__name__)
 #: MPEG-4 part 2, which all wheels of OpenCV can write. A frame of 1920 x 1080, textured with a little noise, took 6.0
 #: ms of one thread and 34 kB, and 1.5 ms to decode. MJPEG took 11 ms and 309 kB, VP8 109 ms, FFV1 74 ms and 3.1 MB. Of
 #: a killed program's AVI file all but the last 32 KiB is there; Matroska lost up to 5 MB.
-_CODEC, _SUFFIX = "XVID", ".avi"
+_CODEC = "XVID"
+_RIG_FILE = "rig.toml"
 #: Largest number of frames of a camera that wait to be encoded: 6 MB each at 1920 x 1080.
 _MOST_WAITING = 8
 #: Lower priority of the threads that encode, as `nice` counts it: tracking comes first.
@@ -65,7 +67,7 @@ class RecordedCounts:
 
 
 class CameraRecorder:
-    """Writes the frames of one camera, and their times.
+    """Writes the frames of one camera, and their times, in a thread that the first frame starts.
 
     Args:
         folder: existing folder of the recording.
@@ -88,13 +90,12 @@ class CameraRecorder:
         *,
         least_free_bytes: int = _LEAST_FREE_BYTES,
     ) -> None:
-        check_file_name(name, "cameras")
         self._folder, self._fps, self._image_size_wh = folder, fps, image_size_wh
         self._least_free_bytes = least_free_bytes
-        self.video, self.times = folder / f"{name}{_SUFFIX}", folder / f"{name}_times.csv"
+        self.video, self.times = (folder / file for file in _files_of(name))
         self.counts = RecordedCounts()
         self._num_taken, self._last_s = 0, -np.inf
-        self._is_late, self._has_failed = False, False
+        self._is_late = self._has_failed = False
         self._waiting: queue.SimpleQueue[tuple[np.ndarray, float] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
 
@@ -129,7 +130,7 @@ class CameraRecorder:
             self._waiting.put(None)
             thread.join(CLOSE_S)
             # Counted in the file: FFmpeg does not report what did not reach the disk.
-            self.counts.frames = readable_frames(self.video)
+            self.counts.frames = _readable_frames(self.video)
             num_lost = self._num_taken - self.counts.frames
             self.counts.left_out += num_lost
             if num_lost and not self._has_failed:
@@ -138,17 +139,12 @@ class CameraRecorder:
         return self.counts
 
     def _encode(self) -> None:
-        """The thread that encodes the frames."""
         if sys.platform == "linux":  # where threads have priorities of their own
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
-            with (
-                self.times.open("w", encoding="utf-8", newline="") as times,
-                contextlib.closing(
-                    VideoEncoder(self.video, _CODEC, self._fps, self._image_size_wh)
-                ) as encoder,
-            ):
+            encoder = VideoEncoder(self.video, _CODEC, self._fps, self._image_size_wh)
+            with self.times.open("w", encoding="utf-8", newline="") as times, contextlib.closing(encoder):
                 times.write("frame,time_s\n")
                 while (frame := self._waiting.get()) is not None:
                     if shutil.disk_usage(self._folder).free < self._least_free_bytes:
@@ -166,7 +162,13 @@ class CameraRecorder:
             logger.warning(text, self._folder, found)
 
 
-def readable_frames(video: Path) -> int:
+def _files_of(name: str) -> tuple[str, str]:
+    """Names of the video and of the file of times of a camera."""
+    check_file_name(name, "cameras")
+    return f"{name}.avi", f"{name}_times.csv"
+
+
+def _readable_frames(video: Path) -> int:
     """Number of frames of a recorded video; 0 for a file that is none."""
     try:
         return probe(video).num_frames
@@ -194,20 +196,25 @@ class RecordingFolder:
     ) -> None:
         self._folder, self._recording = folder, recording
         self._rig = recording.rig.select([name for name in recording.rig.names if name in names])
+        self._tables: dict[str, CameraTable] = {}
         if folder.resolve() == recording.folder.resolve():
-            expected, found = "another folder", "that of the cameras' recording.toml"
-            raise SettingsError("--record", expected=expected, found=found)
-        self._sizes_wh: dict[str, tuple[int, int]] = {}
-        for name, size_wh in zip(self._rig.names, self._rig.cameras.image_size_wh, strict=True):
-            width, height = map(int, size_wh)
-            self._sizes_wh[name] = width, height
+            found = "that of the cameras' recording.toml"
+            raise SettingsError("--record", expected="another folder", found=found)
+        for name in self._rig.names:
+            width, height = self._size_wh(name)
             if width % 2 or height % 2:
-                expected = (
-                    "images with even numbers of pixels, because the codec halves the resolution of colours"
-                )
+                expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
                 raise SettingsError(
                     "--record", expected=expected, found=f"{width} x {height} of camera {name}"
                 )
+            video, times = _files_of(name)
+            ignore = recording.ignore.get(name)
+            self._tables[name] = CameraTable(
+                video=video,
+                timestamps=times,
+                ignore=None if ignore is None else f"{name}_ignore{ignore.suffix}",
+                line_time_s=recording.line_time_s.get(name, 0.0),
+            )
         if not force and folder.is_dir() and any(folder.iterdir()):
             expected, found = "a new or an empty folder", "a folder with files"
             remedy = "pass --force to replace an earlier recording in it"
@@ -215,7 +222,7 @@ class RecordingFolder:
 
     def recorder(self, name: str, fps: float) -> CameraRecorder:
         """The recorder of a camera."""
-        return CameraRecorder(self._folder, name, fps, self._sizes_wh[name])
+        return CameraRecorder(self._folder, name, fps, self._size_wh(name))
 
     def begin(self) -> None:
         """Write the rig, the images of what is ignored, and a recording.toml with all cameras.
@@ -227,12 +234,13 @@ class RecordingFolder:
             self._folder.mkdir(parents=True, exist_ok=True)
             # Otherwise the files of an earlier recording would be taken for those of a camera that stays silent.
             self._remove_files()
-            for name, copy in self._ignore_files().items():
-                shutil.copyfile(self._recording.ignore[name], copy)
+            for name, table in self._tables.items():
+                if table.ignore is not None:
+                    shutil.copyfile(self._recording.ignore[name], self._folder / table.ignore)
         except OSError as error:
             expected, found = "a folder that can be written", error.strerror or f"{error}"
             raise OutputError(self._folder, expected=expected, found=found) from error
-        write_rig(self._folder / "rig.toml", self._rig, force=True)
+        write_rig(self._folder / _RIG_FILE, self._rig, force=True)
         self._write(self._rig.names)
 
     def end(self) -> None:
@@ -241,46 +249,29 @@ class RecordingFolder:
         Raises:
             OutputError: the recording.toml cannot be written; then it still names all cameras.
         """
-        names = self._rig.names
-        there = [name for name in names if readable_frames(self.recorder(name, 1.0).video) >= 2]
-        if not there:
+        there = [name for name in self._tables if _readable_frames(self._folder / _files_of(name)[0]) >= 2]
+        if there:
+            self._write(there)
+        else:
             # So that the folder can be used again.
             with contextlib.suppress(OSError):
                 self._remove_files()
                 self._folder.rmdir()
-        elif there != list(names):
-            self._write(there)
+
+    def _size_wh(self, name: str) -> tuple[int, int]:
+        width, height = self._rig.cameras.image_size_wh[self._rig.names.index(name)]
+        return int(width), int(height)
 
     def _remove_files(self) -> None:
         """Remove the files of this recording, or of an earlier one."""
-        files = [self._folder / "rig.toml", self._folder / RECORDING_FILE, *self._ignore_files().values()]
-        for name in self._rig.names:
-            recorder = self.recorder(name, 1.0)
-            files += [recorder.video, recorder.times]
-        for file in files:
-            file.unlink(missing_ok=True)
-
-    def _ignore_files(self) -> dict[str, Path]:
-        """Copies of the images of what is ignored, by the camera's name."""
-        ignore = self._recording.ignore
-        return {
-            name: self._folder / f"{name}_ignore{ignore[name].suffix}"
-            for name in self._rig.names
-            if name in ignore
-        }
+        of_cameras = [(each.video, each.timestamps, each.ignore) for each in self._tables.values()]
+        for file in (_RIG_FILE, RECORDING_FILE, *itertools.chain(*of_cameras)):
+            if file is not None:
+                (self._folder / f"{file}").unlink(missing_ok=True)
 
     def _write(self, names: Sequence[str]) -> None:
-        recording, ignore = self._recording, self._ignore_files()
-        tables = {}
-        for name in names:
-            recorder = self.recorder(name, 1.0)
-            tables[name] = CameraTable(
-                video=recorder.video.name,
-                timestamps=recorder.times.name,
-                ignore=ignore[name].name if name in ignore else None,
-                line_time_s=recording.line_time_s.get(name, 0.0),
-            )
-        bounds_m = recording.bounds_m
+        bounds_m = self._recording.bounds_m
         world = WorldTable() if bounds_m is None else WorldTable(bounds_m=(bounds_m[0::2], bounds_m[1::2]))
-        content = RecordingFile(version=1, calibration="rig.toml", cameras=tables, world=world)
+        tables = {name: self._tables[name] for name in names}
+        content = RecordingFile(version=1, calibration=_RIG_FILE, cameras=tables, world=world)
         write_recording_file(self._folder / RECORDING_FILE, content)

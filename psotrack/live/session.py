@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-import msgspec
 import numpy as np
 
 from psotrack.errors import InputError, OutputError, PsotrackError
@@ -17,7 +16,7 @@ from psotrack.live.cameras import LiveCamera
 from psotrack.live.front_end import FrontEnd
 from psotrack.live.meeting import CameraCounts, Instant
 from psotrack.live.recorder import RecordedCounts
-from psotrack.pipeline import CausalRun, causal_settings
+from psotrack.pipeline import causal_settings, causal_tracker
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures, usual_drone_px
@@ -78,7 +77,7 @@ class LiveSession:
 
     Attributes:
         result: what the session has done so far.
-        record: rate, settings, seed and volume of the run, fit for JSON.
+        record: cameras, settings, versions and volume of the run, fit for JSON.
     """
 
     def __init__(
@@ -92,32 +91,24 @@ class LiveSession:
         wait_s: float = WAIT_S,
     ) -> None:
         settings = causal_settings(settings)
-        names = {each.name for each in cameras}
-        rig = recording.rig.select([name for name in recording.rig.names if name in names])
+        rig = recording.rig.select([camera.name for camera in cameras])
         sizes_wh = [(int(width), int(height)) for width, height in rig.cameras.image_size_wh]
         scaled = settings.silhouettes.scaled(sizes_wh, usual_drone_px(recording.rig))
-        self._cameras = cameras
-        self._rate_hz = settings.rate_hz or max(each.fps for each in cameras)
-        self._front_end = FrontEnd(cameras, scaled, self._rate_hz, first_s=first_s, wait_s=wait_s)
         width, height = (-(-np.array(sizes_wh) // scaled.reduction)).max(axis=0).tolist()
-        self._shape = height, width
-        self._line_time_s = np.array([each.line_time_s for each in cameras], np.float32)
-        self._run = CausalRun(
+        self._rate_hz = settings.rate_hz or max(camera.fps for camera in cameras)
+        self._front_end = FrontEnd(cameras, scaled, self._rate_hz, first_s=first_s, wait_s=wait_s)
+        self._shape = len(cameras), height, width
+        self._line_time_s = np.array([camera.line_time_s for camera in cameras], np.float32)
+        self._tracker, self.record = causal_tracker(
             rig,
             settings,
             fps=self._rate_hz,
             bounds_m=recording.bounds_m,
             reduction=scaled.reduction,
-            shape=self._shape,
+            shape=(height, width),
             most_drones=most_drones,
         )
-        self.record = {
-            "rate_hz": self._rate_hz,
-            "settings": msgspec.to_builtins(settings),
-            "seed": settings.seed,
-            "volume": self._run.volume,
-        }
-        self.result = LiveResult(counts={each.name: CameraCounts() for each in cameras})
+        self.result = LiveResult(counts=self._front_end.counts)
 
     def stop(self) -> None:
         """End the session after the present instant; from any thread or signal handler."""
@@ -141,55 +132,52 @@ class LiveSession:
             InputError: fewer than two cameras can film, or no frame came.
             OutputError: the last output has failed.
         """
-        outputs = list(outputs)
+        outputs, result = list(outputs), self.result
         try:
             with self._front_end as front_end:
                 compiling_s = time.monotonic()
-                self._run.compile()
-                self.result.compile_s = time.monotonic() - compiling_s
+                self._tracker.compile()
+                result.compile_s = time.monotonic() - compiling_s
                 # What was made so far is not searched for garbage again and again, which takes as long as a frame.
                 gc.collect()
                 gc.freeze()
                 began_s = front_end.begin(longest_s)
-                self.result.counts = front_end.counts
-                before = None
                 for instant, num_left_out in front_end.instants():
-                    self._track(instant, 1 if before is None else instant.number - before, outputs)
-                    before = instant.number
-                    self.result.left_out += num_left_out
-                    self.result.seconds = time.monotonic() - began_s
+                    self._track(instant, outputs)
+                    result.left_out += num_left_out
+                    result.seconds = time.monotonic() - began_s
                     if on_instant is not None:
-                        on_instant(self.result, front_end.films)
-                    self._run.look_ahead()
+                        on_instant(result, front_end.films)
+                    self._tracker.look_ahead()
         finally:
             gc.unfreeze()
-        self.result.recorded = self._front_end.recorded
+        result.recorded = self._front_end.recorded
         self._check()
-        return self.result
+        return result
 
     def _check(self) -> None:
         """Raise the error of a session without a result."""
-        bugs = [error for error in self._front_end.errors if not isinstance(error, PsotrackError)]
-        if bugs:
-            raise bugs[0]
-        count, num_able = len(self._cameras), self._front_end.num_able
-        remedy = "the lines above say why" if num_able < count else ""
+        for error in self._front_end.errors:
+            if not isinstance(error, PsotrackError):
+                raise error
+        count, num_able = len(self.result.counts), self._front_end.num_able
         if num_able < 2 or not self.result.instants:
             expected, found = "at least two cameras that film", f"{num_able} of {count}"
             if num_able >= 2:
                 expected, found = "frames", "none until the session ended"
+            remedy = "the lines above say why" if num_able < count else ""
             raise InputError("the cameras", expected=expected, found=found, remedy=remedy)
 
-    def _track(self, instant: Instant, elapsed: int, outputs: list[RowsOutput]) -> None:
-        images = np.zeros((len(self._cameras), *self._shape), np.uint8)
-        for index, image in enumerate(instant.coverage):
-            if image is not None:
-                images[index, : image.shape[0], : image.shape[1]] = image
-        is_there = np.array([image is not None for image in instant.coverage])
-        exposures = Exposures(
-            instant.offset_s.astype(np.float32), is_there, is_there.astype(np.float32), self._line_time_s
-        )
-        rows = self._run.step(instant.number, instant.time_s, images, exposures, num_frames=elapsed)
+    def _track(self, instant: Instant, outputs: list[RowsOutput]) -> None:
+        images = np.zeros(self._shape, np.uint8)
+        for image, shown in zip(images, instant.coverage, strict=True):
+            if shown is not None:
+                image[: shown.shape[0], : shown.shape[1]] = shown
+        is_there = np.array([shown is not None for shown in instant.coverage])
+        offset_s, share = instant.offset_s.astype(np.float32), is_there.astype(np.float32)
+        exposures = Exposures(offset_s, is_there, share, self._line_time_s)
+        rows = self._tracker.step(instant.number, instant.time_s, images, exposures)
+        result = self.result
         for output in list(outputs):
             try:
                 output.write(rows)
@@ -198,8 +186,7 @@ class LiveSession:
                 if not outputs:
                     raise
                 logger.warning("%s; tracking goes on with the other outputs", error)
-                self.result.failed_outputs.append(error)
-        result = self.result
+                result.failed_outputs.append(error)
         result.instants += 1
         result.delay_s.append(time.monotonic() - instant.arrived_s)
         del result.delay_s[: -round(3600 * self._rate_hz)]

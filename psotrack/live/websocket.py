@@ -1,7 +1,8 @@
 """Rows by WebSocket: one text message of JSON per drone and instant, to all clients that are connected.
 
 The server is that of the package `websockets`, in a thread of its own, so that tracking never waits for a client. Rows
-for a client that reads slowly, or not at all, wait in memory; a client for which too many wait is disconnected.
+for a client that reads slowly, or not at all, wait in memory, and behind them the server's question for an answer:
+a client that does not answer in time is disconnected.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-#: Rows that may wait for a client, bytes: four drones for half a minute at 25 per second; the system holds some more.
-_MOST_WAITING = 2**20
+#: How often a client is asked whether it is there, and time that it has to answer, seconds: in both together, rows of
+#: sixteen drones at 25 per second take 6 MB of memory.
+_ASKED_S = 10.0
+#: Bytes that may wait for a client until the server itself waits for it: never, so that it is asked.
+_NEVER = 2**40
 #: Time for clients to take the last rows and to close the connection, seconds.
 _CLOSE_S = 1.0
 #: Largest message of a client, bytes: nothing is expected from clients.
@@ -42,17 +46,18 @@ class WebSocketLines:
     Args:
         address: PORT, which programs on this computer reach, or HOST:PORT, where HOST is an address of this computer.
 
+        asked_s: how often a client is asked whether it is there, and time that it has to answer, seconds.
+
     Attributes:
         address: address for clients, such as ws://127.0.0.1:9000.
         num_clients: number of clients that have connected.
-        num_too_slow: number of them that were disconnected, because they read too slowly.
 
     Raises:
         SettingsError: the address is none, or the package `websockets` is not installed.
         OutputError: no server can listen there.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, asked_s: float = _ASKED_S) -> None:
         host, port = host_and_port("--websocket", address, usual_host="127.0.0.1")
         try:
             from websockets.asyncio.server import broadcast, serve
@@ -62,7 +67,7 @@ class WebSocketLines:
                 "--websocket", expected=expected, found="it is not installed", remedy=remedy
             ) from error
         self.address = f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
-        self.num_clients = self.num_too_slow = 0
+        self.num_clients = 0
         self._broadcast = broadcast
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -75,10 +80,11 @@ class WebSocketLines:
                 port,
                 origins=_OWN_PAGES if host in _OWN_HOSTS else None,
                 compression=None,
+                ping_interval=asked_s,
+                ping_timeout=asked_s,
                 close_timeout=_CLOSE_S,
                 max_size=_MOST_RECEIVED,
-                # Above what may wait, or pings and the end would wait for the client too.
-                write_limit=2 * _MOST_WAITING,
+                write_limit=_NEVER,
                 logger=_SILENT,
             )
 
@@ -91,7 +97,7 @@ class WebSocketLines:
 
     def write(self, rows: Trajectories) -> None:
         """Hand over the rows of an instant; does not wait for any client."""
-        self._loop.call_soon_threadsafe(self._send, rows)
+        self._loop.call_soon_threadsafe(self._send, lines_of(rows))
 
     def close(self) -> None:
         """Let clients take the last rows, for a second at most, and end the server."""
@@ -100,16 +106,9 @@ class WebSocketLines:
             asyncio.run_coroutine_threadsafe(self._server.wait_closed(), self._loop).result()
             self._end_thread()
 
-    def _send(self, rows: Trajectories) -> None:
-        for client in self._server.connections:
-            transport = client.transport
-            if transport.get_write_buffer_size() > _MOST_WAITING and not transport.is_closing():
-                logger.warning("a client of --websocket reads too slowly and is disconnected")
-                self.num_too_slow += 1
-                transport.abort()
-        clients = [each for each in self._server.connections if not each.transport.is_closing()]
-        for message in lines_of(rows) if clients else []:
-            self._broadcast(clients, message)
+    def _send(self, lines: list[str]) -> None:
+        for line in lines:
+            self._broadcast(self._server.connections, line)
 
     async def _talk(self, connection: ServerConnection) -> None:
         self.num_clients += 1

@@ -1,27 +1,100 @@
-"""Parts that the caller brings instead of the package's own, and the method that a run uses."""
+"""Parts that the caller brings instead of the package's own, and the interface of a method of tracking.
+
+A method is given to `psotrack.track(..., method=...)`, or by name as a plugin (see `psotrack.support.plugins`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.correspondence import Sightings
 from psotrack.detection import Detector
 from psotrack.errors import SettingsError
-from psotrack.methods import Method
+from psotrack.geometry import Rig
+from psotrack.initiation import InitialState
 from psotrack.recordings import Recording
 from psotrack.settings import YOLO, TrackSettings
 from psotrack.silhouettes import (
     BackgroundModel,
     Living,
+    Silhouettes,
     SilhouetteSettings,
     find_background,
     scaled_settings,
 )
-from psotrack.support import check_interface, identify, make_plugin
+from psotrack.support import Report, check_interface, identify, make_plugin, no_progress
 from psotrack.tracking import Score, Search
+from psotrack.trajectories import Tracks
 
 #: The methods of this package.
-BUILT_IN_METHODS = ("swarm", "projection-lines", "fused")
+_BUILT_IN = ("swarm", "projection-lines", "fused")
+
+
+@dataclass(frozen=True)
+class MethodInputs:
+    """Inputs of a method for one run.
+
+    Attributes:
+        rig: the cameras, calibrated.
+        silhouettes: silhouettes of all cameras at the instants (`Silhouettes.read` gives the coverage of some of them,
+            0 to 255; `exposures` says when each camera's frame was exposed, None where all were exposed together); None
+            where none were computed.
+        sightings: detections of all cameras at all instants; None for a method that does not read detections.
+        initial: positions, velocities and sizes of the drones at frame 0, (drones, 3) each, metres and m/s.
+        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        fps: instants per second.
+        settings: settings of the run; the seed of random numbers is `settings.seed`.
+    """
+
+    rig: Rig
+    silhouettes: Silhouettes | None
+    sightings: Sightings | None
+    initial: InitialState
+    bounds_m: Float[np.ndarray, "2 3"]
+    fps: float
+    settings: TrackSettings
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A method of tracking: from silhouettes or detections of the whole recording to tracks.
+
+    A method is called once per run, outside of any compiled function; its inputs and results are NumPy arrays. The
+    stages after the method (identity, smoothing, body offset, record) are the same for all methods.
+
+    Attributes:
+        reads_detections: whether the method is given detections, besides silhouettes.
+    """
+
+    @property
+    def reads_detections(self) -> bool: ...  # noqa: D102
+
+    def __call__(self, inputs: MethodInputs, report: Report = no_progress) -> Tracks:
+        """Track the drones through all frames.
+
+        Args:
+            inputs: inputs of the run.
+            report: shows progress: `with report("name", num_frames) as advance:`, then `advance(1)` per frame.
+
+        Returns:
+            Tracks of all frames, with all drones that the method found. NaN stands for numbers that the method does
+            not have.
+        """
+        ...
+
+
+#: Interface of each of `Parts`.
+_INTERFACES: dict[str, type] = {
+    "search": Search,
+    "score": Score,
+    "method": Method,
+    "background": BackgroundModel,
+    "detector": Detector,
+}
 
 
 @dataclass(frozen=True)
@@ -46,25 +119,31 @@ class Parts:
     detector: Detector | None = None
 
     def __post_init__(self) -> None:
-        for kind, interface in _INTERFACES.items():
-            if getattr(self, kind) is not None:
-                check_interface(kind, getattr(self, kind), interface)
+        for kind, part in self._brought.items():
+            check_interface(kind, part, _INTERFACES[kind])
+
+    @property
+    def _brought(self) -> dict[str, Any]:
+        return {kind: part for kind, part in vars(self).items() if part is not None}
 
     @property
     def record(self) -> dict[str, Any]:
         """Identities of the parts that the caller brings, by kind, fit for JSON."""
-        brought = {kind: getattr(self, kind) for kind in _INTERFACES}
-        return {kind: identify(part) for kind, part in brought.items() if part is not None}
+        return {kind: identify(part) for kind, part in self._brought.items()}
 
 
-#: Interface of each of `Parts`.
-_INTERFACES: dict[str, type] = {
-    "search": Search,
-    "score": Score,
-    "method": Method,
-    "background": BackgroundModel,
-    "detector": Detector,
-}
+def find_method(settings: TrackSettings, parts: Parts) -> Method | None:
+    """The method that the caller brings, or that an entry point names; None for the methods of this package.
+
+    Raises:
+        SettingsError: there is no method of the settings' name.
+    """
+    if parts.method is not None or settings.method in _BUILT_IN:
+        return parts.method
+    method: Method = make_plugin(
+        "method", settings.method, settings, interface=Method, setting="method", built_in=_BUILT_IN
+    )
+    return method
 
 
 def with_background(parts: Parts, recording: Recording, settings: SilhouetteSettings) -> Parts:
@@ -79,32 +158,9 @@ def with_background(parts: Parts, recording: Recording, settings: SilhouetteSett
     return parts if model is None or isinstance(model, Living) else replace(parts, background=model)
 
 
-def method_plugin(settings: TrackSettings, parts: Parts) -> Method | None:
-    """The method that the caller brings, or that an entry point names; None for the methods of this package."""
-    if parts.method is not None:
-        return parts.method
-    if settings.method in BUILT_IN_METHODS:
-        return None
-    method: Method = make_plugin(
-        "method", settings.method, settings, interface=Method, setting="method", built_in=BUILT_IN_METHODS
-    )
-    return method
-
-
-def tracks_silhouettes(settings: TrackSettings, plugin: Method | None) -> bool:
-    """Whether the method of the run follows silhouettes, alone or beside detections."""
-    return plugin is None and settings.method in ("swarm", "fused")
-
-
-def tracks_detections(settings: TrackSettings, plugin: Method | None) -> bool:
-    """Whether the method of the run follows detections, alone or beside silhouettes."""
-    return plugin is None and settings.method in ("projection-lines", "fused")
-
-
-def check_detector_is_used(settings: TrackSettings, parts: Parts) -> None:
+def check_detector_is_used(settings: TrackSettings, method: Method | None) -> None:
     """Raise `SettingsError` if a detector is brought, but the method reads no detections or others are named."""
-    method = method_plugin(settings, parts)
-    if not (tracks_detections(settings, method) if method is None else method.reads_detections):
+    if settings.method == "swarm" if method is None else not method.reads_detections:
         name = settings.method if method is None else type(method).__name__
         expected = "a method that reads detections, such as projection-lines or fused"
         raise SettingsError("detector", expected=expected, found=f"method {name}")

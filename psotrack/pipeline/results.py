@@ -21,14 +21,11 @@ from psotrack.clocks import CameraClocks
 from psotrack.errors import InputError
 from psotrack.identity import Identities, postprocess
 from psotrack.initiation import count_common, find_cut_off, find_outside, state_at_first_frame
-from psotrack.methods import MethodResult
+from psotrack.pipeline.inputs import Run
 from psotrack.pipeline.parts import Parts
-from psotrack.pipeline.preparation import PreparedRun
-from psotrack.recordings import Recording
-from psotrack.settings import MotionSettings, TrackSettings, setting_names
-from psotrack.silhouettes import Silhouettes
+from psotrack.settings import TrackSettings, setting_names
 from psotrack.support import html_block, html_lines
-from psotrack.trajectories import DroneSizes, Trajectories, drones_html
+from psotrack.trajectories import Tracks, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +34,26 @@ logger = logging.getLogger(__name__)
 _FEW_MET = 0.2
 #: Settings that the data give where nobody does, and the key of the record's `volume` that says which.
 _FOUND = {"motion.max_speed_m_s": "speed_from", "bounds_m": "bounds_from"}
-_MISSING = object()
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """The result of a method for one run.
+
+    Attributes:
+        tracks: tracks of all frames.
+        points: for each drone the point that its track follows (no image shows where the origin of the body is), as
+            the record has it: the contract's key `points`.
+        input_keys: digests of the inputs, by camera.
+        seconds: seconds of each stage; "track" and "compile" at least; "finish" so far.
+        errors: errors of the tracks that come from the cameras; None where the method states all errors itself.
+    """
+
+    tracks: Tracks
+    points: list[dict[str, Any]]
+    input_keys: Mapping[str, str]
+    seconds: Mapping[str, float]
+    errors: TrackErrors | None = None
 
 
 @dataclass(frozen=True)
@@ -86,51 +102,51 @@ def changed_settings(record: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a run that somebody chose and that are not today's defaults, by their dotted names.
 
     Args:
-        record: record of the run; settings that it lacks, because a later version brought them, are left out.
+        record: record of the run.
     """
-    # Through JSON, because a record that was read from a file has lists where settings have tuples.
-    usual, used = (
-        msgspec.json.decode(msgspec.json.encode(settings))
-        for settings in (TrackSettings(), record["settings"])
-    )
-    changed = {}
-    for name in setting_names():
-        part, dot, field = name.partition(".")
-        value, default = (
-            each.get(part, {}).get(field, _MISSING) if dot else each.get(part, _MISSING)
-            for each in (used, usual)
-        )
+    usual, changed = _by_name(TrackSettings()), {}
+    for name, value in _by_name(record["settings"]).items():
         # The record has the values that were used, also where the data gave them.
         found = name in _FOUND and record.get("volume", {}).get(_FOUND[name]) != "given"
-        if value is not _MISSING and value != default and not found:
+        if value != usual[name] and not found:
             changed[name] = value
     return changed
 
 
+def _by_name(settings: TrackSettings | Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that are there, by their dotted names."""
+    # Through JSON, because a record that was read from a file has lists where settings have tuples.
+    content = msgspec.json.decode(msgspec.json.encode(settings))
+    values = {}
+    for name in setting_names():
+        part, _, field = name.rpartition(".")
+        of_part = content.get(part, {}) if part else content
+        if field in of_part:
+            values[name] = of_part[field]
+    return values
+
+
 def finish(
-    recording: Recording,
-    silhouettes: Silhouettes | None,
-    run: PreparedRun,
-    parts: Parts,
-    result: MethodResult,
-    clocks: CameraClocks | None = None,
+    run: Run, parts: Parts, result: MethodResult, clocks: CameraClocks | None = None
 ) -> TrackedRecording | InputError:
     """Resolve identities, smooth, move to the body's origin, and write the record of one run."""
-    settings, tracks = run.settings, result.tracks
+    recording, silhouettes = run.recording, run.silhouettes
+    settings, tracks, errors = run.settings, result.tracks, result.errors
     limited = find_outside(run.volume) or find_cut_off(tracks, run.volume, recording.fps)
     if limited is not None:
         logger.warning("%s", limited)
     if not tracks.num_drones:
-        return _no_drones(recording, silhouettes, run)
+        return _no_drones(run)
     warn_of_missing_drones(settings, tracks.num_drones)
     began = time.perf_counter()
-    errors = result.errors
+    # How errors fade is known once the whole recording was seen.
+    smoothing = settings.motion if errors is None else errors.smoothing(settings.motion)
     trajectories, identities = postprocess(
         tracks,
         settings.motion,
         settings.identity,
         fps=recording.fps,
-        smoothing=None if not settings.smooth else _smoothing(settings.motion, errors),
+        smoothing=smoothing if settings.smooth else None,
     )
     if errors is not None:
         trajectories = errors.added_to(
@@ -140,14 +156,19 @@ def finish(
     timeline = recording.timeline()
     trajectories = replace(trajectories, position_m=body_m, time_s=timeline.time_s)
     of_silhouettes = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
-    seconds = {**of_silhouettes, **result.seconds, "finish": _finish_s(result, began)}
-    own_s = sum(seconds[stage] for stage in ("track", "compile", "finish"))
+    seconds = {**of_silhouettes, "finish": 0.0, **result.seconds}
+    seconds["finish"] += time.perf_counter() - began
+    seconds["total"] = sum(seconds[stage] for stage in ("track", "compile", "finish"))
     record = {
         "sequence": recording.name,
         "frames": trajectories.num_frames,
         "cameras": list(recording.rig.names),
         "rate_hz": timeline.rate_hz,
-        "camera_times": _times_record(recording),
+        "camera_times": {
+            name: {"fps": times.fps, "time_offset_s": times.time_offset_s, "frames": times.num_frames}
+            for name, times in recording.frame_times.items()
+            if name in recording.rig.names
+        },
         **({} if clocks is None else {"camera_clocks": clocks.record(recording.rig.names)}),
         "settings": msgspec.to_builtins(settings),
         **({"parts": parts.record} if parts.record else {}),
@@ -155,14 +176,25 @@ def finish(
         "start": {name: value.tolist() for name, value in vars(state_at_first_frame(tracks)).items()},
         "bounds_m": run.volume.bounds_m.tolist(),
         "volume": run.volume.record,
-        "drones": _sizes_record(tracks.sizes),
+        "drones": [
+            {
+                "drone": drone,
+                "size_m": size_m.tolist(),
+                "size_std_m": [None] * 3,
+                "size_frames": num_frames.tolist(),
+                "fill": None,
+            }
+            for drone, (size_m, num_frames) in enumerate(
+                zip(tracks.sizes.size_m, tracks.sizes.num_frames, strict=True)
+            )
+        ],
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
-        "points": [asdict(point) for point in result.points],
+        "points": result.points,
         "camera_errors": {} if errors is None else errors.record(recording.rig.names),
         "encounters": [asdict(encounter) for encounter in identities.encounters],
         "input_keys": dict(result.input_keys),
         "left_out": {} if silhouettes is None else dict(silhouettes.left_out),
-        "seconds": {stage: round(value, 4) for stage, value in (seconds | {"total": own_s}).items()},
+        "seconds": {stage: round(value, 4) for stage, value in seconds.items()},
         **environment(),
     }
     return TrackedRecording(trajectories, tracks.sizes.size_m, identities, record)
@@ -175,13 +207,14 @@ def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:
         logger.warning("--drones %d: only %d drones were seen; the tracks have no others", count, num_drones)
 
 
-def _no_drones(recording: Recording, silhouettes: Silhouettes | None, run: PreparedRun) -> InputError:
+def _no_drones(run: Run) -> InputError:
     """The error that says why no drone was found, as far as that is known."""
     found = "none in any frame"
     remedy = (
         "look at what the cameras see (`psotrack silhouettes`), or give the drones' first positions (init)"
     )
-    detected = run.detections.sightings if run.detections is not None else silhouettes
+    recording = run.recording
+    detected = run.silhouettes if run.sightings is None else run.sightings
     if detected is not None:
         common = count_common(recording.rig, detected)
         if common.met < _FEW_MET * common.seen:
@@ -230,39 +263,3 @@ def real_time_factors(record: Mapping[str, Any], wall_s: float, not_running_s: f
         "real_time_factor": round(video_s / wall_s, 3),
         "real_time_factor_running": round(video_s / max(wall_s - not_running_s, 1e-3), 3),
     }
-
-
-def _times_record(recording: Recording) -> dict[str, dict[str, Any]]:
-    """When each camera's frames were exposed, as the tracker used it, fit for JSON."""
-    return {
-        name: {"fps": times.fps, "time_offset_s": times.time_offset_s, "frames": times.num_frames}
-        for name, times in recording.frame_times.items()
-        if name in recording.rig.names
-    }
-
-
-def _smoothing(motion: MotionSettings, errors: TrackErrors | None) -> MotionSettings:
-    """The motion model of the smoother: how errors fade is known once the whole recording was seen."""
-    return motion if errors is None else errors.smoothing(motion)
-
-
-def _finish_s(result: MethodResult, began: float) -> float:
-    return result.seconds.get("finish", 0.0) + time.perf_counter() - began
-
-
-def _sizes_record(sizes: DroneSizes) -> list[dict[str, Any]]:
-    """What was learned of each drone's size, fit for JSON: null for what is not known."""
-
-    def or_none(values: np.ndarray) -> list[float | None]:
-        return [None if np.isnan(value) else float(value) for value in values]
-
-    return [
-        {
-            "drone": drone,
-            "size_m": sizes.size_m[drone].tolist(),
-            "size_std_m": or_none(sizes.std_m[drone]),
-            "size_frames": sizes.num_frames[drone].tolist(),
-            "fill": or_none(sizes.fill[drone]) or None,
-        }
-        for drone in range(len(sizes.size_m))
-    ]

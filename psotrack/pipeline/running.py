@@ -1,49 +1,54 @@
-"""The list of stages, from a recording to trajectories and a record.
+"""From a recording to trajectories and a record, and how each method tracks on the way.
 
-    recording -> silhouettes or detections -> room bounds -> initial state -> tracking -> fusion
-              -> identity and smoothing -> record
+    recording -> silhouettes or detections -> room bounds -> tracking by swarm, projection lines, both or a plugin
+              -> errors of the cameras -> fusion -> identity and smoothing -> record
 
-`track_recording` is what the command line, sweeps and notebooks call; `track_runs` does the stages for many settings at
-once. Only this module knows the whole recording and the whole settings: each stage is given what it needs, and
-returns a result.
+`track_recording` is what the command line and notebooks call; `track_runs` does what follows the silhouettes, for the
+many settings of a sweep at once.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
+from psotrack.camera_errors import CameraViews, views_of_middles, views_of_sightings, with_camera_errors
+from psotrack.clocks import CameraClocks
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
+from psotrack.fusion import fuse_tracks, fused_errors
 from psotrack.geometry import views_meet
-from psotrack.initiation import MovingPoints, first_drones, given_state, known_motion, start_source
-from psotrack.methods import (
-    MethodInputs,
-    MethodResult,
-    fuse_methods,
-    track_by_plugin,
-    track_by_projection_lines,
-    track_by_swarm,
-    usable_for,
-)
-from psotrack.pipeline.clock_correction import advise_on_clocks, estimate_clocks, with_clocks
+from psotrack.initiation import first_drones, given_state, known_motion, start_source
+from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
+from psotrack.pipeline.inputs import Run, SharedInputs, prepare, usable_for
 from psotrack.pipeline.parts import (
+    MethodInputs,
     Parts,
     check_detector_is_used,
-    tracks_silhouettes,
+    find_method,
     with_background,
 )
-from psotrack.pipeline.preparation import PreparedRun, prepare
-from psotrack.pipeline.results import TrackedRecording, finish, with_real_time
+from psotrack.pipeline.results import (
+    MethodResult,
+    TrackedRecording,
+    finish,
+    with_real_time,
+)
+from psotrack.projection_lines import LineSettings, track_detections
 from psotrack.recordings import Recording
-from psotrack.settings import TrackSettings
+from psotrack.settings import BLOBS, TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import Report, load_ahead, no_progress
 from psotrack.tracking import RunInputs, tracker_settings
+from psotrack.tracking import track_recording as track_by_blocks
+from psotrack.trajectories import Status, Tracks
 
 
 def track_recording(
@@ -75,25 +80,14 @@ def track_recording(
     recording = usable_for(recording, settings, videos=parts.detector is not None)
     if parts.method is not None:
         recording = recording.usable(silhouettes=True)
-    if len(recording.rig) < 2:
-        raise InputError(
-            recording.folder,
-            expected="at least two cameras that can be used, because one camera does not show distances",
-            found=", ".join(recording.rig.names),
-        )
-    if not views_meet(recording.rig.cameras):
-        raise InputError(
-            recording.folder,
-            expected="cameras of which two have a place in view together",
-            found=f"that no views of {', '.join(recording.rig.names)} meet",
-            remedy="check the places and directions of the cameras in the calibration",
-        )
+    _check_cameras(recording)
     # Wrong names are refused before silhouettes are computed, which takes minutes.
-    if tracks_silhouettes(settings, parts.method):
+    method = find_method(settings, parts)
+    if method is None and settings.method != "projection-lines":
         tracker_settings(settings, search=parts.search, score=parts.score)
     start_source(recording, settings.init)
     if parts.detector is not None:
-        check_detector_is_used(settings, parts)
+        check_detector_is_used(settings, method)
         folder = stored_detections(parts.detector, recording, cache=cache, report=report)
         settings = msgspec.structs.replace(settings, detections=str(folder))
     silhouettes = None
@@ -109,12 +103,29 @@ def track_recording(
             report=report,
         )
     load_ahead()
-    (tracked,) = track_runs(recording, silhouettes, [settings], parts=parts, report=report)
+    ((run, result, clocks),) = _track(recording, silhouettes, [settings], parts, report)
+    tracked = finish(run, parts, result, clocks)
     if isinstance(tracked, InputError):
         raise tracked
-    if settings.clocks == "given" and len(recording.rig) > 2:
-        advise_on_clocks(recording, silhouettes, settings, tracked.trajectories)
+    if clocks is None and len(recording.rig) > 2:
+        advise_on_clocks(run, result.tracks)
     return replace(tracked, record=with_real_time(tracked.record, time.perf_counter() - began))
+
+
+def _check_cameras(recording: Recording) -> None:
+    if len(recording.rig) < 2:
+        raise InputError(
+            recording.folder,
+            expected="at least two cameras that can be used, because one camera does not show distances",
+            found=", ".join(recording.rig.names),
+        )
+    if not views_meet(recording.rig.cameras):
+        raise InputError(
+            recording.folder,
+            expected="cameras of which two have a place in view together",
+            found=f"that no views of {', '.join(recording.rig.names)} meet",
+            remedy="check the places and directions of the cameras in the calibration",
+        )
 
 
 def track_runs(
@@ -148,69 +159,54 @@ def track_runs(
     """
     if silhouettes is None and (parts.method is not None or any(each.needs_silhouettes for each in settings)):
         raise SettingsError("silhouettes", expected="silhouettes of all cameras", found="none")
-    tracked: dict[int, TrackedRecording | InputError] = {}
-    for rate_hz in dict.fromkeys(each.rate_hz for each in settings):
-        numbers = [number for number, each in enumerate(settings) if each.rate_hz == rate_hz]
-        timed = recording.at_rate(rate_hz)
-        shown = None if silhouettes is None else silhouettes.at_instants(timed.timeline())
-        results = _track_at_instants(timed, shown, [settings[number] for number in numbers], parts, report)
-        for number, (run, result) in zip(numbers, results, strict=True):
-            if run.settings.clocks == "auto" and result.tracks.num_drones:
-                clocks = estimate_clocks(timed, shown, run, result)
-                corrected = with_clocks(timed, clocks)
-                again = None if silhouettes is None else silhouettes.at_instants(corrected.timeline())
-                ((run, result),) = _track_at_instants(corrected, again, [settings[number]], parts, report)
-                tracked[number] = finish(corrected, again, run, parts, result, clocks)
-            else:
-                tracked[number] = finish(timed, shown, run, parts, result)
-    return [tracked[number] for number in range(len(settings))]
+    tracked = _track(recording, silhouettes, settings, parts, report)
+    return [finish(run, parts, result, clocks) for run, result, clocks in tracked]
 
 
-def _track_at_instants(
+def _track(
     recording: Recording,
     silhouettes: Silhouettes | None,
     settings: Sequence[TrackSettings],
     parts: Parts,
     report: Report,
-) -> list[tuple[PreparedRun, MethodResult]]:
-    """Each run and the result of its method; the silhouettes are those at the recording's instants."""
-    points: dict[str, MovingPoints] = {}
-    runs = [prepare(recording, silhouettes, each, parts, points, report) for each in settings]
-    in_silhouettes = [run for run in runs if tracks_silhouettes(run.settings, run.plugin)]
-    by_swarm = iter(_track_silhouettes(recording, silhouettes, in_silhouettes, parts, report))
+) -> list[tuple[Run, MethodResult, CameraClocks | None]]:
+    """Each run, the result of its method, and the clocks where they were estimated, before a second pass."""
+    rates_hz = dict.fromkeys(each.rate_hz for each in settings)
+    shared = {rate_hz: SharedInputs.of(recording.at_rate(rate_hz), silhouettes) for rate_hz in rates_hz}
+    runs = [prepare(shared[each.rate_hz], each, parts, report) for each in settings]
+    by_swarm: dict[Run, MethodResult] = {}
+    for one in shared.values():
+        together = [run for run in runs if run.by_swarm and run.recording is one.recording]
+        by_swarm |= _track_by_swarm(together, parts, report)
     results = []
-    for run in runs:
-        if run.plugin is not None:
-            results.append((run, _track_by_plugin(recording, silhouettes, run, report)))
-            continue
-        swarm = next(by_swarm) if tracks_silhouettes(run.settings, run.plugin) else None
-        result = swarm
-        if run.detections is not None:
-            lines = track_by_projection_lines(
-                recording.rig,
-                run.detections,
-                run.settings,
-                fps=recording.fps,
-                bounds_m=run.volume.bounds_m,
-                known=known_motion(run.source, run.settings.drones, recording.fps),
-                report=report,
-            )
-            result = lines if swarm is None else fuse_methods(swarm, lines, run.settings, recording.fps)
-        assert result is not None, "each method of the package uses the swarm, projection lines, or both"
-        results.append((run, result))
+    for run, given in zip(runs, settings, strict=True):
+        result, clocks = _result_of(run, by_swarm.get(run), report), None
+        if given.clocks == "auto" and result.tracks.num_drones:
+            clocks = estimate_clocks(run, result.tracks)
+            once = msgspec.structs.replace(given, clocks="given")
+            corrected = with_clocks(run.recording, clocks)
+            ((again, result, _),) = _track(corrected, silhouettes, [once], parts, report)
+            run = replace(again, settings=msgspec.structs.replace(again.settings, clocks="auto"))
+        results.append((run, result, clocks))
     return results
 
 
-def _track_silhouettes(
-    recording: Recording,
-    silhouettes: Silhouettes | None,
-    runs: Sequence[PreparedRun],
-    parts: Parts,
-    report: Report,
-) -> list[MethodResult]:
-    """The results of the swarm, for all its runs together."""
+def _result_of(run: Run, swarm: MethodResult | None, report: Report) -> MethodResult:
+    """The result of the run's method; `swarm` is that of the swarm, where the method uses it."""
+    if run.plugin is not None:
+        return _track_by_plugin(run, report)
+    if run.sightings is None:
+        assert swarm is not None, "each method of the package uses the swarm, projection lines, or both"
+        return swarm
+    lines = _track_by_lines(run, report)
+    return lines if swarm is None else _fused(run, swarm, lines)
+
+
+def _track_by_swarm(runs: Sequence[Run], parts: Parts, report: Report) -> dict[Run, MethodResult]:
+    """The results of the swarm, for all its runs together; the seconds of a run are its share of all."""
     if not runs:
-        return []
+        return {}
+    recording, silhouettes = runs[0].recording, runs[0].silhouettes
     assert silhouettes is not None
     inputs = [
         RunInputs(
@@ -220,31 +216,117 @@ def _track_silhouettes(
         )
         for run in runs
     ]
-    settings = [run.settings for run in runs]
-    return track_by_swarm(recording.rig, silhouettes, inputs, settings, recording.fps, report)
+    began = time.perf_counter()
+    tracked, compile_s = track_by_blocks(recording.rig, silhouettes, inputs, fps=recording.fps, report=report)
+    track_s = time.perf_counter() - began - compile_s
+    shares = {"compile": compile_s / len(runs), "track": track_s / len(runs)}
+    results = {}
+    for run, (tracks, places) in zip(runs, tracked, strict=True):
+        views = partial(views_of_middles, recording.rig.cameras, silhouettes.exposures, places)
+        result = MethodResult(
+            tracks, _points(tracks, "silhouette"), silhouettes.keys, {**silhouettes.seconds, **shares}
+        )
+        results[run] = _with_camera_errors(run, result, views)
+    return results
 
 
-def _track_by_plugin(
-    recording: Recording, silhouettes: Silhouettes | None, run: PreparedRun, report: Report
+def _track_by_lines(run: Run, report: Report) -> MethodResult:
+    """The result of the projection lines."""
+    assert run.sightings is not None
+    rig, settings = run.recording.rig, run.settings
+    began = time.perf_counter()
+    tracks = track_detections(
+        rig.cameras,
+        run.sightings,
+        LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m),
+        fps=run.recording.fps,
+        bounds_m=run.volume.bounds_m,
+        known=known_motion(run.source, settings.drones, run.recording.fps),
+        report=report,
+    )
+    seconds = {"compile": 0.0, "track": run.read_s + time.perf_counter() - began}
+    result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
+    return _with_camera_errors(run, result, partial(views_of_sightings, rig.cameras, run.sightings))
+
+
+def _with_camera_errors(
+    run: Run, result: MethodResult, views_at: Callable[[np.ndarray, np.ndarray], CameraViews]
 ) -> MethodResult:
+    """The result with covariances that hold for the errors that the cameras show at the drones' places."""
+    tracks, settings = result.tracks, run.settings
+    if not tracks.num_drones:
+        return result
+    began = time.perf_counter()
+    found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
+    states = (np.asarray(value, np.float64) for value in (tracks.position_m, tracks.velocity_m_s))
+    views = views_at(*(np.where(found, state, np.nan) for state in states))
+    tracks, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, run.recording.fps)
+    seconds = {**result.seconds, "finish": time.perf_counter() - began}
+    return replace(result, tracks=tracks, errors=errors, seconds=seconds)
+
+
+def _fused(run: Run, swarm: MethodResult, lines: MethodResult) -> MethodResult:
+    """The results of both methods in one, and the errors of the cameras that they contain."""
+    began = time.perf_counter()
+    settings, fps = run.settings, run.recording.fps
+    fusion = fuse_tracks(
+        swarm.tracks,
+        lines.tracks,
+        settings.motion,
+        fps=fps,
+        max_coasting_s=settings.status.max_coasting_s,
+        same_foreground=settings.detections == BLOBS,
+    )
+    tracks, errors = fusion.tracks, None
+    if swarm.errors is not None or lines.errors is not None:
+        tracks, errors = fused_errors(fusion, swarm.errors, lines.errors, settings.motion, fps)
+    both = ("finish", "compile", "track")
+    seconds = {
+        **swarm.seconds,
+        **{stage: swarm.seconds.get(stage, 0.0) + lines.seconds.get(stage, 0.0) for stage in both},
+    }
+    seconds["track"] += time.perf_counter() - began
+    keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
+    points = _points(tracks, "box")
+    for point, offset_m, std_m in zip(points, fusion.offset.offset_m, fusion.offset.std_m, strict=True):
+        if point["drone"] < swarm.tracks.num_drones:
+            point["middle_of"] = "silhouette"
+        if np.isfinite(offset_m).all():
+            point |= {"box_off_m": offset_m.tolist(), "box_off_std_m": std_m.tolist()}
+    return MethodResult(tracks, points, keys, seconds, errors)
+
+
+def _track_by_plugin(run: Run, report: Report) -> MethodResult:
     """The result of the method that is plugged in, which is given the drones of the first frames."""
     assert run.plugin is not None
-    sightings = None if run.detections is None else run.detections.sightings
-    initial = None
+    recording, silhouettes, settings = run.recording, run.silhouettes, run.settings
+    initial, keys = None, {}
     if silhouettes is not None:
-        initial = given_state(recording.rig, silhouettes, run.source, run.settings.drones, recording.fps)
+        initial = given_state(recording.rig, silhouettes, run.source, settings.drones, recording.fps)
+        keys = dict(silhouettes.keys)
     if initial is None:
-        shown = sightings if silhouettes is None else silhouettes
+        shown = run.sightings if silhouettes is None else silhouettes
         assert shown is not None
         initial = first_drones(
             recording.rig,
             shown,
             fps=recording.fps,
             bounds_m=run.volume.bounds_m,
-            max_speed_m_s=run.settings.motion.speed_limit_m_s,
-            drones=run.settings.drones,
+            max_speed_m_s=settings.motion.speed_limit_m_s,
+            drones=settings.drones,
         )
-    inputs = MethodInputs(
-        recording.rig, silhouettes, sightings, initial, run.volume.bounds_m, recording.fps, run.settings
+    began = time.perf_counter()
+    tracks = run.plugin(
+        MethodInputs(
+            recording.rig, silhouettes, run.sightings, initial, run.volume.bounds_m, recording.fps, settings
+        ),
+        report,
     )
-    return track_by_plugin(run.plugin, inputs, report)
+    seconds = {"compile": 0.0, "track": time.perf_counter() - began}
+    return MethodResult(tracks, _points(tracks, "silhouette"), keys, seconds)
+
+
+def _points(tracks: Tracks, middle_of: Literal["silhouette", "box"]) -> list[dict[str, Any]]:
+    """For each drone the point that its track follows; where its box is beside it, fusion alone finds out."""
+    known = {"middle_of": middle_of, "box_off_m": None, "box_off_std_m": None}
+    return [{"drone": drone, **known} for drone in range(tracks.num_drones)]

@@ -13,7 +13,7 @@ import numpy as np
 from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError
 from psotrack.geometry import Camera
-from psotrack.methods import check_detections, detection_files_of, usable_for
+from psotrack.pipeline import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
 from psotrack.settings import YOLO
 from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute, silhouette_keys

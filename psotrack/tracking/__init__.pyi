@@ -12,13 +12,12 @@ from .parameters import TrackerSettings, find_score, find_search, tracker_settin
 from .recording import Places, track_recording
 from .run import RunInputs
 from .search import ParticleSwarm, Search, SearchRegion, particle_swarm
-from .stepwise import DroneRow, StepwiseTracker
+from .stepwise import StepwiseTracker
 from .tracker import DISPERSION_FRAMES
 
 __all__ = [
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
-    "DroneRow",
     "ParticleSwarm",
     "Places",
     "RunInputs",

@@ -7,7 +7,7 @@ a drone that was lost for long is forgotten, so that neither memory nor time gro
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -19,34 +19,14 @@ from psotrack.tracking.block import Block, Engine, Setting, make_block
 from psotrack.tracking.parameters import TrackerSettings
 from psotrack.tracking.run import RunInputs, Start, SwarmRun
 from psotrack.tracking.tracker import Rows
-from psotrack.trajectories import Status
+from psotrack.trajectories import Trajectories
 
 logger = logging.getLogger(__name__)
 
 #: A drone that was not seen for longer is forgotten, seconds; and what is remembered of the drones' flights.
 FORGOTTEN_S, REMEMBERED_S = 30.0, 60.0
-
-
-@dataclass(frozen=True)
-class DroneRow:
-    """One drone in one frame.
-
-    Attributes:
-        drone: number of the drone, from 0 in the order of their births.
-        position_m, velocity_m_s: (3,), metres and m/s.
-        covariance_m2: (3, 3), covariance of the position.
-        fitness: score in [0, 1].
-        num_cameras: number of cameras that see the drone.
-        status: tracked, coasting or lost.
-    """
-
-    drone: int
-    position_m: Float[np.ndarray, "3"]
-    velocity_m_s: Float[np.ndarray, "3"]
-    covariance_m2: Float[np.ndarray, "3 3"]
-    fitness: float
-    num_cameras: int
-    status: Status
+#: What is told of a drone besides its position.
+_SHOWN = ("velocity_m_s", "covariance_m2", "fitness", "num_cameras", "status")
 
 
 class StepwiseTracker:
@@ -75,7 +55,7 @@ class StepwiseTracker:
     ) -> None:
         self._setting = Setting(rig, reduction, border_cells(rig.cameras.image_size_wh, reduction), fps)
         self._engine = Engine(self._setting)
-        self._shape, self._limited = shape, settings.drones.count is not None
+        self._shape, self._drones = shape, settings.drones
         self._most = settings.drones.count or most_drones
         self._run = SwarmRun(
             self._setting,
@@ -85,7 +65,6 @@ class StepwiseTracker:
             memory_frames=max(1, round(REMEMBERED_S * fps)),
         )
         self._starts: list[Start] = []
-        self._instant = -1
         self._was_full = False
         self._latest: tuple[Block, Rows] | None = None
 
@@ -105,37 +84,40 @@ class StepwiseTracker:
 
     def step(
         self,
+        instant: int,
+        time_s: float,
         coverage: UInt8[np.ndarray, "cameras height width"],
         exposures: Exposures,
-        *,
-        num_frames: int = 1,
-    ) -> list[DroneRow]:
-        """The drones in the next frame: those that are known so far.
+    ) -> Trajectories:
+        """The drones at the next instant, those that are known so far, in the order of their births.
 
         Args:
+            instant: number of the instant, which grows; by more than 1 where frames were left out.
+            time_s: its time, seconds.
             coverage: (cameras, height, width), silhouettes of the frame, 0 to 255.
             exposures: when each camera's frame was exposed, and which cameras have one; NumPy arrays.
-            num_frames: instants since the last frame; above 1 where frames were left out.
+
+        Returns:
+            Positions of the bodies' origins, named by the drones' numbers, from 0.
         """
         everywhere = foreground_is_everywhere(coverage)
         is_there = np.asarray(exposures.is_there) & ~everywhere
         coverage = np.where(is_there[:, None, None], coverage, np.uint8(0))
         exposed = replace(exposures, is_there=is_there)
         exposed = Exposures(*(np.asarray(value)[None] for value in vars(exposed).values()))
-        self._instant += num_frames
-        instant = np.array([self._instant])
-        block = make_block(self._setting, instant, coverage[None], exposed, elapsed=num_frames)
+        elapsed = 1 if self._latest is None else instant - int(self._latest[0].instant[0])
+        block = make_block(self._setting, np.array([instant]), coverage[None], exposed, elapsed=elapsed)
         # A track that was to begin in a frame that was left out begins now.
-        late_s = [(self._instant - start.instant) / self._setting.fps for start in self._starts]
+        late_s = [(instant - start.instant) / self._setting.fps for start in self._starts]
         starts = [
-            replace(start, instant=self._instant, position_m=start.position_m + late * start.velocity_m_s)
+            replace(start, instant=instant, position_m=start.position_m + late * start.velocity_m_s)
             for start, late in zip(self._starts, late_s, strict=True)
         ]
         ((slots, rows),) = self._engine.track([self._run.job(block, starts)], block)
         self._starts = []
         self._run.finish(block, slots, rows)
         self._latest = block, rows
-        return self._rows(rows)
+        return self._of_known(rows, instant, time_s)
 
     def look_ahead(self) -> None:
         """What need not be done before the rows of a frame are passed on: births, and drones that are forgotten.
@@ -144,31 +126,28 @@ class StepwiseTracker:
         """
         assert self._latest is not None, "step comes first"
         block, rows = self._latest
-        run, following = self._run, self._instant + 1
+        run, instant = self._run, int(block.instant[0])
 
         def begin(candidate: TrackCandidate) -> tuple[int, np.ndarray, np.ndarray]:
             last = max(candidate.path)
             position_m, velocity_m_s = state_at(candidate.path, last, run.fps, run.max_speed_m_s)
-            ago_s = (following - last) / run.fps
-            return following, position_m + ago_s * velocity_m_s, velocity_m_s
+            ago_s = (instant + 1 - last) / run.fps
+            return instant + 1, position_m + ago_s * velocity_m_s, velocity_m_s
 
         self._starts = run.plan(run.search(block, rows, run.slots), block, rows, begin)
-        run.forget(self._instant - round(FORGOTTEN_S * run.fps))
-        if len(run.known) == self._most and not self._was_full and not self._limited:
+        run.forget(instant - round(FORGOTTEN_S * run.fps))
+        if len(run.known) == self._most and not self._was_full and self._drones.count is None:
             logger.warning("%d drones are tracked; further drones are left out (--most-drones)", self._most)
             self._was_full = True
 
-    def _rows(self, rows: Rows) -> list[DroneRow]:
-        number = self._run.drone
-        return [
-            DroneRow(
-                int(number[slot]),
-                np.asarray(rows.position_m)[0, slot],
-                np.asarray(rows.velocity_m_s)[0, slot],
-                np.asarray(rows.covariance_m2)[0, slot],
-                float(rows.fitness[0, slot]),
-                int(rows.num_cameras[0, slot]),
-                Status(int(rows.status[0, slot])),
-            )
-            for slot in sorted(self._run.known, key=lambda slot: int(number[slot]))
-        ]
+    def _of_known(self, rows: Rows, instant: int, time_s: float) -> Trajectories:
+        number, body_offset_m = self._run.drone, np.array(self._drones.body_offset_m, np.float32)
+        slots = sorted(self._run.known, key=lambda slot: int(number[slot]))
+        known = {name: np.asarray(getattr(rows, name))[:, slots] for name in _SHOWN}
+        return Trajectories(
+            frame=np.array([instant]),
+            time_s=np.array([time_s]),
+            drones=tuple(f"{number[slot]}" for slot in slots),
+            position_m=np.asarray(rows.position_m)[:, slots] - body_offset_m,
+            **known,
+        )

@@ -1,0 +1,68 @@
+"""Clocks of the cameras from a run's tracks: advice where the given times are wrong, and the corrected recording."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from psotrack.clocks import CameraClocks, clocks_of_tracks
+from psotrack.correspondence import from_silhouettes
+from psotrack.pipeline.inputs import Run
+from psotrack.recordings import Recording
+from psotrack.settings import BLOBS
+from psotrack.trajectories import Tracks
+
+logger = logging.getLogger(__name__)
+
+#: Number of instants in which given times of the frames are checked.
+CHECKED_INSTANTS = 100
+#: Least error of a camera's given times that is worth a warning, as a share of the interval between instants.
+CERTAIN_SHARE = 0.3
+
+
+def estimate_clocks(run: Run, tracks: Tracks, most: int | None = None) -> CameraClocks:
+    """Clocks of the cameras, from the tracks of a run and what the cameras show at them.
+
+    Args:
+        run: the run.
+        tracks: its tracks.
+        most: largest number of instants that are used, those in the middle; None for all.
+    """
+    timeline = run.recording.timeline()
+    count = min(most or timeline.num_instants, timeline.num_instants)
+    first = (timeline.num_instants - count) // 2
+    rows = np.arange(first, first + count)
+    shown = None if run.silhouettes is None else run.silhouettes.part(first, first + count)
+    if run.sightings is not None:
+        sightings = run.sightings.in_frames(rows)
+        shown = shown if run.settings.detections == BLOBS else None
+    else:
+        assert shown is not None, "a run has silhouettes or sightings"
+        sightings = from_silhouettes(shown)
+    part = tracks.with_arrays(lambda _, values: values[rows])
+    return clocks_of_tracks(run.recording.rig, sightings, timeline.part(rows), part, shown)
+
+
+def advise_on_clocks(run: Run, tracks: Tracks) -> None:
+    """Warn if some instants in the middle show for certain that a camera's given times are wrong."""
+    names, rate_hz = run.recording.rig.names, run.recording.fps
+    clocks = estimate_clocks(run, tracks, CHECKED_INSTANTS)
+    certain = clocks.is_certain(CERTAIN_SHARE / rate_hz)
+    if certain.any():
+        worst = int(np.where(certain, np.abs(clocks.offset_s), 0.0).argmax())
+        logger.warning(
+            "camera %s: its video shows the scene %.0f ± %.0f ms %s, against the other cameras; "
+            "--clocks auto takes the clocks from the data",
+            names[worst],
+            1e3 * abs(clocks.late_s[worst]),
+            1e3 * clocks.offset_std_s[worst],
+            "late" if clocks.late_s[worst] > 0 else "early",
+        )
+
+
+def with_clocks(recording: Recording, clocks: CameraClocks) -> Recording:
+    """The recording with corrected times of the frames, and with as many instants as before."""
+    times = clocks.corrected(recording.frame_times, recording.rig.names)
+    return replace(recording, frame_times=times, rate_hz=recording.fps, num_instants=recording.num_frames)

@@ -1,0 +1,185 @@
+"""The cameras and detections that the settings of a run can use, and what the run knows before it tracks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from psotrack.correspondence import Sightings, from_detections, from_silhouettes
+from psotrack.datasets.dpjait import detection_files, read_detections
+from psotrack.errors import InputError
+from psotrack.initiation import (
+    FlightVolume,
+    MovingPoints,
+    StartSource,
+    flight_volume,
+    moving_blobs,
+    moving_detections,
+    start_source,
+)
+from psotrack.pipeline.parts import Method, Parts, find_method
+from psotrack.recordings import Recording
+from psotrack.settings import BLOBS, YOLO, TrackSettings
+from psotrack.silhouettes import Silhouettes
+from psotrack.support import Report, digest_file, no_progress
+
+
+def usable_for(
+    recording: Recording,
+    settings: TrackSettings,
+    *,
+    cameras: Sequence[str] | None = None,
+    num_frames: int | None = None,
+    videos: bool = False,
+) -> Recording:
+    """A recording with the cameras that these settings can use, and the detections that they name.
+
+    Args:
+        recording: the recording as it was opened.
+        settings: settings of a run.
+        cameras: names of the cameras to use; None uses all.
+        num_frames: number of instants to use from the start; None uses all.
+        videos: whether each camera needs a video, because a detector reads its frames; if not, stored silhouettes are
+            as good as a video.
+
+    Raises:
+        InputError: detections cannot be read, no camera can be used (see `Recording.usable`), or fewer than two
+            cameras have the videos or stored silhouettes that the method needs.
+        SettingsError: a camera is unknown, or the recording has fewer instants.
+    """
+    if settings.reads_detections and settings.detections != YOLO:
+        recording = recording.with_detections(detection_files_of(recording, settings.detections))
+    usable = recording.usable(
+        cameras, num_frames, videos=videos or settings.needs_each_video, silhouettes=not videos
+    )
+    shown = [name for name in usable.rig.names if name in usable.videos or name in usable.silhouettes]
+    if settings.needs_silhouettes and len(shown) < min(2, len(usable.rig)):
+        raise InputError(
+            recording.folder,
+            expected=f"videos of at least two cameras for --method {settings.method}",
+            found=", ".join(shown) or "none",
+            remedy="--method projection-lines needs detections only",
+        )
+    return usable
+
+
+def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
+    """The file of detections of each camera, found by `TrackSettings.detections`.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    if source != YOLO:
+        return detection_files(Path(source), recording.rig.names)
+    if recording.detections is None:
+        raise InputError(
+            recording.folder,
+            expected="detections in dl_data or in recording.toml",
+            found="none",
+            remedy="use --detections blobs, or --detections FOLDER",
+        )
+    return {name: path for name, path in recording.detections.items() if name in recording.rig.names}
+
+
+def check_detections(recording: Recording, settings: TrackSettings) -> None:
+    """Check the detections that a run reads against a recording as it was opened (see `Recording.check_detections`).
+
+    Raises:
+        InputError: there are no detections, a file cannot be read, or it belongs to other frames.
+    """
+    if settings.reads_detections:
+        recording.check_detections(detection_files_of(recording, settings.detections))
+
+
+def read_sightings(
+    recording: Recording, silhouettes: Silhouettes | None, source: str, report: Report = no_progress
+) -> tuple[Sightings, dict[str, str]]:
+    """Read the detections that `TrackSettings.detections` names, and digests of their files or silhouettes by camera.
+
+    Raises:
+        InputError: the detections cannot be read.
+    """
+    if source == BLOBS:
+        assert silhouettes is not None
+        return from_silhouettes(silhouettes, report), dict(silhouettes.keys)
+    files = detection_files_of(recording, source)
+    detections = {name: read_detections(path) for name, path in files.items()}
+    times = [each for name, each in recording.frame_times.items() if name in recording.rig.names]
+    sightings = from_detections(detections, recording.rig, max(each.num_frames for each in times))
+    keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
+    return sightings.at_instants(recording.timeline()), keys
+
+
+@dataclass(frozen=True)
+class SharedInputs:
+    """A recording at the instants of some runs, and what these runs share.
+
+    Attributes:
+        recording: the recording at these instants.
+        silhouettes: silhouettes of all cameras at these instants; None where no run needs them.
+        points: moving points that the runs have found so far, by the source of the detections.
+    """
+
+    recording: Recording
+    silhouettes: Silhouettes | None
+    points: dict[str, MovingPoints] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, recording: Recording, silhouettes: Silhouettes | None) -> SharedInputs:
+        """Those of a recording, with its silhouettes in all frames."""
+        return cls(recording, None if silhouettes is None else silhouettes.at_instants(recording.timeline()))
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What is known of a run before it tracks.
+
+    Attributes:
+        recording, silhouettes: those at the instants of the run.
+        settings: settings of the run, with the speed limit that was found.
+        source: source of the first positions.
+        volume: bounds of the room, and where they come from.
+        plugin: the method that the caller brings or that an entry point names; None for the methods of this package.
+        sightings: detections of all cameras at the instants; None where the method reads none.
+        detection_keys: digests of the files or silhouettes that the detections come from, by camera.
+        read_s: time in which the detections were read, seconds.
+    """
+
+    recording: Recording
+    silhouettes: Silhouettes | None
+    settings: TrackSettings
+    source: StartSource
+    volume: FlightVolume
+    plugin: Method | None
+    sightings: Sightings | None
+    detection_keys: Mapping[str, str]
+    read_s: float
+
+    @property
+    def by_swarm(self) -> bool:
+        """Whether the swarm follows the silhouettes, alone or beside projection lines."""
+        return self.plugin is None and self.settings.method != "projection-lines"
+
+
+def prepare(shared: SharedInputs, settings: TrackSettings, parts: Parts, report: Report = no_progress) -> Run:
+    """Read the detections that the method needs, and find the volume and the speed limit (see `track_runs`)."""
+    began = time.perf_counter()
+    recording, silhouettes, points = shared.recording, shared.silhouettes, shared.points
+    plugin = find_method(settings, parts)
+    sightings, source, keys = None, BLOBS, dict[str, str]()
+    if settings.method != "swarm" if plugin is None else plugin.reads_detections:
+        source = settings.detections
+        sightings, keys = read_sightings(recording, silhouettes, source, report)
+    read_s = time.perf_counter() - began
+    bounds_m, speed_m_s = settings.bounds_m or recording.bounds_m, settings.motion.max_speed_m_s
+    if source not in points and (bounds_m is None or speed_m_s is None):
+        if sightings is not None:
+            points[source] = moving_detections(recording.rig, sightings, recording.fps)
+        elif silhouettes is not None:
+            points[source] = moving_blobs(recording.rig, silhouettes, recording.fps)
+    volume = flight_volume(recording.rig, points.get(source), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
+    settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
+    start = start_source(recording, settings.init)
+    return Run(recording, silhouettes, settings, start, volume, plugin, sightings, keys, read_s)
