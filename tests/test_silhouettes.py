@@ -30,18 +30,20 @@ from psotrack.errors import InputError, OutputError, PsotrackError, SettingsErro
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
 from psotrack.silhouettes import (
+    Mog2,
     ScaledSettings,
     Silhouettes,
     SilhouetteSettings,
     compute,
+    coverage,
     is_whole,
+    learning_step,
     removable,
     silhouette_keys,
     usual_drone_px,
 )
 from psotrack.silhouettes import store as silhouette_store
 from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import coverage, foreground
 from psotrack.silhouettes.living_background import Living
 from psotrack.support import Advance, map_in_processes
 
@@ -106,13 +108,13 @@ def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def _expected(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
     """Compute silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
     scaled = settings.scaled([video.image_size_wh for video in recording.videos.values()])
-    step = silhouette_store.learning_step(recording.num_frames, scaled)
+    step = learning_step(recording.num_frames, scaled)
     factor = scaled.reduction // scaled.working_reduction
     return np.stack(
         [
             [
                 coverage(mask, factor)
-                for mask in foreground(read_frames(video, step), read_frames(video), scaled)
+                for mask in Mog2(scaled).foreground(read_frames(video, step), read_frames(video))
             ]
             for video in recording.videos.values()
         ],

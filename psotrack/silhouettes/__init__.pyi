@@ -13,7 +13,7 @@ from .computation import (
     usual_drone_px,
 )
 from .exposures import Exposures, moved_by
-from .foreground import BackgroundModel, Mog2, coverage, reduce_frame
+from .foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
 from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
 from .seals import SEAL_FILE, is_whole, removable
@@ -53,6 +53,7 @@ __all__ = [
     "is_damaged",
     "is_whole",
     "key_of",
+    "learning_step",
     "list_entries",
     "made_of",
     "masks_out",
