@@ -30,6 +30,7 @@ from psotrack.errors import InputError, OutputError, PsotrackError, SettingsErro
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
 from psotrack.silhouettes import (
+    Living,
     Mog2,
     ScaledSettings,
     Silhouettes,
@@ -38,13 +39,13 @@ from psotrack.silhouettes import (
     coverage,
     is_whole,
     learning_step,
-    removable,
-    silhouette_keys,
+    list_entries,
+    remove_entry,
+    stored_silhouettes,
     usual_drone_px,
 )
 from psotrack.silhouettes import store as silhouette_store
 from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.living_background import Living
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
@@ -52,8 +53,6 @@ SIZE_WH = (162, 118)  # not multiples of 4
 SETTINGS = SilhouetteSettings(
     background="mog2", reduction=4, working_reduction=2, min_blob_px=64, num_learning_frames=10
 )
-#: What these settings are for videos of any size.
-SCALED = SETTINGS.scaled([SIZE_WH])
 
 
 def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
@@ -96,8 +95,8 @@ def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List that gets the name of the video of each frame that this process decodes, in order."""
     names: list[str] = []
 
-    def read_and_count(video, step=1):  # type: ignore[no-untyped-def]
-        for frame in read_frames(video, step):
+    def read_and_count(video, step=1, **how):  # type: ignore[no-untyped-def]
+        for frame in read_frames(video, step, **how):
             names.append(video.path.stem)
             yield frame
 
@@ -130,19 +129,40 @@ def _unfinished_folders(cache: Path) -> list[Path]:
     return list(cache.glob(".*"))
 
 
+def _keys(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> dict[str, str]:
+    return {name: each.key for name, each in stored_silhouettes(recording, settings, Path()).items()}
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_stored_silhouettes_equal_direct_computation(folder: Path, tmp_path: Path, jobs: int) -> None:
+    started: list[tuple[str, int]] = []
+    done: list[int] = []
+
+    @contextlib.contextmanager
+    def report(description: str, total: int) -> Iterator[Advance]:
+        started.append((description, total))
+        yield done.append
+
     recording = _make_recording(folder)
-    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
+    for _ in range(2):
+        silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
+    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
+    assert sum(done) == 3 * (NUM_FRAMES + 10)
     assert silhouettes.cameras == ("cam1", "cam2", "cam3")
     assert silhouettes.shape == (30, 41)
     assert (silhouettes.num_frames, silhouettes.reduction) == (NUM_FRAMES, 4)
+    assert silhouettes.keys == _keys(recording)
     all_frames = _read_all(silhouettes)
     assert all_frames.dtype == np.uint8
     assert all_frames.flags.c_contiguous
     np.testing.assert_array_equal(all_frames, _expected(recording))
     assert all_frames.any(axis=(2, 3)).all(), "every frame of every camera shows a disc"
     assert _unfinished_folders(tmp_path / "cache") == []
+    for start, stop in [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)]:
+        np.testing.assert_array_equal(silhouettes.read(start, stop), all_frames[start:stop])
+    for start, stop in [(-1, 5), (5, 31), (6, 5)]:
+        with pytest.raises(SettingsError, match=f"expected a part of 0 to 30, found {start} to {stop}"):
+            silhouettes.read(start, stop)
 
 
 def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kept(
@@ -160,53 +180,32 @@ def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kep
         np.testing.assert_array_equal(_read_all(silhouettes)[:, camera], masks)
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)])
-def test_any_range_of_frames_can_be_read(
-    video_folder: Path, shared_silhouettes: Silhouettes, start: int, stop: int
-) -> None:
-    frames = shared_silhouettes.read(start, stop)
-    assert frames.shape == (stop - start, 3, 30, 41)
-    np.testing.assert_array_equal(frames, _read_all(shared_silhouettes)[start:stop])
-
-
-@pytest.mark.parametrize(("start", "stop"), [(-1, 5), (5, 31), (6, 5)])
-def test_missing_frames_are_refused(shared_silhouettes: Silhouettes, start: int, stop: int) -> None:
-    with pytest.raises(SettingsError, match=f"frames: expected a part of 0 to 30, found {start} to {stop}"):
-        shared_silhouettes.read(start, stop)
-
-
-@pytest.fixture(scope="session")
-def shared_silhouettes(video_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Silhouettes:
-    return compute(_make_recording(video_folder), SETTINGS, cache=tmp_path_factory.mktemp("cache"), jobs=1)
-
-
-def test_second_call_reads_without_decoding(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
+def test_only_what_is_missing_is_decoded(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
+    shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
     first = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 3 * (NUM_FRAMES + 10)
+    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10), "equal videos are decoded once"
     assert first.seconds["decode"] > 0
     assert first.seconds["foreground"] > 0
+    before = _read_all(first)
+    np.testing.assert_array_equal(before[:, 0], before[:, 1])
     decoded_videos.clear()
-    second = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert decoded_videos == []
-    assert second.seconds == {"decode": 0.0, "foreground": 0.0}
-    assert second.keys == first.keys
-    np.testing.assert_array_equal(_read_all(second), _read_all(first))
-
-
-def test_name_and_folder_of_a_video_are_not_in_the_key(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    decoded_videos.clear()
+    # Name and folder of a video are not in the key.
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
     (moved / "cam3.avi").rename(moved / "other.avi")
-    compute(_make_recording(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    second = compute(_make_recording(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert decoded_videos == []
+    assert second.seconds == {"decode": 0.0, "foreground": 0.0}
+    np.testing.assert_array_equal(_read_all(second), before)
+    _write_video(folder / "cam2.avi", seed=5)
+    recording = _make_recording(folder)
+    third = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert set(decoded_videos) == {"cam2"}
+    np.testing.assert_array_equal(_read_all(third), _expected(recording))
+    np.testing.assert_array_equal(_read_all(first), before)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
+def test_every_setting_the_model_and_the_number_of_frames_are_in_the_key(video_folder: Path) -> None:
+    changes: list[dict[str, Any]] = [
         {"reduction": 2},
         {"working_reduction": 1},
         {"num_learning_frames": 11},
@@ -215,28 +214,18 @@ def test_name_and_folder_of_a_video_are_not_in_the_key(
         {"shadows": "drop"},
         {"shadow_weight": 0.4},
         {"min_blob_px": 33},
-        {"first_look": False},
-    ],
-)
-def test_every_setting_is_in_the_key(video_folder: Path, change: dict[str, object]) -> None:
-    video = probe(video_folder / "cam1.avi")
-    changed = msgspec.structs.replace(SCALED, **change)
-    assert silhouette_store.key_of(video, changed) != silhouette_store.key_of(video, SCALED)
-
-
-def test_the_test_of_the_key_covers_every_setting() -> None:
-    changes = test_every_setting_is_in_the_key.pytestmark[0].args[1]
-    assert {name for change in changes for name in change} == set(ScaledSettings.__struct_fields__)
-
-
-def test_the_background_model_is_in_the_key(video_folder: Path) -> None:
+        {"background": "living"},
+        {"background": "living", "first_look": False},
+    ]
+    assert {name for change in changes for name in change} >= set(ScaledSettings.__struct_fields__)
     recording = _make_recording(video_folder)
-    models = (SETTINGS, msgspec.structs.replace(SETTINGS, background="living"))
-    mog2, living = (silhouette_keys(recording, settings) for settings in models)
-    assert mog2.keys() == living.keys() == set(recording.rig.names)
-    assert not set(mog2.values()) & set(living.values())
+    keys = [
+        _keys(recording, msgspec.structs.replace(SETTINGS, **change))["cam1"] for change in [{}, *changes]
+    ]
+    keys += [_keys(recording.usable(num_frames=12))["cam1"]]
+    assert len(set(keys)) == len(keys)
     with pytest.raises(SettingsError, match=r"background: expected .*found liveing"):
-        silhouette_keys(recording, SilhouetteSettings(background="liveing"))
+        _keys(recording, SilhouetteSettings(background="liveing"))
 
 
 @pytest.mark.parametrize(
@@ -309,80 +298,11 @@ def test_what_the_living_background_does_not_use_is_refused(setting: str, value:
     assert getattr(SilhouetteSettings(background="mog2", **{setting: value}), setting) == value
 
 
-def test_a_changed_setting_computes_again_and_keeps_the_old_silhouettes(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    recording = _make_recording(folder)
-    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    before = _read_all(first)
-    decoded_videos.clear()
-    changed = msgspec.structs.replace(SETTINGS, reduction=2)
-    second = compute(recording, changed, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 3 * (NUM_FRAMES + 10)
-    np.testing.assert_array_equal(_read_all(second), _expected(recording, changed))
-    np.testing.assert_array_equal(_read_all(first), before)
-
-
-def test_only_a_changed_video_is_computed_again(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    decoded_videos.clear()
-    _write_video(folder / "cam2.avi", seed=5)
-    recording = _make_recording(folder)
-    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert set(decoded_videos) == {"cam2"}
-    np.testing.assert_array_equal(_read_all(silhouettes), _expected(recording))
-
-
-def test_fewer_frames_have_another_key(folder: Path, tmp_path: Path) -> None:
-    recording = _make_recording(folder)
-    all_frames = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    shorter = recording.usable(num_frames=12)
+def test_fewer_frames_are_made_anew(folder: Path, tmp_path: Path) -> None:
+    shorter = _make_recording(folder).usable(num_frames=12)
     silhouettes = compute(shorter, SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert silhouettes.num_frames == 12
-    assert set(silhouettes.keys.values()).isdisjoint(all_frames.keys.values())
     np.testing.assert_array_equal(_read_all(silhouettes), _expected(shorter))
-
-
-def test_equal_videos_are_computed_once(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
-    shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
-    silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10)
-    all_frames = _read_all(silhouettes)
-    np.testing.assert_array_equal(all_frames[:, 0], all_frames[:, 1])
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_progress_adds_up(folder: Path, tmp_path: Path, jobs: int) -> None:
-    started: list[tuple[str, int]] = []
-    done: list[int] = []
-
-    @contextlib.contextmanager
-    def report(description: str, total: int) -> Iterator[Advance]:
-        started.append((description, total))
-        yield done.append
-
-    for _ in range(2):
-        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
-    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
-    assert sum(done) == 3 * (NUM_FRAMES + 10)
-
-
-@pytest.mark.parametrize("damage", ["chunk", "metadata", "shape"])
-def test_damaged_silhouettes_are_computed_again(folder: Path, tmp_path: Path, damage: str) -> None:
-    recording = _make_recording(folder)
-    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    stored = tmp_path / "cache" / first.keys["cam2"]
-    if damage == "chunk":
-        (stored / "c" / "1" / "0" / "0").unlink()
-    elif damage == "metadata":
-        (stored / "zarr.json").write_text("{")
-    else:
-        text = (stored / "zarr.json").read_text()
-        (stored / "zarr.json").write_text(text.replace("41", "40"))
-    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
 @pytest.fixture(scope="module")
@@ -413,8 +333,9 @@ def test_no_changed_bit_and_no_truncation_goes_unnoticed(whole_cache: Path, data
 
 
 @pytest.mark.parametrize("file", ["c/0/0/0", "zarr.json", "seal"])
-def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
-    folder: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("is_missing", [False, True])
+def test_damage_is_named_and_the_silhouettes_are_made_anew(
+    folder: Path, tmp_path: Path, file: str, is_missing: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     recording = _make_recording(folder)
     first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
@@ -422,6 +343,8 @@ def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
     content = bytearray((damaged / file).read_bytes())
     content[len(content) // 2] ^= 1
     (damaged / file).write_bytes(content)
+    if is_missing:
+        (damaged / file).unlink()
     caplog.clear()
     again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
@@ -430,15 +353,15 @@ def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
     np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
-def test_a_folder_that_is_read_is_not_removable(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_that_is_read_is_not_removed(folder: Path, tmp_path: Path) -> None:
     silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    path = tmp_path / "cache" / silhouettes.keys["cam2"]
-    with removable(path) as free:
-        assert not free
+    entries = list_entries(tmp_path / "cache")
+    assert not any(remove_entry(entry) for entry in entries)
+    assert _read_all(silhouettes).any()
     del silhouettes
     gc.collect()
-    with removable(path) as free:
-        assert free
+    assert all(remove_entry(entry) for entry in entries)
+    assert list_entries(tmp_path / "cache") == []
 
 
 def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path: Path) -> None:
@@ -584,7 +507,7 @@ def test_jobs_below_one(folder: Path, tmp_path: Path) -> None:
 
 def test_cache_that_is_a_file(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("mine")
-    with pytest.raises(OutputError, match="cache: expected a folder to write to, found File exists"):
+    with pytest.raises(OutputError, match="expected to write silhouettes, found Not a directory"):
         compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert (tmp_path / "cache").read_text() == "mine"
 
@@ -676,7 +599,7 @@ def test_a_killed_computation_is_resumed(
         # The workers notice the end of their parent and remove their unfinished folders.
         assert not _unfinished_folders(cache)
     recording = _make_recording(folder)
-    keys = {name: silhouette_store.key_of(video, SCALED) for name, video in recording.videos.items()}
+    keys = _keys(recording)
     finished = _stored_keys(cache)
     resumed = compute(recording, SETTINGS, cache=cache, jobs=1)
     assert set(decoded_videos) == {name for name, key in keys.items() if key not in finished}

@@ -48,7 +48,7 @@ def advise_on_clocks(
     if settings.reads_detections or silhouettes is None:
         sightings = read_sightings(recording, None, settings.detections).sightings.in_frames(rows)
     else:
-        part = silhouettes.at_instants(timeline).part(int(rows[0]), int(rows[-1]) + 1)
+        part = silhouettes.at_instants(timeline.part(rows))
         sightings = from_silhouettes(part)
     tracked = tracked.at_frames(rows)
     shown = replace(tracked, position_m=tracked.position_m + np.array(settings.drones.body_offset_m))
