@@ -21,7 +21,7 @@ from psotrack.cli import cli
 from psotrack.errors import SettingsError
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
-from psotrack.silhouettes import ScaledSettings, find_background
+from psotrack.silhouettes import ForegroundSettings, find_background
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import identify
 from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area
@@ -564,11 +564,11 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
             "score.kind: expected one of soft, hard, high-dice, found iou",
         ),
         (
-            lambda: find_background("mean", ScaledSettings()),
+            lambda: find_background("mean", ForegroundSettings()),
             "background: expected one of mog2, living, absent, median, found mean",
         ),
         (
-            lambda: find_background("absent", ScaledSettings()),
+            lambda: find_background("absent", ForegroundSettings()),
             "background absent: expected own_parts:no_such_function to be importable, found module 'own_parts' "
             "has no attribute 'no_such_function'",
         ),

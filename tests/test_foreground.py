@@ -52,7 +52,7 @@ def _centroid_px(cells: np.ndarray, cell_px: int) -> np.ndarray:
 def test_a_disc_is_found_at_its_true_centre(working_reduction: int, reduction: int) -> None:
     rng = np.random.default_rng(5)
     background = _make_background(rng)
-    fg_settings = ForegroundSettings(working_reduction=working_reduction)
+    fg_settings = ForegroundSettings(working_reduction=working_reduction, reduction=reduction)
     centres = rng.uniform([30, 30], [WIDTH - 30, HEIGHT - 30], (60, 2))
     frames = [_draw_frame(background, rng, (x, y)) for x, y in centres]
     found = [
@@ -200,10 +200,11 @@ def test_learning_frames_spread_over_the_video(num_frames: int, num_learning_fra
         ({"working_reduction": 1.5}, "working_reduction: expected a whole number, found 1.5"),
         ({"num_learning_frames": 0}, "num_learning_frames: expected a whole number of at least 1, found 0"),
         ({"min_blob_px": -1}, "min_blob_px: expected a whole number of at least 0, found -1"),
-        ({"learning_rate": -0.1}, "learning_rate: expected a number from 0 to 1, found -0.1"),
-        ({"learning_rate": float("nan")}, "learning_rate: expected a number from 0 to 1, found nan"),
-        ({"shadow_weight": 1.5}, "shadow_weight: expected a number from 0 to 1, found 1.5"),
+        ({"learning_rate": -0.1}, "learning_rate: expected a number of at least 0, found -0.1"),
+        ({"learning_rate": float("nan")}, "learning_rate: expected a number of at least 0, found NaN"),
+        ({"shadow_weight": 1.5}, "shadow_weight: expected a number of at most 1, found 1.5"),
         ({"var_threshold": 0.0}, "var_threshold: expected a number above 0, found 0"),
+        ({"var_threshold": float("inf")}, "var_threshold: expected a number above 0, found inf"),
         ({"shadows": "maybe"}, "shadows: expected one of keep, drop, weight, found maybe"),
     ],
 )

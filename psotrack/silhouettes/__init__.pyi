@@ -9,7 +9,7 @@ from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
 from .masks import MaskTask, masks_out, write_masks
 from .seals import SEAL_FILE, is_whole
-from .settings import ForegroundSettings, ScaledSettings, Shadows, SilhouetteSettings, check_whole
+from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, ignored_pixels
 from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
@@ -24,7 +24,6 @@ __all__ = [
     "LivingBackground",
     "MaskTask",
     "Mog2",
-    "ScaledSettings",
     "Shadows",
     "SilhouetteSettings",
     "Silhouettes",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2
 from psotrack.silhouettes.living_background import Living
-from psotrack.silhouettes.settings import LIVING, MOG2, ScaledSettings
+from psotrack.silhouettes.settings import LIVING, MOG2, ForegroundSettings
 from psotrack.support import make_plugin
 
 
-def find_background(name: str, settings: ScaledSettings) -> BackgroundModel:
+def find_background(name: str, settings: ForegroundSettings) -> BackgroundModel:
     """The background model of a name: "mog2", "living" or a plugin.
 
     Raises:

@@ -6,10 +6,9 @@ array and its seal, and files of compiled programs. Everything else in the folde
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import re
-import secrets
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,14 +103,13 @@ def remove_entry(entry: CacheEntry) -> bool:
         if entry.kind == "program":
             entry.path.unlink()
             return True
-        held = lock(entry.path, shared=False)
-        if held is None:
-            return not entry.path.exists()
-        # A folder that is half removed must not stand under its own name.
-        aside = entry.path.with_name(f".{entry.path.name}.{secrets.token_hex(4)}.partial")
-        with held:
-            os.rename(entry.path, aside)
-        shutil.rmtree(aside)
+        seal = entry.path / SEAL_FILE
+        with lock(entry.path, shared=False) or contextlib.nullcontext() as held:
+            if held is None and seal.exists():
+                return False
+            # First the seal: nobody reads what is left of a folder without it.
+            seal.unlink(missing_ok=True)
+            shutil.rmtree(entry.path)
     except FileNotFoundError:
         return True  # Another process has removed the entry.
     except OSError as error:
@@ -132,7 +130,8 @@ def _entry(path: Path) -> CacheEntry | None:
         if not {each.name for each in path.iterdir()} <= {ARRAY_FILE, SEAL_FILE, CHUNKS}:
             return None
         size_bytes = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-        used_s = (path / SEAL_FILE).stat().st_mtime
+        seal = path / SEAL_FILE
+        used_s = (seal if seal.exists() else path).stat().st_mtime
     except OSError:
         return None
     return CacheEntry(path, "silhouettes", _video_of(path), size_bytes, used_s)

@@ -19,7 +19,7 @@ from psotrack.recordings import Recording, StoredSilhouettes, TruncatedVideoErro
 from psotrack.silhouettes.background_models import find_background
 from psotrack.silhouettes.foreground import BackgroundModel
 from psotrack.silhouettes.frames import FramesOfInstants, Silhouettes
-from psotrack.silhouettes.settings import MOG2, ScaledSettings, SilhouetteSettings, check_whole
+from psotrack.silhouettes.settings import MOG2, ForegroundSettings, SilhouetteSettings, check_whole
 from psotrack.silhouettes.store import (
     Task,
     background_identity,
@@ -27,7 +27,6 @@ from psotrack.silhouettes.store import (
     open_sealed,
     open_stored,
     reduced_shape,
-    remove_stale,
     store,
     task_of,
 )
@@ -85,23 +84,23 @@ def compute(
         raise InputError(recording.folder, expected="at least one video", found="none")
     scaled = scaled_settings(settings, recording)
     model = find_background(settings.background, scaled) if background is None else background
-    tasks = _tasks(recording, scaled, Path(cache), model)
+    tasks = _tasks(recording, scaled, model, Path(cache))
     places = _places(recording, tasks)
     for name, place in places.items():
         if name not in tasks:
             _check_made_with(name, place, scaled, model)
     opened = {name: _opened(name, places, tasks, recording.rig) for name in places}
-    missing = [tasks[name] for name, array in opened.items() if array is None and name in tasks]
+    missing = {name: tasks[name] for name, array in opened.items() if array is None and name in tasks}
     try:
-        seconds = _make(missing, jobs, report)
+        seconds = _make(list(missing.values()), jobs, report)
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
+    places |= {name: task.stored for name, task in missing.items()}
+    opened |= {name: _opened(name, places, tasks, recording.rig) for name in missing}
     arrays: dict[str, zarr.Array | FramesOfInstants] = {}
     unusable: dict[str, list[Interval]] = {}
     for name, place in places.items():
         array = opened[name]
-        if array is None:
-            array = _opened(name, places, tasks, recording.rig)
         if array is None:
             raise InputError(
                 place.path,
@@ -143,7 +142,7 @@ def tasks_of(recording: Recording, settings: SilhouetteSettings, cache: Path) ->
     if not recording.videos:
         return {}
     scaled = scaled_settings(settings, recording)
-    return _tasks(recording, scaled, cache, find_background(settings.background, scaled))
+    return _tasks(recording, scaled, find_background(settings.background, scaled), cache)
 
 
 def stored_silhouettes(
@@ -161,7 +160,7 @@ def stored_silhouettes(
     return _places(recording, tasks_of(recording, settings, cache))
 
 
-def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> ScaledSettings:
+def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> ForegroundSettings:
     """The settings of silhouettes for the images and the rig of a recording with videos or stored silhouettes.
 
     Where the settings leave a value open, cameras that have stored silhouettes and no video decide.
@@ -191,7 +190,7 @@ def usual_drone_px(rig: Rig) -> float | None:
 
 
 def _tasks(
-    recording: Recording, scaled: ScaledSettings, cache: Path, model: BackgroundModel
+    recording: Recording, scaled: ForegroundSettings, model: BackgroundModel, cache: Path
 ) -> dict[str, Task]:
     videos = {name: recording.videos[name] for name in recording.rig.names if name in recording.videos}
     with ThreadPoolExecutor() as threads:  # digests of files
@@ -213,38 +212,35 @@ def _places(recording: Recording, tasks: Mapping[str, Task]) -> dict[str, Stored
 
 
 def _check_made_with(
-    name: str, stored: StoredSilhouettes, scaled: ScaledSettings, model: BackgroundModel
+    name: str, stored: StoredSilhouettes, scaled: ForegroundSettings, model: BackgroundModel
 ) -> None:
     """Raise `SettingsError` for silhouettes without a video that were made with other settings."""
-    asked = msgspec.to_builtins(scaled) | {"background": background_identity(model, scaled)}
-    made = msgspec.to_builtins(_made_with(stored)) | {"background": stored.made_of.get("background")}
+    asked = _made_how(scaled, background_identity(model, scaled))
+    made = _made_how(_made_with(stored), stored.made_of.get("background"))
     for setting in asked:
         if asked[setting] != made[setting]:
-            expected, found = made[setting], asked[setting]
-            if setting == "background":
-                expected, found = _different_names(expected, found)
             raise SettingsError(
                 f"silhouettes.{setting}",
-                expected=f"{expected}, with which the stored silhouettes of camera {name} were made",
-                found=f"{found}",
+                expected=f"{made[setting]}, with which the stored silhouettes of camera {name} were made",
+                found=f"{asked[setting]}",
                 remedy=f"other silhouettes than {stored.path} need the camera's video",
             )
 
 
-def _different_names(*identities: dict[str, Any] | None) -> list[str]:
-    """Names of two background models; with their keys where only these differ."""
-    names = [MOG2 if each is None else each["class"].rpartition(".")[2] for each in identities]
-    return names if names[0] != names[1] else [f"{each}" for each in identities]
+def _made_how(settings: ForegroundSettings, background: dict[str, Any] | None) -> dict[str, Any]:
+    """Settings by name, with the class and the key of the background model."""
+    model = background or {"class": MOG2}
+    return msgspec.to_builtins(settings) | {"background": model["class"], "background.key": model.get("key")}
 
 
-def _made_with(stored: StoredSilhouettes) -> ScaledSettings:
+def _made_with(stored: StoredSilhouettes) -> ForegroundSettings:
     """The settings with which stored silhouettes were made.
 
     Raises:
         InputError: this version does not know these settings.
     """
     try:
-        return msgspec.convert(stored.made_of["settings"], ScaledSettings)
+        return msgspec.convert(stored.made_of["settings"], ForegroundSettings)
     except (msgspec.ValidationError, SettingsError) as error:
         expected = "silhouettes that were made with settings of this version"
         raise InputError(stored.path, expected=expected, found=f"{error}") from error
@@ -276,7 +272,6 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
         if task.stored.path.exists():
             logger.warning("%s: damaged silhouettes in the cache; they are made anew", task.stored.path)
     logger.info("silhouettes: computing those of %d videos", len(missing))
-    remove_stale(missing[0].stored.path.parent)
     with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
         for taken in map_in_processes(store, missing, jobs=jobs, advance=advance):
             seconds = {stage: seconds[stage] + taken[stage] for stage in seconds}

@@ -6,10 +6,7 @@ This module does not import JAX, because every worker process imports this modul
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
-import secrets
-import shutil
 import time
 import weakref
 from collections.abc import Iterator
@@ -22,18 +19,18 @@ import numpy as np
 import zarr
 from jaxtyping import Bool, UInt8
 from zarr.codecs import ZstdCodec
+from zarr.core.buffer import Buffer
+from zarr.storage import MemoryStore
 
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import MADE_OF, StoredSilhouettes, VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.first_look import look_first
 from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
 from psotrack.silhouettes.living_background import Living
 from psotrack.silhouettes.seals import SEAL_FILE, is_whole, lock, seal_of
-from psotrack.silhouettes.settings import ScaledSettings
+from psotrack.silhouettes.settings import ForegroundSettings
 from psotrack.silhouettes.usable_frames import LEAST_FRAMES, Interval, foreground_is_everywhere, intervals_of
-from psotrack.support import Advance, digest_file, digest_record, identify
-
-logger = logging.getLogger(__name__)
+from psotrack.support import Advance, atomic_write, digest_file, digest_record, identify
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
 SCHEMA = 1
@@ -46,12 +43,6 @@ _LEFT_OUT = "left_out"
 
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
-
-#: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
-_STALE_S = 24 * 3600
-
-#: Longest time that zarr goes on writing, seconds.
-_ZARR_WRITES_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +58,7 @@ class Task:
     """
 
     video: VideoInfo
-    settings: ScaledSettings
+    settings: ForegroundSettings
     background: BackgroundModel
     ignore: Path | None
     stored: StoredSilhouettes
@@ -83,7 +74,7 @@ class Task:
 
 def task_of(
     video: VideoInfo,
-    settings: ScaledSettings,
+    settings: ForegroundSettings,
     background: BackgroundModel,
     ignore: Path | None,
     cache: Path,
@@ -109,7 +100,7 @@ def task_of(
     return Task(video, settings, background, ignore, stored)
 
 
-def background_identity(background: BackgroundModel, settings: ScaledSettings) -> dict[str, Any] | None:
+def background_identity(background: BackgroundModel, settings: ForegroundSettings) -> dict[str, Any] | None:
     """What silhouettes are said to be made of beside their settings; None for MOG2, which has no others."""
     return None if background == Mog2(settings) else identify(background)
 
@@ -167,52 +158,28 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
     """
     path = task.stored.path
     shape = (task.video.num_frames, *reduced_shape(task.video.image_size_wh, task.settings.reduction))
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        temporary.mkdir(parents=True)
-        seconds = _write(temporary, shape, task, advance)
+    seconds = {"decode": 0.0, "foreground": 0.0}
+    with contextlib.suppress(_StoredMeanwhileError), atomic_write(path) as temporary:
+        _write(temporary, shape, task, seconds, advance)
         (temporary / SEAL_FILE).write_text(seal_of(temporary), encoding="ascii")
-        try:
-            os.rename(temporary, path)  # fails if `path` is a folder that is not empty
-        except OSError:
-            # A whole folder is never moved away, because a process that reads it would see zeros meanwhile.
-            if open_sealed(path, shape) is None:
-                shutil.rmtree(path)
-                os.rename(temporary, path)
-    except OSError as error:
-        raise OutputError(
-            path,
-            expected="to write silhouettes",
-            found=error.strerror or f"{error}",
-            remedy="what was stored before is unchanged",
-        ) from error
-    finally:
-        _remove(temporary)
+        # A whole folder is not replaced, because a process that reads it would see zeros meanwhile.
+        if open_sealed(path, shape) is not None:
+            raise _StoredMeanwhileError
     return seconds
 
 
-def _remove(folder: Path) -> None:
-    """Remove an unfinished folder. Zarr writes in a thread of its own, after an exception for some moments too."""
-    end_s = time.monotonic() + _ZARR_WRITES_S
-    while folder.exists() and time.monotonic() < end_s:
-        shutil.rmtree(folder, ignore_errors=True)
-        time.sleep(0.02)
+class _StoredMeanwhileError(Exception):
+    """Another process has stored the same silhouettes."""
 
 
-def remove_stale(cache: Path) -> None:
-    """Remove unfinished folders of processes that were killed more than a day ago."""
-    for folder in cache.glob(".*.partial"):
-        with contextlib.suppress(OSError):  # another process works in the folder, or has just finished
-            newest = max(file.stat().st_mtime for file in (folder, *folder.rglob("*")))
-            if time.time() - newest > _STALE_S:
-                logger.info("removing %s, left by a process that was killed", folder)
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-def _write(folder: Path, shape: tuple[int, int, int], task: Task, advance: Advance) -> dict[str, float]:
-    video, settings = task.video, task.settings
+def _write(
+    folder: Path, shape: tuple[int, int, int], task: Task, seconds: dict[str, float], advance: Advance
+) -> None:
+    video, settings, started = task.video, task.settings, time.perf_counter()
+    files: dict[str, Buffer] = {}
     array: zarr.Array = zarr.create_array(
-        folder,
+        # Zarr writes in a thread of its own, which would go on for some moments after an exception.
+        MemoryStore(files),
         shape=shape,
         chunks=(CHUNK_FRAMES, *shape[1:]),
         dtype=np.uint8,
@@ -220,9 +187,7 @@ def _write(folder: Path, shape: tuple[int, int, int], task: Task, advance: Advan
         attributes={"video": video.path.name, MADE_OF: dict(task.stored.made_of)},
         # Chunks of zeros are written too, so that a missing chunk is always a damage.
         config={"write_empty_chunks": True},
-        overwrite=True,
     )
-    started, seconds = time.perf_counter(), {"decode": 0.0, "foreground": 0.0}
     chunk, everywhere = np.empty((CHUNK_FRAMES, *shape[1:]), np.uint8), [np.zeros(0, bool)]
     for index, mask in enumerate(foreground_of(task, seconds, advance)):
         chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
@@ -230,9 +195,17 @@ def _write(folder: Path, shape: tuple[int, int, int], task: Task, advance: Advan
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
             array[index + 1 - count : index + 1] = chunk[:count]
             everywhere.append(foreground_is_everywhere(chunk[:count]))
+            _move_to_disk(files, folder)
     array.update_attributes({_LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
+    _move_to_disk(files, folder)
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
-    return seconds
+
+
+def _move_to_disk(files: dict[str, Buffer], folder: Path) -> None:
+    while files:
+        name, content = files.popitem()
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.to_bytes())
 
 
 def foreground_of(
