@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import ForegroundSettings, find_background
+from psotrack.silhouettes import ForegroundSettings, Living, LivingBackground
 from psotrack.silhouettes.lighting import light_of, remove_light
-from psotrack.silhouettes.living_background import Living, LivingBackground
 from psotrack.silhouettes.object_blobs import find_objects, largest
 
 HEIGHT, WIDTH = 120, 160
@@ -236,14 +235,6 @@ def test_an_object_is_no_change_of_the_light() -> None:
     )
     assert np.abs(without[~drone] - room[~drone]).max() < 2
     assert without[drone].max() < 35
-
-
-def test_the_living_background_is_found_by_name_and_its_settings_are_its_key() -> None:
-    model = find_background("living", ForegroundSettings(min_blob_px=9))
-    assert isinstance(model, Living)
-    other = find_background("living", ForegroundSettings(min_blob_px=10))
-    assert other is not None
-    assert model.key != other.key
 
 
 def test_a_drone_does_not_grow_together_with_a_faint_change_around_it() -> None:
