@@ -39,12 +39,12 @@ from psotrack.silhouettes import (
     is_whole,
     learning_step,
     list_entries,
+    look_first,
     remove_entry,
     stored_silhouettes,
     usual_drone_px,
 )
 from psotrack.silhouettes import store as silhouette_store
-from psotrack.silhouettes.first_look import look_first
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30

@@ -4,6 +4,7 @@ from .blobs import border_cells, find_blobs
 from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
 from .computation import compute, scaled_settings, stored_silhouettes, tasks_of, usual_drone_px
 from .exposures import Exposures, moved_by
+from .first_look import look_first
 from .foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
 from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
@@ -11,10 +12,11 @@ from .masks import MaskTask, masks_out, write_masks
 from .seals import SEAL_FILE, is_whole
 from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, ignored_pixels
-from .summed_area import box_sum, pack, packed_box_sums, summed_area_table
+from .summed_area import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 
 __all__ = [
+    "LOW_BITS",
     "SEAL_FILE",
     "BackgroundModel",
     "CacheEntry",
@@ -44,6 +46,7 @@ __all__ = [
     "is_whole",
     "learning_step",
     "list_entries",
+    "look_first",
     "masks_out",
     "moved_by",
     "pack",
