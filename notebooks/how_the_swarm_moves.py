@@ -36,8 +36,7 @@ from psotrack.datasets.dpjait import read_sequence
 from psotrack.initiation import first_drones, room_bounds
 from psotrack.reports import PointCloud, Scene3D
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import compute, summed_area_table
-from psotrack.silhouettes.computation import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings, compute, summed_area_table
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import SoftIoU, on_device, swarm

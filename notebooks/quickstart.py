@@ -31,7 +31,7 @@ from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
 from psotrack.reports import view_3d
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes.computation import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.trajectories import write_trajectories

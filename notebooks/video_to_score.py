@@ -35,11 +35,15 @@ from psotrack.geometry import make_extents, project_boxes
 from psotrack.initiation import first_drones, room_bounds
 from psotrack.recordings import read_frames
 from psotrack.settings import DroneSettings
-from psotrack.silhouettes import compute, scaled_settings, summed_area_table
-from psotrack.silhouettes.computation import SilhouetteSettings
-from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import coverage
-from psotrack.silhouettes.living_background import Living
+from psotrack.silhouettes import (
+    Living,
+    SilhouetteSettings,
+    compute,
+    coverage,
+    look_first,
+    scaled_settings,
+    summed_area_table,
+)
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking import SoftIoU, on_device

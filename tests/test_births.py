@@ -25,8 +25,14 @@ from psotrack.initiation import (
     unexplained,
 )
 from psotrack.settings import DroneSettings
-from psotrack.silhouettes import Exposures, ForegroundSettings, Silhouettes, border_cells
-from psotrack.silhouettes.foreground import foreground, learning_step
+from psotrack.silhouettes import (
+    Exposures,
+    ForegroundSettings,
+    Mog2,
+    Silhouettes,
+    border_cells,
+    learning_step,
+)
 from psotrack.trajectories import Trajectories
 
 FPS = 25.0
@@ -314,7 +320,7 @@ def departure():
             picture = room * (1 - covered) + 25.0 * covered + rng.normal(0.0, 2.0, room.shape)
             video.append(np.clip(picture, 0, 255).astype(np.uint8))
         step = learning_step(len(video), settings)
-        masks.append(np.stack(list(foreground(video[::step], video, settings))))
+        masks.append(np.stack(list(Mog2(settings).foreground(video[::step], video))))
     coverage = np.stack(masks, axis=1)
     # The mean over the drone's place: background while it stands, a ghost after the departure.
     cells = away[0] > 128

@@ -55,31 +55,20 @@ def detector(models, layout, **settings):
 
 
 @pytest.mark.parametrize("layout", SIZES)
-class TestLayouts:
-    def test_a_square_is_found(self, models, layout):
-        size = SIZES[layout]
-        bgr, there = black(size), square(size, 5, 6)
-        paint(bgr, there)
-        xyxy, confidence = detector(models, layout).boxes(bgr)
-        # The square's edges are whole pixels of the network's input: exact up to rounding of float32.
-        np.testing.assert_allclose(xyxy, [there], atol=1e-4)
-        assert confidence == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
-
-    def test_the_brighter_of_two_squares_is_first(self, models, layout):
-        size = SIZES[layout]
-        bgr, dim, bright = black(size), square(size, 2, 3), square(size, 9, 7)
-        paint(bgr, dim, 200)
-        paint(bgr, bright)
-        xyxy, confidence = detector(models, layout).boxes(bgr)
-        np.testing.assert_allclose(xyxy, [bright, dim], atol=1e-4)
-        # OpenCV's convolutions round: measured 2e-4.
-        assert confidence[1] == pytest.approx(1 / (1 + np.exp(-40 * (200 / 255 - 0.75))), abs=1e-3)
-        xyxy, _ = detector(models, layout, confidence=0.9).boxes(bgr)
-        np.testing.assert_allclose(xyxy, [bright], atol=1e-4)
-
-    def test_a_black_image_has_no_boxes(self, models, layout):
-        xyxy, confidence = detector(models, layout).boxes(black(SIZES[layout]))
-        assert (xyxy.shape, confidence.shape) == ((0, 4), (0,))
+def test_squares_are_found_the_brightest_first(models, layout):
+    size = SIZES[layout]
+    bgr, dim, bright = black(size), square(size, 2, 3), square(size, 9, 7)
+    xyxy, confidence = detector(models, layout).boxes(bgr)
+    assert (xyxy.shape, confidence.shape) == ((0, 4), (0,))
+    paint(bgr, dim, 200)
+    paint(bgr, bright)
+    xyxy, confidence = detector(models, layout).boxes(bgr)
+    # The squares' edges are whole pixels of the network's input: exact up to rounding of float32.
+    np.testing.assert_allclose(xyxy, [bright, dim], atol=1e-4)
+    # OpenCV's convolutions round: measured 2e-4.
+    np.testing.assert_allclose(confidence, 1 / (1 + np.exp([-10, -40 * (200 / 255 - 0.75)])), atol=1e-3)
+    xyxy, _ = detector(models, layout, confidence=0.9).boxes(bgr)
+    np.testing.assert_allclose(xyxy, [bright], atol=1e-4)
 
 
 def test_overlapping_boxes_are_suppressed(models):
@@ -140,24 +129,20 @@ class TestInvalidModels:
         assert "\n" not in str(error.value)
         assert capfd.readouterr() == ("", "")
 
-    @pytest.mark.parametrize("size", [96, 640])
-    def test_a_model_of_another_input_size(self, models, capfd, size):
-        with pytest.raises(
-            InputError, match=f"a network for images of {size} x {size} pixels.*--size"
-        ) as error:
-            detector(models, "v8", size=size).boxes(black(128))
+    @pytest.mark.parametrize(
+        ("layout", "size", "words"),
+        [
+            ("v8", 96, "a network for images of 96 x 96 pixels.*--size"),
+            ("v8", 640, "a network for images of 640 x 640 pixels.*--size"),
+            ("none", 128, r"none.onnx: .* layout of YOLO, found \(1, 1, 13, 13\)"),
+            ("logits", 128, "logits.onnx: expected .* from 0 to 1, found scores from 0 to 10;"),
+        ],
+    )
+    def test_models_for_other_images_or_with_other_outputs(self, models, capfd, layout, size, words):
+        with pytest.raises(InputError, match=words) as error:
+            detector(models, layout, size=size).boxes(np.full_like(black(128), 255))
         assert "\n" not in str(error.value)
         assert capfd.readouterr() == ("", "")
-
-    def test_an_output_of_unknown_layout(self, models):
-        with pytest.raises(InputError, match=r"none.onnx: .* layout of YOLO, found \(1, 1, 13, 13\)"):
-            detector(models, "none").boxes(black(128))
-
-    def test_scores_outside_0_to_1(self, models):
-        with pytest.raises(
-            InputError, match=r"logits.onnx: expected .* from 0 to 1, found scores from 0 to 10;"
-        ):
-            detector(models, "logits").boxes(np.full_like(black(128), 255))
 
     @pytest.mark.parametrize("settings", [{"confidence": 0.0}, {"nms": 1.5}, {"size": 0}])
     def test_invalid_settings(self, settings):
@@ -195,29 +180,23 @@ class TestVideos:
         return CliRunner().invoke(command, [str(sequence), *map(str, options)], catch_exceptions=False)
 
     def test_the_command_writes_a_file_per_camera(self, models, sequence, tmp_path):
-        result = self.run(models, sequence, tmp_path / "boxes")
-        assert result.exit_code == 0
-        assert "2 cameras, 4 frames, 0.38 boxes per frame and camera" in result.stdout
-        assert sorted(path.name for path in (tmp_path / "boxes").iterdir()) == ["0.csv", "1.csv"]
-        found = read_detections(tmp_path / "boxes" / "0.csv")
-        assert found.frame.tolist() == [0, 2, 3]
-        np.testing.assert_allclose(found.in_frame(3).xyxy, [square(128, 6, 6)], atol=1e-4)
-        assert len(read_detections(tmp_path / "boxes" / "1.csv")) == 0
-
-    def test_files_are_replaced_only_with_force(self, models, sequence, tmp_path):
         (tmp_path / "1.csv").write_text("mine")
         with pytest.raises(OutputError, match=r"1.csv: .*--force"):
             self.run(models, sequence, tmp_path)
         assert not (tmp_path / "0.csv").exists()
-        assert self.run(models, sequence, tmp_path, "--force").exit_code == 0
+        result = self.run(models, sequence, tmp_path, "--force")
+        assert result.exit_code == 0
+        assert "2 cameras, 4 frames, 0.38 boxes per frame and camera" in result.stdout
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["0.csv", "1.csv"]
+        found = read_detections(tmp_path / "0.csv")
+        assert found.frame.tolist() == [0, 2, 3]
+        np.testing.assert_allclose(found.in_frame(3).xyxy, [square(128, 6, 6)], atol=1e-4)
+        assert len(read_detections(tmp_path / "1.csv")) == 0
 
     def test_json_of_selected_cameras_and_frames(self, models, sequence, tmp_path):
         result = self.run(models, sequence, tmp_path / "b", "--cameras", "0", "--frames", "3", "--json", "-")
-        assert json.loads(result.stdout) == {
-            "out": str(tmp_path / "b"),
-            "frames": 3,
-            "detections": {"0": 2},
-        }
+        expected = {"out": str(tmp_path / "b"), "frames": 3, "detections": {"0": 2}}
+        assert json.loads(result.stdout) == expected
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from psotrack.recordings import VideoWriter, probe, read_frames
-from psotrack.silhouettes import ForegroundSettings, first_look
-from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import reduce_frame
+from psotrack.silhouettes import ForegroundSettings, first_look, look_first, reduce_frame
 
 SIZE_WH = (64, 48)
 SETTINGS = ForegroundSettings(working_reduction=2, num_learning_frames=10)

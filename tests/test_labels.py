@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,42 +105,29 @@ def test_missing_orientations():
     assert np.isnan(corners_m[1, 1]).all()
 
 
-@pytest.mark.parametrize(("min_inside", "expected"), [(0.7, [85, 30, 100, 50]), (0.8, [np.nan] * 4)])
-def test_a_box_is_cut_at_the_image_border(min_inside, expected):
-    """The box reaches from 85 to 105 in an image of 100 pixels: three quarters are inside."""
-    settings = msgspec.structs.replace(CUBE, min_inside=min_inside)
-    np.testing.assert_allclose(compute_labels((4.5, 0.0, 0.0), settings=settings), [expected], atol=0.06)
-
-
-def test_a_box_outside_the_image_has_no_label_even_with_min_inside_0():
-    settings = msgspec.structs.replace(CUBE, min_inside=0.0)
-    assert np.isnan(compute_labels((7.0, 0, 0), (0, 0, -6.0), settings=settings)).all()
-
-
-def test_a_drone_behind_the_camera_has_no_label():
-    """The three drones are behind the camera, around the camera, and with one corner behind the camera."""
-    settings = msgspec.structs.replace(CUBE, min_inside=0.0)
-    assert np.isnan(compute_labels((0, -2000.0, 0), (0, -1000.0, 0), (0, -999.5, 0), settings=settings)).all()
+NONE = [np.nan] * 4
+#: Of the nearer drone of two, half a metre beside the farther one: it covers three quarters.
+NEAR = [45, 30, 65, 50]
 
 
 @pytest.mark.parametrize(
-    ("max_hidden", "hidden"), [(0.74, True), (0.76, False)], ids=["more than allowed", "allowed"]
+    ("places_m", "change", "expected"),
+    [
+        # Three quarters of a box from 85 to 105 are in an image of 100 pixels.
+        ([(4.5, 0, 0)], {"min_inside": 0.7}, [[85, 30, 100, 50]]),
+        ([(4.5, 0, 0)], {"min_inside": 0.8}, [NONE]),
+        ([(7, 0, 0), (0, 0, -6)], {"min_inside": 0.0}, [NONE, NONE]),
+        # Behind the camera, around the camera, and with one corner behind the camera.
+        ([(0, -2000, 0), (0, -1000, 0), (0, -999.5, 0)], {"min_inside": 0.0}, [NONE, NONE, NONE]),
+        ([(0, 5, 0), (0.5, 0, 0)], {"max_hidden": 0.74}, [NONE, NEAR]),
+        ([(0, 5, 0), (0.5, 0, 0)], {"max_hidden": 0.76}, [[40, 30, 60, 50], NEAR]),
+        # Drones without an image or a pose hide no other drone.
+        ([(0, 0, 0), (0, -1500, 0), (math.nan,) * 3], {"max_hidden": 0.0}, [[40, 30, 60, 50], NONE, NONE]),
+    ],
 )
-def test_a_nearer_drone_hides_a_farther_one(max_hidden, hidden):
-    """The nearer drone is shifted by half a metre of two metres: three quarters are covered."""
-    settings = msgspec.structs.replace(CUBE, max_hidden=max_hidden)
-    far, near = compute_labels((0.0, 5.0, 0.0), (0.5, 0.0, 0.0), settings=settings)
-    assert np.isnan(far).all() == hidden
-    np.testing.assert_allclose(near, [45, 30, 65, 50], atol=0.03)
-
-
-def test_a_drone_without_pose_hides_no_other_drone():
-    for hidden_drone in [(0.0, -1500.0, 0.0), (math.nan, math.nan, math.nan)]:
-        assert np.isfinite(
-            compute_labels(
-                (0.0, 0.0, 0.0), hidden_drone, settings=msgspec.structs.replace(CUBE, max_hidden=0.0)
-            )[0]
-        ).all()
+def test_drones_at_the_border_behind_the_camera_and_behind_each_other(places_m, change, expected):
+    found = compute_labels(*places_m, settings=msgspec.structs.replace(CUBE, **change))
+    np.testing.assert_allclose(found, expected, atol=0.06)
 
 
 def test_no_drones():
@@ -338,36 +326,16 @@ def test_the_data_set_can_be_loaded_by_a_trainer(data, written_data_set):
                     assert np.abs(stored.astype(int) - shown).mean() < 2.0
 
 
-def test_every_other_frame(data, tmp_path):
-    result = run_labels(
-        data / "S12_D3", data / "S01_D2_A", "--out", tmp_path / "set", "--every", 2, "--jobs", 1
-    )
-    assert result.exit_code == 0
-    assert result.stdout == ""
-    frames = {(part, image.stem[-6:]) for part, image in load_data_set(tmp_path / "set")}
-    assert frames == {("train", "000002"), ("val", "000002")}
-
-
-def test_an_image_without_drones_has_an_empty_label_file(data, tmp_path):
-    """An offset of one kilometre moves all drones out of all images."""
-    run_labels(
-        data / "S01_D2_A",
-        data / "S12_D3",
-        *("--out", tmp_path / "set", "--offset", "0,0,-1000", "--every", 2, "--jobs", 1),
-    )
+def test_options_choose_the_frames_the_part_and_the_place_of_the_boxes(data, tmp_path):
+    """An offset of one kilometre moves all drones out of all images: their label files are empty."""
+    options = ["--every", 2, "--validation", "S01_D2_A", "--offset", "0,0,-1000", "--jobs", 1]
+    result = run_labels(data / "S01_D2_A", data / "S12_D3", "--out", tmp_path / "set", *options)
+    assert (result.exit_code, result.stdout) == (0, "")
     found = load_data_set(tmp_path / "set")
+    parts = {(part, image.name[:3], image.stem[-6:]) for part, image in found}
+    assert parts == {("val", "S01", "000002"), ("train", "S12", "000002")}
     assert len(found) == 12
     assert not any(map(len, found.values()))
-
-
-def test_sequences_for_validation_can_be_chosen(data, tmp_path):
-    run_labels(
-        data / "S01_D2_A",
-        data / "S12_D3",
-        *("--out", tmp_path / "set", "--validation", "S01_D2_A", "--every", 2, "--jobs", 1),
-    )
-    parts = {(part, image.name[:3]) for part, image in load_data_set(tmp_path / "set")}
-    assert parts == {("val", "S01"), ("train", "S12")}
 
 
 def test_sequences_that_cannot_be_split(data, tmp_path):
@@ -388,7 +356,7 @@ def test_sequences_that_cannot_be_split(data, tmp_path):
 
 def test_only_a_data_set_is_replaced_and_only_with_force(data, written_data_set, tmp_path):
     both = (data / "S01_D2_A", data / "S12_D3")
-    out, _ = written_data_set
+    out = shutil.copytree(written_data_set[0], tmp_path / "set")
     assert "--force" in refusal_message(OutputError, *both, "--out", out)
     precious = tmp_path / "home"
     precious.mkdir()
@@ -397,10 +365,8 @@ def test_only_a_data_set_is_replaced_and_only_with_force(data, written_data_set,
         OutputError, *both, "--out", precious, "--force"
     )
     assert (precious / "thesis.tex").exists()
-    again = tmp_path / "set"
-    run_labels(*both, "--out", again, "--every", 1, "--jobs", 1)
-    run_labels(*both, "--out", again, "--every", 2, "--jobs", 1, "--force")
-    assert {image.stem[-6:] for _, image in load_data_set(again)} == {"000002"}
+    run_labels(*both, "--out", out, "--every", 2, "--jobs", 1, "--force")
+    assert {image.stem[-6:] for _, image in load_data_set(out)} == {"000002"}
 
 
 def test_a_broken_video_leaves_nothing_behind(data, tmp_path):
@@ -425,16 +391,6 @@ def test_without_a_reference(data, tmp_path):
         write_data_set(
             [replace(first, truth=unknown), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
         )
-
-
-def test_a_gap_of_one_frame_in_the_reference_is_bridged(data, tmp_path):
-    first, second = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
-    position_m = first.truth.position_m.copy()
-    position_m[2] = np.nan
-    gap = replace(first, truth=replace(first.truth, position_m=position_m))
-    counts = write_data_set([gap, second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
-    # Frame 0 has no pose, and there is none before it.
-    assert counts["train"]["images"] == 3 * len(first.rig)
 
 
 def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):

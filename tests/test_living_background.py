@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import ForegroundSettings, ScaledSettings, find_background
+from psotrack.silhouettes import ForegroundSettings, Living, LivingBackground
 from psotrack.silhouettes.lighting import light_of, remove_light
-from psotrack.silhouettes.living_background import Living, LivingBackground
 from psotrack.silhouettes.object_blobs import find_objects, largest
 
 HEIGHT, WIDTH = 120, 160
@@ -238,14 +237,6 @@ def test_an_object_is_no_change_of_the_light() -> None:
     assert without[drone].max() < 35
 
 
-def test_the_living_background_is_found_by_name_and_its_settings_are_its_key() -> None:
-    model = find_background("living", ScaledSettings(min_blob_px=9))
-    assert isinstance(model, Living)
-    other = find_background("living", ScaledSettings(min_blob_px=10))
-    assert other is not None
-    assert model.key != other.key
-
-
 def test_a_drone_does_not_grow_together_with_a_faint_change_around_it() -> None:
     """A cloud that comes changes the image faintly: the drone before it keeps its size, and the cloud is no object."""
     rng = np.random.default_rng(9)
@@ -279,7 +270,9 @@ def test_all_foreground_belongs_to_blobs_that_changed(seed: int, strength: float
 def test_a_pixel_at_a_contour_has_the_share_that_the_object_covers() -> None:
     rng = np.random.default_rng(5)
     wall = np.full((HEIGHT, WIDTH, 3), 150.0)
-    background = LivingBackground(ScaledSettings(working_reduction=2, reduction=2), _exposed(wall, rng), 100)
+    background = LivingBackground(
+        ForegroundSettings(working_reduction=2, reduction=2), _exposed(wall, rng), 100
+    )
     for _ in range(10):
         background.step(_exposed(wall, rng))
     scene = wall.copy()

@@ -19,8 +19,7 @@ from psotrack.recordings import (
     read_frames,
     recording_of_video,
 )
-from psotrack.silhouettes import SilhouetteSettings, compute
-from psotrack.silhouettes.blobs import find_blobs
+from psotrack.silhouettes import SilhouetteSettings, compute, find_blobs
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 12
 #: Side of the moving square, pixels.

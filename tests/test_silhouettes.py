@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -30,19 +29,22 @@ from psotrack.errors import InputError, OutputError, PsotrackError, SettingsErro
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
 from psotrack.silhouettes import (
-    ScaledSettings,
+    ForegroundSettings,
+    Living,
+    Mog2,
     Silhouettes,
     SilhouetteSettings,
     compute,
+    coverage,
     is_whole,
-    removable,
-    silhouette_keys,
+    learning_step,
+    list_entries,
+    look_first,
+    remove_entry,
+    stored_silhouettes,
     usual_drone_px,
 )
 from psotrack.silhouettes import store as silhouette_store
-from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import coverage, foreground
-from psotrack.silhouettes.living_background import Living
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
@@ -50,8 +52,6 @@ SIZE_WH = (162, 118)  # not multiples of 4
 SETTINGS = SilhouetteSettings(
     background="mog2", reduction=4, working_reduction=2, min_blob_px=64, num_learning_frames=10
 )
-#: What these settings are for videos of any size.
-SCALED = SETTINGS.scaled([SIZE_WH])
 
 
 def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
@@ -94,8 +94,8 @@ def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List that gets the name of the video of each frame that this process decodes, in order."""
     names: list[str] = []
 
-    def read_and_count(video, step=1):  # type: ignore[no-untyped-def]
-        for frame in read_frames(video, step):
+    def read_and_count(video, step=1, **how):  # type: ignore[no-untyped-def]
+        for frame in read_frames(video, step, **how):
             names.append(video.path.stem)
             yield frame
 
@@ -106,13 +106,13 @@ def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def _expected(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
     """Compute silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
     scaled = settings.scaled([video.image_size_wh for video in recording.videos.values()])
-    step = silhouette_store.learning_step(recording.num_frames, scaled)
+    step = learning_step(recording.num_frames, scaled)
     factor = scaled.reduction // scaled.working_reduction
     return np.stack(
         [
             [
                 coverage(mask, factor)
-                for mask in foreground(read_frames(video, step), read_frames(video), scaled)
+                for mask in Mog2(scaled).foreground(read_frames(video, step), read_frames(video))
             ]
             for video in recording.videos.values()
         ],
@@ -128,19 +128,40 @@ def _unfinished_folders(cache: Path) -> list[Path]:
     return list(cache.glob(".*"))
 
 
+def _keys(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> dict[str, str]:
+    return {name: each.key for name, each in stored_silhouettes(recording, settings, Path()).items()}
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_stored_silhouettes_equal_direct_computation(folder: Path, tmp_path: Path, jobs: int) -> None:
+    started: list[tuple[str, int]] = []
+    done: list[int] = []
+
+    @contextlib.contextmanager
+    def report(description: str, total: int) -> Iterator[Advance]:
+        started.append((description, total))
+        yield done.append
+
     recording = _make_recording(folder)
-    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
+    for _ in range(2):
+        silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
+    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
+    assert sum(done) == 3 * (NUM_FRAMES + 10)
     assert silhouettes.cameras == ("cam1", "cam2", "cam3")
     assert silhouettes.shape == (30, 41)
     assert (silhouettes.num_frames, silhouettes.reduction) == (NUM_FRAMES, 4)
+    assert silhouettes.keys == _keys(recording)
     all_frames = _read_all(silhouettes)
     assert all_frames.dtype == np.uint8
     assert all_frames.flags.c_contiguous
     np.testing.assert_array_equal(all_frames, _expected(recording))
     assert all_frames.any(axis=(2, 3)).all(), "every frame of every camera shows a disc"
     assert _unfinished_folders(tmp_path / "cache") == []
+    for start, stop in [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)]:
+        np.testing.assert_array_equal(silhouettes.read(start, stop), all_frames[start:stop])
+    for start, stop in [(-1, 5), (5, 31), (6, 5)]:
+        with pytest.raises(SettingsError, match=f"expected a part of 0 to 30, found {start} to {stop}"):
+            silhouettes.read(start, stop)
 
 
 def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kept(
@@ -158,53 +179,32 @@ def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kep
         np.testing.assert_array_equal(_read_all(silhouettes)[:, camera], masks)
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)])
-def test_any_range_of_frames_can_be_read(
-    video_folder: Path, shared_silhouettes: Silhouettes, start: int, stop: int
-) -> None:
-    frames = shared_silhouettes.read(start, stop)
-    assert frames.shape == (stop - start, 3, 30, 41)
-    np.testing.assert_array_equal(frames, _read_all(shared_silhouettes)[start:stop])
-
-
-@pytest.mark.parametrize(("start", "stop"), [(-1, 5), (5, 31), (6, 5)])
-def test_missing_frames_are_refused(shared_silhouettes: Silhouettes, start: int, stop: int) -> None:
-    with pytest.raises(SettingsError, match=f"frames: expected a part of 0 to 30, found {start} to {stop}"):
-        shared_silhouettes.read(start, stop)
-
-
-@pytest.fixture(scope="session")
-def shared_silhouettes(video_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Silhouettes:
-    return compute(_make_recording(video_folder), SETTINGS, cache=tmp_path_factory.mktemp("cache"), jobs=1)
-
-
-def test_second_call_reads_without_decoding(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
+def test_only_what_is_missing_is_decoded(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
+    shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
     first = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 3 * (NUM_FRAMES + 10)
+    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10), "equal videos are decoded once"
     assert first.seconds["decode"] > 0
     assert first.seconds["foreground"] > 0
+    before = _read_all(first)
+    np.testing.assert_array_equal(before[:, 0], before[:, 1])
     decoded_videos.clear()
-    second = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert decoded_videos == []
-    assert second.seconds == {"decode": 0.0, "foreground": 0.0}
-    assert second.keys == first.keys
-    np.testing.assert_array_equal(_read_all(second), _read_all(first))
-
-
-def test_name_and_folder_of_a_video_are_not_in_the_key(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    decoded_videos.clear()
+    # Name and folder of a video are not in the key.
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
     (moved / "cam3.avi").rename(moved / "other.avi")
-    compute(_make_recording(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    second = compute(_make_recording(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert decoded_videos == []
+    assert second.seconds == {"decode": 0.0, "foreground": 0.0}
+    np.testing.assert_array_equal(_read_all(second), before)
+    _write_video(folder / "cam2.avi", seed=5)
+    recording = _make_recording(folder)
+    third = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert set(decoded_videos) == {"cam2"}
+    np.testing.assert_array_equal(_read_all(third), _expected(recording))
+    np.testing.assert_array_equal(_read_all(first), before)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
+def test_every_setting_the_model_and_the_number_of_frames_are_in_the_key(video_folder: Path) -> None:
+    changes: list[dict[str, Any]] = [
         {"reduction": 2},
         {"working_reduction": 1},
         {"num_learning_frames": 11},
@@ -213,28 +213,18 @@ def test_name_and_folder_of_a_video_are_not_in_the_key(
         {"shadows": "drop"},
         {"shadow_weight": 0.4},
         {"min_blob_px": 33},
-        {"first_look": False},
-    ],
-)
-def test_every_setting_is_in_the_key(video_folder: Path, change: dict[str, object]) -> None:
-    video = probe(video_folder / "cam1.avi")
-    changed = msgspec.structs.replace(SCALED, **change)
-    assert silhouette_store.key_of(video, changed) != silhouette_store.key_of(video, SCALED)
-
-
-def test_the_test_of_the_key_covers_every_setting() -> None:
-    changes = test_every_setting_is_in_the_key.pytestmark[0].args[1]
-    assert {name for change in changes for name in change} == set(ScaledSettings.__struct_fields__)
-
-
-def test_the_background_model_is_in_the_key(video_folder: Path) -> None:
+        {"background": "living"},
+        {"background": "living", "first_look": False},
+    ]
+    assert {name for change in changes for name in change} >= set(ForegroundSettings.__struct_fields__)
     recording = _make_recording(video_folder)
-    models = (SETTINGS, msgspec.structs.replace(SETTINGS, background="living"))
-    mog2, living = (silhouette_keys(recording, settings) for settings in models)
-    assert mog2.keys() == living.keys() == set(recording.rig.names)
-    assert not set(mog2.values()) & set(living.values())
+    keys = [
+        _keys(recording, msgspec.structs.replace(SETTINGS, **change))["cam1"] for change in [{}, *changes]
+    ]
+    keys += [_keys(recording.usable(num_frames=12))["cam1"]]
+    assert len(set(keys)) == len(keys)
     with pytest.raises(SettingsError, match=r"background: expected .*found liveing"):
-        silhouette_keys(recording, SilhouetteSettings(background="liveing"))
+        _keys(recording, SilhouetteSettings(background="liveing"))
 
 
 @pytest.mark.parametrize(
@@ -307,80 +297,11 @@ def test_what_the_living_background_does_not_use_is_refused(setting: str, value:
     assert getattr(SilhouetteSettings(background="mog2", **{setting: value}), setting) == value
 
 
-def test_a_changed_setting_computes_again_and_keeps_the_old_silhouettes(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    recording = _make_recording(folder)
-    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    before = _read_all(first)
-    decoded_videos.clear()
-    changed = msgspec.structs.replace(SETTINGS, reduction=2)
-    second = compute(recording, changed, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 3 * (NUM_FRAMES + 10)
-    np.testing.assert_array_equal(_read_all(second), _expected(recording, changed))
-    np.testing.assert_array_equal(_read_all(first), before)
-
-
-def test_only_a_changed_video_is_computed_again(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    decoded_videos.clear()
-    _write_video(folder / "cam2.avi", seed=5)
-    recording = _make_recording(folder)
-    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert set(decoded_videos) == {"cam2"}
-    np.testing.assert_array_equal(_read_all(silhouettes), _expected(recording))
-
-
-def test_fewer_frames_have_another_key(folder: Path, tmp_path: Path) -> None:
-    recording = _make_recording(folder)
-    all_frames = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    shorter = recording.usable(num_frames=12)
+def test_fewer_frames_are_made_anew(folder: Path, tmp_path: Path) -> None:
+    shorter = _make_recording(folder).usable(num_frames=12)
     silhouettes = compute(shorter, SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert silhouettes.num_frames == 12
-    assert set(silhouettes.keys.values()).isdisjoint(all_frames.keys.values())
     np.testing.assert_array_equal(_read_all(silhouettes), _expected(shorter))
-
-
-def test_equal_videos_are_computed_once(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
-    shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
-    silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10)
-    all_frames = _read_all(silhouettes)
-    np.testing.assert_array_equal(all_frames[:, 0], all_frames[:, 1])
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_progress_adds_up(folder: Path, tmp_path: Path, jobs: int) -> None:
-    started: list[tuple[str, int]] = []
-    done: list[int] = []
-
-    @contextlib.contextmanager
-    def report(description: str, total: int) -> Iterator[Advance]:
-        started.append((description, total))
-        yield done.append
-
-    for _ in range(2):
-        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
-    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
-    assert sum(done) == 3 * (NUM_FRAMES + 10)
-
-
-@pytest.mark.parametrize("damage", ["chunk", "metadata", "shape"])
-def test_damaged_silhouettes_are_computed_again(folder: Path, tmp_path: Path, damage: str) -> None:
-    recording = _make_recording(folder)
-    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    stored = tmp_path / "cache" / first.keys["cam2"]
-    if damage == "chunk":
-        (stored / "c" / "1" / "0" / "0").unlink()
-    elif damage == "metadata":
-        (stored / "zarr.json").write_text("{")
-    else:
-        text = (stored / "zarr.json").read_text()
-        (stored / "zarr.json").write_text(text.replace("41", "40"))
-    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
 @pytest.fixture(scope="module")
@@ -411,8 +332,9 @@ def test_no_changed_bit_and_no_truncation_goes_unnoticed(whole_cache: Path, data
 
 
 @pytest.mark.parametrize("file", ["c/0/0/0", "zarr.json", "seal"])
-def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
-    folder: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("is_missing", [False, True])
+def test_damage_is_named_and_the_silhouettes_are_made_anew(
+    folder: Path, tmp_path: Path, file: str, is_missing: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     recording = _make_recording(folder)
     first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
@@ -420,6 +342,8 @@ def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
     content = bytearray((damaged / file).read_bytes())
     content[len(content) // 2] ^= 1
     (damaged / file).write_bytes(content)
+    if is_missing:
+        (damaged / file).unlink()
     caplog.clear()
     again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
@@ -428,15 +352,15 @@ def test_a_changed_bit_is_named_and_the_silhouettes_are_made_anew(
     np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
-def test_a_folder_that_is_read_is_not_removable(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_that_is_read_is_not_removed(folder: Path, tmp_path: Path) -> None:
     silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    path = tmp_path / "cache" / silhouettes.keys["cam2"]
-    with removable(path) as free:
-        assert not free
+    entries = list_entries(tmp_path / "cache")
+    assert not any(remove_entry(entry) for entry in entries)
+    assert _read_all(silhouettes).any()
     del silhouettes
     gc.collect()
-    with removable(path) as free:
-        assert free
+    assert all(remove_entry(entry) for entry in entries)
+    assert list_entries(tmp_path / "cache") == []
 
 
 def test_damage_after_opening_is_an_error_not_background(folder: Path, tmp_path: Path) -> None:
@@ -487,20 +411,6 @@ def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(folder: Path,
     compute(recording.usable(num_frames=advised), SETTINGS, cache=tmp_path / "cache", jobs=1)
     with pytest.raises(InputError, match="can be decoded"):
         compute(recording.usable(num_frames=advised + 1), SETTINGS, cache=tmp_path / "cache", jobs=1)
-
-
-def test_missing_video(folder: Path, tmp_path: Path) -> None:
-    recording = _make_recording(folder)
-    (folder / "cam2.avi").unlink()
-    with pytest.raises(InputError, match=r"cam2\.avi: expected a readable video, found No such file"):
-        compute(recording, SETTINGS, cache=tmp_path / "cache")
-
-
-def test_camera_without_video(folder: Path, tmp_path: Path) -> None:
-    recording = _make_recording(folder)
-    videos = {name: video for name, video in recording.videos.items() if name != "cam2"}
-    with pytest.raises(InputError, match=r"expected a video for each of the cameras .* found none for cam2"):
-        compute(replace(recording, videos=videos), SETTINGS, cache=tmp_path / "cache")
 
 
 def test_a_camera_without_video_sees_nothing_where_not_all_need_one(folder: Path, tmp_path: Path) -> None:
@@ -560,43 +470,31 @@ def test_what_is_ignored_is_background_and_belongs_to_the_key(folder: Path, tmp_
     np.testing.assert_array_equal(after[:, 1:], before[:, 1:])
 
 
-def test_an_ignored_part_of_another_size_is_an_error(folder: Path, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
-    recording = replace(_make_recording(folder), ignore={"cam1": tmp_path / "small.png"})
-    with pytest.raises(
-        InputError, match=r"small\.png: expected 162 x 118 pixels as in cam1\.avi, found 10 x 10"
-    ):
-        compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-
-
 @pytest.mark.parametrize("reduction", [0, -4, 3, True])
 def test_invalid_reductions_are_refused(reduction: int) -> None:
     with pytest.raises(SettingsError, match="reduction: expected a "):
         SilhouetteSettings(reduction=reduction, working_reduction=2)
 
 
-def test_jobs_below_one(folder: Path, tmp_path: Path) -> None:
+def test_what_is_missing_or_wrong_is_named(folder: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    recording = _make_recording(folder)
     with pytest.raises(SettingsError, match="jobs: expected a whole number of at least 1, found 0"):
-        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=0)
-
-
-def test_cache_that_is_a_file(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "cache").write_text("mine")
-    with pytest.raises(OutputError, match="cache: expected a folder to write to, found File exists"):
-        compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert (tmp_path / "cache").read_text() == "mine"
-
-
-def test_unfinished_folders_of_killed_processes_are_removed_after_a_day(folder: Path, tmp_path: Path) -> None:
-    old, young = tmp_path / "cache" / ".a.1.partial", tmp_path / "cache" / ".b.2.partial"
-    for partial in (old, young):
-        partial.mkdir(parents=True)
-        (partial / "zarr.json").write_text("{}")
-    two_days_ago = time.time() - 48 * 3600
-    for path in (old / "zarr.json", old):
-        os.utime(path, (two_days_ago, two_days_ago))
-    compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert _unfinished_folders(tmp_path / "cache") == [young]
+        compute(recording, SETTINGS, cache=cache, jobs=0)
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
+    with pytest.raises(InputError, match=r"small\.png: expected 162 x 118 .* as in cam1\.avi, found 10 x 10"):
+        compute(replace(recording, ignore={"cam1": tmp_path / "small.png"}), SETTINGS, cache=cache, jobs=1)
+    videos = {name: video for name, video in recording.videos.items() if name != "cam2"}
+    with pytest.raises(InputError, match=r"expected a video for each of the cameras .* found none for cam2"):
+        compute(replace(recording, videos=videos), SETTINGS, cache=cache)
+    (folder / "cam2.avi").unlink()
+    with pytest.raises(InputError, match=r"cam2\.avi: expected a readable video, found No such file"):
+        compute(recording, SETTINGS, cache=cache)
+    shutil.rmtree(cache, ignore_errors=True)
+    cache.write_text("mine")
+    with pytest.raises(OutputError, match=r"cache/.*: expected a path that can be written, found "):
+        compute(replace(recording, videos=videos), SETTINGS, cache=cache, jobs=1, all_videos=False)
+    assert cache.read_text() == "mine"
 
 
 # --- other processes ---
@@ -674,10 +572,11 @@ def test_a_killed_computation_is_resumed(
         # The workers notice the end of their parent and remove their unfinished folders.
         assert not _unfinished_folders(cache)
     recording = _make_recording(folder)
-    keys = {name: silhouette_store.key_of(video, SCALED) for name, video in recording.videos.items()}
+    keys = _keys(recording)
     finished = _stored_keys(cache)
     resumed = compute(recording, SETTINGS, cache=cache, jobs=1)
     assert set(decoded_videos) == {name for name, key in keys.items() if key not in finished}
+    assert not _unfinished_folders(cache)
     np.testing.assert_array_equal(_read_all(resumed), _expected(recording))
 
 
@@ -724,7 +623,7 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
     )
     assert full.returncode == 1
     assert "OutputError" in full.stderr
-    assert "expected to write silhouettes, found File too large; what was stored before" in full.stderr
+    assert "expected a path that can be written, found File too large; earlier results" in full.stderr
     assert _unfinished_folders(cache) == []
     assert len(_stored_keys(cache)) == 3
     np.testing.assert_array_equal(

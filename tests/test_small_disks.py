@@ -404,15 +404,15 @@ def test_a_cache_that_cannot_be_written_is_read(run_psotrack, disk, root, tmp_pa
     assert (tmp_path / "tracks.csv").read_bytes() == (tmp_path / "again.csv").read_bytes()
 
 
-#: `psotrack` on a slow disk: each file of the stored silhouettes takes this long, seconds.
+#: `psotrack` on a slow disk: each file of the stored silhouettes takes this long.
 SLOW = """
-import asyncio
-from zarr.storage import LocalStore
-write = LocalStore.set
-async def write_slowly(*words):
-    await asyncio.sleep(0.3)
-    await write(*words)
-LocalStore.set = write_slowly
+import time
+from pathlib import Path
+write = Path.write_bytes
+def write_slowly(*words):
+    time.sleep(0.3)
+    return write(*words)
+Path.write_bytes = write_slowly
 from psotrack.cli import main
 main()
 """

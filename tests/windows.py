@@ -8,8 +8,7 @@ import numpy as np
 from helpers import far_camera, float32, make_unnamed_rig
 
 from psotrack.geometry import make_extents
-from psotrack.silhouettes import summed_area_table
-from psotrack.silhouettes.summed_area import LOW_BITS
+from psotrack.silhouettes import LOW_BITS, summed_area_table
 from psotrack.tracking import SoftIoU
 from psotrack.tracking.fitness import ScoreInputs, drone_fitness, score_inputs
 from psotrack.tracking.patches import SIDE, ExpectedDrones, cut, make_pyramid

@@ -27,8 +27,7 @@ from psotrack.geometry import project, viewpoints
 from psotrack.pipeline import track_runs
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import compute
-from psotrack.silhouettes.computation import SilhouetteSettings
+from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.simulation import SimulationSettings, scenarios, simulate
 from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories

@@ -36,8 +36,7 @@ import pandas as pd
 from psotrack.datasets import open_recording
 from psotrack.recordings import Recording, VideoInfo, read_frames
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import scaled_settings
-from psotrack.silhouettes.foreground import reduce_frame
+from psotrack.silhouettes import reduce_frame, scaled_settings
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 from psotrack.support import Advance, map_in_processes, progress_bar
 

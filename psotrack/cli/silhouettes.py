@@ -137,7 +137,7 @@ def _write_masks(
     """Write the masks of all cameras; returns what was written, as JSON."""
     import os
 
-    from psotrack.silhouettes import MaskTask, frames_to_decode, masks_out, tasks_of, write_masks
+    from psotrack.silhouettes import MaskTask, masks_out, tasks_of, write_masks
     from psotrack.support import map_in_processes, refuse_to_overwrite
 
     places = masks_out(out, tuple(recording.videos))
@@ -147,7 +147,7 @@ def _write_masks(
     jobs = jobs or os.cpu_count() or 1
     if jobs < 1:
         raise SettingsError("jobs", expected="at least 1", found=f"{jobs}")
-    with report_to(quiet)("masks", sum(frames_to_decode(task.foreground) for task in tasks)) as advance:
+    with report_to(quiet)("masks", sum(task.foreground.num_decoded for task in tasks)) as advance:
         counts = list(map_in_processes(write_masks, tasks, jobs=jobs, advance=advance))
     return {
         "masks": dict(zip(places, counts, strict=True)),

@@ -24,7 +24,7 @@ from psotrack.live.cameras import LiveCamera
 from psotrack.live.meeting import CameraCounts, Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import SourceFrame
-from psotrack.silhouettes import LivingBackground, ScaledSettings, coverage, ignored_pixels, reduce_frame
+from psotrack.silhouettes import ForegroundSettings, LivingBackground, coverage, ignored_pixels, reduce_frame
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class FrontEnd:
     def __init__(
         self,
         cameras: Sequence[LiveCamera],
-        settings: ScaledSettings,
+        settings: ForegroundSettings,
         rate_hz: float,
         *,
         first_s: float,
@@ -236,7 +236,7 @@ class CameraSilhouettes:
         ignore: image that is white where nothing counts as foreground; None for no such image.
     """
 
-    def __init__(self, settings: ScaledSettings, name: str, ignore: Path | None) -> None:
+    def __init__(self, settings: ForegroundSettings, name: str, ignore: Path | None) -> None:
         self._settings, self._name, self._ignore = settings, name, ignore
         self._ignored: Bool[np.ndarray, "rows columns"] | None = None
         self._background: LivingBackground | None = None

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from psotrack.recordings import Detections
 from psotrack.silhouettes.blobs import find_blobs
-from psotrack.silhouettes.computation import Silhouettes
+from psotrack.silhouettes.frames import Silhouettes
 from psotrack.silhouettes.settings import MIN_COVERAGE
 from psotrack.support import Report, no_progress
 
@@ -32,31 +32,29 @@ def blob_detections(
     """
     found: dict[str, Detections] = {}
     with report("blobs", sum(array.shape[0] for array in silhouettes.arrays)) as advance:
-        for index, name in enumerate(silhouettes.cameras):
-            array, border = silhouettes.arrays[index], silhouettes.borders[index]
-            frames, boxes, scores = [], [], []
+        for name, array, size_wh in zip(silhouettes.cameras, silhouettes.arrays, image_sizes_wh, strict=True):
+            rows = [np.empty((0, 6))]
             for begin in range(0, array.shape[0], _CHUNK_FRAMES):
                 chunk = np.asarray(array[begin : begin + _CHUNK_FRAMES])
                 for frame, coverage in enumerate(chunk, begin):
-                    blobs = find_blobs(coverage, silhouettes.reduction, border)
-                    # Pixel centres are at whole numbers, so that the edges of a box are half a pixel further.
-                    xyxy = (
-                        np.hstack([blobs.centre_px - blobs.size_px / 2, blobs.centre_px + blobs.size_px / 2])
-                        + 0.5
-                    )
-                    cells = np.rint(xyxy / silhouettes.reduction).astype(int)
-                    frames += [frame] * len(xyxy)
-                    boxes.append(np.minimum(xyxy, np.tile(image_sizes_wh[index], 2)))
-                    scores += [_confidence(coverage[y0:y1, x0:x1]) for x0, y0, x1, y1 in cells]
+                    rows.append(_rows(frame, coverage, silhouettes.reduction, size_wh))
                 advance(len(chunk))
-            found[name] = Detections(
-                np.array(frames, np.int64),
-                np.concatenate([np.empty((0, 4)), *boxes]),
-                np.array(scores, np.float64),
-            )
+            table = np.concatenate(rows)
+            found[name] = Detections(table[:, 0].astype(np.int64), table[:, 1:5], table[:, 5])
     return found
 
 
-def _confidence(coverage: np.ndarray) -> float:
-    inside = coverage[coverage >= MIN_COVERAGE]
-    return float(inside.mean() / 255) if inside.size else 0.0
+def _rows(
+    frame: int, coverage: np.ndarray, reduction: int, size_wh: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "blobs 6"]:
+    """Frame, box and confidence of each blob of one silhouette."""
+    blobs = find_blobs(coverage, reduction)
+    # Pixel centres are at whole numbers, so that the edges of a box are half a pixel further.
+    x0_y0 = blobs.centre_px - blobs.size_px / 2 + 0.5
+    xyxy = np.hstack([x0_y0, x0_y0 + blobs.size_px])
+    cells = np.rint(xyxy / reduction).astype(int).tolist()
+    inside = [coverage[y0:y1, x0:x1] for x0, y0, x1, y1 in cells]
+    confidence = [each[each >= MIN_COVERAGE].mean() / 255 for each in inside]
+    return np.column_stack(
+        [np.full(len(xyxy), frame), np.minimum(xyxy, np.tile(size_wh, 2)), np.array(confidence)]
+    )

@@ -6,10 +6,9 @@ array and its seal, and files of compiled programs. Everything else in the folde
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import re
-import secrets
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from typing import Literal
 
 from psotrack.errors import InputError, OutputError
 from psotrack.recordings import ARRAY_FILE
-from psotrack.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole, removable
+from psotrack.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole, lock
 
 #: Name of a folder of silhouettes, and names of compiled programs: of psotrack's own store, and of JAX's cache.
 _KEY = re.compile(r"[0-9a-f]{40}")
@@ -53,13 +52,12 @@ def list_entries(cache: Path) -> list[CacheEntry]:
         InputError: the folder does not exist or cannot be read.
     """
     try:
-        folders = [path for path in cache.iterdir() if _is_silhouettes(path)]
+        paths = [*cache.iterdir(), *(cache / _COMPILED).glob("*")]
     except OSError as error:
         found = (error.strerror or f"{error}").lower()
         raise InputError(cache, expected="a cache folder", found=found) from error
-    programs = [path for path in (cache / _COMPILED).glob("*") if _is_program(path)]
-    entries = [_entry(path) for path in (*folders, *programs)]
-    return sorted((entry for entry in entries if entry is not None), key=lambda entry: entry.used_s)
+    entries = [entry for path in paths if (entry := _entry(path)) is not None]
+    return sorted(entries, key=lambda entry: entry.used_s)
 
 
 def is_damaged(entry: CacheEntry) -> bool:
@@ -103,15 +101,15 @@ def remove_entry(entry: CacheEntry) -> bool:
     """
     try:
         if entry.kind == "program":
-            entry.path.unlink(missing_ok=True)
+            entry.path.unlink()
             return True
-        with removable(entry.path) as free:
-            if not free:
+        seal = entry.path / SEAL_FILE
+        with lock(entry.path, shared=False) or contextlib.nullcontext() as held:
+            if held is None and seal.exists():
                 return False
-            # A folder that is half removed must not stand under its own name.
-            aside = entry.path.with_name(f".{entry.path.name}.{secrets.token_hex(4)}.partial")
-            os.rename(entry.path, aside)
-        shutil.rmtree(aside)
+            # First the seal: nobody reads what is left of a folder without it.
+            seal.unlink(missing_ok=True)
+            shutil.rmtree(entry.path)
     except FileNotFoundError:
         return True  # Another process has removed the entry.
     except OSError as error:
@@ -120,33 +118,27 @@ def remove_entry(entry: CacheEntry) -> bool:
     return True
 
 
-def _is_silhouettes(path: Path) -> bool:
-    if not _KEY.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
-        return False
-    return {each.name for each in path.iterdir()} <= {ARRAY_FILE, SEAL_FILE, CHUNKS}
-
-
-def _is_program(path: Path) -> bool:
-    return bool(_PROGRAM.fullmatch(path.name)) and not path.is_symlink() and path.is_file()
-
-
 def _entry(path: Path) -> CacheEntry | None:
-    """The entry at a path; None where another process has just removed it."""
+    """The entry at a path; None where there is none, or another process has just removed it."""
+    is_program = path.parent.name == _COMPILED and _PROGRAM.fullmatch(path.name)
+    if path.is_symlink() or not (is_program or _KEY.fullmatch(path.name)):
+        return None
     try:
-        files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-        size_bytes = sum(file.stat().st_size for file in files)
+        if is_program:
+            status = path.stat()
+            return CacheEntry(path, "program", "", status.st_size, status.st_mtime)
+        if not {each.name for each in path.iterdir()} <= {ARRAY_FILE, SEAL_FILE, CHUNKS}:
+            return None
+        size_bytes = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
         seal = path / SEAL_FILE
         used_s = (seal if seal.exists() else path).stat().st_mtime
     except OSError:
         return None
-    if path.is_file():
-        return CacheEntry(path, "program", "", size_bytes, used_s)
     return CacheEntry(path, "silhouettes", _video_of(path), size_bytes, used_s)
 
 
 def _video_of(folder: Path) -> str:
     try:
-        video = json.loads((folder / ARRAY_FILE).read_bytes())["attributes"]["video"]
+        return str(json.loads((folder / ARRAY_FILE).read_bytes())["attributes"]["video"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return ""
-    return video if isinstance(video, str) else ""

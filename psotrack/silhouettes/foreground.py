@@ -79,7 +79,7 @@ class BackgroundModel(Protocol):
 
 @dataclass(frozen=True)
 class Mog2:
-    """The background model of this package (see the module).
+    """The background model "mog2" (see the module).
 
     Attributes:
         settings: settings of the foreground.
@@ -97,42 +97,20 @@ class Mog2:
         learning: Iterable[UInt8[np.ndarray, "height width 3"]],
         frames: Iterable[UInt8[np.ndarray, "height width 3"]],
     ) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
-        """See `BackgroundModel`."""
-        return foreground(learning, frames, self.settings)
+        """See `BackgroundModel`: values between 0 and 255 are weighted shadow."""
+        settings = self.settings
+        model = learned_mog2(((1.0, reduce_frame(frame, settings)) for frame in learning), settings)
+        levels = _levels(settings)
+        least_px = math.ceil(settings.min_blob_px / settings.working_reduction**2)
+        for frame in frames:
+            labels = model.apply(reduce_frame(frame, settings), learningRate=settings.learning_rate)
+            yield remove_speckle(cv2.LUT(labels, levels), least_px)
 
 
-def foreground(
-    learning: Iterable[UInt8[np.ndarray, "height width 3"]],
-    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
-    settings: ForegroundSettings,
-) -> Iterator[UInt8[np.ndarray, "working_height working_width"]]:
-    """Yield the foreground of each frame; the background is learned from other frames first.
-
-    Args:
-        learning: BGR frames from the whole video, at least one; the background is what most of these frames show.
-        frames: BGR frames in order.
-        settings: settings of the foreground.
-
-    Yields:
-        Images in which 0 is background, 255 foreground, and values between weighted shadow. Pixel (i, j) covers the
-        pixels [r * i, r * i + r) x [r * j, r * j + r) of the frame, where r is `working_reduction`.
-    """
-    model = learn_background(learning, settings)
-    for frame in frames:
-        yield classify(model, frame, settings)
-
-
-def learn_background(
-    frames: Iterable[UInt8[np.ndarray, "height width 3"]], settings: ForegroundSettings
-) -> cv2.BackgroundSubtractorMOG2:
-    """Learn the background from frames, each with the same weight; their order does not matter."""
-    return learn_weighted(((1.0, reduce_frame(frame, settings)) for frame in frames), settings)
-
-
-def learn_weighted(
+def learned_mog2(
     images: Iterable[tuple[float, _Image]], settings: ForegroundSettings
 ) -> cv2.BackgroundSubtractorMOG2:
-    """Learn the background from weights and reduced images; their order does not matter."""
+    """OpenCV's MOG2 after it learned the background from weights and reduced images; their order does not matter."""
     model = cv2.createBackgroundSubtractorMOG2(
         history=settings.num_learning_frames, varThreshold=settings.var_threshold, detectShadows=True
     )
@@ -143,18 +121,6 @@ def learn_weighted(
         total += weight
         model.apply(image, learningRate=weight / total)
     return model
-
-
-def classify(
-    model: cv2.BackgroundSubtractorMOG2,
-    frame: UInt8[np.ndarray, "height width 3"],
-    settings: ForegroundSettings,
-) -> UInt8[np.ndarray, "working_height working_width"]:
-    """Foreground of one frame, as `foreground` yields it; updates `model` at `learning_rate`."""
-    mask = model.apply(reduce_frame(frame, settings), learningRate=settings.learning_rate)
-    return remove_speckle(
-        cv2.LUT(mask, _levels(settings)), math.ceil(settings.min_blob_px / settings.working_reduction**2)
-    )
 
 
 def remove_speckle(

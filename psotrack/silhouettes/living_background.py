@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.silhouettes.foreground import learn_weighted, reduce_frame
+from psotrack.silhouettes.foreground import learned_mog2, reduce_frame
 from psotrack.silhouettes.lighting import light_of, remove_light
 from psotrack.silhouettes.object_blobs import ObjectBlobs, find_objects, gradient, largest
 from psotrack.silhouettes.settings import ForegroundSettings
@@ -128,7 +128,7 @@ class Living:
             learning: weights and reduced frames from the whole video.
             frames: all frames in their order, reduced.
         """
-        most_frames = np.asarray(learn_weighted(learning, self.settings).getBackgroundImage())
+        most_frames = np.asarray(learned_mog2(learning, self.settings).getBackgroundImage())
         background = LivingBackground(self.settings, most_frames, self.settings.num_learning_frames)
         coming = iter(frames)
         first = list(itertools.islice(coming, _FIRST_FRAMES))

@@ -47,12 +47,22 @@ def write_masks(task: MaskTask, advance: Advance) -> int:
         SettingsError: the background model yields masks of a wrong number, type or shape.
         OutputError: the masks cannot be written.
     """
-    video = task.foreground.video
-    masks = _at_size(task.foreground, advance)
-    if task.out.suffix.lower() in CODECS:
-        return _write_video(task.out, video, masks)
-    count = 0
+    video, reduction = task.foreground.video, task.foreground.settings.working_reduction
+    width, height = video.image_size_wh
+    if task.out.suffix.lower() in CODECS and (width % 2 or height % 2):
+        raise SettingsError(
+            "--masks",
+            expected="a folder, because a video has an even width and height",
+            found=f"{task.out.name} for {width} x {height} pixels",
+        )
+    masks = (
+        np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
+        for mask in foreground_of(task.foreground, {"decode": 0.0, "foreground": 0.0}, advance)
+    )
     with atomic_write(task.out) as temporary:
+        if task.out.suffix.lower() in CODECS:
+            return _write_video(task.out, temporary, video, masks)
+        count = 0
         temporary.mkdir()
         for count, mask in enumerate(masks, 1):
             there, coded = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
@@ -62,33 +72,20 @@ def write_masks(task: MaskTask, advance: Advance) -> int:
     return count
 
 
-def _at_size(task: Task, advance: Advance) -> Iterator[UInt8[np.ndarray, "height width"]]:
-    width, height = task.video.image_size_wh
-    reduction = task.settings.working_reduction
-    for mask in foreground_of(task, {"decode": 0.0, "foreground": 0.0}, advance):
-        yield np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
-
-
-def _write_video(path: Path, video: VideoInfo, masks: Iterator[UInt8[np.ndarray, "height width"]]) -> int:
-    width, height = video.image_size_wh
-    if width % 2 or height % 2:
-        raise SettingsError(
-            "--masks",
-            expected="a folder, because a video has an even width and height",
-            found=f"{path.name} for {width} x {height} pixels",
-        )
-    with atomic_write(path) as temporary:
-        # The ending of the temporary file says the container.
-        try:
-            encoder = VideoEncoder(temporary, CODECS[path.suffix.lower()], video.fps, (width, height))
-        except OSError as error:
-            raise OutputError(path, expected="a video that can be written", found=str(error)) from error
-        try:
-            for mask in masks:
-                encoder.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
-        finally:
-            encoder.close()
-        check_video_written(path, temporary, encoder.num_frames)
+def _write_video(
+    path: Path, temporary: Path, video: VideoInfo, masks: Iterator[UInt8[np.ndarray, "height width"]]
+) -> int:
+    """Write a video to a temporary file, whose ending says the container."""
+    try:
+        encoder = VideoEncoder(temporary, CODECS[path.suffix.lower()], video.fps, video.image_size_wh)
+    except OSError as error:
+        raise OutputError(path, expected="a video that can be written", found=str(error)) from error
+    try:
+        for mask in masks:
+            encoder.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
+    finally:
+        encoder.close()
+    check_video_written(path, temporary, encoder.num_frames)
     return encoder.num_frames
 
 

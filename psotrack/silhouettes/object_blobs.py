@@ -60,7 +60,11 @@ class ObjectBlobs:
         """(height, width), 255 at the blobs that have edges of their own: objects, also if they stand still."""
         own = np.zeros_like(self.mask)
         for blobs, contours in self.found:
-            own.ravel()[blobs.chosen(_has_own_edges(contours, image, background)).pixels] = 255
+            edges, before = (
+                contours.means(_gradient_at(levels, contours.pixels)) for levels in (image, background)
+            )
+            has_edges = edges > _OWN_EDGES * before + _LEAST_EDGE
+            own.ravel()[blobs.chosen(has_edges).pixels] = 255
         return own
 
 
@@ -91,11 +95,13 @@ def find_objects(
             break
         contours = _contours(blobs, changed.shape)
         levels, steepness = difference.ravel()[blobs.pixels], _gradient_at(difference, contours.pixels)
+        contrast = np.minimum(blobs.sums(levels) / np.maximum(blobs.area, 1), _SHARP_DIFFERENCE)
+        is_sharp = contours.means(steepness) > _SHARP * contrast + _NOISE_GRADIENT
+        # Where the difference is a step, and not the slope of a cloud.
+        step = _STEEP * _ending_level(blobs, levels, share) + _NOISE_GRADIENT
+        is_steep = contours.means(steepness > step[contours.blob]) >= steep_part
         # A blob that fills the image has no contour.
-        is_object = (contours.length == 0) | (
-            _is_sharp(blobs, contours, levels, steepness)
-            & (_steep_part(blobs, contours, levels, steepness, share) >= steep_part)
-        )
+        is_object = (contours.length == 0) | (is_sharp & is_steep)
         objects = blobs.chosen(is_object)
         mask.ravel()[objects.pixels] = 255
         found.append((objects, contours))
@@ -103,54 +109,6 @@ def find_objects(
             break
         changed = _mask_of(blobs.chosen(~is_object).pixels, changed.shape)
     return ObjectBlobs(mask, found)
-
-
-def _is_sharp(
-    blobs: _PixelBlobs,
-    contours: _Contours,
-    levels: Shaped[np.ndarray, "pixels"],
-    steepness: Float[np.ndarray, "points"],
-) -> Bool[np.ndarray, "blobs"]:
-    """Whether the difference to the background rises steeply at a blob's contour, in the mean.
-
-    Args:
-        blobs: the blobs.
-        contours: their contours.
-        levels: (pixels,), difference to the background at the blobs' pixels.
-        steepness: (points,), gradient of the difference at the contours.
-    """
-    contrast = blobs.sums(levels) / np.maximum(blobs.area, 1)
-    least = _SHARP * np.minimum(contrast, _SHARP_DIFFERENCE) + _NOISE_GRADIENT
-    return contours.means(steepness) > least
-
-
-def _steep_part(
-    blobs: _PixelBlobs,
-    contours: _Contours,
-    levels: Shaped[np.ndarray, "pixels"],
-    steepness: Float[np.ndarray, "points"],
-    share: float,
-) -> Float[np.ndarray, "blobs"]:
-    """(blobs,), part of a blob's contour where the difference is a step, and not the slope of a cloud.
-
-    Args:
-        blobs, contours, levels, steepness: as for `_is_sharp`.
-        share: share of its contrast at which a blob ends.
-    """
-    least = _STEEP * _ending_level(blobs, levels, share) + _NOISE_GRADIENT
-    return contours.means(steepness > least[contours.blob])
-
-
-def _has_own_edges(
-    contours: _Contours,
-    image: UInt8[np.ndarray, "height width 3"],
-    background: UInt8[np.ndarray, "height width 3"],
-) -> Bool[np.ndarray, "blobs"]:
-    """Whether the frame has edges at a blob's contour that the background does not have."""
-    edges, edges_before = (
-        contours.means(_gradient_at(levels, contours.pixels)) for levels in (image, background)
-    )
-    return edges > _OWN_EDGES * edges_before + _LEAST_EDGE
 
 
 @dataclass(frozen=True)

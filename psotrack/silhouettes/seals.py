@@ -6,10 +6,7 @@ that was cut short and a missing file are noticed. Processes that read the folde
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -24,73 +21,43 @@ SEAL_FILE = "seal"
 CHUNKS = "c"
 
 
-def write_seal(folder: Path) -> None:
-    """Write the seal of a folder whose files are complete.
+def seal_of(folder: Path) -> str:
+    """Digest of every byte of the array in a folder.
 
     Raises:
-        OSError: the folder cannot be written.
         InputError: a file cannot be read.
     """
-    (folder / SEAL_FILE).write_text(_seal_of(folder), encoding="ascii")
+    files = [folder / ARRAY_FILE, *(path for path in (folder / CHUNKS).rglob("*") if path.is_file())]
+    return digest_record({path.relative_to(folder).as_posix(): digest_file(path) for path in files})
 
 
 def is_whole(folder: Path) -> bool:
     """Whether a folder has a seal, and no byte of the folder was changed since; every byte is read."""
     try:
-        return (folder / SEAL_FILE).read_bytes() == _seal_of(folder).encode("ascii")
+        return (folder / SEAL_FILE).read_bytes() == seal_of(folder).encode("ascii")
     except (OSError, InputError):
         return False
 
 
-def hold(folder: Path) -> IO[bytes] | None:
-    """Open the seal of a folder with a shared lock; None where there is no seal, or a process removes the folder.
+def lock(folder: Path, *, shared: bool) -> IO[bytes] | None:
+    """Lock a folder until the returned file, its seal, is closed.
 
-    As long as the file is open, `removable` leaves the folder alone. The time of the seal becomes the time of this use.
+    None where there is no seal, or where another process has a lock and one of both is not shared. Whoever reads the
+    folder shares a lock; whoever removes it does not.
     """
-    with contextlib.suppress(OSError):  # a cache that cannot be written, or no seal
-        os.utime(folder / SEAL_FILE)
     try:
-        file = (folder / SEAL_FILE).open("rb")
+        seal = (folder / SEAL_FILE).open("rb" if shared else "r+b")
     except OSError:
         return None
-    if _lock(file, shared=True):
-        return file
-    file.close()
-    return None
-
-
-@contextlib.contextmanager
-def removable(folder: Path) -> Iterator[bool]:
-    """Yield whether no process reads a folder; until the block ends, no process begins to read the folder."""
-    try:
-        file = (folder / SEAL_FILE).open("r+b")
-    except FileNotFoundError:
-        # Processes of this version read no folder without a seal.
-        yield True
-        return
-    except OSError:
-        yield False
-        return
-    with file:
-        yield _lock(file, shared=False)
-
-
-def _lock(file: IO[bytes], *, shared: bool) -> bool:
-    """Try to lock an open file; True also on Windows, where a folder with an open file cannot be removed."""
-    if sys.platform == "win32":
-        return True
+    if sys.platform == "win32":  # where a folder with an open file cannot be removed anyway
+        return seal
     import fcntl
 
     try:
-        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        # A file system without locks: reading goes on, and nothing is removed.
-        return shared
-    return True
-
-
-def _seal_of(folder: Path) -> str:
-    files = [folder / ARRAY_FILE, *(path for path in (folder / CHUNKS).rglob("*") if path.is_file())]
-    return digest_record({path.relative_to(folder).as_posix(): digest_file(path) for path in files})
+        fcntl.flock(seal, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except OSError as error:
+        # On a file system without locks, reading goes on and nothing is removed.
+        if isinstance(error, BlockingIOError) or not shared:
+            seal.close()
+            return None
+    return seal

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import msgspec
+from msgspec import Meta
 
 from psotrack.errors import SettingsError, check_positive
-from psotrack.support import check_types
+from psotrack.support import Share, check_types
 
 #: Names of the background models of this package.
 MOG2, LIVING = "mog2", "living"
@@ -34,6 +35,9 @@ _SPECKLE, _LEAST_BLOB_PX = 0.2, 4
 #: pixels. The model itself tells speckle from objects, down to this size (`object_blobs`).
 _LEAST_OBJECT_PX = 9
 
+#: Numbers of frames or pixels.
+_OneOrMore = Annotated[int, Meta(ge=1)]
+_NoneOrMore = Annotated[int, Meta(ge=0)]
 #: Meaning of MOG2's shadow label: foreground, background, or foreground with a smaller weight.
 Shadows = Literal["keep", "drop", "weight"]
 
@@ -47,28 +51,23 @@ def check_whole(name: str, value: object, *, lowest: int) -> None:
 class _CommonSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that do not depend on the size of the images; the docstrings of the subclasses describe them."""
 
-    num_learning_frames: int = 50
-    learning_rate: float = 0.0
+    num_learning_frames: _OneOrMore = 50
+    learning_rate: Share = 0.0
     var_threshold: float = 8.0
     shadows: Shadows = "keep"
-    shadow_weight: float = 0.5
+    shadow_weight: Share = 0.5
     first_look: bool = True
 
     def __post_init__(self) -> None:
         check_types(self)
-        check_whole("num_learning_frames", self.num_learning_frames, lowest=1)
-        for name in ("learning_rate", "shadow_weight"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(name, expected="a number from 0 to 1", found=f"{getattr(self, name):g}")
         check_positive("var_threshold", self.var_threshold)
         if self.shadows not in get_args(Shadows):
-            raise SettingsError(
-                "shadows", expected=f"one of {', '.join(get_args(Shadows))}", found=f"{self.shadows}"
-            )
+            expected = f"one of {', '.join(get_args(Shadows))}"
+            raise SettingsError("shadows", expected=expected, found=f"{self.shadows}")
 
 
 class ForegroundSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings that separate foreground from background, for images of a known size.
+    """Settings that separate foreground from background and reduce it, for images of a known size.
 
     Attributes:
         num_learning_frames, learning_rate, var_threshold, shadows, shadow_weight, first_look: as in
@@ -76,45 +75,26 @@ class ForegroundSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
             image; 1 is the full image.
         min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
-
-    Raises:
-        SettingsError: a value is out of range.
-    """
-
-    working_reduction: int = 2
-    min_blob_px: int = 64
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_whole("working_reduction", self.working_reduction, lowest=1)
-        check_whole("min_blob_px", self.min_blob_px, lowest=0)
-
-    @property
-    def soft_edges(self) -> bool:
-        """Whether a mask tells the share of each pixel at a contour, instead of foreground or background."""
-        return False
-
-
-class ScaledSettings(ForegroundSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of silhouettes for images of a known size: `ForegroundSettings` and the reduction.
-
-    Attributes:
         reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
 
     Raises:
         SettingsError: a value is out of range.
     """
 
-    reduction: int = 4
+    working_reduction: _OneOrMore = 2
+    min_blob_px: _NoneOrMore = 64
+    reduction: _OneOrMore = 4
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_whole("reduction", self.reduction, lowest=1)
         _check_multiple(self.reduction, self.working_reduction)
 
     @property
     def soft_edges(self) -> bool:
-        """See `ForegroundSettings`: where masks are stored as they are, no mean of finer pixels tells the shares."""
+        """Whether a mask tells the share of each pixel at a contour, instead of foreground or background.
+
+        Where masks are stored as they are, no mean of finer pixels tells the shares.
+        """
         return self.reduction == self.working_reduction > 1
 
 
@@ -144,17 +124,14 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
 
     background: str = LIVING
     drone_px: float | None = None
-    reduction: int | None = None
-    working_reduction: int | None = None
-    min_blob_px: int | None = None
+    reduction: _OneOrMore | None = None
+    working_reduction: _OneOrMore | None = None
+    min_blob_px: _NoneOrMore | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.drone_px is not None:
             check_positive("drone_px", self.drone_px)
-        for name, lowest in (("reduction", 1), ("working_reduction", 1), ("min_blob_px", 0)):
-            if getattr(self, name) is not None:
-                check_whole(name, getattr(self, name), lowest=lowest)
         if self.reduction is not None and self.working_reduction is not None:
             _check_multiple(self.reduction, self.working_reduction)
         if self.background == LIVING:
@@ -179,7 +156,7 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
 
     def scaled(
         self, image_sizes_wh: Sequence[tuple[int, int]], usual_px: float | None = None
-    ) -> ScaledSettings:
+    ) -> ForegroundSettings:
         """These settings for images of given sizes.
 
         Args:
@@ -205,7 +182,9 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         elif least_px is None:
             least_px = max(_LEAST_BLOB_PX, round((_SPECKLE * across_px) ** 2))
         common = {name: getattr(self, name) for name in _CommonSettings.__struct_fields__}
-        return ScaledSettings(working_reduction=working, reduction=reduction, min_blob_px=least_px, **common)
+        return ForegroundSettings(
+            working_reduction=working, reduction=reduction, min_blob_px=least_px, **common
+        )
 
 
 def _check_multiple(reduction: int, working_reduction: int) -> None:

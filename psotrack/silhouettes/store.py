@@ -5,13 +5,11 @@ This module does not import JAX, because every worker process imports this modul
 
 from __future__ import annotations
 
-import logging
+import contextlib
 import os
-import secrets
-import shutil
 import time
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,29 +19,18 @@ import numpy as np
 import zarr
 from jaxtyping import Bool, UInt8
 from zarr.codecs import ZstdCodec
+from zarr.core.buffer import Buffer
+from zarr.storage import MemoryStore
 
-from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import MADE_OF, VideoInfo, digest_video, read_frames, read_mask
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import MADE_OF, StoredSilhouettes, VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import (
-    BackgroundModel,
-    Mog2,
-    coverage,
-    learning_step,
-    reduce_frame,
-)
+from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
 from psotrack.silhouettes.living_background import Living
-from psotrack.silhouettes.seals import hold, is_whole, write_seal
-from psotrack.silhouettes.settings import ScaledSettings
-from psotrack.silhouettes.usable_frames import (
-    LEAST_FRAMES,
-    Interval,
-    foreground_is_everywhere,
-    intervals_of,
-)
-from psotrack.support import Advance, digest_file, digest_record, identify
-
-logger = logging.getLogger(__name__)
+from psotrack.silhouettes.seals import SEAL_FILE, is_whole, lock, seal_of
+from psotrack.silhouettes.settings import ForegroundSettings
+from psotrack.silhouettes.usable_frames import LEAST_FRAMES, Interval, foreground_is_everywhere, intervals_of
+from psotrack.support import Advance, atomic_write, digest_file, digest_record, identify
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
 SCHEMA = 1
@@ -57,95 +44,95 @@ _LEFT_OUT = "left_out"
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
 
-#: An unfinished folder that was not changed for this long was left by a process that was killed, seconds.
-_STALE_S = 24 * 3600
-
-#: Longest time that zarr goes on writing, seconds.
-_ZARR_WRITES_S = 1.0
-
 
 @dataclass(frozen=True)
 class Task:
-    """Task of making one video's silhouettes and storing them in the folder `cache` / `key`.
+    """Task of making one video's silhouettes.
 
     Attributes:
         video: the video.
         settings: settings of the silhouettes.
-        cache: folder of the store.
-        made_of: what the silhouettes are made of (see `made_of`); its digest is their key.
-        background: background model; None is MOG2.
+        background: background model.
         ignore: image of the video's size, white where nothing counts as foreground; None for no such image.
+        stored: where the silhouettes are stored, and what they are made of; the digest of this is their key.
     """
 
     video: VideoInfo
-    settings: ScaledSettings
-    cache: Path
-    made_of: Mapping[str, Any]
-    background: BackgroundModel | None = None
-    ignore: Path | None = None
+    settings: ForegroundSettings
+    background: BackgroundModel
+    ignore: Path | None
+    stored: StoredSilhouettes
 
     @property
-    def key(self) -> str:
-        """Name of the silhouettes' folder."""
-        return digest_record(self.made_of)
+    def num_decoded(self) -> int:
+        """Number of frames that are decoded: all, and those of a pass that learns the background."""
+        num_frames = self.video.num_frames
+        if isinstance(self.background, Living):
+            return num_frames
+        return num_frames + len(range(0, num_frames, learning_step(num_frames, self.settings)))
 
 
-def made_of(
+def task_of(
     video: VideoInfo,
-    settings: ScaledSettings,
-    background: BackgroundModel | None = None,
-    ignore: Path | None = None,
-) -> dict[str, Any]:
-    """Everything that silhouettes depend on: digest of the video, frames, settings, background model, ignored part.
+    settings: ForegroundSettings,
+    background: BackgroundModel,
+    ignore: Path | None,
+    cache: Path,
+) -> Task:
+    """The task of making a video's silhouettes, stored in a folder of `cache`; nothing is computed but digests.
 
     Raises:
         InputError: the video cannot be read.
         SettingsError: the key of the background model is no plain data.
     """
-    parts: dict[str, Any] = {
+    made_of: dict[str, Any] = {
         "schema": SCHEMA,
         "content": digest_video(video),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
     }
-    if background is not None:
-        parts["background"] = identify(background)
+    identity = background_identity(background, settings)
+    if identity is not None:
+        made_of["background"] = identity
     if ignore is not None:
-        parts["ignore"] = digest_file(ignore, expected="a readable image")
-    return parts
+        made_of["ignore"] = digest_file(ignore, expected="a readable image")
+    stored = StoredSilhouettes(cache / digest_record(made_of), video.num_frames, made_of)
+    return Task(video, settings, background, ignore, stored)
 
 
-def key_of(
-    video: VideoInfo,
-    settings: ScaledSettings,
-    background: BackgroundModel | None = None,
-    ignore: Path | None = None,
-) -> str:
-    """Digest of what silhouettes are made of, in 40 digits; arguments and errors as of `made_of`."""
-    return digest_record(made_of(video, settings, background, ignore))
+def background_identity(background: BackgroundModel, settings: ForegroundSettings) -> dict[str, Any] | None:
+    """What silhouettes are said to be made of beside their settings; None for MOG2, which has no others."""
+    return None if background == Mog2(settings) else identify(background)
 
 
-def open_stored(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:
+def reduced_shape(image_size_wh: tuple[int, int], reduction: int) -> tuple[int, int]:
+    """Height and width of images that are reduced, cells; a cell at the border may reach beyond the image."""
+    width, height = image_size_wh
+    return -(-height // reduction), -(-width // reduction)
+
+
+def open_stored(path: Path, shape: tuple[int, int, int]) -> zarr.Array | None:
     """Open stored silhouettes (frames, height, width); None if they do not exist or are damaged."""
     try:
         array = zarr.open_array(path, mode="r", zarr_format=3)
     except Exception:  # zarr raises whatever a damaged description leads to
         return None
     # zarr reads a missing chunk as zeros, which would look like frames without foreground.
-    whole = array.shape == (num_frames, *shape) and array.nchunks_initialized == array.nchunks
-    whole &= _LEFT_OUT in array.attrs
+    whole = array.shape == shape and array.nchunks_initialized == array.nchunks and _LEFT_OUT in array.attrs
     return array if whole else None
 
 
-def open_whole(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Array | None:
+def open_sealed(path: Path, shape: tuple[int, int, int]) -> zarr.Array | None:
     """As `open_stored`, but every byte is compared with the folder's seal first.
 
     As long as the array is in memory, other processes do not remove the folder from the cache.
     """
-    held = hold(path)
+    held = lock(path, shared=True)
     if held is None:
         return None
-    array = open_stored(path, num_frames, shape) if is_whole(path) else None
+    with contextlib.suppress(OSError):  # a cache that cannot be written
+        os.utime(path / SEAL_FILE)  # the time of this use
+    array = open_stored(path, shape) if is_whole(path) else None
     if array is None:
         held.close()
     else:
@@ -153,24 +140,10 @@ def open_whole(path: Path, num_frames: int, shape: tuple[int, int]) -> zarr.Arra
     return array
 
 
-def left_out(array: zarr.Array) -> list[Interval]:
-    """Intervals of the frames of stored silhouettes in which the foreground makes no sense."""
+def left_out(array: zarr.Array, num_frames: int) -> list[Interval]:
+    """Intervals of the first frames of stored silhouettes in which the foreground makes no sense."""
     intervals: Any = array.attrs[_LEFT_OUT]  # as JSON keeps them
-    return [(int(start), int(stop)) for start, stop in intervals]
-
-
-def reduced_shape(video: VideoInfo, reduction: int) -> tuple[int, int]:
-    """Height and width of a video's silhouettes, cells."""
-    width, height = video.image_size_wh
-    return -(-height // reduction), -(-width // reduction)
-
-
-def frames_to_decode(task: Task) -> int:
-    """Number of frames of which `store` tells its progress."""
-    num_frames = task.video.num_frames
-    if isinstance(task.background, Living):
-        return num_frames
-    return num_frames + len(range(0, num_frames, learning_step(num_frames, task.settings)))
+    return [(start, min(stop, num_frames)) for start, stop in intervals if start < num_frames]
 
 
 def store(task: Task, advance: Advance) -> dict[str, float]:
@@ -183,73 +156,56 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
         SettingsError: the background model yields masks of a wrong number, type or shape.
         OutputError: the store cannot be written.
     """
-    path = task.cache / task.key
-    temporary = task.cache / f".{task.key}.{secrets.token_hex(4)}.partial"
-    shape = reduced_shape(task.video, task.settings.reduction)
-    try:
-        temporary.mkdir(parents=True)
-        seconds = _write(temporary, shape, task, advance)
-        write_seal(temporary)
-        if open_stored(temporary, task.video.num_frames, shape) is None:
-            raise OSError("another program changed the folder")
-        _publish(temporary, path, task.video.num_frames, shape)
-    except OSError as error:
-        raise OutputError(
-            path,
-            expected="to write silhouettes",
-            found=error.strerror or f"{error}",
-            remedy="what was stored before is unchanged",
-        ) from error
-    finally:
-        _remove(temporary)
+    path = task.stored.path
+    shape = (task.video.num_frames, *reduced_shape(task.video.image_size_wh, task.settings.reduction))
+    seconds = {"decode": 0.0, "foreground": 0.0}
+    with contextlib.suppress(_StoredMeanwhileError), atomic_write(path) as temporary:
+        _write(temporary, shape, task, seconds, advance)
+        (temporary / SEAL_FILE).write_text(seal_of(temporary), encoding="ascii")
+        # A whole folder is not replaced, because a process that reads it would see zeros meanwhile.
+        if open_sealed(path, shape) is not None:
+            raise _StoredMeanwhileError
     return seconds
 
 
-def _remove(folder: Path) -> None:
-    """Remove an unfinished folder. Zarr writes in a thread of its own, after an exception for some moments too."""
-    end_s = time.monotonic() + _ZARR_WRITES_S
-    while folder.exists() and time.monotonic() < end_s:
-        shutil.rmtree(folder, ignore_errors=True)
-        time.sleep(0.02)
+class _StoredMeanwhileError(Exception):
+    """Another process has stored the same silhouettes."""
 
 
-def remove_stale(cache: Path) -> None:
-    """Remove unfinished folders of processes that were killed more than a day ago."""
-    for folder in cache.glob(".*.partial"):
-        try:
-            newest = max(file.stat().st_mtime for file in (folder, *folder.rglob("*")))
-        except OSError:
-            continue  # another process works in the folder, or has just finished
-        if time.time() - newest > _STALE_S:
-            logger.info("removing %s, left by a process that was killed", folder)
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _write(folder: Path, shape: tuple[int, int], task: Task, advance: Advance) -> dict[str, float]:
-    video, settings = task.video, task.settings
+def _write(
+    folder: Path, shape: tuple[int, int, int], task: Task, seconds: dict[str, float], advance: Advance
+) -> None:
+    video, settings, started = task.video, task.settings, time.perf_counter()
+    files: dict[str, Buffer] = {}
     array: zarr.Array = zarr.create_array(
-        folder,
-        shape=(video.num_frames, *shape),
-        chunks=(CHUNK_FRAMES, *shape),
+        # Zarr writes in a thread of its own, which would go on for some moments after an exception.
+        MemoryStore(files),
+        shape=shape,
+        chunks=(CHUNK_FRAMES, *shape[1:]),
         dtype=np.uint8,
         compressors=ZstdCodec(level=3, checksum=True),
-        attributes={"video": video.path.name, MADE_OF: dict(task.made_of)},
+        attributes={"video": video.path.name, MADE_OF: dict(task.stored.made_of)},
         # Chunks of zeros are written too, so that a missing chunk is always a damage.
         config={"write_empty_chunks": True},
-        overwrite=True,
     )
-    started, seconds = time.perf_counter(), {"decode": 0.0, "foreground": 0.0}
-    chunk, everywhere = np.empty((CHUNK_FRAMES, *shape), np.uint8), []
+    chunk, everywhere = np.empty((CHUNK_FRAMES, *shape[1:]), np.uint8), [np.zeros(0, bool)]
     for index, mask in enumerate(foreground_of(task, seconds, advance)):
         chunk[index % CHUNK_FRAMES] = coverage(mask, settings.reduction // settings.working_reduction)
         count = index % CHUNK_FRAMES + 1
         if count == CHUNK_FRAMES or index + 1 == video.num_frames:
             array[index + 1 - count : index + 1] = chunk[:count]
             everywhere.append(foreground_is_everywhere(chunk[:count]))
-    unusable = np.concatenate([np.zeros(0, bool), *everywhere])
-    array.update_attributes({_LEFT_OUT: intervals_of(unusable, LEAST_FRAMES)})
+            _move_to_disk(files, folder)
+    array.update_attributes({_LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
+    _move_to_disk(files, folder)
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
-    return seconds
+
+
+def _move_to_disk(files: dict[str, Buffer], folder: Path) -> None:
+    while files:
+        name, content = files.popitem()
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content.to_bytes())
 
 
 def foreground_of(
@@ -260,20 +216,16 @@ def foreground_of(
     Args:
         task: the video, the settings and the background model.
         seconds: the time of "decode" is added.
-        advance: is told of each decoded frame, `frames_to_decode` in all.
+        advance: is told of each decoded frame, `Task.num_decoded` in all.
 
     Raises:
         InputError: the video ends early.
         SettingsError: the background model yields masks of a wrong number, type or shape.
     """
-    video, settings = task.video, task.settings
-    background = Mog2(settings) if task.background is None else task.background
-    if isinstance(background, Living) and settings.working_reduction > 1:
-        # Only reduced frames are kept. A model that the user brings may keep what it is given.
-        read = read_frames(video, into_one=True)
-    else:
-        read = read_frames(video)
-    frames = _decoded(read, seconds, advance)
+    video, settings, background = task.video, task.settings, task.background
+    # "living" keeps only reduced frames. A model that the user brings may keep what it is given.
+    into_one = isinstance(background, Living) and settings.working_reduction > 1
+    frames = _decoded(read_frames(video, into_one=into_one), seconds, advance)
     if isinstance(background, Living) and settings.first_look:
         masks = background.masks(*look_first(video, frames, settings))
     elif isinstance(background, Living):
@@ -281,19 +233,20 @@ def foreground_of(
     else:
         learning = read_frames(video, learning_step(video.num_frames, settings))
         masks = background.foreground(_decoded(learning, seconds, advance), frames)
-    ignored = (
-        None
-        if task.ignore is None
-        else ignored_pixels(task.ignore, video.path.name, video.image_size_wh, settings.working_reduction)
-    )
-    index = -1
-    for index, mask in enumerate(masks):
-        _check_mask(mask, index, task)
+    shape = reduced_shape(video.image_size_wh, settings.working_reduction)
+    ignored = None
+    if task.ignore is not None:
+        size_wh, name = video.image_size_wh, video.path.name
+        ignored = ignored_pixels(task.ignore, name, size_wh, settings.working_reduction)
+    count = 0
+    for count, mask in enumerate(masks, 1):
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.uint8 and mask.shape == shape
+        if not is_mask or count > video.num_frames:
+            kind = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+            raise _wrong_masks(task, shape, f"{kind} as mask {count - 1}")
         yield mask if ignored is None else np.where(ignored, np.uint8(0), mask)
-    if index + 1 < video.num_frames:
-        raise SettingsError(
-            _model_name(task), expected=f"{video.num_frames} masks, one per frame", found=f"{index + 1}"
-        )
+    if count < video.num_frames:
+        raise _wrong_masks(task, shape, f"{count} masks")
 
 
 def ignored_pixels(
@@ -318,22 +271,13 @@ def ignored_pixels(
     return coverage(255 * white, reduction) > 0
 
 
-def _check_mask(mask: object, index: int, task: Task) -> None:
-    """Raise `SettingsError` unless a background model's mask has the right type and shape, and belongs to a frame."""
-    shape = reduced_shape(task.video, task.settings.working_reduction)
-    is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.uint8 and mask.shape == shape
-    if not is_mask or index >= task.video.num_frames:
-        found = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise SettingsError(
-            _model_name(task),
-            expected=f"{task.video.num_frames} masks of type uint8 and shape {shape}, the frame's height and width "
-            f"divided by silhouettes.working_reduction = {task.settings.working_reduction}",
-            found=f"{found} as mask {index}",
-        )
-
-
-def _model_name(task: Task) -> str:
-    return f"background model {type(task.background or Mog2).__name__}"
+def _wrong_masks(task: Task, shape: tuple[int, int], found: str) -> SettingsError:
+    return SettingsError(
+        f"background model {type(task.background).__name__}",
+        expected=f"{task.video.num_frames} masks of type uint8 and shape {shape}, the frame's height and width "
+        f"divided by silhouettes.working_reduction = {task.settings.working_reduction}",
+        found=found,
+    )
 
 
 def _decoded(
@@ -348,22 +292,3 @@ def _decoded(
             return
         yield frame
         advance(1)
-
-
-def _publish(temporary: Path, path: Path, num_frames: int, shape: tuple[int, int]) -> None:
-    """Move a folder to its place, unless another process has put an undamaged folder there.
-
-    An undamaged folder is never moved away, because a process that reads it would see zeros meanwhile.
-    """
-    try:
-        os.rename(temporary, path)  # fails if `path` is a folder that is not empty
-        return
-    except OSError:
-        if not path.exists():
-            raise
-    if open_whole(path, num_frames, shape) is not None:
-        return
-    damaged = temporary.with_name(f"{temporary.stem}.damaged{temporary.suffix}")
-    os.rename(path, damaged)
-    os.rename(temporary, path)
-    shutil.rmtree(damaged, ignore_errors=True)

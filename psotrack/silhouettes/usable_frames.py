@@ -7,8 +7,6 @@ frame at that time.
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from jaxtyping import Bool, UInt8
 
@@ -59,16 +57,10 @@ def intervals_of(chosen: Bool[np.ndarray, "frames"], least_frames: int = 1) -> l
 
 
 def in_words(intervals: list[Interval], *, gap_frames: int) -> str:
-    """Intervals as text: "frames 120 to 180, 300"; those with short gaps between them as one interval.
-
-    Args:
-        intervals: intervals in order, at least one.
-        gap_frames: shorter gaps are not named.
-    """
-    starts = [intervals[0][0], *(b[0] for a, b in pairwise(intervals) if b[0] - a[1] >= gap_frames)]
-    stops = [*(a[1] for a, b in pairwise(intervals) if b[0] - a[1] >= gap_frames), intervals[-1][1]]
-    named = [
-        f"{start}" if stop - start == 1 else f"{start} to {stop - 1}"
-        for start, stop in zip(starts, stops, strict=True)
-    ]
-    return ", ".join(named)
+    """Intervals as text: "120 to 180, 300"; those with shorter gaps between them than `gap_frames` as one interval."""
+    joined: list[Interval] = []
+    for start, stop in intervals:
+        if joined and start - joined[-1][1] < gap_frames:
+            start, _ = joined.pop()
+        joined.append((start, stop))
+    return ", ".join(f"{start} to {stop - 1}" if stop - start > 1 else f"{start}" for start, stop in joined)

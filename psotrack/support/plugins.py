@@ -8,7 +8,7 @@ that maps a part of the settings to an object with the kind's interface:
 | "search"     | `psotrack.searches`    | `SwarmSettings`      | `Search`          |
 | "score"      | `psotrack.scores`      | `ScoreSettings`      | `Score`           |
 | "method"     | `psotrack.methods`     | `TrackSettings`      | `Method`          |
-| "background" | `psotrack.backgrounds` | `ScaledSettings` | `BackgroundModel` |
+| "background" | `psotrack.backgrounds` | `ForegroundSettings` | `BackgroundModel` |
 | "detector"   | `psotrack.detectors`   | `DetectorSettings`   | `Detector`        |
 
 Installed packages add plugins as entry points, which all commands find. `register_plugin` adds a plugin to this Python
@@ -51,7 +51,7 @@ def register_plugin(kind: PluginKind, name: str, make: Callable[[Any], Any]) -> 
         kind: "search", "score", "method", "background" or "detector".
         name: name of the plugin in settings.
         make: function or class that makes the object from its part of the settings: `SwarmSettings` (search),
-            `ScoreSettings` (score), `TrackSettings` (method), `ScaledSettings` (background), `DetectorSettings`
+            `ScoreSettings` (score), `TrackSettings` (method), `ForegroundSettings` (background), `DetectorSettings`
             (detector).
 
     Raises:

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.silhouettes import open_stored, reduced_shape, scaled_settings
 from psotrack.sweep.cells import Cell, cell_key
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.machine import provenance
@@ -164,12 +163,10 @@ def _rule_s(rows: pd.DataFrame) -> pd.Series:
 def _silhouettes_s(cell: Cell, inputs: Inputs) -> float:
     """Time of making a cell's missing silhouettes, with all processes."""
     recording, keys = inputs.recording_of(cell), inputs.keys_of(cell)
-    scaled = scaled_settings(cell.settings.silhouettes, recording)
     megapixels = [
         video.num_frames * video.image_size_wh[0] * video.image_size_wh[1] / 1e6
         for name, video in recording.videos.items()
-        if open_stored(inputs.cache / keys[name], video.num_frames, reduced_shape(video, scaled.reduction))
-        is None
+        if not (inputs.cache / keys[name]).exists()
     ]
     jobs = min(inputs.jobs or os.cpu_count() or 1, max(len(megapixels), 1))
     return MEGAPIXEL_S * sum(megapixels) / jobs

@@ -16,7 +16,7 @@ from psotrack.geometry import Camera
 from psotrack.pipeline import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
 from psotrack.settings import YOLO
-from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute, silhouette_keys
+from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute, stored_silhouettes
 from psotrack.support import digest_file
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.locks import Locks
@@ -132,7 +132,8 @@ class Inputs:
                 raise InputError(recording.folder, expected="a reference to compare with", found="none")
             keys = {}
             if cell.settings.needs_silhouettes:
-                keys = silhouette_keys(recording, cell.settings.silhouettes)
+                stored = stored_silhouettes(recording, cell.settings.silhouettes, self.cache)
+                keys = {name: each.key for name, each in stored.items()}
             keys |= {
                 "calibration": _digest_arrays(*_arrays_of(recording.rig.cameras)),
                 "reference": _digest_arrays(recording.truth.position_m, recording.truth.orientation_wxyz),

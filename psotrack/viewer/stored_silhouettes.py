@@ -8,14 +8,7 @@ import msgspec
 
 from psotrack.errors import InputError
 from psotrack.flights import TrackedFlight
-from psotrack.silhouettes import (
-    Silhouettes,
-    SilhouetteSettings,
-    compute,
-    open_stored,
-    reduced_shape,
-    tasks_of,
-)
+from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute, stored_silhouettes
 from psotrack.support import Report, no_progress
 
 
@@ -43,11 +36,9 @@ def find_silhouettes(
         return None
     settings = _settings(flight)
     recording = flight.recording.usable(videos=False)
-    if not make:
-        for task in tasks_of(recording, settings, cache).values():
-            shape = reduced_shape(task.video, task.settings.reduction)
-            if open_stored(task.cache / task.key, task.video.num_frames, shape) is None:
-                return None
+    stored = stored_silhouettes(recording, settings, cache).values()
+    if not make and not all(each.path.exists() for each in stored):
+        return None
     return compute(recording, settings, cache=cache, jobs=jobs, all_videos=False, report=report)
 
 
