@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,8 +46,8 @@ from psotrack.projection_lines import LineSettings, track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
-from psotrack.support import Report, load_ahead, no_progress
-from psotrack.tracking import RunInputs, tracker_settings
+from psotrack.support import Report, load_ahead, no_progress, processors
+from psotrack.tracking import Places, RunInputs, tracker_settings
 from psotrack.tracking import track_recording as track_by_blocks
 from psotrack.trajectories import Status, Tracks
 
@@ -220,14 +221,17 @@ def _track_by_swarm(runs: Sequence[Run], parts: Parts, report: Report) -> dict[R
     tracked, compile_s = track_by_blocks(recording.rig, silhouettes, inputs, fps=recording.fps, report=report)
     track_s = time.perf_counter() - began - compile_s
     shares = {"compile": compile_s / len(runs), "track": track_s / len(runs)}
-    results = {}
-    for run, (tracks, places) in zip(runs, tracked, strict=True):
+
+    def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
+        tracks, places = found
         views = partial(views_of_middles, recording.rig.cameras, silhouettes.exposures, places)
-        result = MethodResult(
-            tracks, _points(tracks, "silhouette"), silhouettes.keys, {**silhouettes.seconds, **shares}
-        )
-        results[run] = _with_camera_errors(run, result, views)
-    return results
+        seconds = {**silhouettes.seconds, **shares}
+        result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
+        return _with_camera_errors(run, result, views)
+
+    # NumPy computes most of it without Python's lock.
+    with ThreadPoolExecutor(processors()) as threads:
+        return dict(zip(runs, threads.map(with_errors, runs, tracked), strict=True))
 
 
 def _track_by_lines(run: Run, report: Report) -> MethodResult:
