@@ -15,7 +15,7 @@ from psotrack.initiation import InitialState
 from psotrack.pipeline import causal_settings
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures
-from psotrack.tracking import RunInputs, StepwiseTracker, block, stepwise, track_recording, tracker_settings
+from psotrack.tracking import RunInputs, StepwiseTracker, block, stepwise, track_silhouettes, tracker_settings
 from psotrack.tracking.run import SwarmRun
 from psotrack.trajectories import Status, Trajectories
 
@@ -162,7 +162,9 @@ def test_a_recording_is_tracked_as_it_is_frame_by_frame(
 ) -> None:
     """Both find the same drones. Tracks begin at different instants, with other random numbers."""
     runs = [RunInputs(ROOM_M, tracker_settings(track_settings(**EFFORT)))]
-    (((tracks, _),), _) = track_recording(RIG, silhouettes_in_memory(RIG, coverage, REDUCTION), runs, fps=FPS)
+    (((tracks, _),), _) = track_silhouettes(
+        RIG, silhouettes_in_memory(RIG, coverage, REDUCTION), runs, fps=FPS
+    )
     apart_m = []
     for frame, rows in enumerate(tracked):
         drones = np.array(rows.drones, int)

@@ -6,7 +6,7 @@ from helpers import ROOM_M, ring_rig, silhouettes_in_memory, track_settings
 
 from psotrack.initiation import InitialState
 from psotrack.silhouettes import Exposures
-from psotrack.tracking import RunInputs, StepwiseTracker, block, track_recording, tracker_settings
+from psotrack.tracking import RunInputs, StepwiseTracker, block, track_silhouettes, tracker_settings
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +28,7 @@ def track(num_drones, *, seed=0, fps=25.0, **settings):
     inputs = RunInputs(
         ROOM_M * (1 + 0.1 * seed), tracker_settings(track_settings(**(effort | settings))), given
     )
-    ((tracks, _),), _ = track_recording(
+    ((tracks, _),), _ = track_silhouettes(
         RIG, silhouettes_in_memory(RIG, coverage, REDUCTION), [inputs], fps=fps
     )
     assert tracks.num_drones == num_drones

@@ -100,39 +100,27 @@ def test_an_instant_waits_for_a_frame_and_not_for_ever() -> None:
     assert meeting.cameras[2].counts.missing == 1
 
 
-def test_an_instant_waits_for_a_frame_that_is_in_work() -> None:
-    meeting = _meeting(2)
-    _put(meeting, 0, 0, 0.0, 0.0)
-    meeting.announce(1, 0.0, 0.0)
-    assert meeting.take(5.0) is None
-    meeting.put(1, 0.0, _image(0), 0.0)
-    instant = meeting.take(5.0)
-    assert instant is not None
-    assert [_number(image) for image in instant.coverage] == [0, 0]
-
-
-def test_nobody_waits_for_a_frame_of_a_camera_that_has_ended() -> None:
-    """A camera whose frame fails in work ends: its instant waited for ever."""
+@pytest.mark.parametrize(
+    ("ends", "shown", "left_out"),
+    [
+        (lambda meeting: meeting.put(1, 0.0, _image(0), 0.0), 0, 0),
+        (lambda meeting: meeting.put(1, 0.0, None, 0.0), -1, 1),
+        # A camera whose frame fails in work ends: its instant waited for ever.
+        (lambda meeting: meeting.end(1), -1, 0),
+    ],
+)
+def test_an_instant_waits_for_a_frame_that_is_in_work(ends, shown: int, left_out: int) -> None:
     meeting = _meeting(2)
     _put(meeting, 0, 0, 0.0, 0.0)
     meeting.announce(1, 0.0, 0.0)
     assert meeting.has_work
-    meeting.end(1)
+    assert meeting.take(5.0) is None
+    ends(meeting)
     assert not meeting.has_work
     instant = meeting.take(0.0)
     assert instant is not None
-    assert [_number(image) for image in instant.coverage] == [0, -1]
-
-
-def test_a_frame_that_is_left_out_is_missing() -> None:
-    meeting = _meeting(2)
-    _put(meeting, 0, 0, 0.0, 0.0)
-    meeting.announce(1, 0.0, 0.0)
-    meeting.put(1, 0.0, None, 0.0)
-    instant = meeting.take(0.0)
-    assert instant is not None
-    assert [_number(image) for image in instant.coverage] == [0, -1]
-    assert meeting.cameras[1].counts.left_out == 1
+    assert [_number(image) for image in instant.coverage] == [0, shown]
+    assert meeting.cameras[1].counts.left_out == left_out
 
 
 def test_a_doubled_frame_counts_once() -> None:

@@ -8,7 +8,7 @@ from helpers import assert_same, draw_coverage, float32, ring_rig, silhouettes_i
 
 from psotrack.geometry import look_at, make_camera, make_extents, make_rig, project_boxes
 from psotrack.initiation import InitialState
-from psotrack.tracking import RunInputs, track_recording, tracker_settings
+from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
 from psotrack.tracking.moments import HALF_PER_STD, measure
 from psotrack.tracking.patches import ExpectedDrones, cut, make_pyramid
 
@@ -140,7 +140,9 @@ def learned(size_of_frame, *, first=1.0, height_m=HOVER_M[2]):
     bounds_m = np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]])
     settings = tracker_settings(track_settings(particles=20, iterations=15, drones=1))
     silhouettes = silhouettes_in_memory(RIG, coverage, REDUCTION)
-    (((tracks, _),), _) = track_recording(RIG, silhouettes, [RunInputs(bounds_m, settings, given)], fps=25.0)
+    (((tracks, _),), _) = track_silhouettes(
+        RIG, silhouettes, [RunInputs(bounds_m, settings, given)], fps=25.0
+    )
     return tracks.sizes.size_m[0] / SIZE_M, tracks
 
 

@@ -13,7 +13,7 @@ from psotrack.identity import postprocess
 from psotrack.initiation import InitialState
 from psotrack.pipeline import track_runs
 from psotrack.recordings import FrameTimes, Recording
-from psotrack.tracking import RunInputs, track_recording, tracker_settings
+from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import ARRAYS, Status, Trajectories
 
 pytestmark = pytest.mark.slow
@@ -69,7 +69,7 @@ RUNS = [
 
 
 def tracked(silhouettes, runs, *, side_by_side):
-    results, _ = track_recording(RIG, silhouettes, runs, fps=FPS, side_by_side=side_by_side)
+    results, _ = track_silhouettes(RIG, silhouettes, runs, fps=FPS, side_by_side=side_by_side)
     return results
 
 

@@ -7,7 +7,7 @@ from helpers import ROOM_M, draw_coverage, ring_rig, track_settings
 from psotrack.initiation import InitialState
 from psotrack.recordings import FrameTimes, make_timeline
 from psotrack.silhouettes import Silhouettes
-from psotrack.tracking import RunInputs, track_recording, tracker_settings
+from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -46,7 +46,7 @@ def figures(frame_times, given=None):
     velocity = (positions(step_s) - positions(0.0)) / step_s
     initial = InitialState(positions(0.0), velocity, SIZE_M, np.array([5.0]))
     inputs = RunInputs(ROOM_M, tracker_settings(SETTINGS), initial)
-    (((tracks, _),), _) = track_recording(RIG, silhouettes, [inputs], fps=timeline.rate_hz)
+    (((tracks, _),), _) = track_silhouettes(RIG, silhouettes, [inputs], fps=timeline.rate_hz)
     settled = slice(15, None)
     error_m = (tracks.position_m[:, :1] - positions(timeline.time_s))[settled]
     inverse = np.linalg.inv(tracks.covariance_m2[settled, :1])

@@ -8,7 +8,7 @@ from helpers import ROOM_M, drawn_silhouettes, ring_rig, track_settings
 
 from psotrack.identity import postprocess
 from psotrack.initiation import InitialState
-from psotrack.tracking import RunInputs, track_recording, tracker_settings
+from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status
 
 pytestmark = pytest.mark.slow
@@ -54,7 +54,7 @@ def silhouettes(optimised):
 
 def track(silhouettes, given=None, **settings):
     runs = [RunInputs(ROOM_M, tracker_settings(track_settings(**(EFFORT | settings))), given)]
-    (((tracks, _),), _) = track_recording(RIG, silhouettes, runs, fps=FPS)
+    (((tracks, _),), _) = track_silhouettes(RIG, silhouettes, runs, fps=FPS)
     return tracks, trajectories_of(tracks)
 
 

@@ -34,17 +34,16 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from psotrack import methods
 from psotrack.datasets import open_recording
 from psotrack.errors import SettingsError
-from psotrack.pipeline import results, track_runs
+from psotrack.pipeline import results, running, track_runs
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled, progress_bar, use_device
 from psotrack.sweep import Grid, read_grid, sweep
-from psotrack.tracking import track_recording
+from psotrack.tracking import track_silhouettes
 from psotrack.tracking.block import Block, Engine, Job
 from psotrack.tracking.run import SwarmRun
 from psotrack.trajectories import Status, Trajectories
@@ -64,8 +63,8 @@ CORES = 2
 HOST = (
     ("births", SwarmRun, "search"),
     ("births", SwarmRun, "plan"),
-    ("camera errors", methods, "views_of_middles"),
-    ("camera errors", methods, "with_camera_errors"),
+    ("camera errors", running, "views_of_middles"),
+    ("camera errors", running, "with_camera_errors"),
     ("identities", results, "postprocess"),
 )
 NAMES = ("swarm", "blocks without iterations", *dict.fromkeys(name for name, _, _ in HOST))
@@ -237,8 +236,8 @@ def clock(*, side_by_side: bool | None) -> Iterator[Counter[str]]:
 
     with ExitStack() as stack:
         stack.enter_context(patch.object(Engine, "track", timed_block))
-        side = partial(track_recording, side_by_side=side_by_side)
-        stack.enter_context(patch.object(methods, "track_recording", side))
+        side = partial(track_silhouettes, side_by_side=side_by_side)
+        stack.enter_context(patch.object(running, "track_silhouettes", side))
         for name, owner, function in HOST:
             stack.enter_context(patch.object(owner, function, timed(name, getattr(owner, function))))
         yield seconds

@@ -156,8 +156,8 @@ def finish(
     timeline = recording.timeline()
     trajectories = replace(trajectories, position_m=body_m, time_s=timeline.time_s)
     of_silhouettes = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
-    seconds = {**of_silhouettes, "finish": 0.0, **result.seconds}
-    seconds["finish"] += time.perf_counter() - began
+    seconds = {**of_silhouettes, **result.seconds}
+    seconds["finish"] = seconds.get("finish", 0.0) + time.perf_counter() - began
     seconds["total"] = sum(seconds[stage] for stage in ("track", "compile", "finish"))
     record = {
         "sequence": recording.name,

@@ -47,8 +47,7 @@ from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import Report, load_ahead, no_progress, processors
-from psotrack.tracking import Places, RunInputs, tracker_settings
-from psotrack.tracking import track_recording as track_by_blocks
+from psotrack.tracking import Places, RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status, Tracks
 
 
@@ -218,7 +217,9 @@ def _track_by_swarm(runs: Sequence[Run], parts: Parts, report: Report) -> dict[R
         for run in runs
     ]
     began = time.perf_counter()
-    tracked, compile_s = track_by_blocks(recording.rig, silhouettes, inputs, fps=recording.fps, report=report)
+    tracked, compile_s = track_silhouettes(
+        recording.rig, silhouettes, inputs, fps=recording.fps, report=report
+    )
     track_s = time.perf_counter() - began - compile_s
     shares = {"compile": compile_s / len(runs), "track": track_s / len(runs)}
 

@@ -9,7 +9,7 @@ from .fitness import (
     foreground_and_area,
 )
 from .parameters import TrackerSettings, find_score, find_search, tracker_settings
-from .recording import Places, track_recording
+from .recording import Places, track_silhouettes
 from .run import RunInputs
 from .search import ParticleSwarm, Search, SearchRegion, particle_swarm
 from .stepwise import StepwiseTracker
@@ -35,6 +35,6 @@ __all__ = [
     "foreground_and_area",
     "on_device",
     "particle_swarm",
-    "track_recording",
+    "track_silhouettes",
     "tracker_settings",
 ]

@@ -50,7 +50,7 @@ class _Progress:
     arrivals: list[Arrival] = field(default_factory=list)
 
 
-def track_recording(
+def track_silhouettes(
     rig: Rig,
     silhouettes: Silhouettes,
     runs: Sequence[RunInputs],
