@@ -27,6 +27,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from unittest.mock import patch
 
@@ -224,13 +225,23 @@ def clock(*, side_by_side: bool | None) -> Iterator[Counter[str]]:
         )
         return found
 
+    lock, active, since = Lock(), Counter[str](), {}
+
     def timed(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """The call; its seconds count once where several threads are in it."""
+
         def called(*arguments: Any, **named: Any) -> Any:
-            began = time.perf_counter()
+            with lock:
+                active[name] += 1
+                if active[name] == 1:
+                    since[name] = time.perf_counter()
             try:
                 return call(*arguments, **named)
             finally:
-                seconds[name] += time.perf_counter() - began
+                with lock:
+                    active[name] -= 1
+                    if not active[name]:
+                        seconds[name] += time.perf_counter() - since[name]
 
         return called
 
