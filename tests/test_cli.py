@@ -595,7 +595,7 @@ def test_info_refuses_a_video_that_is_cut_short(run: Run, sequence: Path) -> Non
     assert_one_line(run("info", sequence), "cam2i_s.avi", "can be decoded")
 
 
-#: Program that runs `psotrack` and presses Ctrl-C when psotrack opens the first file in the folder that is the first argument.
+#: Program that runs `psotrack` and presses Ctrl-C when it first opens a file in the folder that is the first argument.
 INTERRUPTED = """
 import signal, sys
 
