@@ -595,7 +595,7 @@ def test_info_refuses_a_video_that_is_cut_short(run: Run, sequence: Path) -> Non
     assert_one_line(run("info", sequence), "cam2i_s.avi", "can be decoded")
 
 
-#: Program that runs `psotrack` and presses Ctrl-C when psotrack makes the folder that is the first argument.
+#: Program that runs `psotrack` and presses Ctrl-C when it first opens a file in the folder that is the first argument.
 INTERRUPTED = """
 import signal, sys
 
@@ -604,7 +604,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 folder = sys.argv.pop(1)
 
 def press(event, arguments):
-    if event == "os.mkdir" and str(arguments[0]) == folder:
+    global folder
+    # The command looks whether silhouettes are stored.
+    if event == "open" and folder and str(arguments[0]).startswith(folder):
+        folder = ""
         signal.raise_signal(signal.SIGINT)
 
 sys.addaudithook(press)
