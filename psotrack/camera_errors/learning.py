@@ -39,7 +39,7 @@ _LEAST_NOISE = 0.02
 #: Variance of the noise in the first fit of turns and clocks, squared pixels.
 _NO_NOISE = 1e-6
 #: Rounds in which noise and constant errors are learned in turn.
-_ROUNDS = 3
+_ROUNDS = 2
 
 
 @dataclass(frozen=True)
