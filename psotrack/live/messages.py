@@ -114,8 +114,6 @@ class UdpLines:
                 text = "--udp %s: expected to send rows, found %s; tracking goes on"
                 logger.warning(text, self._address, found)
             self._said = found
-        else:
-            self._said = ""
 
     def close(self) -> None:
         """Close the socket."""

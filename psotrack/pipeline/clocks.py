@@ -34,7 +34,9 @@ def estimate_clocks(run: Run, tracks: Tracks, most: int | None = None) -> Camera
     count = min(most or timeline.num_instants, timeline.num_instants)
     first = (timeline.num_instants - count) // 2
     rows = np.arange(first, first + count)
-    shown = None if run.silhouettes is None else run.silhouettes.part(first, first + count)
+    shown = run.silhouettes
+    if shown is not None and count < timeline.num_instants:  # else they stay on the disk
+        shown = shown.part(first, first + count)
     if run.sightings is not None:
         sightings = run.sightings.in_frames(rows)
         shown = shown if run.settings.detections == BLOBS else None
