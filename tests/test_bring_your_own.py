@@ -25,7 +25,7 @@ from psotrack.silhouettes import ForegroundSettings, find_background
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import identify
 from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area
-from psotrack.trajectories import DroneSizes, Status, Tracks
+from psotrack.trajectories import Status, Tracks
 
 pytestmark = pytest.mark.slow
 
@@ -121,12 +121,8 @@ class Hover:
             num_cameras=np.full((frames, drones), len(inputs.rig)),
             status=np.full((frames, drones), Status.TRACKED),
             measured_size_m=np.full((frames, drones, 3), np.nan),
-            sizes=DroneSizes(
-                start.size_m,
-                np.full((drones, 3), np.nan),
-                np.zeros((drones, 3), int),
-                np.full((drones, 1), np.nan),
-            ),
+            size_m=start.size_m,
+            size_frames=np.zeros((drones, 3), int),
         )
 
 
@@ -426,7 +422,7 @@ import numpy as np
 
 from psotrack.geometry import project_boxes
 from psotrack.tracking import camera_weights, foreground_and_area
-from psotrack.trajectories import DroneSizes, Status, Tracks
+from psotrack.trajectories import Status, Tracks
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from psotrack.camera_errors import CameraErrors, Fading, LastingCovariances, Tra
 from psotrack.fusion import fuse_tracks, fused_errors
 from psotrack.fusion.fusion import COMMON_CORRELATION
 from psotrack.settings import MotionSettings
-from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks
+from psotrack.trajectories import Arrival, Status, Tracks
 
 FPS, FRAMES = 25.0, 200
 SETTINGS, MAX_COASTING_S = MotionSettings(), 0.5
@@ -52,9 +52,8 @@ def simulate_method(truth_m, std_m, *, seed, hidden=(), offset_m=(0.0, 0.0, 0.0)
         num_cameras=np.where(status == Status.TRACKED, 4, 0),
         status=status,
         measured_size_m=np.full(truth_m.shape, np.nan),
-        sizes=DroneSizes(
-            size_m, 0.1 * size_m, np.zeros(size_m.shape, int), np.full((len(size_m), 3), np.nan)
-        ),
+        size_m=size_m,
+        size_frames=np.zeros(size_m.shape, int),
         arrivals=tuple(arrivals),
     )
 
@@ -204,7 +203,7 @@ def test_drones_found_only_by_the_lines_come_last():
     np.testing.assert_allclose(fused.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
     # The first arrival of the projection lines is ignored, because the swarm has a track of this drone.
     assert fused.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
-    assert fused.sizes.size_m.shape == (3, 3)
+    assert fused.size_m.shape == (3, 3)
     assert fused.measured_size_m.shape == (FRAMES, 3, 3)
 
 

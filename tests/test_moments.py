@@ -143,7 +143,7 @@ def learned(size_of_frame, *, first=1.0, height_m=HOVER_M[2]):
     (((tracks, _),), _) = track_silhouettes(
         RIG, silhouettes, [RunInputs(bounds_m, settings, given)], fps=25.0
     )
-    return tracks.sizes.size_m[0] / SIZE_M, tracks
+    return tracks.size_m[0] / SIZE_M, tracks
 
 
 @pytest.mark.slow

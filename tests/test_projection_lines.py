@@ -193,7 +193,7 @@ def test_known_drones_come_first_in_the_given_order_and_others_beside_them_from_
 
 def test_sizes_agree_with_the_boxes():
     tracked = track(circles(2))
-    np.testing.assert_allclose(tracked.sizes.size_m, [[0.5, 0.5, 0.2]] * 2, rtol=0.02)
+    np.testing.assert_allclose(tracked.size_m, [[0.5, 0.5, 0.2]] * 2, rtol=0.02)
 
 
 def test_fitness_is_the_share_of_the_cameras_that_agree():

@@ -82,11 +82,10 @@ def one_after_another(silhouettes):
 def test_a_run_of_a_batch_has_the_bytes_of_the_run_alone(silhouettes, one_after_another, run):
     ((alone, alone_places),) = tracked(silhouettes, [RUNS[run]], side_by_side=False)
     tracks, places = one_after_another[run]
-    for name in ARRAYS:
+    for name in (*ARRAYS, "size_m", "size_frames"):
         assert getattr(tracks, name).tobytes() == getattr(alone, name).tobytes(), name
-    for one, other in ((tracks.sizes, alone.sizes), (places, alone_places)):
-        for each in fields(one):
-            assert getattr(one, each.name).tobytes() == getattr(other, each.name).tobytes(), each.name
+    for each in fields(places):
+        assert getattr(places, each.name).tobytes() == getattr(alone_places, each.name).tobytes(), each.name
     assert tracks.arrivals == alone.arrivals
     assert (tracks.position_m[5] != one_after_another[run - 1][0].position_m[5, : tracks.num_drones]).any()
 
@@ -121,7 +120,7 @@ def assert_same_tracks(one, other):
         assert np.median(distance_m[seen[:, drone], drone]) <= MEDIAN_M
     # The drones are metres apart: a drone with another number would be no nearer than that in a single frame.
     assert distance_m[seen].max() < SIZE_M.min()
-    np.testing.assert_allclose(one.sizes.size_m, other.sizes.size_m, atol=2 * MEDIAN_M)
+    np.testing.assert_allclose(one.size_m, other.size_m, atol=2 * MEDIAN_M)
 
 
 def test_runs_together_have_the_covariances_and_camera_errors_of_each_run_alone(silhouettes, tmp_path):

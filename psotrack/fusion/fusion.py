@@ -28,7 +28,7 @@ from psotrack.correspondence import SEPARATION_M
 from psotrack.motion import GATE_999, Measurements, filter_measurements, motion_params
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
-from psotrack.trajectories import Status, Tracks, unknown_value
+from psotrack.trajectories import ARRAYS, Status, Tracks, unknown_value
 
 #: Least number of common frames from which the offset of the two points is estimated; with fewer the offset is taken
 #: as 0.
@@ -135,7 +135,8 @@ def fuse_tracks(
         num_cameras=np.maximum(first.num_cameras, second.num_cameras),
         status=status,
         measured_size_m=first.measured_size_m,
-        sizes=swarm.sizes.joined(lines.sizes.of_drones(alone)),
+        size_m=np.concatenate([swarm.size_m, lines.size_m[alone]]),
+        size_frames=np.concatenate([swarm.size_frames, lines.size_frames[alone]]),
         arrivals=(*swarm.arrivals, *arrivals),
     )
     return Fusion(fused, offset, swarm_drones, lines_drones, lines_share)
@@ -155,7 +156,7 @@ def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
 
 
 def _of_drones(tracks: Tracks, drones: Int[np.ndarray, "drones"]) -> Tracks:
-    """The arrays of some drones, in the order of `drones`; the values of drone -1 are unknown. Sizes do not change."""
+    """The arrays of some drones, in the order of `drones`; the values of drone -1 are unknown."""
 
     def chosen(name: str, value: np.ndarray) -> np.ndarray:
         # The fitness of a drone that was not found is 0, not unknown.
@@ -163,7 +164,10 @@ def _of_drones(tracks: Tracks, drones: Int[np.ndarray, "drones"]) -> Tracks:
         column = np.full_like(value[:, :1], unknown, shape=(len(value), 1, *value.shape[2:]))
         return np.concatenate([value, column], axis=1)[:, drones]
 
-    return tracks.with_arrays(lambda name, value: chosen(name, np.asarray(value)))
+    arrays: dict[str, Any] = {name: chosen(name, np.asarray(getattr(tracks, name))) for name in ARRAYS}
+    for name in ("size_m", "size_frames"):
+        (arrays[name],) = chosen(name, getattr(tracks, name)[None])
+    return replace(tracks, **arrays)
 
 
 def _point_offset(

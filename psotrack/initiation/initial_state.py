@@ -172,7 +172,7 @@ def state_at_first_frame(tracks: Tracks) -> InitialState:
     position_m, velocity_m_s = (
         np.asarray(value[0], np.float64)[there] for value in (tracks.position_m, tracks.velocity_m_s)
     )
-    size_m = np.asarray(tracks.sizes.size_m, np.float64)[there]
+    size_m = np.asarray(tracks.size_m, np.float64)[there]
     return InitialState(position_m, velocity_m_s, size_m, np.asarray(tracks.num_cameras[0], float)[there])
 
 

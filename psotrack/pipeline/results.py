@@ -184,9 +184,7 @@ def finish(
                 "size_frames": num_frames.tolist(),
                 "fill": None,
             }
-            for drone, (size_m, num_frames) in enumerate(
-                zip(tracks.sizes.size_m, tracks.sizes.num_frames, strict=True)
-            )
+            for drone, (size_m, num_frames) in enumerate(zip(tracks.size_m, tracks.size_frames, strict=True))
         ],
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
         "points": result.points,
@@ -197,7 +195,7 @@ def finish(
         "seconds": {stage: round(value, 4) for stage, value in seconds.items()},
         **environment(),
     }
-    return TrackedRecording(trajectories, tracks.sizes.size_m, identities, record)
+    return TrackedRecording(trajectories, tracks.size_m, identities, record)
 
 
 def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from psotrack.initiation import LostTracks, Measurement, find_lost_tracks
-from psotrack.trajectories import Arrival, DroneSizes, Status, Tracks, padded
+from psotrack.trajectories import ARRAYS, Arrival, Status, Tracks, padded
 
 #: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.
 SPAN_FRAMES = 25
@@ -38,17 +38,23 @@ class History:
 
     def __init__(self, num_frames: int) -> None:
         self._arrivals: list[Arrival] = []
-        self._span_m = np.empty((num_frames, 0, 2))
-        vector = np.empty((num_frames, 0, 3))
-        matrix, number = np.empty((num_frames, 0, 3, 3)), np.empty((num_frames, 0))
-        whole = number.astype(int)
-        sizes = DroneSizes(vector[0], vector[0], vector[0].astype(int), number[0, :, None])
-        self._tracks = Tracks(vector, vector, matrix, vector, matrix, number, whole, whole, vector, sizes)
+        vector, matrix, number = (np.empty((num_frames, 0, *shape)) for shape in ((3,), (3, 3), ()))
+        self._arrays = {
+            "position_m": vector,
+            "velocity_m_s": vector,
+            "covariance_m2": matrix,
+            "measured_m": vector,
+            "measured_covariance_m2": matrix,
+            "fitness": number,
+            "num_cameras": number.astype(int),
+            "status": number.astype(int),
+            "measured_size_m": vector,
+            "span_m": vector[..., :2],
+        }
 
     def grow(self, num_drones: int) -> None:
         """Make room for more drones."""
-        self._tracks = self._tracks.with_arrays(lambda name, array: padded(name, array, num_drones))
-        self._span_m = padded("span_m", self._span_m, num_drones)
+        self._arrays = {name: padded(name, array, num_drones) for name, array in self._arrays.items()}
 
     def begins(self, frame: int, drone: int, *, again: bool) -> None:
         """A drone comes after frame 0, or comes back."""
@@ -72,23 +78,27 @@ class History:
             measured: what the frame shows; None where it does not show the drone.
             num_in_view: number of cameras with the drone in view.
         """
-        tracks = self._tracks
-        tracks.position_m[at], tracks.velocity_m_s[at] = position_m, velocity_m_s
-        tracks.covariance_m2[at] = covariance_m2
-        tracks.status[at] = int(Status.COASTING)
+        values = {
+            "position_m": position_m,
+            "velocity_m_s": velocity_m_s,
+            "covariance_m2": covariance_m2,
+            "status": int(Status.COASTING),
+        }
         if measured is not None:
-            tracks.status[at] = int(Status.TRACKED)
-            tracks.measured_m[at], tracks.measured_covariance_m2[at] = (
-                measured.position_m,
-                measured.covariance_m2,
-            )
-            tracks.num_cameras[at] = measured.num_cameras
-            tracks.fitness[at] = measured.num_cameras / max(measured.num_cameras, num_in_view)
-            self._span_m[at] = measured.span_m
+            values |= {
+                "status": int(Status.TRACKED),
+                "measured_m": measured.position_m,
+                "measured_covariance_m2": measured.covariance_m2,
+                "num_cameras": measured.num_cameras,
+                "fitness": measured.num_cameras / max(measured.num_cameras, num_in_view),
+                "span_m": measured.span_m,
+            }
+        for name, value in values.items():
+            self._arrays[name][at] = value
 
     def span_m(self, drone: int, frames: slice = slice(None)) -> Float[np.ndarray, "2"]:
         """Width and height of a drone, median of some frames, metres; NaN if the drone was not found in them."""
-        spans = self._span_m[frames, drone]
+        spans = self._arrays["span_m"][frames, drone]
         found = np.isfinite(spans).all(axis=-1)
         return np.median(spans[found], axis=0) if found.any() else np.full(2, np.nan)
 
@@ -101,19 +111,20 @@ class History:
         """The drones that may be found again after a frame."""
         until = np.s_[: frame + 1, :num_drones]
         return find_lost_tracks(
-            self._tracks.position_m[until],
-            self._tracks.velocity_m_s[until],
-            self._tracks.status[until] == Status.TRACKED,
+            self._arrays["position_m"][until],
+            self._arrays["velocity_m_s"][until],
+            self._arrays["status"][until] == Status.TRACKED,
             self.sizes_m(num_drones),
             np.arange(frame + 1),
             fps,
         )
 
     def tracks(self, num_drones: int) -> Tracks:
-        """The tracks of all drones; the sizes are those of the boxes, and their standard errors are unknown."""
+        """The tracks of all drones; the sizes are those of the boxes."""
         size_m = self.sizes_m(num_drones).astype(np.float32)
-        unknown = np.full_like(size_m, np.nan)
-        sizes = DroneSizes(size_m, unknown, np.zeros(size_m.shape, int), np.empty((num_drones, 0)))
-        tracks = self._tracks.with_arrays(lambda name, array: padded(name, array, num_drones))
-        arrivals = sorted(self._arrivals, key=lambda arrival: arrival.frame)
-        return replace(tracks, sizes=sizes, arrivals=tuple(arrivals))
+        return Tracks(
+            **{name: self._arrays[name][:, :num_drones] for name in ARRAYS},
+            size_m=size_m,
+            size_frames=np.zeros(size_m.shape, int),
+            arrivals=tuple(sorted(self._arrivals, key=lambda arrival: arrival.frame)),
+        )

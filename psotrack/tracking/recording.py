@@ -19,7 +19,7 @@ from psotrack.support import Report, no_progress
 from psotrack.tracking.block import BLOCK_FRAMES, Block, Engine, Setting, make_block
 from psotrack.tracking.run import RunInputs, Start, SwarmRun
 from psotrack.tracking.tracker import Rows, Slots
-from psotrack.trajectories import ARRAYS, Arrival, DroneSizes, Tracks, padded
+from psotrack.trajectories import ARRAYS, Arrival, Tracks, padded
 
 #: Largest number of searches for new drones in a block: each time with the drones that the search before has found.
 _MOST_SEARCHES = 3
@@ -175,12 +175,10 @@ def _results(each: _Progress) -> tuple[Tracks, Places]:
     box_px = arrays.pop("box_px")
     places = Places(arrays.pop("middle_px"), box_px[..., 2:])
     slots = each.run.with_room(each.run.slots)
-    sizes = DroneSizes(
-        np.asarray(slots.size_m)[:num_drones],
-        np.full((num_drones, 3), np.nan),
-        np.asarray(slots.size_frames)[:num_drones],
-        np.empty((num_drones, 0)),
+    tracks = Tracks(
+        **{name: arrays[name] for name in ARRAYS},
+        size_m=np.asarray(slots.size_m)[:num_drones],
+        size_frames=np.asarray(slots.size_frames)[:num_drones],
+        arrivals=tuple(each.arrivals),
     )
-    return Tracks(
-        **{name: arrays[name] for name in ARRAYS}, sizes=sizes, arrivals=tuple(each.arrivals)
-    ), places
+    return tracks, places

@@ -4,7 +4,7 @@ from .resampling import resample
 from .row_streams import RowStream
 from .showing import drones_html
 from .summaries import DroneSummary, summarise, summary_columns
-from .tracks import ARRAYS, Arrival, DroneSizes, Tracks, padded, unknown_value
+from .tracks import ARRAYS, Arrival, Tracks, padded, unknown_value
 from .trajectories import Status, Trajectories
 
 __all__ = [
@@ -12,7 +12,6 @@ __all__ = [
     "GATE_M",
     "UNASSIGNED",
     "Arrival",
-    "DroneSizes",
     "DroneSummary",
     "RowStream",
     "Status",

@@ -31,41 +31,6 @@ class Arrival:
     again: bool
 
 
-@dataclass(frozen=True)
-class DroneSizes:
-    """What was learned of the drones' sizes.
-
-    Attributes:
-        size_m: (drones, 3), full lengths along the world's axes, metres.
-        std_m: (drones, 3), standard errors of the lengths, metres; NaN where they are not known.
-        num_frames: (drones, 3), frames from which each length was learned.
-        fill: (drones, windows), share of each of the score's windows that is foreground; NaN where it is not known.
-    """
-
-    size_m: Float[np.ndarray, "drones 3"]
-    std_m: Float[np.ndarray, "drones 3"]
-    num_frames: Int[np.ndarray, "drones 3"]
-    fill: Float[np.ndarray, "drones windows"]
-
-    def joined(self, other: DroneSizes) -> DroneSizes:
-        """These drones, and after them the drones of `other`."""
-        windows = max(self.fill.shape[1], other.fill.shape[1])
-        fills = [
-            np.pad(one.fill, [(0, 0), (0, windows - one.fill.shape[1])], constant_values=np.nan)
-            for one in (self, other)
-        ]
-        return DroneSizes(
-            np.concatenate([self.size_m, other.size_m]),
-            np.concatenate([self.std_m, other.std_m]),
-            np.concatenate([self.num_frames, other.num_frames]),
-            np.concatenate(fills),
-        )
-
-    def of_drones(self, drones: Int[np.ndarray, "chosen"]) -> DroneSizes:
-        """The sizes of some drones, in the order of `drones`."""
-        return DroneSizes(self.size_m[drones], self.std_m[drones], self.num_frames[drones], self.fill[drones])
-
-
 @dataclass(frozen=True, repr=False)
 class Tracks:
     """Tracks of a whole recording, NumPy arrays with axes (frames, drones, ...).
@@ -83,7 +48,8 @@ class Tracks:
         num_cameras: (frames, drones), cameras that see the drone.
         status: (frames, drones), values of `Status`.
         measured_size_m: (frames, drones, 3), full lengths from each frame alone, metres; NaN where unknown.
-        sizes: what was learned of the drones' sizes.
+        size_m: (drones, 3), full lengths of the drones along the world's axes, metres.
+        size_frames: (drones, 3), number of frames from which each length was learned.
         arrivals: drones that came after frame 0, or that came back.
     """
 
@@ -96,7 +62,8 @@ class Tracks:
     num_cameras: Int[np.ndarray, "frames drones"]
     status: Int[np.ndarray, "frames drones"]
     measured_size_m: Float[np.ndarray, "frames drones 3"]
-    sizes: DroneSizes
+    size_m: Float[np.ndarray, "drones 3"]
+    size_frames: Int[np.ndarray, "drones 3"]
     arrivals: tuple[Arrival, ...] = ()
 
     __repr__ = short_repr
