@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     Array = np.ndarray | jax.Array
 else:
     # NumPy turns arrays without axes into scalars. Static type checkers do not get them: scalars cannot be indexed.
-    Array = np.ndarray | np.generic | jax.Array
+    # A kernel (`psotrack.tracking.kernel`) reads its arrays through references.
+    Array = np.ndarray | np.generic | jax.Array | jax.Ref
 
 Key = PRNGKeyArray
 Coverage = UInt8[Array, "cameras height width"]

@@ -99,9 +99,10 @@ if TYPE_CHECKING:
     "--search",
     default=TRACK.swarm.search,
     show_default=True,
-    metavar="pso|NAME",
-    help="Search for the best positions: pso is particle swarm optimisation; NAME is a search that an installed "
-    "package adds.",
+    metavar="pso|pso-kernel|NAME",
+    help="Search for the best positions: pso is particle swarm optimisation; pso-kernel is the same as one kernel per "
+    "frame, for a GPU (unproven: no GPU has run it yet; slow on a CPU); NAME is a search that an installed package "
+    "adds.",
 )
 @click.option(
     "--seed", type=int, default=TRACK.seed, show_default=True, help="Seed of the swarm's random numbers."

@@ -123,7 +123,6 @@ def _box_sums(
     """Sums of boxes; `unpacked` splits whole sums into those of the images that share the tables."""
     x0, y0, x1, y1 = edges
     height1, num_cameras, width1 = tables.shape
-    flat, row = jnp.reshape(tables, -1), num_cameras * width1
 
     def split(edge: Array, last: int) -> tuple[Array, Array]:
         # The cell of the edge, and the share of the cell before the edge; at the last border this is 1.
@@ -133,28 +132,36 @@ def _box_sums(
 
     (i0, fx0), (i1, fx1) = split(x0, width1 - 1), split(jnp.maximum(x0, x1), width1 - 1)
     (j0, fy0), (j1, fy1) = split(y0, height1 - 1), split(jnp.maximum(y0, y1), height1 - 1)
-    row0, row1 = camera * width1 + j0 * row, camera * width1 + j1 * row
 
-    def read(index: Array) -> Array:
+    def read(j: Array, i: Array) -> list[Array]:
+        """The table at a cell's corner, right of it, below it, and across."""
+        if isinstance(tables, jax.Ref):
+            of_box = jnp.broadcast_to(camera, j.shape)
+            return [tables[j + down, of_box, i + right] for down in (0, 1) for right in (0, 1)]
         # Indices are in bounds by construction, and a check in the tracker's innermost loop would cost time.
-        return flat.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        flat, row = jnp.reshape(tables, -1), num_cameras * width1
+        index = camera * width1 + j * row + i
+        return [
+            flat.at[index + step].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            for step in (0, 1, row, row + 1)
+        ]
 
     def floats(total: Array) -> tuple[Array, ...]:
         return tuple(part.astype(x0.dtype) for part in unpacked(total))
 
-    def corner(index: Array, fx: Array, fy: Array) -> tuple[Array, tuple[Array, ...]]:
+    def corner(j: Array, i: Array, fx: Array, fy: Array) -> tuple[Array, tuple[Array, ...]]:
         # The table at the cell's corner, and the part that bilinear interpolation adds. Integers are subtracted before
         # the conversion to float32, because the sums of a 1080p image exceed 2^24. Each difference is the sum over a
         # box, so `unpacked` can split the difference.
-        here, right, below, across = (read(index + step) for step in (0, 1, row, row + 1))
+        here, right, below, across = read(j, i)
         steps = (floats(step) for step in (right - here, below - here, across - below - right + here))
         added = tuple(
             fx * right + fy * below + (fx * fy) * across for right, below, across in zip(*steps, strict=True)
         )
         return here, added
 
-    (c00, f00), (c10, f10) = corner(row0 + i0, fx0, fy0), corner(row0 + i1, fx1, fy0)
-    (c01, f01), (c11, f11) = corner(row1 + i0, fx0, fy1), corner(row1 + i1, fx1, fy1)
+    (c00, f00), (c10, f10) = corner(j0, i0, fx0, fy0), corner(j0, i1, fx1, fy0)
+    (c01, f01), (c11, f11) = corner(j1, i0, fx0, fy1), corner(j1, i1, fx1, fy1)
     whole = floats((c11 - c01) - (c10 - c00))
     return tuple(
         of + ((a11 - a01) - (a10 - a00))

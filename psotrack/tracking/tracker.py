@@ -24,6 +24,7 @@ from psotrack.geometry import Camera, Extents, make_extents, project_boxes
 from psotrack.motion import MotionParams, MotionState, kalman
 from psotrack.silhouettes import Exposures
 from psotrack.tracking.fitness import (
+    DroneFitness,
     Score,
     ScoreInputs,
     SoftIoU,
@@ -475,11 +476,10 @@ def _search(
     particles, drones, _ = first.shape
     groups = (1, 3 * drones) if program.joint else (drones, 3)
 
-    def objective(position: Array) -> Array:
-        position = position.reshape(particles, drones, 3)
-        if program.joint:
-            return joint_fitness(inputs, position, slots.present)[:, None]
-        return drone_fitness(inputs, position)
+    def together(position: Array) -> Array:
+        return joint_fitness(inputs, position.reshape(first.shape), slots.present)[:, None]
+
+    objective = together if program.joint else DroneFitness(inputs)
 
     of_groups = SearchRegion(
         low=region.low.reshape(groups),
