@@ -27,7 +27,15 @@ from hypothesis import strategies as st
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import FrameTimes, Recording, TruncatedVideoError, VideoWriter, probe, read_frames
+from psotrack.recordings import (
+    FrameTimes,
+    Recording,
+    TruncatedVideoError,
+    VideoWriter,
+    probe,
+    probe_silhouettes,
+    read_frames,
+)
 from psotrack.silhouettes import (
     ForegroundSettings,
     Living,
@@ -347,8 +355,28 @@ def test_damage_is_named_and_the_silhouettes_are_made_anew(
     caplog.clear()
     again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert lines == [f"{damaged}: damaged silhouettes in the cache; they are made anew"]
+    assert lines == [f"{damaged}: damaged silhouettes; they are made anew"]
     assert is_whole(damaged)
+    np.testing.assert_array_equal(_read_all(again), _expected(recording))
+
+
+def test_damaged_silhouettes_beside_a_video_are_named_and_made_from_it(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The recording itself brings these silhouettes, as an archive does."""
+    recording = _make_recording(folder)
+    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    brought = tmp_path / "brought"
+    (tmp_path / "cache" / first.keys["cam2"]).rename(brought)
+    recording = replace(recording, silhouettes={"cam2": probe_silhouettes(brought)})
+    with_both = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    assert not (tmp_path / "cache" / first.keys["cam2"]).exists()
+    del with_both
+    (brought / "c/0/0/0").unlink()
+    caplog.clear()
+    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert lines == [f"{brought}: damaged silhouettes; they are made anew"]
     np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 

@@ -91,6 +91,9 @@ def compute(
             _check_made_with(name, place, scaled, model)
     opened = {name: _opened(name, places, tasks, recording.rig) for name in places}
     missing = {name: tasks[name] for name, array in opened.items() if array is None and name in tasks}
+    for path in dict.fromkeys(places[name].path for name in missing):
+        if path.exists():
+            logger.warning("%s: damaged silhouettes; they are made anew", path)
     try:
         seconds = _make(list(missing.values()), jobs, report)
     except TruncatedVideoError as error:
@@ -268,9 +271,6 @@ def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
     missing = list({task.stored.path: task for task in tasks}.values())
     if not missing:
         return seconds
-    for task in missing:
-        if task.stored.path.exists():
-            logger.warning("%s: damaged silhouettes in the cache; they are made anew", task.stored.path)
     logger.info("silhouettes: computing those of %d videos", len(missing))
     with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
         for taken in map_in_processes(store, missing, jobs=jobs, advance=advance):
