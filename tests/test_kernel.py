@@ -92,7 +92,9 @@ def test_the_tracks_are_those_of_the_swarm():
 
     def tracked(search):
         chosen = tracker_settings(track_settings(search=search, drones=2, **EFFORT))
-        (((tracks, _),), _) = track_silhouettes(rig, silhouettes, [RunInputs(ROOM_M, chosen, given)], fps=25.0)
+        (((tracks, _),), _) = track_silhouettes(
+            rig, silhouettes, [RunInputs(ROOM_M, chosen, given)], fps=25.0
+        )
         return tracks.position_m
 
     np.testing.assert_allclose(tracked("pso-kernel"), tracked("pso"), atol=1e-5)
