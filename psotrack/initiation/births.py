@@ -71,9 +71,9 @@ MIN_DISTANCE = 0.8
 #: A place whose span grows by more than this ratio is given up: a drone that departs from its ghost, which are one blob
 #: at first.
 MAX_GROWTH = 1.5
-#: A candidate that moves by less than this share of its span, or by less than this number of standard deviations, in
-#: the first or in the second half of its frames stands still.
-MIN_TRAVEL, TRAVEL_SIGMAS = 0.0125, 2.5
+#: A candidate that moves by less than this share of its span in `WINDOW_FRAMES`, or by less than this number of
+#: standard deviations, at its begin, at its end or in one half of its frames stands still.
+MIN_TRAVEL, TRAVEL_SIGMAS = 0.04, 3.0
 #: A candidate moves if its last place is farther from its first than this share of its span.
 MIN_DISPLACEMENT = 0.5
 #: Standard deviation of a followed place's acceleration, m/s².
@@ -539,21 +539,24 @@ def _hidden(
 
 
 def _is_moving(path: _Path) -> bool:
-    """Whether a candidate has moved far, or moves in both halves of its frames.
+    """Whether a candidate has moved far, or moves on steadily from its begin to its end.
 
-    A ghost seems to move, by a quarter of its span, while the drone that departs still overlaps it.
+    A ghost seems to move, by a quarter of its span, while the drone that departs still overlaps it: it stands before,
+    or after, or is faster and faster.
     """
     places_m, span_m = path.places_m, float(path.span_m.max())
     if float(np.linalg.norm(places_m[-1] - places_m[0])) > MIN_DISPLACEMENT * span_m:
         return True
-    for half_m in np.array_split(places_m, 2):
-        count = len(half_m)
+    ends_m = places_m[:WINDOW_FRAMES], places_m[-WINDOW_FRAMES:]
+    for part_m in (*ends_m, *np.array_split(places_m, 2)):
+        count = len(part_m)
         frame = np.arange(count)
         # Way along the straight line that fits the places best, and its standard deviation, from their scatter.
-        line = np.polyfit(frame, half_m, 1)
+        line = np.polyfit(frame, part_m, 1)
         way_m = float(np.linalg.norm(line[0])) * (count - 1)
-        off_m = half_m - frame[:, None] * line[0] - line[1]
+        off_m = part_m - frame[:, None] * line[0] - line[1]
         std_m = float(np.sqrt(np.square(off_m).sum() / (3 * max(count - 2, 1))))
-        if way_m < max(MIN_TRAVEL * span_m, TRAVEL_SIGMAS * std_m * np.sqrt(12 / count)):
+        least_m = MIN_TRAVEL * span_m * min(1.0, count / WINDOW_FRAMES)
+        if way_m < max(least_m, TRAVEL_SIGMAS * std_m * np.sqrt(12 / count)):
             return False
     return True
