@@ -72,7 +72,7 @@ MIN_DISTANCE = 0.8
 #: at first.
 MAX_GROWTH = 1.5
 #: A candidate that moves by less than this share of its span in `WINDOW_FRAMES`, or by less than this number of
-#: standard deviations, at its begin, at its end or in one half of its frames stands still.
+#: standard deviations, in its first or last frames or in one half of its frames stands still.
 MIN_TRAVEL, TRAVEL_SIGMAS = 0.04, 3.0
 #: A candidate moves if its last place is farther from its first than this share of its span.
 MIN_DISPLACEMENT = 0.5
@@ -539,7 +539,7 @@ def _hidden(
 
 
 def _is_moving(path: _Path) -> bool:
-    """Whether a candidate has moved far, or moves on steadily from its begin to its end.
+    """Whether a candidate has moved far, or moves on steadily in all parts of its path.
 
     A ghost seems to move, by a quarter of its span, while the drone that departs still overlaps it: it stands before,
     or after, or is faster and faster.

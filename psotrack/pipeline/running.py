@@ -140,8 +140,8 @@ def track_runs(
 
     Runs of the swarm form a batch if they have the same number of drones, and if their settings differ only in the seed
     and in numbers other than `swarm.particles` and `score.windows`. The runs of a batch share one compiled program and
-    one copy of the silhouettes; an accelerator computes them side by side. The runs are spread over all devices
-    (`jax.devices()`). The seconds of a run are its share of the seconds of all runs.
+    one copy of the silhouettes; an accelerator computes them side by side. The seconds of a run are its share of the
+    seconds of all runs.
 
     Args:
         recording: a recording that was checked for use (see `Recording.usable`).
