@@ -92,6 +92,16 @@ def new_births(rig, *, max_speed_m_s=MAX_SPEED_M_S, **rules):
     )
 
 
+def step(births, instant, images, *known_m, size_m=SIZE_M, drawn_m=None, rig=RIG, reduction=REDUCTION):
+    """The next frame, with known drones at some places."""
+    position_m = np.array(known_m).reshape(-1, 3)
+    sizes_m = np.broadcast_to(np.array(size_m, float), position_m.shape)
+    boxes_size_m = sizes_m if drawn_m is None else np.broadcast_to(drawn_m, sizes_m.shape)
+    box_px = boxes_of(rig, position_m, boxes_size_m) if known_m else np.empty((0, len(rig), 4))
+    blobs = FrameBlobs.of(images, reduction, border_cells(rig.cameras.image_size_wh, reduction))
+    births.step(instant, unexplained(blobs, box_px), KnownDrones(position_m, sizes_m, box_px))
+
+
 def candidates_in(
     coverage,
     *known_m,
@@ -104,14 +114,9 @@ def candidates_in(
 ):
     """Candidates after all frames; `first` is the instant of the first frame."""
     births = new_births(rig, **options)
-    borders = border_cells(rig.cameras.image_size_wh, reduction)
-    sizes_m = np.broadcast_to(np.array(size_m, float), (len(known_m), 3))
-    drawn_m = sizes_m if boxes_size_m is None else np.broadcast_to(boxes_size_m, sizes_m.shape)
+    of_frames = {"size_m": size_m, "drawn_m": boxes_size_m, "rig": rig, "reduction": reduction}
     for frame, images in enumerate(coverage):
-        position_m = np.array([one[frame] for one in known_m]).reshape(-1, 3)
-        box_px = boxes_of(rig, position_m, drawn_m) if known_m else np.empty((0, len(rig), 4))
-        view = unexplained(FrameBlobs.of(images, reduction, borders), box_px)
-        births.step(first + frame, view, KnownDrones(position_m, sizes_m, box_px))
+        step(births, first + frame, images, *(one[frame] for one in known_m), **of_frames)
     return births.candidates()
 
 
@@ -143,6 +148,23 @@ def two_drones():
     images = draw(ONE, OTHER)
     images.flags.writeable = False
     return images
+
+
+def test_frames_are_followed_again_from_a_copy(two_drones):
+    """A block is tracked again once a drone is known; what was followed before the block is followed on."""
+    births = new_births(RIG)
+    for frame in range(4):
+        step(births, frame, two_drones[frame])
+    before = births.copy()
+    for frame in range(4, 10):
+        step(births, frame, two_drones[frame])
+    one, other = assert_found(births.candidates(), ONE, OTHER)
+    before.take([one])
+    for frame in range(4, 10):
+        step(before, frame, two_drones[frame], ONE[frame])
+    (again,) = assert_found(before.candidates(), OTHER)
+    assert (again.instant, again.number) == (other.instant, other.number) == (0, other.number)
+    assert len(births.candidates()) == 2
 
 
 def test_known_drones_explain_all_foreground(two_drones):

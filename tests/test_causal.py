@@ -32,7 +32,7 @@ AWAY, ENTERS = slice(55, 90), 30
 #: A drone has a track in the frame after the eighth in which it is found.
 SOON = 8
 #: The second drone flies at 0.12 m/s, by half a cell in four frames: it takes two more frames to tell it from a ghost.
-SLOW_SOON = 10
+SLOW_SOON = 8
 EFFORT = {"particles": 20, "iterations": 15}
 
 

@@ -9,9 +9,10 @@ the candidate was first found; but a false track may last to the end of the vide
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -72,7 +73,7 @@ MIN_DISTANCE = 0.8
 #: at first.
 MAX_GROWTH = 1.5
 #: A candidate that moves by less than this share of its span in `WINDOW_FRAMES`, or by less than this number of
-#: standard deviations, in its first or last frames or in one half of its frames stands still.
+#: standard deviations, in its first or last frames stands still.
 MIN_TRAVEL, TRAVEL_SIGMAS = 0.04, 3.0
 #: A candidate moves if its last place is farther from its first than this share of its span.
 MIN_DISPLACEMENT = 0.5
@@ -139,6 +140,7 @@ class TrackCandidate:
             drone stood while the background was learned.
         path: what was measured, by instant.
         is_sure: whether it was found often enough to be a drone that was never seen before.
+        number: number of the followed place, which copies of its `Births` share.
     """
 
     instant: int
@@ -149,6 +151,7 @@ class TrackCandidate:
     moves: bool
     path: dict[int, Measurement] = field(default_factory=dict)
     is_sure: bool = True
+    number: int = 0
 
 
 @dataclass
@@ -156,6 +159,7 @@ class _Path:
     """A place that is followed.
 
     Attributes:
+        number: its number, from 0 in the order of the places' beginnings.
         first: instant in which it was found first.
         found: what was measured, by instant.
         frames: numbers of the frames in which it was found, without those that were left out.
@@ -167,6 +171,7 @@ class _Path:
         dispersion: disagreement of the cameras, averaged over time.
     """
 
+    number: int
     first: int
     dispersion: float
     found: dict[int, Measurement] = field(default_factory=dict)
@@ -186,6 +191,10 @@ class _Path:
     def span_m(self) -> Float[np.ndarray, "2"]:
         """(2,), median width and height."""
         return np.median([one.span_m for one in self.found.values()], axis=0)
+
+    def copy(self) -> _Path:
+        """A copy that goes on by itself."""
+        return replace(self, found=dict(self.found), frames=list(self.frames))
 
 
 @dataclass(frozen=True)
@@ -238,11 +247,18 @@ class Births:
         self._floor_z_m = float(bounds_m[0, 2])
         self._paths: list[_Path] = []
         self._mean, self._covariance = np.empty((0, 6)), np.empty((0, 6, 6))
-        self._instant = self._frame = 0
+        self._instant = self._frame = self._num_begun = 0
         self._is_whole = np.zeros((len(self._viewpoint), 0), bool)
 
     def __len__(self) -> int:
         return len(self._paths)
+
+    def copy(self) -> Births:
+        """The places as they are now, to follow them again through the next frames."""
+        one = copy.copy(self)
+        one._paths = [path.copy() for path in self._paths]
+        one._mean, one._covariance = self._mean.copy(), self._covariance.copy()
+        return one
 
     def step(
         self, instant: int, view: CameraSightings, known: KnownDrones, usual_dispersion: float = 1.0
@@ -285,13 +301,8 @@ class Births:
 
     def take(self, candidates: Iterable[TrackCandidate]) -> None:
         """Follow some candidates no longer, because they have tracks; and none that has not been found for long."""
-        taken = [candidate.path for candidate in candidates]
-        self._keep(
-            [
-                path.missed <= MOST_MISSED and not any(path.found is each for each in taken)
-                for path in self._paths
-            ]
-        )
+        taken = {candidate.number for candidate in candidates}
+        self._keep([path.missed <= MOST_MISSED and path.number not in taken for path in self._paths])
 
     def _predict(self, instant: int) -> None:
         """Go on to an instant, at constant velocity."""
@@ -339,7 +350,8 @@ class Births:
                 if not self._paths[number].missed:
                     continue
             if number < 0:
-                path = _Path(instant, usual_dispersion)
+                path = _Path(self._num_begun, instant, usual_dispersion)
+                self._num_begun += 1
                 begun.append((path, one))
             else:
                 path = self._paths[number]
@@ -488,6 +500,7 @@ class Births:
             ghosts_from is None or path.first < ghosts_from or _is_moving(path),
             path.found,
             is_sure,
+            path.number,
         )
 
     def _size_m(self, path: _Path) -> Float[np.ndarray, "3"]:
@@ -539,7 +552,7 @@ def _hidden(
 
 
 def _is_moving(path: _Path) -> bool:
-    """Whether a candidate has moved far, or moves on steadily in all parts of its path.
+    """Whether a candidate has moved far, or moves on steadily at both ends of its path.
 
     A ghost seems to move, by a quarter of its span, while the drone that departs still overlaps it: it stands before,
     or after, or is faster and faster.
@@ -547,8 +560,7 @@ def _is_moving(path: _Path) -> bool:
     places_m, span_m = path.places_m, float(path.span_m.max())
     if float(np.linalg.norm(places_m[-1] - places_m[0])) > MIN_DISPLACEMENT * span_m:
         return True
-    ends_m = places_m[:WINDOW_FRAMES], places_m[-WINDOW_FRAMES:]
-    for part_m in (*ends_m, *np.array_split(places_m, 2)):
+    for part_m in (places_m[:WINDOW_FRAMES], places_m[-WINDOW_FRAMES:]):
         count = len(part_m)
         frame = np.arange(count)
         # Way along the straight line that fits the places best, and its standard deviation, from their scatter.

@@ -47,13 +47,11 @@ class Pyramid:
     """Silhouettes as they are, and at coarser resolutions: means of 2 x 2, 4 x 4 and 8 x 8 pixels.
 
     Attributes:
-        fine: (..., cameras, rows, columns), 0..255, the silhouettes; no side is shorter than a window.
-        coarse: (..., cameras, rows, columns), the coarser levels beside each other, from `_places`.
+        levels: (..., cameras, rows, columns), 0..255, the levels beside each other, from `_places`.
         shape: height and width of the silhouettes; static.
     """
 
-    fine: UInt8[Array, "*frames cameras rows columns"]
-    coarse: UInt8[Array, "*frames cameras coarse_rows coarse_columns"]
+    levels: UInt8[Array, "*frames cameras rows columns"]
     shape: tuple[int, int] = field(metadata={"static": True})
 
 
@@ -78,13 +76,17 @@ def make_pyramid(coverage: UInt8[Array, "frames cameras height width"]) -> Pyram
     while len(sums) < NUM_LEVELS - 1:
         rows = sums[-1][..., 0::2, :] + sums[-1][..., 1::2, :]
         sums.append(rows[..., 0::2] + rows[..., 1::2])
-    places = _places((height, width))[1:]
+    means = [
+        ((total + (1 << 2 * level >> 1)) >> 2 * level).astype(jnp.uint8)
+        for level, total in enumerate(sums, 1)
+    ]
+    places = _places((height, width))
     longest = max(rows for _, rows, _ in places)
-    levels = []
-    for level, (total, (_, _, columns)) in enumerate(zip(sums, places, strict=True), 1):
-        mean = ((total + (1 << 2 * level >> 1)) >> 2 * level).astype(jnp.uint8)
-        levels.append(_enlarged(mean, longest, columns))
-    return Pyramid(_enlarged(coverage, SIDE, SIDE), jnp.concatenate(levels, axis=-1), (height, width))
+    levels = [
+        _enlarged(image, longest, columns)
+        for image, (_, _, columns) in zip((coverage, *means), places, strict=True)
+    ]
+    return Pyramid(jnp.concatenate(levels, axis=-1), (height, width))
 
 
 def _enlarged(image: UInt8[Array, "*frames rows columns"], rows: int, columns: int) -> Array:
@@ -96,12 +98,12 @@ def _enlarged(image: UInt8[Array, "*frames rows columns"], rows: int, columns: i
 
 
 def _places(shape: tuple[int, int]) -> list[tuple[int, int, int]]:
-    """First column of each level in its array, and its rows and columns: at least those of a window."""
+    """First column of each level, and its rows and columns: at least those of a window."""
     step = 2 ** (NUM_LEVELS - 1)
     even = [length + -length % step for length in shape]
     sides = [shape, *([length >> level for length in even] for level in range(1, NUM_LEVELS))]
     rows, columns = ([max(side[axis], SIDE) for side in sides] for axis in range(2))
-    firsts = [0, 0, *np.cumsum(columns[1:-1]).tolist()]
+    firsts = np.cumsum([0, *columns[:-1]]).tolist()
     return list(zip(firsts, rows, columns, strict=True))
 
 
@@ -256,15 +258,11 @@ def _windows(
 
     row, column = first(boxes.y_middle, places[..., 1]), first(boxes.x_middle, places[..., 2])
 
-    def windows_of(image: Array, at_column: Array) -> Array:
-        def window(camera: Array, at_row: Array, at_column: Array) -> Array:
-            return jax.lax.dynamic_slice(image, (camera, at_row, at_column), (1, SIDE, SIDE))[0]
+    def window(camera: Array, at_row: Array, at_column: Array) -> Array:
+        return jax.lax.dynamic_slice(pyramid.levels, (camera, at_row, at_column), (1, SIDE, SIDE))[0]
 
-        cameras = jnp.arange(row.shape[1])
-        return jax.vmap(jax.vmap(window), in_axes=(None, 0, 0))(cameras, row, at_column)
-
-    coarse = windows_of(pyramid.coarse, column + places[..., 0])
-    value = jnp.where((level == 0)[..., None, None], windows_of(pyramid.fine, column), coarse)
+    windows_of = jax.vmap(jax.vmap(window), in_axes=(None, 0, 0))
+    value = windows_of(jnp.arange(row.shape[1]), row, column + places[..., 0])
     value, row, column, pixel_px = jax.lax.optimization_barrier((value, row, column, pixel_px))
     return Windows(
         value=value.astype(jnp.int32),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections import deque
 from collections.abc import Callable
@@ -177,8 +176,7 @@ class SwarmRun:
         self.fps, self.max_speed_m_s = setting.fps, settings.motion.speed_limit_m_s
         self.program = tracker_program(settings, setting.reduction, on_cpu=on_cpu)
         self._most = settings.drones.count or most_drones
-        self._new_births = partial(
-            Births,
+        self._births = self._births_before = Births(
             setting.rig.cameras,
             BirthRules(
                 settings.status.min_cameras_to_begin,
@@ -190,7 +188,6 @@ class SwarmRun:
             bounds_m=inputs.bounds_m,
             max_speed_m_s=settings.motion.speed_limit_m_s,
         )
-        self._births = self._searched = self._new_births()
         self._key = jax.random.key(settings.seed)
         self._num_born = 0
         self._known_params: dict[int, TrackerParams] = {}
@@ -294,14 +291,16 @@ class SwarmRun:
         """
         if self._nothing_may_begin(block, rows):
             return ()
-        births = self._new_births() if again else self._births
+        if not again:
+            self._births_before = self._births
         is_first = not self._memory and not self._num_born
         key = self._bounds_m.tobytes(), self.max_speed_m_s, self._settings.status.min_cameras_to_begin
         if is_first and key in block.births:
             # Before the first drone, all runs that look for the same drones find the same.
-            found, self._births = copy.deepcopy(block.births[key])
-            self._searched = self._births
+            found, births = block.births[key]
+            self._births = births.copy()
             return found
+        births = self._births = self._births_before.copy()
         size_m = np.asarray(slots.size_m, np.float64)
         for frame, blobs in enumerate(block.blobs):
             box_px = np.asarray(rows.box_px[frame], np.float64)
@@ -310,9 +309,9 @@ class SwarmRun:
             position_m = np.where(np.asarray(explains)[:, None], rows.position_m[frame], np.nan)
             known = KnownDrones(position_m.astype(np.float64), size_m, box_px)
             births.step(int(block.instant[frame]), view, known)
-        found, self._searched = births.candidates(), births
+        found = births.candidates()
         if is_first:
-            block.births[key] = copy.deepcopy((found, births))
+            block.births[key] = found, births.copy()
         return found
 
     def plan(
@@ -331,7 +330,7 @@ class SwarmRun:
             begin: instant at which a candidate's track begins, and its position and velocity then.
         """
         if not candidates:
-            self._searched.take(())
+            self._births.take(())
             return []
         lost, known = self._lost(block, rows), self.known
         most = None if self._most is None else max(self._most - len(known), 0)
@@ -344,9 +343,9 @@ class SwarmRun:
             max_births=most,
         )
         # What is no drone yet, because it does not move for instance, is followed on.
-        self._searched.take(
-            each for each, row in zip(candidates, assignment, strict=True) if row >= 0 or row == NEW
-        )
+        taken = [each for each, row in zip(candidates, assignment, strict=True) if row >= 0 or row == NEW]
+        self._births.take(taken)
+        self._births_before.take(taken)
         starts = []
         for candidate, row in zip(candidates, assignment.tolist(), strict=True):
             if row >= 0:
