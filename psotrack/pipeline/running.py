@@ -24,7 +24,7 @@ from psotrack.camera_errors import CameraViews, views_of_middles, views_of_sight
 from psotrack.clocks import CameraClocks
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
-from psotrack.fusion import fuse_tracks, fused_errors
+from psotrack.fusion import fuse_tracks
 from psotrack.geometry import views_meet
 from psotrack.initiation import first_drones, given_state, known_motion, start_source
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
@@ -273,18 +273,15 @@ def _with_camera_errors(
 def _fused(run: Run, swarm: MethodResult, lines: MethodResult) -> MethodResult:
     """The results of both methods in one, and the errors of the cameras that they contain."""
     began = time.perf_counter()
-    settings, fps = run.settings, run.recording.fps
     fusion = fuse_tracks(
         swarm.tracks,
         lines.tracks,
-        settings.motion,
-        fps=fps,
-        max_coasting_s=settings.status.max_coasting_s,
-        same_foreground=settings.detections == BLOBS,
+        run.settings.motion,
+        fps=run.recording.fps,
+        max_coasting_s=run.settings.status.max_coasting_s,
+        same_foreground=run.settings.detections == BLOBS,
+        errors=(swarm.errors, lines.errors),
     )
-    tracks, errors = fusion.tracks, None
-    if swarm.errors is not None or lines.errors is not None:
-        tracks, errors = fused_errors(fusion, swarm.errors, lines.errors, settings.motion, fps)
     both = ("finish", "compile", "track")
     seconds = {
         **swarm.seconds,
@@ -292,13 +289,13 @@ def _fused(run: Run, swarm: MethodResult, lines: MethodResult) -> MethodResult:
     }
     seconds["track"] += time.perf_counter() - began
     keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
-    points = _points(tracks, "box")
-    for point, offset_m, std_m in zip(points, fusion.offset.offset_m, fusion.offset.std_m, strict=True):
+    points = _points(fusion.tracks, "box")
+    for point, offset_m, std_m in zip(points, fusion.offset_m, fusion.offset_std_m, strict=True):
         if point["drone"] < swarm.tracks.num_drones:
             point["middle_of"] = "silhouette"
         if np.isfinite(offset_m).all():
             point |= {"box_off_m": offset_m.tolist(), "box_off_std_m": std_m.tolist()}
-    return MethodResult(tracks, points, keys, seconds, errors)
+    return MethodResult(fusion.tracks, points, keys, seconds, fusion.errors)
 
 
 def _track_by_plugin(run: Run, report: Report) -> MethodResult:
