@@ -258,9 +258,9 @@ def track(
     refuse_files(out, record_path, *([] if causal else [ambiguity_path]), force=force)
     chosen = chosen_settings(settings)
     num_frames, causal, most_drones = chosen_extent(num_frames, causal, most_drones)
-    parts = Parts(
-        detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
-    )
+    parts = Parts()
+    if detector is not None:
+        parts["detector"] = find_detector(detector, DetectorSettings(size=detector_size))
     keep_compiled(compiled_folder(cache))
     start_s = time.perf_counter() - started
     opened = open_recording(sequence)
@@ -283,8 +283,8 @@ def track(
         chosen,
         cache=cache_folder(cache),
         jobs=jobs,
-        parts=parts,
         report=report_to(quiet),
+        **parts,
     )
     identities, time_s = tracked.identities, tracked.trajectories.time_s
     record = with_real_time(tracked.record, time.perf_counter() - started, start_s=start_s)

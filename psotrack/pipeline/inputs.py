@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from psotrack.clocks import CameraClocks
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
@@ -139,23 +140,27 @@ class Run:
     Attributes:
         recording, silhouettes: those at the instants of the run.
         settings: settings of the run, with the speed limit that was found.
+        parts: parts that the caller brings.
         source: source of the first positions.
         volume: bounds of the room, and where they come from.
         plugin: the method that the caller brings or that an entry point names; None for the methods of this package.
         sightings: detections of all cameras at the instants; None where the method reads none.
         detection_keys: digests of the files or silhouettes that the detections come from, by camera.
         read_s: time in which the detections were read, seconds.
+        clocks: clocks of the cameras, where they were estimated and corrected; None elsewhere.
     """
 
     recording: Recording
     silhouettes: Silhouettes | None
     settings: TrackSettings
+    parts: Parts
     source: StartSource
     volume: FlightVolume
     plugin: Method | None
     sightings: Sightings | None
     detection_keys: Mapping[str, str]
     read_s: float
+    clocks: CameraClocks | None = None
 
     @property
     def by_swarm(self) -> bool:
@@ -182,4 +187,4 @@ def prepare(shared: SharedInputs, settings: TrackSettings, parts: Parts, report:
     volume = flight_volume(recording.rig, points.get(source), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)
-    return Run(recording, silhouettes, settings, start, volume, plugin, sightings, keys, read_s)
+    return Run(recording, silhouettes, settings, parts, start, volume, plugin, sightings, keys, read_s)

@@ -17,14 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.camera_errors import TrackErrors
-from psotrack.clocks import CameraClocks
 from psotrack.errors import InputError
 from psotrack.identity import Identities, postprocess
 from psotrack.initiation import count_common, find_cut_off, find_outside, state_at_first_frame
 from psotrack.pipeline.inputs import Run
-from psotrack.pipeline.parts import Parts
 from psotrack.settings import TrackSettings, setting_names
-from psotrack.support import html_block, html_lines
+from psotrack.support import html_block, html_lines, identify
 from psotrack.trajectories import Tracks, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)
@@ -126,9 +124,7 @@ def _by_name(settings: TrackSettings | Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def finish(
-    run: Run, parts: Parts, result: MethodResult, clocks: CameraClocks | None = None
-) -> TrackedRecording | InputError:
+def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
     """Resolve identities, smooth, move to the body's origin, and write the record of one run."""
     recording, silhouettes = run.recording, run.silhouettes
     settings, tracks, errors = run.settings, result.tracks, result.errors
@@ -169,9 +165,9 @@ def finish(
             for name, times in recording.frame_times.items()
             if name in recording.rig.names
         },
-        **({} if clocks is None else {"camera_clocks": clocks.record(recording.rig.names)}),
+        **({} if run.clocks is None else {"camera_clocks": run.clocks.record(recording.rig.names)}),
         "settings": msgspec.to_builtins(settings),
-        **({"parts": parts.record} if parts.record else {}),
+        **({"parts": {kind: identify(part) for kind, part in run.parts.items()}} if run.parts else {}),
         "seed": settings.seed,
         "start": {name: value.tolist() for name, value in vars(state_at_first_frame(tracks)).items()},
         "bounds_m": run.volume.bounds_m.tolist(),
