@@ -8,7 +8,7 @@ fast.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 import msgspec
@@ -324,15 +324,13 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
 def setting_names() -> tuple[str, ...]:
     """Dotted names of all settings, such as `seed`, `swarm.particles`, `silhouettes.reduction`."""
-    return tuple(flatten(msgspec.to_builtins(TrackSettings())))
+    return tuple(dict(flatten(msgspec.to_builtins(TrackSettings()))))
 
 
-def flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values of a nested table by their dotted names; an empty inner table is a value."""
-    values: dict[str, Any] = {}
+def flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of a nested table; an empty inner table is a value."""
     for name, value in content.items():
         if isinstance(value, Mapping) and value:
-            values |= flatten(value, f"{prefix}{name}.")
+            yield from flatten(value, f"{prefix}{name}.")
         else:
-            values[f"{prefix}{name}"] = value
-    return values
+            yield f"{prefix}{name}", value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from psotrack.clocks import CameraClocks
@@ -113,26 +113,6 @@ def read_sightings(
     return sightings.at_instants(recording.timeline()), keys
 
 
-@dataclass(frozen=True)
-class SharedInputs:
-    """A recording at the instants of some runs, and what these runs share.
-
-    Attributes:
-        recording: the recording at these instants.
-        silhouettes: silhouettes of all cameras at these instants; None where no run needs them.
-        points: moving points that the runs have found so far, by the source of the detections.
-    """
-
-    recording: Recording
-    silhouettes: Silhouettes | None
-    points: dict[str, MovingPoints] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, recording: Recording, silhouettes: Silhouettes | None) -> SharedInputs:
-        """Those of a recording, with its silhouettes in all frames."""
-        return cls(recording, None if silhouettes is None else silhouettes.at_instants(recording.timeline()))
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """What is known of a run before it tracks.
@@ -168,10 +148,24 @@ class Run:
         return self.plugin is None and self.settings.method != "projection-lines"
 
 
-def prepare(shared: SharedInputs, settings: TrackSettings, parts: Parts, report: Report = no_progress) -> Run:
-    """Read the detections that the method needs, and find the volume and the speed limit (see `track_runs`)."""
+def prepare(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    points: dict[str, MovingPoints],
+    settings: TrackSettings,
+    parts: Parts,
+    report: Report = no_progress,
+) -> Run:
+    """Read the detections that the method needs, and find the volume and the speed limit (see `track_runs`).
+
+    Args:
+        recording, silhouettes: those at the instants of the run.
+        points: moving points in them by the source of the detections; what is found here is added for other runs.
+        settings: settings of the run.
+        parts: parts that the caller brings.
+        report: shows the progress in frames.
+    """
     began = time.perf_counter()
-    recording, silhouettes, points = shared.recording, shared.silhouettes, shared.points
     plugin = find_method(settings, parts)
     sightings, source, keys = None, BLOBS, dict[str, str]()
     if settings.method != "swarm" if plugin is None else plugin.reads_detections:

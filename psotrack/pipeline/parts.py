@@ -33,8 +33,7 @@ class MethodInputs:
     Attributes:
         rig: the cameras, calibrated.
         silhouettes: silhouettes of all cameras at the instants (`Silhouettes.read` gives the coverage of some of them,
-            0 to 255; `exposures` says when each camera's frame was exposed, None where all were exposed together); None
-            where none were computed.
+            0 to 255; `exposures` says when each camera's frame was exposed, None where all were exposed together).
         sightings: detections of all cameras at all instants; None for a method that does not read detections.
         initial: positions, velocities and sizes of the drones at frame 0, (drones, 3) each, metres and m/s.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
@@ -43,7 +42,7 @@ class MethodInputs:
     """
 
     rig: Rig
-    silhouettes: Silhouettes | None
+    silhouettes: Silhouettes
     sightings: Sightings | None
     initial: InitialState
     bounds_m: Float[np.ndarray, "2 3"]

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
@@ -25,9 +25,9 @@ from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
 from psotrack.fusion import fuse_tracks
 from psotrack.geometry import views_meet
-from psotrack.initiation import first_drones, given_state, known_motion, start_source
+from psotrack.initiation import MovingPoints, first_drones, given_state, known_motion, start_source
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
-from psotrack.pipeline.inputs import Run, SharedInputs, prepare, usable_for
+from psotrack.pipeline.inputs import Run, prepare, usable_for
 from psotrack.pipeline.parts import (
     MethodInputs,
     Parts,
@@ -174,12 +174,16 @@ def _track(
     report: Report,
 ) -> list[tuple[Run, MethodResult]]:
     """Each run and the result of its method; where clocks are to be estimated, of a second pass with these clocks."""
-    rates_hz = dict.fromkeys(each.rate_hz for each in settings)
-    shared = {rate_hz: SharedInputs.of(recording.at_rate(rate_hz), silhouettes) for rate_hz in rates_hz}
-    runs = [prepare(shared[each.rate_hz], each, parts, report) for each in settings]
+
+    @cache
+    def at_rate(rate_hz: float | None) -> tuple[Recording, Silhouettes | None, dict[str, MovingPoints]]:
+        part = recording.at_rate(rate_hz)
+        return part, None if silhouettes is None else silhouettes.at_instants(part.timeline()), {}
+
+    runs = [prepare(*at_rate(each.rate_hz), each, parts, report) for each in settings]
     by_swarm: dict[Run, MethodResult] = {}
-    for one in shared.values():
-        together = [run for run in runs if run.by_swarm and run.recording is one.recording]
+    for rate_hz in dict.fromkeys(each.rate_hz for each in settings):
+        together = [run for run in runs if run.by_swarm and run.settings.rate_hz == rate_hz]
         by_swarm |= _track_by_swarm(together, report)
     results = []
     for run, given in zip(runs, settings, strict=True):
@@ -231,8 +235,7 @@ def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResu
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found
         views = partial(views_of_middles, recording.rig.cameras, silhouettes.exposures, places)
-        seconds = {**silhouettes.seconds, **shares}
-        result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
+        result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, shares)
         return _with_camera_errors(run, result, views)
 
     # NumPy computes most of it without Python's lock.
@@ -254,7 +257,7 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
         known=known_motion(run.source, settings.drones, run.recording.fps),
         report=report,
     )
-    seconds = {"compile": 0.0, "track": run.read_s + time.perf_counter() - began}
+    seconds = {"track": run.read_s + time.perf_counter() - began}
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
     return _with_camera_errors(run, result, partial(views_of_sightings, rig.cameras, run.sightings))
 
@@ -287,11 +290,8 @@ def _fused(run: Run, swarm: MethodResult, lines: MethodResult) -> MethodResult:
         same_foreground=run.settings.detections == BLOBS,
         errors=(swarm.errors, lines.errors),
     )
-    both = ("finish", "compile", "track")
-    seconds = {
-        **swarm.seconds,
-        **{stage: swarm.seconds.get(stage, 0.0) + lines.seconds.get(stage, 0.0) for stage in both},
-    }
+    stages = ("compile", "track", "finish")
+    seconds = {stage: swarm.seconds.get(stage, 0.0) + lines.seconds.get(stage, 0.0) for stage in stages}
     seconds["track"] += time.perf_counter() - began
     keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
     points = _points(fusion.tracks, "box")
@@ -305,18 +305,14 @@ def _fused(run: Run, swarm: MethodResult, lines: MethodResult) -> MethodResult:
 
 def _track_by_plugin(run: Run, report: Report) -> MethodResult:
     """The result of the method that is plugged in, which is given the drones of the first frames."""
-    assert run.plugin is not None
     recording, silhouettes, settings = run.recording, run.silhouettes, run.settings
-    initial, keys = None, {}
-    if silhouettes is not None:
-        initial = given_state(recording.rig, silhouettes, run.source, settings.drones, recording.fps)
-        keys = dict(silhouettes.keys)
+    assert run.plugin is not None
+    assert silhouettes is not None
+    initial = given_state(recording.rig, silhouettes, run.source, settings.drones, recording.fps)
     if initial is None:
-        shown = run.sightings if silhouettes is None else silhouettes
-        assert shown is not None
         initial = first_drones(
             recording.rig,
-            shown,
+            silhouettes,
             fps=recording.fps,
             bounds_m=run.volume.bounds_m,
             max_speed_m_s=settings.motion.speed_limit_m_s,
@@ -329,8 +325,8 @@ def _track_by_plugin(run: Run, report: Report) -> MethodResult:
         ),
         report,
     )
-    seconds = {"compile": 0.0, "track": time.perf_counter() - began}
-    return MethodResult(tracks, _points(tracks, "silhouette"), keys, seconds)
+    seconds = {"track": time.perf_counter() - began}
+    return MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
 
 
 def _points(tracks: Tracks, middle_of: Literal["silhouette", "box"]) -> list[dict[str, Any]]:
