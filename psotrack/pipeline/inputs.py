@@ -11,6 +11,7 @@ from psotrack.clocks import CameraClocks
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
+from psotrack.geometry import views_meet
 from psotrack.initiation import (
     FlightVolume,
     MovingPoints,
@@ -46,8 +47,8 @@ def usable_for(
             as good as a video.
 
     Raises:
-        InputError: detections cannot be read, no camera can be used (see `Recording.usable`), or fewer than two
-            cameras have the videos or stored silhouettes that the method needs.
+        InputError: detections cannot be read, no camera can be used (see `Recording.usable`), no two cameras have a
+            place in view together, or fewer than two have the videos or stored silhouettes that the method needs.
         SettingsError: a camera is unknown, or the recording has fewer instants.
     """
     if settings.reads_detections and settings.detections != YOLO:
@@ -55,8 +56,22 @@ def usable_for(
     usable = recording.usable(
         cameras, num_frames, videos=videos or settings.needs_each_video, silhouettes=not videos
     )
-    shown = [name for name in usable.rig.names if name in usable.videos or name in usable.silhouettes]
-    if settings.needs_silhouettes and len(shown) < min(2, len(usable.rig)):
+    names = usable.rig.names
+    if len(names) < 2:
+        raise InputError(
+            recording.folder,
+            expected="at least two cameras that can be used, because one camera does not show distances",
+            found=", ".join(names),
+        )
+    if not views_meet(usable.rig.cameras):
+        raise InputError(
+            recording.folder,
+            expected="cameras of which two have a place in view together",
+            found=f"that no views of {', '.join(names)} meet",
+            remedy="check the places and directions of the cameras in the calibration",
+        )
+    shown = [name for name in names if name in usable.videos or name in usable.silhouettes]
+    if settings.needs_silhouettes and len(shown) < 2:
         raise InputError(
             recording.folder,
             expected=f"videos of at least two cameras for --method {settings.method}",
@@ -107,8 +122,8 @@ def read_sightings(
         return from_silhouettes(silhouettes, report), dict(silhouettes.keys)
     files = detection_files_of(recording, source)
     detections = {name: read_detections(path) for name, path in files.items()}
-    times = [each for name, each in recording.frame_times.items() if name in recording.rig.names]
-    sightings = from_detections(detections, recording.rig, max(each.num_frames for each in times))
+    num_frames = max(times.num_frames for times in recording.exposed.values())
+    sightings = from_detections(detections, recording.rig, num_frames)
     keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
     return sightings.at_instants(recording.timeline()), keys
 

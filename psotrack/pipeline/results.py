@@ -70,30 +70,21 @@ class TrackedRecording:
     identities: Identities
     record: Mapping[str, Any]
 
+    @property
+    def _title(self) -> str:
+        drones, frames = self.trajectories.num_drones, self.trajectories.num_frames
+        seen = self.trajectories.seen.mean()
+        return f"{self.record['sequence']}: {drones} drones, {frames} frames, {seen:.1%} seen"
+
     def __repr__(self) -> str:
-        frames, drones = self.trajectories.num_frames, self.trajectories.num_drones
-        return (
-            f"TrackedRecording({self.record['sequence']}: {drones} drones, {frames} frames, "
-            f"{self.trajectories.seen.mean():.1%} seen, {self.record['seconds']['total']:.1f} s)"
-        )
+        return f"TrackedRecording({self._title}, {self.record['seconds']['total']:.1f} s)"
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the drones, their paths from above, other settings than the defaults, and seconds."""
-        drones, frames = self.trajectories.num_drones, self.trajectories.num_frames
-        return html_block(
-            f"{self.record['sequence']}: {drones} drones, {frames} frames, {self.trajectories.seen.mean():.1%} seen",
-            drones_html(self.trajectories, self.size_m),
-            html_lines(
-                {
-                    "settings": ", ".join(
-                        f"{name} = {value}" for name, value in changed_settings(self.record).items()
-                    ),
-                    "seconds": ", ".join(
-                        f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()
-                    ),
-                }
-            ),
-        )
+        changed = [f"{name} = {value}" for name, value in changed_settings(self.record).items()]
+        seconds = [f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()]
+        lines = html_lines({"settings": ", ".join(changed), "seconds": ", ".join(seconds)})
+        return html_block(self._title, drones_html(self.trajectories, self.size_m), lines)
 
 
 def changed_settings(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,6 @@ from psotrack.camera_errors import CameraViews, views_of_middles, views_of_sight
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
 from psotrack.fusion import fuse_tracks
-from psotrack.geometry import views_meet
 from psotrack.initiation import MovingPoints, first_drones, given_state, known_motion, start_source
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
 from psotrack.pipeline.inputs import Run, prepare, usable_for
@@ -78,7 +77,6 @@ def track_recording(
     check_parts(parts)
     detector = parts.get("detector")
     recording = usable_for(recording, settings, videos=detector is not None)
-    _check_cameras(recording)
     # Wrong names are refused before silhouettes are computed, which takes minutes.
     method = find_method(settings, parts)
     if method is None and settings.method != "projection-lines":
@@ -112,22 +110,6 @@ def track_recording(
     if run.clocks is None and len(recording.rig) > 2:
         advise_on_clocks(run, result.tracks)
     return replace(tracked, record=with_real_time(tracked.record, time.perf_counter() - began))
-
-
-def _check_cameras(recording: Recording) -> None:
-    if len(recording.rig) < 2:
-        raise InputError(
-            recording.folder,
-            expected="at least two cameras that can be used, because one camera does not show distances",
-            found=", ".join(recording.rig.names),
-        )
-    if not views_meet(recording.rig.cameras):
-        raise InputError(
-            recording.folder,
-            expected="cameras of which two have a place in view together",
-            found=f"that no views of {', '.join(recording.rig.names)} meet",
-            remedy="check the places and directions of the cameras in the calibration",
-        )
 
 
 def track_runs(
