@@ -97,11 +97,10 @@ def track_recording(
             all_videos=settings.needs_each_video,
             report=report,
         )
-        model = find_background(
-            settings.silhouettes.background, scaled_settings(settings.silhouettes, recording)
-        )
-        if "background" not in parts and not isinstance(model, Living):
-            parts = {**parts, "background": model}
+        if "background" not in parts:
+            scaled = scaled_settings(settings.silhouettes, recording)
+            model = find_background(settings.silhouettes.background, scaled)
+            parts = parts if isinstance(model, Living) else {**parts, "background": model}
     load_ahead()
     ((run, result),) = _track(recording, silhouettes, [settings], parts, report)
     tracked = finish(run, result)
