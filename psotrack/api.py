@@ -4,38 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.datasets import open_recording
-from psotrack.detection import Detector
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
-from psotrack.pipeline import Method, Parts, TrackedRecording, check_detections, track_recording
+from psotrack.pipeline import Parts, TrackedRecording, check_detections, track_recording
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import BackgroundModel, ForegroundSettings, Living
+from psotrack.silhouettes import ForegroundSettings, Living
 from psotrack.support import no_progress, progress_bar, user_cache
-from psotrack.tracking import Score, Search
-
-
-class BroughtParts(TypedDict, total=False):
-    """Parts that a caller of `track` may bring, instead of those that the settings name.
-
-    Attributes:
-        search: the search in one frame (see `Search`).
-        score: the score of positions in single cameras (see `Score`).
-        method: the method of tracking (see `Method`).
-        background: the background model (see `BackgroundModel`).
-        detector: the detector of drones in images (see `Detector`).
-    """
-
-    search: Search
-    score: Score
-    method: Method
-    background: BackgroundModel
-    detector: Detector
 
 
 def read_recording(
@@ -62,7 +42,7 @@ def track(
     cache: Path | str | None = None,
     jobs: int | None = None,
     progress: bool = False,
-    **brought: Unpack[BroughtParts],
+    **brought: Unpack[Parts],
 ) -> TrackedRecording:
     """Track the drones of a recording.
 
@@ -74,7 +54,7 @@ def track(
         cache: folder of stored silhouettes and detections; None takes the user's cache folder.
         jobs: number of processes for the silhouettes; None is one per processor.
         progress: whether to show progress bars.
-        **brought: parts that the caller brings: `search`, `score`, `method`, `background`, `detector`.
+        **brought: parts that the caller brings: `search`, `score`, `method`, `background`, `detector` (see `Parts`).
 
     Raises:
         InputError: a file cannot be used, or no drones are found.
@@ -84,15 +64,15 @@ def track(
         settings = TrackSettings().changed(settings or {})
     if not isinstance(recording, Recording):
         recording = read_recording(recording)
-        if brought.get("detector") is None:
+        if "detector" not in brought:
             check_detections(recording, settings)
     return track_recording(
         recording,
         settings,
         cache=user_cache() if cache is None else cache,
         jobs=jobs,
-        parts=Parts(**brought),
         report=progress_bar if progress else no_progress,
+        **brought,
     )
 
 

@@ -309,18 +309,14 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         50
         """
         parts: dict[str, dict[str, Any]] = {}
-        own: dict[str, Any] = {}
         for name, value in values.items():
             if name not in setting_names():
                 near = nearest(name, setting_names())
                 remedy = f"did you mean {near}?" if near else ""
                 raise SettingsError(name, expected="the name of a setting", found=name, remedy=remedy)
-            value = plain(value)
-            part, dot, field = name.partition(".")
-            if dot:
-                parts.setdefault(part, {})[field] = value
-            else:
-                own[name] = value
+            part, _, field = name.rpartition(".")
+            parts.setdefault(part, {})[field] = plain(value)
+        own = parts.pop("", {})
         for part, fields in parts.items():
             own[part] = msgspec.structs.replace(getattr(self, part), **fields)
         return msgspec.structs.replace(self, **own)
@@ -328,13 +324,13 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
 def setting_names() -> tuple[str, ...]:
     """Dotted names of all settings, such as `seed`, `swarm.particles`, `silhouettes.reduction`."""
-    return tuple(_names_in(TrackSettings()))
+    return tuple(dict(flatten(msgspec.to_builtins(TrackSettings()))))
 
 
-def _names_in(record: msgspec.Struct, prefix: str = "") -> Iterator[str]:
-    for name in record.__struct_fields__:
-        value = getattr(record, name)
-        if isinstance(value, msgspec.Struct):
-            yield from _names_in(value, f"{prefix}{name}.")
+def flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of a nested table; an empty inner table is a value."""
+    for name, value in content.items():
+        if isinstance(value, Mapping) and value:
+            yield from flatten(value, f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}"
+            yield f"{prefix}{name}", value

@@ -376,14 +376,16 @@ def test_a_registered_plugin_is_found_by_name(tmp_path):
 WRONG_PARTS = """
 import psotrack as pt
 from psotrack.errors import SettingsError
-from psotrack.pipeline import Parts
+
+def track_with(**parts):
+    return lambda: pt.track_runs(None, None, [], **parts)
 
 for wrong in (
-    lambda: Parts(search=1),
-    lambda: Parts(score=print),
-    lambda: Parts(method=print),
-    lambda: Parts(background=print),
-    lambda: Parts(detector=print),
+    track_with(search=1),
+    track_with(score=print),
+    track_with(method=print),
+    track_with(background=print),
+    track_with(detector=print),
     lambda: pt.register_plugin("searches", "own", print),
     lambda: pt.register_plugin("search", "own", 1),
 ):

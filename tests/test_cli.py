@@ -579,8 +579,9 @@ def test_a_wrong_name_is_refused_before_silhouettes_are_computed(
     assert not (tmp_path / "cache").exists()
 
 
-def test_one_camera_is_refused(run: Run, sequence: Path, tmp_path: Path) -> None:
-    refused = run(*track(sequence, tmp_path / "tracks.csv", "--cameras", "cam1"))
+@pytest.mark.parametrize("more", [(), ("--causal",)])
+def test_one_camera_is_refused(run: Run, sequence: Path, tmp_path: Path, more: tuple[str, ...]) -> None:
+    refused = run(*track(sequence, tmp_path / "tracks.csv", "--cameras", "cam1", *more))
     assert_one_line(refused, "at least two cameras", "found cam1")
 
 

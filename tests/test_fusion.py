@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from psotrack.camera_errors import CameraErrors, Fading, LastingCovariances, TrackErrors
-from psotrack.fusion import fuse_tracks, fused_errors
-from psotrack.fusion.fusion import COMMON_CORRELATION
+from psotrack.fusion import COMMON_CORRELATION, fuse_tracks
 from psotrack.settings import MotionSettings
 from psotrack.trajectories import Arrival, Status, Tracks
 
@@ -60,7 +59,7 @@ def simulate_method(truth_m, std_m, *, seed, hidden=(), offset_m=(0.0, 0.0, 0.0)
 
 def fuse(swarm, lines, **options):
     fusion = fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S, **options)
-    return fusion.tracks, fusion.offset
+    return fusion.tracks, fusion
 
 
 def simulate_and_fuse(truth_m, swarm=None, lines=None, **options):
@@ -82,7 +81,7 @@ def test_information_adds_up():
     np.testing.assert_allclose(std_m, expected_m, rtol=0.1)
     # The measurements of the projection lines also have the error of the offset between the middles.
     _, middles = fuse(first, second)
-    expected_m2 = 1 / (1 / SWARM_STD_M**2 + 1 / (LINES_STD_M**2 + middles.std_m**2))
+    expected_m2 = 1 / (1 / SWARM_STD_M**2 + 1 / (LINES_STD_M**2 + middles.offset_std_m**2))
     diagonal_m2 = np.diagonal(fused.measured_covariance_m2, axis1=-2, axis2=-1)
     np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
     assert (fused.status == Status.TRACKED).all()
@@ -106,9 +105,9 @@ def test_the_offset_between_the_middles_has_a_standard_error():
     # Standard error of a median of 200 independent differences.
     expected_m = np.sqrt(np.pi / 2 * (SWARM_STD_M**2 + LINES_STD_M**2) / FRAMES)
     # The estimate may be a little smaller, because tails are clipped, and larger, if errors are correlated by chance.
-    assert (middles.std_m[1:] > 0.85 * expected_m).all()
-    assert (middles.std_m[1:] < 2.0 * expected_m).all()
-    assert (np.abs(middles.offset_m - off_m) < 4 * middles.std_m).all()
+    assert (middles.offset_std_m[1:] > 0.85 * expected_m).all()
+    assert (middles.offset_std_m[1:] < 2.0 * expected_m).all()
+    assert (np.abs(middles.offset_m - off_m) < 4 * middles.offset_std_m).all()
 
 
 def test_the_offset_is_less_certain_with_correlated_errors():
@@ -120,7 +119,7 @@ def test_the_offset_is_less_certain_with_correlated_errors():
     _, middles = fuse(first, second)
     # There are 20 independent errors, not 200, so the spread has an error of about a quarter.
     expected_m = np.sqrt(np.pi / 2 / 20) * 0.01
-    np.testing.assert_allclose(middles.std_m / expected_m, 1.0, atol=0.6)
+    np.testing.assert_allclose(middles.offset_std_m / expected_m, 1.0, atol=0.6)
 
 
 def test_a_drone_found_by_one_method_only_has_no_offset():
@@ -131,7 +130,7 @@ def test_a_drone_found_by_one_method_only_has_no_offset():
     )
     _, middles = fuse(swarm, lines)
     assert np.isfinite(middles.offset_m).all(axis=-1).tolist() == [False, True, False]
-    np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.std_m))
+    np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.offset_std_m))
 
 
 def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
@@ -140,7 +139,7 @@ def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
     second = simulate_method(circular_paths(1), LINES_STD_M, seed=1)
     fused, middles = fuse(first, second)
     diagonal_m2 = np.diagonal(fused.measured_covariance_m2[60, 0])
-    np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.std_m[0] ** 2, rtol=1e-9)
+    np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.offset_std_m[0] ** 2, rtol=1e-9)
 
 
 def test_methods_with_the_same_foreground_have_correlated_errors():
@@ -148,7 +147,7 @@ def test_methods_with_the_same_foreground_have_correlated_errors():
     first, second, independent = simulate_and_fuse(circular_paths(2))
     correlated, middles = fuse(first, second, same_foreground=True)
     # The least variance of a weighted mean is 1 / (1ᵀ S⁻¹ 1) along each axis.
-    swarm_m, lines_m = SWARM_STD_M + 0 * middles.std_m, np.hypot(LINES_STD_M, middles.std_m)
+    swarm_m, lines_m = SWARM_STD_M + 0 * middles.offset_std_m, np.hypot(LINES_STD_M, middles.offset_std_m)
     cross_m2 = COMMON_CORRELATION * swarm_m * lines_m
     joint_m2 = np.moveaxis(np.array([[swarm_m**2, cross_m2], [cross_m2, lines_m**2]]), (0, 1), (-2, -1))
     expected_m2 = 1 / np.linalg.inv(joint_m2).sum(axis=(-2, -1))
@@ -241,9 +240,7 @@ def lasting_errors(variance_m2):
 
 
 def fused_lasting(swarm, lines, swarm_errors, lines_errors):
-    fusion = fuse_tracks(swarm, lines, SETTINGS, fps=FPS, max_coasting_s=MAX_COASTING_S)
-    _, errors = fused_errors(fusion, swarm_errors, lines_errors, SETTINGS, FPS)
-    return errors.lasting
+    return fuse(swarm, lines, errors=(swarm_errors, lines_errors))[1].errors.lasting
 
 
 def test_errors_that_last_are_not_averaged():

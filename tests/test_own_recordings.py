@@ -109,7 +109,7 @@ class Own:
 
 
 def test_an_own_method_beside_projection_lines_needs_videos(folder, tmp_path):
-    with pytest.raises(InputError, match="expected a video for each of the cameras"):
+    with pytest.raises(InputError, match="expected at least one video"):
         pt.track(folder, {"method": "projection-lines"}, method=Own(), cache=tmp_path)
 
 

@@ -53,7 +53,7 @@ import pandas as pd
 
 from psotrack.evaluation import evaluate
 from psotrack.live import Meeting
-from psotrack.pipeline import Parts, SharedInputs, TrackedRecording, prepare, track_runs
+from psotrack.pipeline import TrackedRecording, prepare, track_runs
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes, compute
@@ -297,7 +297,7 @@ def start_s(recording: Recording, silhouettes: Silhouettes) -> float:
     recording = replace(recording, bounds_m=None)
     silhouettes = silhouettes.at_instants(recording.timeline())
     began = time.process_time()
-    prepare(SharedInputs(recording, silhouettes), TrackSettings(), Parts())
+    prepare(recording, silhouettes, {}, TrackSettings(), {})
     return time.process_time() - began
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from psotrack.archives.manifest import Manifest
 from psotrack.errors import InputError
-from psotrack.settings import TrackSettings
+from psotrack.settings import TrackSettings, flatten
 from psotrack.support import read_text
 from psotrack.trajectories import Trajectories, read_trajectories
 
@@ -103,9 +103,9 @@ def compare_with_archive(
     old, new = read_trajectories(was), read_trajectories(tracks)
     old_record = _read_record(folder / manifest.record)
     differences = _differences(
-        {**_flat(manifest.settings), **_circumstances(old_record)},
+        {**dict(flatten(manifest.settings)), **_circumstances(old_record)},
         # By way of JSON, which has lists and no tuples.
-        {**_flat(msgspec.json.decode(msgspec.json.encode(settings))), **_circumstances(record)},
+        {**dict(flatten(msgspec.json.decode(msgspec.json.encode(settings)))), **_circumstances(record)},
     )
     unlike = ""
     if not np.array_equal(old.frame, new.frame):
@@ -154,19 +154,12 @@ def _circumstances(record: Mapping[str, Any]) -> dict[str, Any]:
         "cameras": record.get("cameras"),
         "frames": record.get("frames"),
         "causal": record.get("causal", False),
-        **_flat({"parts": record.get("parts", {}), "input_keys": record.get("input_keys", {})}),
+        **dict(flatten(record.get("parts", {}), "parts.")),
+        **dict(flatten(record.get("input_keys", {}), "input_keys.")),
     }
     for part in _ENVIRONMENT:
         found |= record.get(part, {})
     return found
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted names."""
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
 
 
 def _differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

@@ -258,9 +258,9 @@ def track(
     refuse_files(out, record_path, *([] if causal else [ambiguity_path]), force=force)
     chosen = chosen_settings(settings)
     num_frames, causal, most_drones = chosen_extent(num_frames, causal, most_drones)
-    parts = Parts(
-        detector=None if detector is None else find_detector(detector, DetectorSettings(size=detector_size)),
-    )
+    parts = Parts()
+    if detector is not None:
+        parts["detector"] = find_detector(detector, DetectorSettings(size=detector_size))
     keep_compiled(compiled_folder(cache))
     start_s = time.perf_counter() - started
     opened = open_recording(sequence)
@@ -283,8 +283,8 @@ def track(
         chosen,
         cache=cache_folder(cache),
         jobs=jobs,
-        parts=parts,
         report=report_to(quiet),
+        **parts,
     )
     identities, time_s = tracked.identities, tracked.trajectories.time_s
     record = with_real_time(tracked.record, time.perf_counter() - started, start_s=start_s)
@@ -317,11 +317,11 @@ def _track_causally(
     started: float,
 ) -> None:
     """Track a recording without the future, and write the rows of each frame as it is done."""
-    from psotrack.pipeline import CausalRecording, with_real_time
+    from psotrack.pipeline import track_causally, with_real_time
     from psotrack.trajectories import RowStream, read_trajectories
 
     start_s = time.perf_counter() - started
-    run = CausalRecording(
+    frames, record = track_causally(
         recording,
         settings,
         cache=cache_folder(cache),
@@ -330,9 +330,9 @@ def _track_causally(
         report=report_to(quiet),
     )
     with RowStream(out, force=force, record=out.with_suffix(".json")) as rows:
-        for frame in run:
+        for frame in frames:
             rows.write(frame)
-    record = with_real_time(run.record, time.perf_counter() - started, start_s=start_s)
+    record = with_real_time(record, time.perf_counter() - started, start_s=start_s)
     record, sentence = with_comparison(record, out, settings)
     write_json(out.with_suffix(".json"), record)
     output_json(json_path, record, force)

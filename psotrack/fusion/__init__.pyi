@@ -1,7 +1,7 @@
-from .fusion import Fusion, fuse_tracks, fused_errors
+from .fusion import COMMON_CORRELATION, Fusion, fuse_tracks
 
 __all__ = [
+    "COMMON_CORRELATION",
     "Fusion",
     "fuse_tracks",
-    "fused_errors",
 ]

@@ -28,7 +28,7 @@ from psotrack.correspondence import SEPARATION_M
 from psotrack.motion import GATE_999, Measurements, filter_measurements, motion_params
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
-from psotrack.trajectories import ARRAYS, Status, Tracks, unknown_value
+from psotrack.trajectories import ARRAYS, Status, Tracks, padded
 
 #: Least number of common frames from which the offset of the two points is estimated; with fewer the offset is taken
 #: as 0.
@@ -45,35 +45,21 @@ COMMON_CORRELATION = 0.5
 
 
 @dataclass(frozen=True)
-class PointOffset:
-    """Vector from the middle of each drone's silhouettes to the middle of its boxes, constant over time.
-
-    Attributes:
-        offset_m: (drones, 3), along the world's axes, metres; NaN where too few frames show both.
-        std_m: (drones, 3), standard errors, metres.
-    """
-
-    offset_m: Float[np.ndarray, "drones 3"]
-    std_m: Float[np.ndarray, "drones 3"]
-
-
-@dataclass(frozen=True)
 class Fusion:
-    """The tracks of both methods as one, and what they were made of.
+    """The tracks of both methods as one.
 
     Attributes:
         tracks: the fused tracks: the drones of the swarm under their numbers, then drones that only the lines know.
-        offset: the offset between the two tracked points.
-        swarm_drones, lines_drones: (drones,), number of each fused drone in the swarm and in the lines; -1 for none.
-        lines_share: (frames, drones), weight of the lines' position in the fused position, 0 to 1; NaN where neither
-            method found the drone.
+        offset_m: (drones, 3), vector from the middle of each drone's silhouettes to the middle of its boxes, constant
+            over time, along the world's axes, metres; NaN where too few frames show both.
+        offset_std_m: (drones, 3), its standard errors, metres.
+        errors: errors of both methods that come from the cameras; None where neither method states any.
     """
 
     tracks: Tracks
-    offset: PointOffset
-    swarm_drones: Int[np.ndarray, "drones"]
-    lines_drones: Int[np.ndarray, "drones"]
-    lines_share: Float[np.ndarray, "frames drones"]
+    offset_m: Float[np.ndarray, "drones 3"]
+    offset_std_m: Float[np.ndarray, "drones 3"]
+    errors: TrackErrors | None
 
 
 def fuse_tracks(
@@ -84,6 +70,7 @@ def fuse_tracks(
     fps: float,
     max_coasting_s: float,
     same_foreground: bool = False,
+    errors: tuple[TrackErrors | None, TrackErrors | None] = (None, None),
 ) -> Fusion:
     """The tracks of both methods as one.
 
@@ -99,6 +86,8 @@ def fuse_tracks(
         fps: frames per second.
         max_coasting_s: seconds for which a drone that is not found coasts before it is lost.
         same_foreground: whether the lines' detections are blobs of the foreground that the swarm sees.
+        errors: errors of the swarm's and of the lines' tracks that come from the cameras; None for a method that states
+            none. The noise of the first that states some fades as that of the fused positions.
     """
     matches = _same_drones(swarm, lines)
     alone = np.setdiff1d(np.arange(lines.num_drones), matches)
@@ -109,37 +98,39 @@ def fuse_tracks(
     lines_drones = np.concatenate([matches, alone])
     first = _of_drones(swarm, swarm_drones)
     second = _of_drones(lines, lines_drones)
-    offset = _point_offset(first.found_m(), second.found_m())
-    correlation = COMMON_CORRELATION if same_foreground else 0.0
+    offset_m, offset_std_m = _point_offset(first.found_m(), second.found_m())
     frame = np.arange(swarm.num_frames)
-    measured, lines_share = _weighted(first, second, offset, correlation, frame / fps)
+    correlation = COMMON_CORRELATION if same_foreground else 0.0
+    measured, share = _weighted(first, second, offset_m, offset_std_m, correlation, frame / fps)
     found = measured.was_measured
     moving = filter_measurements(measured, motion_params(settings, found.shape[1]))
     last = _last_found(found)
     coasting = (last >= 0) & (frame[:, None] - last <= round(max_coasting_s * fps))
-    status = np.where(found, Status.TRACKED, np.where(coasting, Status.COASTING, Status.LOST))
-    by_swarm = first.status == Status.TRACKED
     renumbered = {int(drone): swarm.num_drones + number for number, drone in enumerate(alone)}
     arrivals = [
         replace(arrival, drone=renumbered[arrival.drone])
         for arrival in lines.arrivals
         if arrival.drone in renumbered
     ]
-    fused = Tracks(
+    fused = replace(
+        first,
         position_m=moving.position_m,
         velocity_m_s=moving.velocity_m_s,
         covariance_m2=moving.covariance_m2,
         measured_m=measured.position_m,
         measured_covariance_m2=measured.covariance_m2,
-        fitness=np.where(by_swarm, first.fitness, second.fitness),
+        fitness=np.where(first.status == Status.TRACKED, first.fitness, second.fitness),
         num_cameras=np.maximum(first.num_cameras, second.num_cameras),
-        status=status,
-        measured_size_m=first.measured_size_m,
+        status=np.where(found, Status.TRACKED, np.where(coasting, Status.COASTING, Status.LOST)),
         size_m=np.concatenate([swarm.size_m, lines.size_m[alone]]),
         size_frames=np.concatenate([swarm.size_frames, lines.size_frames[alone]]),
         arrivals=(*swarm.arrivals, *arrivals),
     )
-    return Fusion(fused, offset, swarm_drones, lines_drones, lines_share)
+    if not any(errors):
+        return Fusion(fused, offset_m, offset_std_m, None)
+    methods = list(zip(errors, (swarm_drones, lines_drones), strict=True))
+    with_errors, errors_of_both = _with_errors(fused, methods, share, settings, fps)
+    return Fusion(with_errors, offset_m, offset_std_m, errors_of_both)
 
 
 def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
@@ -158,22 +149,19 @@ def _same_drones(swarm: Tracks, lines: Tracks) -> Int[np.ndarray, "drones"]:
 def _of_drones(tracks: Tracks, drones: Int[np.ndarray, "drones"]) -> Tracks:
     """The arrays of some drones, in the order of `drones`; the values of drone -1 are unknown."""
 
-    def chosen(name: str, value: np.ndarray) -> np.ndarray:
-        # The fitness of a drone that was not found is 0, not unknown.
-        unknown = 0.0 if name == "fitness" else unknown_value(name, value.dtype)
-        column = np.full_like(value[:, :1], unknown, shape=(len(value), 1, *value.shape[2:]))
-        return np.concatenate([value, column], axis=1)[:, drones]
-
-    arrays: dict[str, Any] = {name: chosen(name, np.asarray(getattr(tracks, name))) for name in ARRAYS}
-    for name in ("size_m", "size_frames"):
-        (arrays[name],) = chosen(name, getattr(tracks, name)[None])
-    return replace(tracks, **arrays)
+    arrays = {name: np.asarray(getattr(tracks, name)) for name in ARRAYS}
+    sizes = {name: getattr(tracks, name)[None] for name in ("size_m", "size_frames")}
+    chosen: dict[str, Any] = {
+        name: padded(name, value, tracks.num_drones + 1)[:, drones]
+        for name, value in (arrays | sizes).items()
+    }
+    return replace(tracks, **chosen | {name: chosen[name][0] for name in sizes})
 
 
 def _point_offset(
     silhouettes_m: Float[np.ndarray, "frames drones 3"], boxes_m: Float[np.ndarray, "frames drones 3"]
-) -> PointOffset:
-    """The offsets, from frames that show both points.
+) -> tuple[Float[np.ndarray, "drones 3"], Float[np.ndarray, "drones 3"]]:
+    """The offsets of each drone's points and their standard errors (see `Fusion`), from frames that show both points.
 
     Errors of neighbouring frames are correlated (see `standard_error`).
     """
@@ -184,21 +172,28 @@ def _point_offset(
         apart_m = off_m[:, drone] - median_m[drone]
         far_m = FAR * MAD_STD * np.nanmedian(np.abs(apart_m), axis=0)
         std_m[drone] = MEDIAN_ERROR * standard_error(np.clip(apart_m, -far_m, far_m), np.arange(len(off_m)))
-    return PointOffset(median_m, std_m)
+    return median_m, std_m
 
 
 def _weighted(
-    swarm: Tracks, lines: Tracks, offset: PointOffset, correlation: float, time_s: Float[np.ndarray, "frames"]
+    swarm: Tracks,
+    lines: Tracks,
+    offset_m: Float[np.ndarray, "drones 3"],
+    offset_std_m: Float[np.ndarray, "drones 3"],
+    correlation: float,
+    time_s: Float[np.ndarray, "frames"],
 ) -> tuple[Measurements, Float[np.ndarray, "frames drones"]]:
-    """Measured positions of both methods together, and the lines' weight (`Fusion.lines_share`).
+    """Measured positions of both methods together, and the weight of the lines' positions in them, 0 to 1.
+
+    The weight is NaN where neither method found the drone.
 
     Where the two positions disagree more than their covariances allow, one position belongs to another drone or to no
     drone. Then the swarm's position counts, because the swarm sees all of the foreground.
     """
-    first_m, second_m = swarm.found_m(), lines.found_m() - np.nan_to_num(offset.offset_m)
+    first_m, second_m = swarm.found_m(), lines.found_m() - np.nan_to_num(offset_m)
     first_m2 = np.asarray(swarm.measured_covariance_m2, np.float64)
     second_m2 = np.asarray(lines.measured_covariance_m2, np.float64)
-    second_m2 = second_m2 + np.nan_to_num(offset.std_m)[..., None] ** 2 * np.eye(3)
+    second_m2 = second_m2 + np.nan_to_num(offset_std_m)[..., None] ** 2 * np.eye(3)
     by_swarm, by_lines = (np.isfinite(each_m).all(axis=-1) for each_m in (first_m, second_m))
     position_m = np.where(by_swarm[..., None], first_m, second_m)
     covariance_m2 = np.where(by_swarm[..., None, None], first_m2, second_m2)
@@ -225,32 +220,32 @@ def _last_found(found: Bool[np.ndarray, "frames drones"]) -> Int[np.ndarray, "fr
     return np.maximum.accumulate(np.where(found, frame, -1), axis=0)
 
 
-def fused_errors(
-    fusion: Fusion,
-    swarm: TrackErrors | None,
-    lines: TrackErrors | None,
+def _with_errors(
+    fused: Tracks,
+    methods: list[tuple[TrackErrors | None, Int[np.ndarray, "drones"]]],
+    lines_share: Float[np.ndarray, "frames drones"],
     motion: MotionSettings,
     fps: float,
 ) -> tuple[Tracks, TrackErrors]:
-    """Fused tracks with the errors of both methods.
+    """Fused tracks whose noise fades, and the errors of both methods as one.
 
     Errors that last have the same causes in both methods, the turned cameras and the late clocks, and do not average
     out. A weighted mean of two errors has at most the weighted mean of their squares, whatever their correlation: that
     is the covariance of the fused errors that last.
 
     Args:
-        fusion: the fused tracks; their measured covariances are those of the noise that was found.
-        swarm, lines: errors of both methods; None for a method that found no drone. The noise of the first that found
-            one fades as that of the fused positions.
+        fused: the fused tracks; their measured covariances are those of the noise that was found.
+        methods: for the swarm and the lines their errors, and the number in them of each fused drone; -1 for none.
+        lines_share: (frames, drones), weight of the lines' positions (see `_weighted`).
         motion: settings of the motion model that the fusion used.
         fps: frames per second.
     """
-    known = [each.cameras for each in (swarm, lines) if each is not None]
+    known = [errors.cameras for errors, _ in methods if errors is not None]
 
     def mean_square(name: str) -> Any:
         return np.sqrt(np.mean([np.square(getattr(each, name)) for each in known], axis=0))
 
-    errors = replace(
+    cameras = replace(
         known[0],
         noise_px=np.full_like(known[0].noise_px, np.nan),
         lasting_px=mean_square("lasting_px"),
@@ -258,39 +253,24 @@ def fused_errors(
         clock_s=float(mean_square("clock_s")),
         constant_covariance=np.mean([each.constant_covariance for each in known], axis=0),
     )
-    tracks = fusion.tracks
-    measured_m2 = np.asarray(tracks.measured_covariance_m2, np.float64)
     _, filtered = noise_ratios(
-        measured_m2,
-        measured_m2,
-        errors,
+        fused.measured_covariance_m2,
+        fused.measured_covariance_m2,
+        cameras,
         MeasurementErrors(1.0, motion.error_share, motion.error_time_s),
         dt_s=1 / fps,
         jerk_density_m2_s5=motion.jerk_density,
     )
-    corrected = replace(tracks, covariance_m2=tracks.covariance_m2 * filtered[..., None, None])
-    return corrected, TrackErrors(errors, _fused_lasting(fusion, swarm, lines))
-
-
-def _fused_lasting(
-    fusion: Fusion, swarm: TrackErrors | None, lines: TrackErrors | None
-) -> LastingCovariances:
-    """Covariances of the fused positions by errors that last: the weighted means of both methods' covariances."""
     # A drone that is not found keeps the weights of the frame in which it was last found, or first will be.
-    found = np.isfinite(fusion.lines_share)
+    found = np.isfinite(lines_share)
     last = _last_found(found)
     nearest = np.where(last < 0, found.argmax(axis=0), last)
-    share = np.nan_to_num(np.take_along_axis(fusion.lines_share, nearest, axis=0))[..., None, None]
-
-    def of_drones(errors: TrackErrors | None, name: str, drones: Int[np.ndarray, "drones"]) -> np.ndarray:
-        if errors is None:
-            return np.zeros((*found.shape, 3, 3))
-        # Drone -1 has the column of zeros.
-        return np.pad(getattr(errors.lasting, name), [(0, 0), (0, 1), (0, 0), (0, 0)])[:, drones]
-
-    absolute_m2, relative_m2 = (
-        (1 - share) * of_drones(swarm, name, fusion.swarm_drones)
-        + share * of_drones(lines, name, fusion.lines_drones)
-        for name in ("absolute_m2", "relative_m2")
-    )
-    return LastingCovariances(absolute_m2, relative_m2)
+    share = np.nan_to_num(np.take_along_axis(lines_share, nearest, axis=0))[..., None, None]
+    lasting: dict[str, Any] = {"absolute_m2": 0.0, "relative_m2": 0.0}
+    for weight, (errors, drones) in zip((1 - share, share), methods, strict=True):
+        if errors is not None:
+            for name, of_method_m2 in vars(errors.lasting).items():
+                # Drone -1 has the column of zeros.
+                lasting[name] += weight * np.pad(of_method_m2, [(0, 0), (0, 1), (0, 0), (0, 0)])[:, drones]
+    corrected = replace(fused, covariance_m2=fused.covariance_m2 * filtered[..., None, None])
+    return corrected, TrackErrors(cameras, LastingCovariances(**lasting))

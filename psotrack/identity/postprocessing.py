@@ -52,19 +52,18 @@ def postprocess(
         num_cameras=np.asarray(tracks.num_cameras, np.int64),
         status=np.asarray(tracks.status, np.int64),
     )
-    if smoothing is None:
-        return trajectories, identities
-    measured, params = _measurements(tracks, time_s), motion_params(smoothing, tracks.num_drones)
-    # The whole recording shows how much the drones really change their acceleration.
-    known = replace(params, jerk_density_m2_s5=estimate_jerk_density(measured, params))
-    smoothed = smooth(measured, known)
-    smooth_trajectories = replace(
-        trajectories,
-        position_m=smoothed.position_m,
-        velocity_m_s=smoothed.velocity_m_s,
-        covariance_m2=smoothed.covariance_m2,
-    )
-    return smooth_trajectories, identities
+    if smoothing is not None:
+        measured, params = _measurements(tracks, time_s), motion_params(smoothing, tracks.num_drones)
+        # The whole recording shows how much the drones really change their acceleration.
+        known = replace(params, jerk_density_m2_s5=estimate_jerk_density(measured, params))
+        smoothed = smooth(measured, known)
+        trajectories = replace(
+            trajectories,
+            position_m=smoothed.position_m,
+            velocity_m_s=smoothed.velocity_m_s,
+            covariance_m2=smoothed.covariance_m2,
+        )
+    return trajectories, identities
 
 
 def _measurements(tracks: Tracks, time_s: Float[np.ndarray, "frames"]) -> Measurements:

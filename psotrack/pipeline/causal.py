@@ -88,8 +88,16 @@ def causal_tracker(
     }
 
 
-class CausalRecording:
-    """A recording that is tracked as if its cameras were live: iterate over it for the rows of each frame.
+def track_causally(
+    recording: Recording,
+    settings: TrackSettings,
+    *,
+    cache: Path | str,
+    jobs: int | None = None,
+    most_drones: int = 16,
+    report: Report = no_progress,
+) -> tuple[Iterator[Trajectories], dict[str, Any]]:
+    """Track a recording as if its cameras were live.
 
     Args:
         recording: the recording; each camera with a video is used.
@@ -99,63 +107,52 @@ class CausalRecording:
         most_drones: largest number of drones at one time.
         report: shows the progress of each stage, in frames.
 
-    Attributes:
-        record: settings, versions, device and seconds per stage, fit for JSON; complete after the last frame.
+    Returns:
+        The rows of each frame, which are tracked one after the other; and settings, versions, device and seconds per
+        stage, fit for JSON, which are complete after the last frame.
     """
+    settings = causal_settings(settings)
+    made = compute(recording, settings.silhouettes, cache=cache, jobs=jobs, all_videos=False, report=report)
+    timeline = recording.at_rate(settings.rate_hz).timeline()
+    silhouettes = made.at_instants(timeline)
+    tracker, record = causal_tracker(
+        recording.rig,
+        settings,
+        fps=timeline.rate_hz,
+        bounds_m=recording.bounds_m,
+        reduction=made.reduction,
+        shape=made.shape,
+        most_drones=most_drones,
+    )
+    began = time.perf_counter()
+    tracker.compile()
+    seconds = {**made.seconds, "compile": time.perf_counter() - began}
+    record |= {
+        "sequence": recording.name,
+        "frames": timeline.num_instants,
+        "input_keys": dict(made.keys),
+    }
 
-    def __init__(
-        self,
-        recording: Recording,
-        settings: TrackSettings,
-        *,
-        cache: Path | str,
-        jobs: int | None = None,
-        most_drones: int = 16,
-        report: Report = no_progress,
-    ) -> None:
-        self._settings, self._report = causal_settings(settings), report
-        made = compute(
-            recording, self._settings.silhouettes, cache=cache, jobs=jobs, all_videos=False, report=report
-        )
-        self._timeline = recording.at_rate(settings.rate_hz).timeline()
-        self._silhouettes = made.at_instants(self._timeline)
-        self._tracker, record = causal_tracker(
-            recording.rig,
-            self._settings,
-            fps=self._timeline.rate_hz,
-            bounds_m=recording.bounds_m,
-            reduction=made.reduction,
-            shape=made.shape,
-            most_drones=most_drones,
-        )
-        began = time.perf_counter()
-        self._tracker.compile()
-        self.record = record | {
-            "sequence": recording.name,
-            "frames": self._timeline.num_instants,
-            "input_keys": dict(made.keys),
-            "seconds": {**made.seconds, "compile": time.perf_counter() - began},
-        }
-
-    def __iter__(self) -> Iterator[Trajectories]:
-        time_s, exposures = self._timeline.time_s.tolist(), self._silhouettes.exposures
-        exposures = exposures_of(self._timeline) if exposures is None else exposures
+    def rows_of_frames() -> Iterator[Trajectories]:
+        exposures = exposures_of(timeline) if silhouettes.exposures is None else silhouettes.exposures
         drones: set[str] = set()
         seen, began = 0, time.perf_counter()
-        with self._report("track", len(time_s)) as advance:
-            for first in range(0, len(time_s), _READ_FRAMES):
-                stop = min(first + _READ_FRAMES, len(time_s))
-                for frame, coverage in enumerate(self._silhouettes.read(first, stop), first):
-                    rows = self._tracker.step(frame, time_s[frame], coverage, exposures[frame])
+        with report("track", timeline.num_instants) as advance:
+            for first in range(0, timeline.num_instants, _READ_FRAMES):
+                stop = min(first + _READ_FRAMES, timeline.num_instants)
+                for frame, coverage in enumerate(silhouettes.read(first, stop), first):
+                    rows = tracker.step(frame, float(timeline.time_s[frame]), coverage, exposures[frame])
                     drones.update(rows.drones)
                     seen += int(np.sum(rows.status == Status.TRACKED))
                     yield rows
-                    self._tracker.look_ahead()
+                    tracker.look_ahead()
                 advance(stop - first)
-        warn_of_missing_drones(self._settings, len(drones))
-        seconds = self.record["seconds"] | {"track": time.perf_counter() - began}
-        self.record |= {
-            "drones": len(drones),
-            "tracked_rows": seen,
-            "seconds": {stage: round(value, 4) for stage, value in seconds.items()},
-        }
+        warn_of_missing_drones(settings, len(drones))
+        seconds["track"] = time.perf_counter() - began
+        record.update(
+            drones=len(drones),
+            tracked_rows=seen,
+            seconds={stage: round(value, 4) for stage, value in seconds.items()},
+        )
+
+    return rows_of_frames(), record

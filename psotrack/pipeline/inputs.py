@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
+from psotrack.clocks import CameraClocks
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
 from psotrack.datasets.dpjait import detection_files, read_detections
 from psotrack.errors import InputError
+from psotrack.geometry import views_meet
 from psotrack.initiation import (
     FlightVolume,
     MovingPoints,
@@ -45,8 +47,8 @@ def usable_for(
             as good as a video.
 
     Raises:
-        InputError: detections cannot be read, no camera can be used (see `Recording.usable`), or fewer than two
-            cameras have the videos or stored silhouettes that the method needs.
+        InputError: detections cannot be read, no camera can be used (see `Recording.usable`), no two cameras have a
+            place in view together, or fewer than two have the videos or stored silhouettes that the method needs.
         SettingsError: a camera is unknown, or the recording has fewer instants.
     """
     if settings.reads_detections and settings.detections != YOLO:
@@ -54,8 +56,22 @@ def usable_for(
     usable = recording.usable(
         cameras, num_frames, videos=videos or settings.needs_each_video, silhouettes=not videos
     )
-    shown = [name for name in usable.rig.names if name in usable.videos or name in usable.silhouettes]
-    if settings.needs_silhouettes and len(shown) < min(2, len(usable.rig)):
+    names = usable.rig.names
+    if len(names) < 2:
+        raise InputError(
+            recording.folder,
+            expected="at least two cameras that can be used, because one camera does not show distances",
+            found=", ".join(names),
+        )
+    if not views_meet(usable.rig.cameras):
+        raise InputError(
+            recording.folder,
+            expected="cameras of which two have a place in view together",
+            found=f"that no views of {', '.join(names)} meet",
+            remedy="check the places and directions of the cameras in the calibration",
+        )
+    shown = [name for name in names if name in usable.videos or name in usable.silhouettes]
+    if settings.needs_silhouettes and len(shown) < 2:
         raise InputError(
             recording.folder,
             expected=f"videos of at least two cameras for --method {settings.method}",
@@ -106,30 +122,10 @@ def read_sightings(
         return from_silhouettes(silhouettes, report), dict(silhouettes.keys)
     files = detection_files_of(recording, source)
     detections = {name: read_detections(path) for name, path in files.items()}
-    times = [each for name, each in recording.frame_times.items() if name in recording.rig.names]
-    sightings = from_detections(detections, recording.rig, max(each.num_frames for each in times))
+    num_frames = max(times.num_frames for times in recording.exposed.values())
+    sightings = from_detections(detections, recording.rig, num_frames)
     keys = {name: digest_file(path, algorithm="sha256")[:16] for name, path in files.items()}
     return sightings.at_instants(recording.timeline()), keys
-
-
-@dataclass(frozen=True)
-class SharedInputs:
-    """A recording at the instants of some runs, and what these runs share.
-
-    Attributes:
-        recording: the recording at these instants.
-        silhouettes: silhouettes of all cameras at these instants; None where no run needs them.
-        points: moving points that the runs have found so far, by the source of the detections.
-    """
-
-    recording: Recording
-    silhouettes: Silhouettes | None
-    points: dict[str, MovingPoints] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, recording: Recording, silhouettes: Silhouettes | None) -> SharedInputs:
-        """Those of a recording, with its silhouettes in all frames."""
-        return cls(recording, None if silhouettes is None else silhouettes.at_instants(recording.timeline()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,23 +135,27 @@ class Run:
     Attributes:
         recording, silhouettes: those at the instants of the run.
         settings: settings of the run, with the speed limit that was found.
+        parts: parts that the caller brings.
         source: source of the first positions.
         volume: bounds of the room, and where they come from.
         plugin: the method that the caller brings or that an entry point names; None for the methods of this package.
         sightings: detections of all cameras at the instants; None where the method reads none.
         detection_keys: digests of the files or silhouettes that the detections come from, by camera.
         read_s: time in which the detections were read, seconds.
+        clocks: clocks of the cameras, where they were estimated and corrected; None elsewhere.
     """
 
     recording: Recording
     silhouettes: Silhouettes | None
     settings: TrackSettings
+    parts: Parts
     source: StartSource
     volume: FlightVolume
     plugin: Method | None
     sightings: Sightings | None
     detection_keys: Mapping[str, str]
     read_s: float
+    clocks: CameraClocks | None = None
 
     @property
     def by_swarm(self) -> bool:
@@ -163,10 +163,24 @@ class Run:
         return self.plugin is None and self.settings.method != "projection-lines"
 
 
-def prepare(shared: SharedInputs, settings: TrackSettings, parts: Parts, report: Report = no_progress) -> Run:
-    """Read the detections that the method needs, and find the volume and the speed limit (see `track_runs`)."""
+def prepare(
+    recording: Recording,
+    silhouettes: Silhouettes | None,
+    points: dict[str, MovingPoints],
+    settings: TrackSettings,
+    parts: Parts,
+    report: Report = no_progress,
+) -> Run:
+    """Read the detections that the method needs, and find the volume and the speed limit (see `track_runs`).
+
+    Args:
+        recording, silhouettes: those at the instants of the run.
+        points: moving points in them by the source of the detections; what is found here is added for other runs.
+        settings: settings of the run.
+        parts: parts that the caller brings.
+        report: shows the progress in frames.
+    """
     began = time.perf_counter()
-    recording, silhouettes, points = shared.recording, shared.silhouettes, shared.points
     plugin = find_method(settings, parts)
     sightings, source, keys = None, BLOBS, dict[str, str]()
     if settings.method != "swarm" if plugin is None else plugin.reads_detections:
@@ -182,4 +196,4 @@ def prepare(shared: SharedInputs, settings: TrackSettings, parts: Parts, report:
     volume = flight_volume(recording.rig, points.get(source), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)
-    return Run(recording, silhouettes, settings, start, volume, plugin, sightings, keys, read_s)
+    return Run(recording, silhouettes, settings, parts, start, volume, plugin, sightings, keys, read_s)

@@ -5,8 +5,8 @@ A method is given to `psotrack.track(..., method=...)`, or by name as a plugin (
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Protocol, TypedDict, get_type_hints, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -16,17 +16,9 @@ from psotrack.detection import Detector
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig
 from psotrack.initiation import InitialState
-from psotrack.recordings import Recording
 from psotrack.settings import YOLO, TrackSettings
-from psotrack.silhouettes import (
-    BackgroundModel,
-    Living,
-    Silhouettes,
-    SilhouetteSettings,
-    find_background,
-    scaled_settings,
-)
-from psotrack.support import Report, check_interface, identify, make_plugin, no_progress
+from psotrack.silhouettes import BackgroundModel, Silhouettes
+from psotrack.support import Report, check_interface, make_plugin, no_progress
 from psotrack.tracking import Score, Search
 from psotrack.trajectories import Tracks
 
@@ -41,8 +33,7 @@ class MethodInputs:
     Attributes:
         rig: the cameras, calibrated.
         silhouettes: silhouettes of all cameras at the instants (`Silhouettes.read` gives the coverage of some of them,
-            0 to 255; `exposures` says when each camera's frame was exposed, None where all were exposed together); None
-            where none were computed.
+            0 to 255; `exposures` says when each camera's frame was exposed, None where all were exposed together).
         sightings: detections of all cameras at all instants; None for a method that does not read detections.
         initial: positions, velocities and sizes of the drones at frame 0, (drones, 3) each, metres and m/s.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
@@ -51,7 +42,7 @@ class MethodInputs:
     """
 
     rig: Rig
-    silhouettes: Silhouettes | None
+    silhouettes: Silhouettes
     sightings: Sightings | None
     initial: InitialState
     bounds_m: Float[np.ndarray, "2 3"]
@@ -87,49 +78,30 @@ class Method(Protocol):
         ...
 
 
-#: Interface of each of `Parts`.
-_INTERFACES: dict[str, type] = {
-    "search": Search,
-    "score": Score,
-    "method": Method,
-    "background": BackgroundModel,
-    "detector": Detector,
-}
-
-
-@dataclass(frozen=True)
-class Parts:
+class Parts(TypedDict, total=False):
     """Parts that the caller brings, instead of those that the settings name.
 
     Attributes:
-        search: the search in one frame.
-        score: the score of positions in single cameras.
-        method: the method of tracking.
-        background: the background model that makes the silhouettes; only `track_recording` makes silhouettes.
-        detector: makes the detections; only `track_recording` makes detections.
-
-    Raises:
-        SettingsError: a part lacks an attribute or a method of its interface.
+        search: the search in one frame (see `Search`).
+        score: the score of positions in single cameras (see `Score`).
+        method: the method of tracking (see `Method`).
+        background: the background model that makes the silhouettes (see `BackgroundModel`); only `track` and
+            `track_recording` make silhouettes.
+        detector: makes the detections (see `Detector`); only `track` and `track_recording` make detections.
     """
 
-    search: Search | None = None
-    score: Score | None = None
-    method: Method | None = None
-    background: BackgroundModel | None = None
-    detector: Detector | None = None
+    search: Search
+    score: Score
+    method: Method
+    background: BackgroundModel
+    detector: Detector
 
-    def __post_init__(self) -> None:
-        for kind, part in self._brought.items():
-            check_interface(kind, part, _INTERFACES[kind])
 
-    @property
-    def _brought(self) -> dict[str, Any]:
-        return {kind: part for kind, part in vars(self).items() if part is not None}
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """Identities of the parts that the caller brings, by kind, fit for JSON."""
-        return {kind: identify(part) for kind, part in self._brought.items()}
+def check_parts(parts: Parts) -> None:
+    """Raise `SettingsError` if a part lacks an attribute or a method of its interface."""
+    for kind, interface in get_type_hints(Parts).items():
+        if kind in parts:
+            check_interface(kind, parts.get(kind), interface)
 
 
 def find_method(settings: TrackSettings, parts: Parts) -> Method | None:
@@ -138,24 +110,12 @@ def find_method(settings: TrackSettings, parts: Parts) -> Method | None:
     Raises:
         SettingsError: there is no method of the settings' name.
     """
-    if parts.method is not None or settings.method in _BUILT_IN:
-        return parts.method
+    if "method" in parts or settings.method in _BUILT_IN:
+        return parts.get("method")
     method: Method = make_plugin(
         "method", settings.method, settings, interface=Method, setting="method", built_in=_BUILT_IN
     )
     return method
-
-
-def with_background(parts: Parts, recording: Recording, settings: SilhouetteSettings) -> Parts:
-    """The parts with the background model that the settings name, where that model is a plugin.
-
-    Raises:
-        SettingsError: there is no background model of the settings' name.
-    """
-    if parts.background is not None or not (recording.videos or recording.silhouettes):
-        return parts
-    model = find_background(settings.background, scaled_settings(settings, recording))
-    return parts if model is None or isinstance(model, Living) else replace(parts, background=model)
 
 
 def check_detector_is_used(settings: TrackSettings, method: Method | None) -> None:

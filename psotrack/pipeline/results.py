@@ -17,14 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.camera_errors import TrackErrors
-from psotrack.clocks import CameraClocks
 from psotrack.errors import InputError
 from psotrack.identity import Identities, postprocess
 from psotrack.initiation import count_common, find_cut_off, find_outside, state_at_first_frame
 from psotrack.pipeline.inputs import Run
-from psotrack.pipeline.parts import Parts
-from psotrack.settings import TrackSettings, setting_names
-from psotrack.support import html_block, html_lines
+from psotrack.settings import TrackSettings, flatten
+from psotrack.support import html_block, html_lines, identify
 from psotrack.trajectories import Tracks, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)
@@ -45,7 +43,7 @@ class MethodResult:
         points: for each drone the point that its track follows (no image shows where the origin of the body is), as
             the record has it: the contract's key `points`.
         input_keys: digests of the inputs, by camera.
-        seconds: seconds of each stage; "track" and "compile" at least; "finish" so far.
+        seconds: seconds of the stages after the silhouettes: "track" at least, "compile", and "finish" so far.
         errors: errors of the tracks that come from the cameras; None where the method states all errors itself.
     """
 
@@ -72,30 +70,21 @@ class TrackedRecording:
     identities: Identities
     record: Mapping[str, Any]
 
+    @property
+    def _title(self) -> str:
+        drones, frames = self.trajectories.num_drones, self.trajectories.num_frames
+        seen = self.trajectories.seen.mean()
+        return f"{self.record['sequence']}: {drones} drones, {frames} frames, {seen:.1%} seen"
+
     def __repr__(self) -> str:
-        frames, drones = self.trajectories.num_frames, self.trajectories.num_drones
-        return (
-            f"TrackedRecording({self.record['sequence']}: {drones} drones, {frames} frames, "
-            f"{self.trajectories.seen.mean():.1%} seen, {self.record['seconds']['total']:.1f} s)"
-        )
+        return f"TrackedRecording({self._title}, {self.record['seconds']['total']:.1f} s)"
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the drones, their paths from above, other settings than the defaults, and seconds."""
-        drones, frames = self.trajectories.num_drones, self.trajectories.num_frames
-        return html_block(
-            f"{self.record['sequence']}: {drones} drones, {frames} frames, {self.trajectories.seen.mean():.1%} seen",
-            drones_html(self.trajectories, self.size_m),
-            html_lines(
-                {
-                    "settings": ", ".join(
-                        f"{name} = {value}" for name, value in changed_settings(self.record).items()
-                    ),
-                    "seconds": ", ".join(
-                        f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()
-                    ),
-                }
-            ),
-        )
+        changed = [f"{name} = {value}" for name, value in changed_settings(self.record).items()]
+        seconds = [f"{stage} {spent:.1f}" for stage, spent in self.record["seconds"].items()]
+        lines = html_lines({"settings": ", ".join(changed), "seconds": ", ".join(seconds)})
+        return html_block(self._title, drones_html(self.trajectories, self.size_m), lines)
 
 
 def changed_settings(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,31 +93,22 @@ def changed_settings(record: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         record: record of the run.
     """
-    usual, changed = _by_name(TrackSettings()), {}
-    for name, value in _by_name(record["settings"]).items():
-        # The record has the values that were used, also where the data gave them.
-        found = name in _FOUND and record.get("volume", {}).get(_FOUND[name]) != "given"
-        if value != usual[name] and not found:
-            changed[name] = value
-    return changed
-
-
-def _by_name(settings: TrackSettings | Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that are there, by their dotted names."""
     # Through JSON, because a record that was read from a file has lists where settings have tuples.
-    content = msgspec.json.decode(msgspec.json.encode(settings))
-    values = {}
-    for name in setting_names():
-        part, _, field = name.rpartition(".")
-        of_part = content.get(part, {}) if part else content
-        if field in of_part:
-            values[name] = of_part[field]
-    return values
+    usual, used = (
+        dict(flatten(msgspec.json.decode(msgspec.json.encode(settings))))
+        for settings in (TrackSettings(), record["settings"])
+    )
+
+    def is_chosen(name: str) -> bool:
+        # The record has the values that were used, also where the data gave them.
+        return name not in _FOUND or record.get("volume", {}).get(_FOUND[name]) == "given"
+
+    return {
+        name: used[name] for name in usual if used.get(name, usual[name]) != usual[name] and is_chosen(name)
+    }
 
 
-def finish(
-    run: Run, parts: Parts, result: MethodResult, clocks: CameraClocks | None = None
-) -> TrackedRecording | InputError:
+def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
     """Resolve identities, smooth, move to the body's origin, and write the record of one run."""
     recording, silhouettes = run.recording, run.silhouettes
     settings, tracks, errors = run.settings, result.tracks, result.errors
@@ -155,9 +135,10 @@ def finish(
     body_m = trajectories.position_m - settings.drones.body_offset_m
     timeline = recording.timeline()
     trajectories = replace(trajectories, position_m=body_m, time_s=timeline.time_s)
-    of_silhouettes = {"decode": 0.0, "foreground": 0.0} if silhouettes is None else silhouettes.seconds
-    seconds = {**of_silhouettes, **result.seconds}
-    seconds["finish"] = seconds.get("finish", 0.0) + time.perf_counter() - began
+    seconds = dict.fromkeys(("decode", "foreground", "compile", "finish"), 0.0)
+    seconds |= {} if silhouettes is None else silhouettes.seconds
+    seconds |= result.seconds
+    seconds["finish"] += time.perf_counter() - began
     seconds["total"] = sum(seconds[stage] for stage in ("track", "compile", "finish"))
     record = {
         "sequence": recording.name,
@@ -169,9 +150,9 @@ def finish(
             for name, times in recording.frame_times.items()
             if name in recording.rig.names
         },
-        **({} if clocks is None else {"camera_clocks": clocks.record(recording.rig.names)}),
+        **({} if run.clocks is None else {"camera_clocks": run.clocks.record(recording.rig.names)}),
         "settings": msgspec.to_builtins(settings),
-        **({"parts": parts.record} if parts.record else {}),
+        **({"parts": {kind: identify(part) for kind, part in run.parts.items()}} if run.parts else {}),
         "seed": settings.seed,
         "start": {name: value.tolist() for name, value in vars(state_at_first_frame(tracks)).items()},
         "bounds_m": run.volume.bounds_m.tolist(),
@@ -233,31 +214,20 @@ def environment() -> dict[str, Any]:
 
 
 def with_real_time(record: Mapping[str, Any], wall_s: float, *, start_s: float = 0.0) -> dict[str, Any]:
-    """The record with its real-time factors: seconds of video over seconds of wall clock.
+    """The record with its real-time factors: seconds of video per second of wall clock.
+
+    The factor "running" leaves out the time in which the program started and compiled.
 
     Args:
         record: record of a run.
         wall_s: time from the first byte that was read to the last row, seconds.
         start_s: part of it that the program took to start.
     """
-    not_running_s = start_s + record["seconds"]["compile"]
+    video_s = record["frames"] / record["rate_hz"]
+    running_s = max(wall_s - start_s - record["seconds"]["compile"], 1e-3)
     return {
         **record,
         "seconds": {**record["seconds"], "total": round(wall_s, 4)},
-        **real_time_factors(record, wall_s, not_running_s),
-    }
-
-
-def real_time_factors(record: Mapping[str, Any], wall_s: float, not_running_s: float) -> dict[str, float]:
-    """Seconds of video per second of wall clock, and the same without the start of the program and compilation.
-
-    Args:
-        record: record of a run.
-        wall_s: seconds of wall clock that the run took.
-        not_running_s: part of these seconds in which the program started and compiled.
-    """
-    video_s = record["frames"] / record["rate_hz"]
-    return {
         "real_time_factor": round(video_s / wall_s, 3),
-        "real_time_factor_running": round(video_s / max(wall_s - not_running_s, 1e-3), 3),
+        "real_time_factor_running": round(video_s / running_s, 3),
     }

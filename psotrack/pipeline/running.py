@@ -13,28 +13,26 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import msgspec
 import numpy as np
 
 from psotrack.camera_errors import CameraViews, views_of_middles, views_of_sightings, with_camera_errors
-from psotrack.clocks import CameraClocks
 from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
-from psotrack.fusion import fuse_tracks, fused_errors
-from psotrack.geometry import views_meet
-from psotrack.initiation import first_drones, given_state, known_motion, start_source
+from psotrack.fusion import fuse_tracks
+from psotrack.initiation import MovingPoints, first_drones, given_state, known_motion, start_source
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
-from psotrack.pipeline.inputs import Run, SharedInputs, prepare, usable_for
+from psotrack.pipeline.inputs import Run, prepare, usable_for
 from psotrack.pipeline.parts import (
     MethodInputs,
     Parts,
     check_detector_is_used,
+    check_parts,
     find_method,
-    with_background,
 )
 from psotrack.pipeline.results import (
     MethodResult,
@@ -45,7 +43,7 @@ from psotrack.pipeline.results import (
 from psotrack.projection_lines import LineSettings, track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
-from psotrack.silhouettes import Silhouettes, compute
+from psotrack.silhouettes import Living, Silhouettes, compute, find_background, scaled_settings
 from psotrack.support import Report, load_ahead, no_progress, processors
 from psotrack.tracking import Places, RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status, Tracks
@@ -57,8 +55,8 @@ def track_recording(
     *,
     cache: Path | str,
     jobs: int | None = None,
-    parts: Parts = Parts(),  # noqa: B008  frozen
     report: Report = no_progress,
+    **parts: Unpack[Parts],
 ) -> TrackedRecording:
     """Track the drones of a recording from its videos.
 
@@ -67,8 +65,8 @@ def track_recording(
         settings: settings of the run.
         cache: folder of the stored silhouettes and detections.
         jobs: number of processes that make silhouettes; None is one per processor.
-        parts: parts that the caller brings.
         report: shows the progress of each stage, in frames.
+        **parts: parts that the caller brings (see `Parts`).
 
     Raises:
         InputError: a video cannot be used, or the drones cannot be found.
@@ -76,56 +74,41 @@ def track_recording(
         OutputError: the silhouettes or the detections cannot be stored.
     """
     began = time.perf_counter()
-    needs_silhouettes = settings.needs_silhouettes or parts.method is not None
-    recording = usable_for(recording, settings, videos=parts.detector is not None)
-    if parts.method is not None:
-        recording = recording.usable(silhouettes=True)
-    _check_cameras(recording)
+    check_parts(parts)
+    detector = parts.get("detector")
+    recording = usable_for(recording, settings, videos=detector is not None)
     # Wrong names are refused before silhouettes are computed, which takes minutes.
     method = find_method(settings, parts)
     if method is None and settings.method != "projection-lines":
-        tracker_settings(settings, search=parts.search, score=parts.score)
+        tracker_settings(settings, search=parts.get("search"), score=parts.get("score"))
     start_source(recording, settings.init)
-    if parts.detector is not None:
+    if detector is not None:
         check_detector_is_used(settings, method)
-        folder = stored_detections(parts.detector, recording, cache=cache, report=report)
+        folder = stored_detections(detector, recording, cache=cache, report=report)
         settings = msgspec.structs.replace(settings, detections=str(folder))
     silhouettes = None
-    if needs_silhouettes:
-        parts = with_background(parts, recording, settings.silhouettes)
+    if settings.needs_silhouettes or "method" in parts:
         silhouettes = compute(
             recording,
             settings.silhouettes,
             cache=Path(cache),
             jobs=jobs,
-            background=parts.background,
+            background=parts.get("background"),
             all_videos=settings.needs_each_video,
             report=report,
         )
+        if "background" not in parts:
+            scaled = scaled_settings(settings.silhouettes, recording)
+            model = find_background(settings.silhouettes.background, scaled)
+            parts = parts if isinstance(model, Living) else {**parts, "background": model}
     load_ahead()
-    ((run, result, clocks),) = _track(recording, silhouettes, [settings], parts, report)
-    tracked = finish(run, parts, result, clocks)
+    ((run, result),) = _track(recording, silhouettes, [settings], parts, report)
+    tracked = finish(run, result)
     if isinstance(tracked, InputError):
         raise tracked
-    if clocks is None and len(recording.rig) > 2:
+    if run.clocks is None and len(recording.rig) > 2:
         advise_on_clocks(run, result.tracks)
     return replace(tracked, record=with_real_time(tracked.record, time.perf_counter() - began))
-
-
-def _check_cameras(recording: Recording) -> None:
-    if len(recording.rig) < 2:
-        raise InputError(
-            recording.folder,
-            expected="at least two cameras that can be used, because one camera does not show distances",
-            found=", ".join(recording.rig.names),
-        )
-    if not views_meet(recording.rig.cameras):
-        raise InputError(
-            recording.folder,
-            expected="cameras of which two have a place in view together",
-            found=f"that no views of {', '.join(recording.rig.names)} meet",
-            remedy="check the places and directions of the cameras in the calibration",
-        )
 
 
 def track_runs(
@@ -133,8 +116,8 @@ def track_runs(
     silhouettes: Silhouettes | None,
     settings: Sequence[TrackSettings],
     *,
-    parts: Parts = Parts(),  # noqa: B008  frozen
     report: Report = no_progress,
+    **parts: Unpack[Parts],
 ) -> list[TrackedRecording | InputError]:
     """Track a recording once for each of the settings; on a CPU each result has the same bits as from the run alone.
 
@@ -147,8 +130,8 @@ def track_runs(
         recording: a recording that was checked for use (see `Recording.usable`).
         silhouettes: silhouettes of all cameras; None where no run needs them (see `TrackSettings.needs_silhouettes`).
         settings: settings of each run.
-        parts: parts that the caller brings, for all runs.
         report: shows the progress in frames; the runs of the swarm go through the frames together.
+        **parts: parts that the caller brings, for all runs (see `Parts`).
 
     Returns:
         For each run its result, or the error that explains why the run has none.
@@ -157,10 +140,11 @@ def track_runs(
         InputError: there is no reference or file for the initial state, or detections cannot be read.
         SettingsError: a setting does not fit the recording.
     """
-    if silhouettes is None and (parts.method is not None or any(each.needs_silhouettes for each in settings)):
+    check_parts(parts)
+    if silhouettes is None and ("method" in parts or any(each.needs_silhouettes for each in settings)):
         raise SettingsError("silhouettes", expected="silhouettes of all cameras", found="none")
     tracked = _track(recording, silhouettes, settings, parts, report)
-    return [finish(run, parts, result, clocks) for run, result, clocks in tracked]
+    return [finish(run, result) for run, result in tracked]
 
 
 def _track(
@@ -169,25 +153,31 @@ def _track(
     settings: Sequence[TrackSettings],
     parts: Parts,
     report: Report,
-) -> list[tuple[Run, MethodResult, CameraClocks | None]]:
-    """Each run, the result of its method, and the clocks where they were estimated, before a second pass."""
-    rates_hz = dict.fromkeys(each.rate_hz for each in settings)
-    shared = {rate_hz: SharedInputs.of(recording.at_rate(rate_hz), silhouettes) for rate_hz in rates_hz}
-    runs = [prepare(shared[each.rate_hz], each, parts, report) for each in settings]
+) -> list[tuple[Run, MethodResult]]:
+    """Each run and the result of its method; where clocks are to be estimated, of a second pass with these clocks."""
+
+    @cache
+    def at_rate(rate_hz: float | None) -> tuple[Recording, Silhouettes | None, dict[str, MovingPoints]]:
+        part = recording.at_rate(rate_hz)
+        return part, None if silhouettes is None else silhouettes.at_instants(part.timeline()), {}
+
+    runs = [prepare(*at_rate(each.rate_hz), each, parts, report) for each in settings]
     by_swarm: dict[Run, MethodResult] = {}
-    for one in shared.values():
-        together = [run for run in runs if run.by_swarm and run.recording is one.recording]
-        by_swarm |= _track_by_swarm(together, parts, report)
+    for rate_hz in dict.fromkeys(each.rate_hz for each in settings):
+        together = [run for run in runs if run.by_swarm and run.settings.rate_hz == rate_hz]
+        by_swarm |= _track_by_swarm(together, report)
     results = []
     for run, given in zip(runs, settings, strict=True):
-        result, clocks = _result_of(run, by_swarm.get(run), report), None
+        result = _result_of(run, by_swarm.get(run), report)
         if given.clocks == "auto" and result.tracks.num_drones:
             clocks = estimate_clocks(run, result.tracks)
             once = msgspec.structs.replace(given, clocks="given")
             corrected = with_clocks(run.recording, clocks)
-            ((again, result, _),) = _track(corrected, silhouettes, [once], parts, report)
-            run = replace(again, settings=msgspec.structs.replace(again.settings, clocks="auto"))
-        results.append((run, result, clocks))
+            ((again, result),) = _track(corrected, silhouettes, [once], parts, report)
+            run = replace(
+                again, settings=msgspec.structs.replace(again.settings, clocks="auto"), clocks=clocks
+            )
+        results.append((run, result))
     return results
 
 
@@ -202,7 +192,7 @@ def _result_of(run: Run, swarm: MethodResult | None, report: Report) -> MethodRe
     return lines if swarm is None else _fused(run, swarm, lines)
 
 
-def _track_by_swarm(runs: Sequence[Run], parts: Parts, report: Report) -> dict[Run, MethodResult]:
+def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResult]:
     """The results of the swarm, for all its runs together; the seconds of a run are its share of all."""
     if not runs:
         return {}
@@ -211,7 +201,7 @@ def _track_by_swarm(runs: Sequence[Run], parts: Parts, report: Report) -> dict[R
     inputs = [
         RunInputs(
             run.volume.bounds_m,
-            tracker_settings(run.settings, search=parts.search, score=parts.score),
+            tracker_settings(run.settings, search=run.parts.get("search"), score=run.parts.get("score")),
             given_state(recording.rig, silhouettes, run.source, run.settings.drones, recording.fps),
         )
         for run in runs
@@ -226,8 +216,7 @@ def _track_by_swarm(runs: Sequence[Run], parts: Parts, report: Report) -> dict[R
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found
         views = partial(views_of_middles, recording.rig.cameras, silhouettes.exposures, places)
-        seconds = {**silhouettes.seconds, **shares}
-        result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
+        result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, shares)
         return _with_camera_errors(run, result, views)
 
     # NumPy computes most of it without Python's lock.
@@ -249,7 +238,7 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
         known=known_motion(run.source, settings.drones, run.recording.fps),
         report=report,
     )
-    seconds = {"compile": 0.0, "track": run.read_s + time.perf_counter() - began}
+    seconds = {"track": run.read_s + time.perf_counter() - began}
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
     return _with_camera_errors(run, result, partial(views_of_sightings, rig.cameras, run.sightings))
 
@@ -273,48 +262,38 @@ def _with_camera_errors(
 def _fused(run: Run, swarm: MethodResult, lines: MethodResult) -> MethodResult:
     """The results of both methods in one, and the errors of the cameras that they contain."""
     began = time.perf_counter()
-    settings, fps = run.settings, run.recording.fps
     fusion = fuse_tracks(
         swarm.tracks,
         lines.tracks,
-        settings.motion,
-        fps=fps,
-        max_coasting_s=settings.status.max_coasting_s,
-        same_foreground=settings.detections == BLOBS,
+        run.settings.motion,
+        fps=run.recording.fps,
+        max_coasting_s=run.settings.status.max_coasting_s,
+        same_foreground=run.settings.detections == BLOBS,
+        errors=(swarm.errors, lines.errors),
     )
-    tracks, errors = fusion.tracks, None
-    if swarm.errors is not None or lines.errors is not None:
-        tracks, errors = fused_errors(fusion, swarm.errors, lines.errors, settings.motion, fps)
-    both = ("finish", "compile", "track")
-    seconds = {
-        **swarm.seconds,
-        **{stage: swarm.seconds.get(stage, 0.0) + lines.seconds.get(stage, 0.0) for stage in both},
-    }
+    stages = ("compile", "track", "finish")
+    seconds = {stage: swarm.seconds.get(stage, 0.0) + lines.seconds.get(stage, 0.0) for stage in stages}
     seconds["track"] += time.perf_counter() - began
     keys = {**swarm.input_keys, **{f"detections of {name}": key for name, key in lines.input_keys.items()}}
-    points = _points(tracks, "box")
-    for point, offset_m, std_m in zip(points, fusion.offset.offset_m, fusion.offset.std_m, strict=True):
+    points = _points(fusion.tracks, "box")
+    for point, offset_m, std_m in zip(points, fusion.offset_m, fusion.offset_std_m, strict=True):
         if point["drone"] < swarm.tracks.num_drones:
             point["middle_of"] = "silhouette"
         if np.isfinite(offset_m).all():
             point |= {"box_off_m": offset_m.tolist(), "box_off_std_m": std_m.tolist()}
-    return MethodResult(tracks, points, keys, seconds, errors)
+    return MethodResult(fusion.tracks, points, keys, seconds, fusion.errors)
 
 
 def _track_by_plugin(run: Run, report: Report) -> MethodResult:
     """The result of the method that is plugged in, which is given the drones of the first frames."""
-    assert run.plugin is not None
     recording, silhouettes, settings = run.recording, run.silhouettes, run.settings
-    initial, keys = None, {}
-    if silhouettes is not None:
-        initial = given_state(recording.rig, silhouettes, run.source, settings.drones, recording.fps)
-        keys = dict(silhouettes.keys)
+    assert run.plugin is not None
+    assert silhouettes is not None
+    initial = given_state(recording.rig, silhouettes, run.source, settings.drones, recording.fps)
     if initial is None:
-        shown = run.sightings if silhouettes is None else silhouettes
-        assert shown is not None
         initial = first_drones(
             recording.rig,
-            shown,
+            silhouettes,
             fps=recording.fps,
             bounds_m=run.volume.bounds_m,
             max_speed_m_s=settings.motion.speed_limit_m_s,
@@ -327,8 +306,8 @@ def _track_by_plugin(run: Run, report: Report) -> MethodResult:
         ),
         report,
     )
-    seconds = {"compile": 0.0, "track": time.perf_counter() - began}
-    return MethodResult(tracks, _points(tracks, "silhouette"), keys, seconds)
+    seconds = {"track": time.perf_counter() - began}
+    return MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
 
 
 def _points(tracks: Tracks, middle_of: Literal["silhouette", "box"]) -> list[dict[str, Any]]:

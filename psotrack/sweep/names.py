@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from psotrack.errors import SettingsError
-from psotrack.settings import setting_names
+from psotrack.settings import flatten, setting_names
 from psotrack.support import nearest
 from psotrack.sweep.cells import Perturbation
 
@@ -64,15 +64,6 @@ def check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
     else:
         remedy = f"did you mean {near}?" if near else f"allowed names are {', '.join(names)}"
     raise SettingsError(f"{prefix}{name}", expected="an allowed name", found=name, remedy=remedy)
-
-
-def flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted names and values of a nested table; an empty inner table is a value."""
-    for name, value in content.items():
-        if isinstance(value, Mapping) and value:
-            yield from flatten(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def nest(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:

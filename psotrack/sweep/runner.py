@@ -16,7 +16,8 @@ import pandas as pd
 
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
-from psotrack.pipeline import TrackedRecording, real_time_factors, track_runs
+from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
+from psotrack.settings import flatten
 from psotrack.support import Report, drop_programs_if_many, no_progress
 from psotrack.sweep.cells import Cell, cell_key, failure_name, title
 from psotrack.sweep.grid_files import Grid, cameras_label
@@ -24,7 +25,6 @@ from psotrack.sweep.inputs import Input, Inputs, folder_of, input_digest, source
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
-from psotrack.sweep.names import flatten
 from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
@@ -258,7 +258,8 @@ def _figures(result: TrackedRecording | InputError, given: Input, wall_s: float)
     seconds = result.record["seconds"]
     figures |= {f"seconds.{stage}": value for stage, value in seconds.items()}
     # A sweep reads stored silhouettes and starts once for all cells, so neither is in the seconds of a run.
-    figures |= real_time_factors(result.record, wall_s, not_running_s=seconds["compile"])
+    timed = with_real_time(result.record, wall_s)
+    figures |= {name: timed[name] for name in ("real_time_factor", "real_time_factor_running")}
     return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.recording.num_frames}
 
 
