@@ -98,8 +98,9 @@ def step(births, instant, images, *known_m, size_m=SIZE_M, drawn_m=None, rig=RIG
     sizes_m = np.broadcast_to(np.array(size_m, float), position_m.shape)
     boxes_size_m = sizes_m if drawn_m is None else np.broadcast_to(drawn_m, sizes_m.shape)
     box_px = boxes_of(rig, position_m, boxes_size_m) if known_m else np.empty((0, len(rig), 4))
-    blobs = FrameBlobs.of(images, reduction, border_cells(rig.cameras.image_size_wh, reduction))
-    births.step(instant, unexplained(blobs, box_px), KnownDrones(position_m, sizes_m, box_px))
+    blobs = FrameBlobs.of(images[None], reduction, border_cells(rig.cameras.image_size_wh, reduction))
+    (view,) = unexplained(blobs, box_px[None])
+    births.step(instant, view, KnownDrones(position_m, sizes_m, box_px))
 
 
 def candidates_in(
@@ -219,9 +220,9 @@ def test_beside_a_drone_of_unknown_size_another_is_found(two_drones):
 
 
 def test_candidates_that_are_taken_are_followed_no_longer(two_drones):
-    births, borders = new_births(RIG), border_cells(RIG.cameras.image_size_wh, REDUCTION)
+    births = new_births(RIG)
     for frame, images in enumerate(two_drones[:10]):
-        births.step(frame, unexplained(FrameBlobs.of(images, REDUCTION, borders), np.empty((0, 6, 4))), NONE)
+        step(births, frame, images)
     one, other = assert_found(births.candidates(), ONE, OTHER)
     births.take([one])
     (left,) = births.candidates()
@@ -439,8 +440,8 @@ def test_two_drones_that_hide_each_other_in_one_view(names):
 def test_the_order_of_cameras_and_of_blobs_does_not_matter(order, random):
     def found_in(rig, rows, arrange):
         births, borders = new_births(rig), border_cells(rig.cameras.image_size_wh, REDUCTION)
-        for frame, images in enumerate(three_drones()[:, rows]):
-            view = unexplained(FrameBlobs.of(images, REDUCTION, borders), np.empty((0, 5, 4)))
+        blobs = FrameBlobs.of(three_drones()[:, rows], REDUCTION, borders)
+        for frame, view in enumerate(unexplained(blobs, np.empty((NUM_FRAMES, 0, 5, 4)))):
             boxes = arrange(range(view.noise_px.shape[1]))
             view = CameraSightings(view.centre_px[:, boxes], view.size_px[:, boxes], view.noise_px[:, boxes])
             births.step(frame, view, NONE)
@@ -576,22 +577,31 @@ def test_drones_of_a_few_cells(times):
 
 
 def test_what_no_known_drone_explains_by_hand():
-    """Of three blobs, one is within a drone's ellipse, one reaches out of it, and one is alone; cells of 4 px."""
-    coverage = np.zeros((2, 40, 60), np.uint8)
-    coverage[0, 10:14, 10:16] = coverage[0, 20:24, 14:40] = coverage[0, 34:38, 2:8] = 255
-    box_px = np.full((2, 2, 4), np.nan)
-    box_px[:, 0] = [[52, 48, 20, 12], [56, 88, 20, 20]]
+    """Of three blobs, one is within a drone's ellipse, one reaches out of it, and one is alone; cells of 4 px.
+
+    The frame after it shows the same in another camera, and no drone is known there.
+    """
+    coverage = np.zeros((2, 2, 40, 60), np.uint8)
+    coverage[0, 0, 10:14, 10:16] = coverage[0, 0, 20:24, 14:40] = coverage[0, 0, 34:38, 2:8] = 255
+    coverage[1, 1] = coverage[0, 0]
+    box_px = np.full((2, 2, 2, 4), np.nan)
+    box_px[0, :, 0] = [[52, 48, 20, 12], [56, 88, 20, 20]]
     blobs = FrameBlobs.of(coverage, 4, np.array([[60, 40], [60, 40]]))
-    view = unexplained(blobs, box_px)
+    view, after = unexplained(blobs, box_px)
     # The ellipse of the second drone has its middle at (14, 22) and is enlarged to 1.3 * 5 + 1.5 = 8 cells.
     np.testing.assert_allclose(view.centre_px[0], [[4 * 31 - 0.5, 87.5], [19.5, 143.5]][::-1], atol=2)
     np.testing.assert_allclose(view.size_px[0], [[24, 16], [4 * 18, 16]], atol=4)
     # The middle of a blob that is cut is less certain.
     assert view.noise_px[0, 1] > 4 * (view.noise_px[0, 0] - NOISE_PX)
     assert np.isnan(view.noise_px[1]).all()
-    absent = Exposures(np.zeros(2), np.array([False, True]), np.ones(2), np.zeros(2))
-    gone = FrameBlobs.of(coverage, 4, np.array([[60, 40], [60, 40]]), absent)
-    assert np.isnan(unexplained(gone, box_px).noise_px).all()
+    assert np.isfinite(after.noise_px).sum(axis=-1).tolist() == [0, 3]
+    zero, there = np.zeros((2, 2)), np.array([[False, True], [True, True]])
+    gone, after = unexplained(
+        FrameBlobs.of(coverage, 4, np.array([[60, 40], [60, 40]]), Exposures(zero, there, zero + 1, zero)),
+        box_px,
+    )
+    assert np.isnan(gone.noise_px).all()
+    assert np.isfinite(after.noise_px).sum() == 3
 
 
 def silhouettes_of(coverage, rig):

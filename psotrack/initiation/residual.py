@@ -6,6 +6,7 @@ which the boxes of the blobs show: only a blob that reaches out of an ellipse is
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -22,21 +23,22 @@ ELLIPSE_FACTOR, ELLIPSE_MARGIN_CELLS = 1.3, 1.5
 
 @dataclass(frozen=True)
 class FrameBlobs:
-    """The blobs of one frame in all cameras, before known drones are taken into account.
+    """The blobs of some frames in all cameras, before known drones are taken into account.
 
     Attributes:
-        coverage: (cameras, height, width), the silhouettes, 0 to 255.
+        coverage: (frames, cameras, height, width), the silhouettes, 0 to 255.
         low, high: (blobs, 2), corners of the blobs' boxes, cells.
         whole: (blobs,), whether the blob does not touch the image's border.
-        camera: (blobs,), the blob's camera.
+        frame, camera: (blobs,), the blob's frame and camera.
         reduction: image pixels per cell, along each side.
-        exposures: when the frames were exposed; None where all were exposed together.
+        exposures: when the frames were exposed; None where all cameras' frames were exposed together.
     """
 
-    coverage: UInt8[np.ndarray, "cameras height width"]
+    coverage: UInt8[np.ndarray, "frames cameras height width"]
     low: Float[np.ndarray, "blobs 2"]
     high: Float[np.ndarray, "blobs 2"]
     whole: Bool[np.ndarray, "blobs"]
+    frame: Int[np.ndarray, "blobs"]
     camera: Int[np.ndarray, "blobs"]
     reduction: int
     exposures: Exposures | None = None
@@ -44,88 +46,96 @@ class FrameBlobs:
     @classmethod
     def of(
         cls,
-        coverage: UInt8[np.ndarray, "cameras height width"],
+        coverage: UInt8[np.ndarray, "frames cameras height width"],
         reduction: int,
         borders: Int[np.ndarray, "cameras 2"],
         exposures: Exposures | None = None,
     ) -> FrameBlobs:
-        """Find the blobs of a frame.
+        """Find the blobs of some frames.
 
         Args:
-            coverage: (cameras, height, width), the silhouettes, 0 to 255.
+            coverage: (frames, cameras, height, width), the silhouettes, 0 to 255.
             reduction: image pixels per cell, along each side.
             borders: (cameras, 2), width and height of the images in cells.
             exposures: when the frames were exposed, in NumPy arrays.
         """
-        there = np.ones(len(coverage), bool) if exposures is None else np.asarray(exposures.is_there)
+        there = np.ones(coverage.shape[:2], bool) if exposures is None else np.asarray(exposures.is_there)
         parts = [
-            _boxes(coverage[camera], borders[camera], np.zeros(2, int), camera)
-            for camera in np.flatnonzero(there).tolist()
+            _boxes(coverage[frame, camera], borders[camera], np.zeros(2, int), frame, camera)
+            for frame, camera in np.argwhere(there).tolist()
         ]
-        low, high, whole, camera = _joined(parts)
-        return cls(coverage, low, high, whole, camera, reduction, exposures)
+        low, high, whole, frame, camera = _joined(parts)
+        return cls(coverage, low, high, whole, frame, camera, reduction, exposures)
 
 
-def unexplained(blobs: FrameBlobs, box_px: Float[np.ndarray, "drones cameras 4"]) -> CameraSightings:
-    """What no known drone explains in a frame.
+def unexplained(
+    blobs: FrameBlobs, box_px: Float[np.ndarray, "frames drones cameras 4"]
+) -> Iterator[CameraSightings]:
+    """What no known drone explains, frame by frame.
 
     A blob that a known drone hides in part has a middle that is less certain, as that of a blob at the border.
 
     Args:
-        blobs: the blobs of the frame.
-        box_px: (drones, cameras, 4), middle and half lengths of the known drones' boxes; NaN where there is none.
+        blobs: the blobs of some frames.
+        box_px: (frames, drones, cameras, 4), middle and half lengths of the known drones' boxes; NaN where there is
+            none.
     """
     middle = box_px[..., :2] / blobs.reduction
     half = ELLIPSE_FACTOR * box_px[..., 2:] / blobs.reduction + ELLIPSE_MARGIN_CELLS
-    # (drones, blobs): comparisons with NaN are false.
-    low, high = (middle - half)[:, blobs.camera], (middle + half)[:, blobs.camera]
-    explained = ((blobs.low >= low) & (blobs.high <= high)).all(axis=-1).any(axis=0)
-    touched = np.asarray(((blobs.low < high) & (blobs.high > low)).all(axis=-1))
-    free = ~explained & ~touched.any(axis=0)
-    parts = [(blobs.low[free], blobs.high[free], blobs.whole[free], blobs.camera[free])]
-    for blob in np.flatnonzero(~explained & touched.any(axis=0)).tolist():
-        camera, drones = int(blobs.camera[blob]), touched[:, blob]
+    # (blobs, drones): comparisons with NaN are false.
+    low, high = (ends[blobs.frame, :, blobs.camera] for ends in (middle - half, middle + half))
+    explained = ((blobs.low[:, None] >= low) & (blobs.high[:, None] <= high)).all(axis=-1).any(axis=-1)
+    touched = np.asarray(((blobs.low[:, None] < high) & (blobs.high[:, None] > low)).all(axis=-1))
+    free = ~explained & ~touched.any(axis=-1)
+    columns = blobs.low, blobs.high, blobs.whole, blobs.frame, blobs.camera
+    parts: list[_Boxes] = [tuple(column[free] for column in columns)]
+    for blob in np.flatnonzero(~explained & touched.any(axis=-1)).tolist():
+        at = int(blobs.frame[blob]), int(blobs.camera[blob])
         corner, end = blobs.low[blob].astype(int), blobs.high[blob].astype(int)
-        cells = blobs.coverage[camera, corner[1] : end[1], corner[0] : end[0]].copy()
-        for at, axes in zip(middle[drones, camera] - corner, half[drones, camera], strict=True):
+        cells = blobs.coverage[at][corner[1] : end[1], corner[0] : end[0]].copy()
+        for drone in np.flatnonzero(touched[blob]).tolist():
             # OpenCV's coordinates begin at the middle of the first cell; with shift=4 they are sixteenths of cells.
-            x, y = np.rint(16 * (at - 0.5)).astype(int).tolist()
-            cv2.ellipse(
-                cells, (x, y), np.rint(16 * axes).astype(int).tolist(), 0, 0, 360, 0, cv2.FILLED, shift=4
-            )
-        first, last, whole, of = _boxes(cells, end - corner, corner, camera)
-        parts.append((first, last, np.zeros_like(whole), of))
-    return _sightings(_joined(parts), len(blobs.coverage), blobs.reduction, blobs.exposures)
+            of = at[0], drone, at[1]
+            x, y = np.rint(16 * (middle[of] - corner - 0.5)).astype(int).tolist()
+            axes = np.rint(16 * half[of]).astype(int).tolist()
+            cv2.ellipse(cells, (x, y), axes, 0, 0, 360, 0, cv2.FILLED, shift=4)
+        first, last, whole, *number = _boxes(cells, end - corner, corner, *at)
+        parts.append((first, last, np.zeros_like(whole), *number))
+    boxes = _joined(parts)
+    for frame in range(len(blobs.coverage)):
+        exposures = None if blobs.exposures is None else blobs.exposures[frame]
+        of_frame = tuple(column[boxes[3] == frame] for column in boxes)
+        yield _sightings(of_frame, blobs.coverage.shape[1], blobs.reduction, exposures)
 
 
-#: Corners of blobs, cells; whether each is whole; their cameras.
-_Boxes = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+#: Corners of blobs, cells; whether each is whole; their frames and cameras.
+_Boxes = tuple[np.ndarray, ...]
 
 
 def _boxes(
     cells: UInt8[np.ndarray, "height width"],
     border: Int[np.ndarray, "2"],
     corner: Int[np.ndarray, "2"],
+    frame: int,
     camera: int,
 ) -> _Boxes:
     """The blobs of a part of a camera's image, whose first cell is `corner`."""
     found = find_blobs(cells, 1, border)
     middle = found.centre_px + 0.5 + corner
-    half = found.size_px / 2
-    return middle - half, middle + half, found.whole, np.full(len(middle), camera)
+    half, count = found.size_px / 2, len(middle)
+    return middle - half, middle + half, found.whole, np.full(count, frame), np.full(count, camera)
 
 
 def _joined(parts: list[_Boxes]) -> _Boxes:
-    none = np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool), np.empty(0, int)
-    low, high, whole, camera = (np.concatenate(columns) for columns in zip(none, *parts, strict=True))
-    return low, high, whole, camera
+    none = np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool), np.empty(0, int), np.empty(0, int)
+    return tuple(np.concatenate(columns) for columns in zip(none, *parts, strict=True))
 
 
 def _sightings(
     boxes: _Boxes, num_cameras: int, reduction: int, exposures: Exposures | None
 ) -> CameraSightings:
-    """Blobs as sightings, padded to the largest number of one camera."""
-    low, high, whole, camera = boxes
+    """Blobs of one frame as sightings, padded to the largest number of one camera."""
+    low, high, whole, _, camera = boxes
     order = np.argsort(camera, kind="stable")
     camera = camera[order]
     place = np.arange(len(camera)) - np.searchsorted(camera, camera)

@@ -84,14 +84,9 @@ class Block:
         return len(self.instant)
 
     @cached_property
-    def blobs(self) -> list[FrameBlobs]:
-        """The blobs of each frame, found once for all runs."""
-        setting = self._setting
-        exposed = [None if self.exposures is None else self.exposures[frame] for frame in range(len(self))]
-        return [
-            FrameBlobs.of(images, setting.reduction, setting.borders, of_frame)
-            for images, of_frame in zip(self.coverage, exposed, strict=True)
-        ]
+    def blobs(self) -> FrameBlobs:
+        """The blobs of the frames, found once for all runs."""
+        return FrameBlobs.of(self.coverage, self._setting.reduction, self._setting.borders, self.exposures)
 
 
 def make_block(

@@ -302,12 +302,11 @@ class SwarmRun:
             return found
         births = self._births = self._births_before.copy()
         size_m = np.asarray(slots.size_m, np.float64)
-        for frame, blobs in enumerate(block.blobs):
-            box_px = np.asarray(rows.box_px[frame], np.float64)
-            view = unexplained(blobs, box_px)
-            explains = np.isfinite(box_px).all(axis=-1).any(axis=-1)
-            position_m = np.where(np.asarray(explains)[:, None], rows.position_m[frame], np.nan)
-            known = KnownDrones(position_m.astype(np.float64), size_m, box_px)
+        box_px = np.asarray(rows.box_px, np.float64)
+        explains = np.asarray(np.isfinite(box_px).all(axis=-1).any(axis=-1))
+        position_m = np.where(explains[..., None], np.asarray(rows.position_m, np.float64), np.nan)
+        for frame, view in enumerate(unexplained(block.blobs, box_px)):
+            known = KnownDrones(position_m[frame], size_m, box_px[frame])
             births.step(int(block.instant[frame]), view, known)
         found = births.candidates()
         if is_first:
