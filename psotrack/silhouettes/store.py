@@ -25,11 +25,11 @@ from zarr.storage import MemoryStore
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import MADE_OF, StoredSilhouettes, VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
+from psotrack.silhouettes.foreground import BackgroundModel, coverage, learning_step, reduce_frame
 from psotrack.silhouettes.living_background import Living
 from psotrack.silhouettes.seals import SEAL_FILE, is_whole, lock, seal_of
 from psotrack.silhouettes.settings import ForegroundSettings
-from psotrack.silhouettes.usable_frames import LEAST_FRAMES, Interval, foreground_is_everywhere, intervals_of
+from psotrack.silhouettes.usable_frames import LEAST_FRAMES, foreground_is_everywhere, intervals_of
 from psotrack.support import Advance, atomic_write, digest_file, digest_record, identify
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
@@ -39,7 +39,7 @@ SCHEMA = 1
 CHUNK_FRAMES = 25
 
 #: Attribute of stored silhouettes: intervals of the frames in which the foreground makes no sense.
-_LEFT_OUT = "left_out"
+LEFT_OUT = "left_out"
 
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
@@ -90,19 +90,12 @@ def task_of(
         "content": digest_video(video),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
+        "background": identify(background),
     }
-    identity = background_identity(background, settings)
-    if identity is not None:
-        made_of["background"] = identity
     if ignore is not None:
         made_of["ignore"] = digest_file(ignore, expected="a readable image")
     stored = StoredSilhouettes(cache / digest_record(made_of), video.num_frames, made_of)
     return Task(video, settings, background, ignore, stored)
-
-
-def background_identity(background: BackgroundModel, settings: ForegroundSettings) -> dict[str, Any] | None:
-    """What silhouettes are said to be made of beside their settings; None for MOG2, which has no others."""
-    return None if background == Mog2(settings) else identify(background)
 
 
 def reduced_shape(image_size_wh: tuple[int, int], reduction: int) -> tuple[int, int]:
@@ -118,7 +111,7 @@ def open_stored(path: Path, shape: tuple[int, int, int]) -> zarr.Array | None:
     except Exception:  # zarr raises whatever a damaged description leads to
         return None
     # zarr reads a missing chunk as zeros, which would look like frames without foreground.
-    whole = array.shape == shape and array.nchunks_initialized == array.nchunks and _LEFT_OUT in array.attrs
+    whole = array.shape == shape and array.nchunks_initialized == array.nchunks and LEFT_OUT in array.attrs
     return array if whole else None
 
 
@@ -138,12 +131,6 @@ def open_sealed(path: Path, shape: tuple[int, int, int]) -> zarr.Array | None:
     else:
         weakref.finalize(array, held.close)
     return array
-
-
-def left_out(array: zarr.Array, num_frames: int) -> list[Interval]:
-    """Intervals of the first frames of stored silhouettes in which the foreground makes no sense."""
-    intervals: Any = array.attrs[_LEFT_OUT]  # as JSON keeps them
-    return [(start, min(stop, num_frames)) for start, stop in intervals if start < num_frames]
 
 
 def store(task: Task, advance: Advance) -> dict[str, float]:
@@ -196,7 +183,7 @@ def _write(
             array[index + 1 - count : index + 1] = chunk[:count]
             everywhere.append(foreground_is_everywhere(chunk[:count]))
             _move_to_disk(files, folder)
-    array.update_attributes({_LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
+    array.update_attributes({LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
     _move_to_disk(files, folder)
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
 
@@ -240,9 +227,8 @@ def foreground_of(
         ignored = ignored_pixels(task.ignore, name, size_wh, settings.working_reduction)
     count = 0
     for count, mask in enumerate(masks, 1):
-        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.uint8 and mask.shape == shape
-        if not is_mask or count > video.num_frames:
-            kind = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        kind = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        if kind != f"uint8 {shape}" or count > video.num_frames:
             raise _wrong_masks(task, shape, f"{kind} as mask {count - 1}")
         yield mask if ignored is None else np.where(ignored, np.uint8(0), mask)
     if count < video.num_frames:
