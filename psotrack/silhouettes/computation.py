@@ -26,7 +26,7 @@ from psotrack.silhouettes.settings import (
     SilhouetteSettings,
     check_whole,
 )
-from psotrack.silhouettes.store import LEFT_OUT, Task, open_sealed, open_stored, reduced_shape, store, task_of
+from psotrack.silhouettes.store import LEFT_OUT, Task, open_stored, reduced_shape, store, task_of
 from psotrack.silhouettes.usable_frames import Interval, in_words
 from psotrack.support import Report, identify, make_plugin, map_in_processes, no_progress
 
@@ -280,7 +280,7 @@ def _opened(
     place = places[name]
     shape = place.made_of["num_frames"], *reduced_shape(_size_wh(rig, name), reduction)
     is_own = name in tasks and place is tasks[name].stored
-    return open_sealed(place.path, shape) if is_own else open_stored(place.path, shape)
+    return open_stored(place.path, shape, is_sealed=is_own)
 
 
 def _size_wh(rig: Rig, name: str) -> tuple[int, int]:

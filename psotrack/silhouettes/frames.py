@@ -9,7 +9,7 @@ import numpy as np
 import zarr
 from jaxtyping import Int, UInt8
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import SettingsError
 from psotrack.recordings import Timeline
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.usable_frames import Interval
@@ -60,7 +60,6 @@ class Silhouettes:
 
         Raises:
             SettingsError: the frames do not exist.
-            InputError: the store was damaged after it was opened.
         """
         if not 0 <= start <= stop <= self.num_frames:
             raise SettingsError(
@@ -68,19 +67,9 @@ class Silhouettes:
             )
         frames = np.zeros((stop - start, len(self.cameras), *self.shape), np.uint8)
         for index, array in enumerate(self.arrays):
-            try:
-                read = np.asarray(array[start:stop])
-                count, height, width = read.shape
-                frames[:count, index, :height, :width] = read
-            # A damaged size asks for any amount of memory.
-            except (OSError, ValueError, RuntimeError, MemoryError) as error:
-                reason = f"{error}" or "more than the memory"
-                raise InputError(
-                    _folder_of(array),
-                    expected="readable silhouettes",
-                    found=f"damage after they were opened ({reason})",
-                    remedy="the same command, run again, makes the silhouettes of a cache anew",
-                ) from error
+            read = np.asarray(array[start:stop])
+            count, height, width = read.shape
+            frames[:count, index, :height, :width] = read
         return frames
 
     def part(self, start: int, stop: int) -> Silhouettes:
@@ -110,13 +99,6 @@ class Silhouettes:
         offset_s = np.where(frame < 0, 0.0, timeline.offset_s)
         exposures = exposures_of(replace(timeline, frame=frame, offset_s=offset_s))
         return replace(self, num_frames=timeline.num_instants, arrays=tuple(shown), exposures=exposures)
-
-
-def _folder_of(array: object) -> object:
-    """The folder of an array that is stored, for messages."""
-    if isinstance(array, FramesOfInstants):
-        return _folder_of(array.array)
-    return array.store.root if isinstance(array, zarr.Array) else "silhouettes"  # type: ignore[attr-defined]
 
 
 def exposures_of(timeline: Timeline) -> Exposures:
