@@ -85,7 +85,7 @@ def compute(
     for name, place in places.items():
         if name not in tasks:
             _check_made_with(name, place, scaled, model)
-    opened = {name: _opened(name, places, tasks, recording.rig, scaled.reduction) for name in places}
+    opened = {name: _opened(name, place, tasks, recording.rig, scaled) for name, place in places.items()}
     missing = {name: tasks[name] for name, array in opened.items() if array is None and name in tasks}
     for path in dict.fromkeys(places[name].path for name in missing):
         if path.exists():
@@ -95,7 +95,7 @@ def compute(
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
     places |= {name: task.stored for name, task in missing.items()}
-    opened |= {name: _opened(name, places, tasks, recording.rig, scaled.reduction) for name in missing}
+    opened |= {name: _opened(name, places[name], tasks, recording.rig, scaled) for name in missing}
     arrays: dict[str, zarr.Array | FramesOfInstants] = {}
     left_out: dict[str, list[Interval]] = {}
     for name, array in opened.items():
@@ -172,14 +172,12 @@ def find_background(name: str, settings: ForegroundSettings) -> BackgroundModel:
     Raises:
         SettingsError: there is no background model of this name.
     """
-    if name == MOG2:
-        return Mog2(settings)
-    if name == LIVING:
-        return Living(settings)
-    model: BackgroundModel = make_plugin(
-        "background", name, settings, interface=BackgroundModel, setting="background", built_in=[MOG2, LIVING]
+    built_in: dict[str, type[Mog2 | Living]] = {MOG2: Mog2, LIVING: Living}
+    if name in built_in:
+        return built_in[name](settings)
+    return make_plugin(
+        "background", name, settings, interface=BackgroundModel, setting="background", built_in=list(built_in)
     )
-    return model
 
 
 def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> ForegroundSettings:
@@ -270,17 +268,11 @@ def _made_with(stored: StoredSilhouettes) -> ForegroundSettings:
 
 
 def _opened(
-    name: str,
-    places: Mapping[str, StoredSilhouettes],
-    tasks: Mapping[str, Task],
-    rig: Rig,
-    reduction: int,
+    name: str, place: StoredSilhouettes, tasks: Mapping[str, Task], rig: Rig, scaled: ForegroundSettings
 ) -> zarr.Array | None:
     """The stored silhouettes of a camera; None if there are none, or they are damaged."""
-    place = places[name]
-    shape = place.made_of["num_frames"], *reduced_shape(_size_wh(rig, name), reduction)
-    is_own = name in tasks and place is tasks[name].stored
-    return open_stored(place.path, shape, is_sealed=is_own)
+    shape = place.made_of["num_frames"], *reduced_shape(_size_wh(rig, name), scaled.reduction)
+    return open_stored(place.path, shape, is_sealed=name in tasks and place is tasks[name].stored)
 
 
 def _size_wh(rig: Rig, name: str) -> tuple[int, int]:
