@@ -343,7 +343,13 @@ def test_silhouettes_at_instants_show_the_frames_of_the_timeline():
     assert shown.read(0, 4)[:, 0, 0, 0].tolist() == [1, 2, 3, 4]
     assert shown.read(0, 4)[:, 1, 0, 0].tolist() == (timeline.frame[:4, 1] + 1).tolist()
     assert shown.part(1, 3).read(0, 2).tolist() == shown.read(1, 3).tolist()
-    assert frames.at_instants(make_timeline({"a": times["a"], "b": times["a"]})) is frames
+    synchronous = make_timeline({"a": times["a"], "b": times["a"]})
+    alike = replace(frames, arrays=(arrays[0], arrays[0]))
+    assert alike.at_instants(synchronous) is alike
+    # A frame that a camera does not have counts as none, not as one without foreground.
+    shorter = frames.at_instants(synchronous)
+    assert shorter.exposures is not None
+    assert shorter.exposures.is_there.tolist() == [[True, True]] * 2 + [[True, False]] * 2
 
 
 def test_sightings_of_synchronous_cameras_stay_as_they_are():

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 def cache() -> None:
     """List, check, prune and empty the cache of silhouettes and compiled programs.
 
-    The next run makes anew what is missing. Entries that a running command reads are left alone, and so is everything
-    in the folder that psotrack did not put there.
+    The next run makes anew what is missing. A running command has read its silhouettes and is not disturbed. What
+    psotrack did not put into the folder is left alone.
 
     \b
     Examples:
@@ -168,22 +168,22 @@ def empty(force: bool, cache: Path | None, quiet: bool, json_path: Path | None) 
 def _remove(
     folder: Path, chosen: list[CacheEntry], dry_run: bool, quiet: bool, force: bool, json_path: Path | None
 ) -> None:
-    """Remove entries, and say which; those in use stay."""
+    """Remove entries, and say which."""
     from psotrack.silhouettes import remove_entry
 
-    removed = [each for each in chosen if dry_run or remove_entry(each)]
-    in_use = [each for each in chosen if each not in removed]
+    if not dry_run:
+        for each in chosen:
+            remove_entry(each)
+    # Nothing is in use: a command has read its silhouettes before it goes on.
     content = {
         "cache": str(folder),
         "dry_run": dry_run,
-        "removed": [str(each.path) for each in removed],
-        "in_use": [str(each.path) for each in in_use],
+        "removed": [str(each.path) for each in chosen],
+        "in_use": [],
     }
     output_json(json_path, content, force)
-    for each in in_use:
-        print_line(quiet, json_path, f"in use, left alone: {each.path}")
     words = "would be removed" if dry_run else "removed"
-    print_line(quiet, json_path, f"{folder}: {words}: {_counted(removed)}")
+    print_line(quiet, json_path, f"{folder}: {words}: {_counted(chosen)}")
 
 
 def _counted(entries: list[CacheEntry]) -> str:

@@ -21,7 +21,6 @@ from psotrack.cli.options import (
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to
-from psotrack.errors import SettingsError
 from psotrack.silhouettes import SilhouetteSettings
 
 if TYPE_CHECKING:
@@ -135,21 +134,10 @@ def _write_masks(
     force: bool,
 ) -> dict[str, Any]:
     """Write the masks of all cameras; returns what was written, as JSON."""
-    import os
+    from psotrack.silhouettes import write_masks
 
-    from psotrack.silhouettes import MaskTask, masks_out, tasks_of, write_masks
-    from psotrack.support import map_in_processes, refuse_to_overwrite
-
-    places = masks_out(out, tuple(recording.videos))
-    for path in places.values():
-        refuse_to_overwrite(path, force)
-    tasks = [MaskTask(task, places[name]) for name, task in tasks_of(recording, settings, out).items()]
-    jobs = jobs or os.cpu_count() or 1
-    if jobs < 1:
-        raise SettingsError("jobs", expected="at least 1", found=f"{jobs}")
-    with report_to(quiet)("masks", sum(task.foreground.num_decoded for task in tasks)) as advance:
-        counts = list(map_in_processes(write_masks, tasks, jobs=jobs, advance=advance))
+    places = write_masks(recording, settings, out, jobs=jobs, force=force, report=report_to(quiet))
     return {
-        "masks": dict(zip(places, counts, strict=True)),
+        "masks": {name: recording.videos[name].num_frames for name in places},
         "files": {name: str(path) for name, path in places.items()},
     }

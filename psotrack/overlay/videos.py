@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from psotrack.overlay.codecs import Codec, video_writer
+from psotrack.overlay.codecs import Codec
 from psotrack.overlay.drawing import ImageTracks, draw_tracks, write_heading
 from psotrack.overlay.map_view import MapTracks, MapView, draw_map
-from psotrack.recordings import VideoInfo, read_frames
+from psotrack.recordings import VideoInfo, encoded_video, read_frames
 from psotrack.support import Advance
 
 #: Time for which a drone's trail is shown, seconds.
@@ -114,7 +114,7 @@ def write_video(task: CameraVideoTask | MosaicTask, advance: Advance) -> None:
         return
     camera = task.camera
     trail_rows = round(TRAIL_S * camera.video.fps)
-    with video_writer(task.path, task.codec, camera.video.fps, camera.size_wh) as encoder:
+    with encoded_video(task.path, task.codec.fourcc, camera.video.fps, camera.size_wh) as encoder:
         for number, frame in enumerate(read_frames(camera.video, into_one=True)):
             words = f"{task.time_s[number]:.2f} s"
             encoder.write(camera.drawn(frame, task.row[number], trail_rows, words))
@@ -127,7 +127,7 @@ def _write_mosaic(task: MosaicTask, advance: Advance) -> None:
     lines = -(-(len(task.cameras) + 1) // columns)
     readers = [_FramesInOrder(camera.video) if camera.video.num_frames else None for camera in task.cameras]
     trail_rows = round(TRAIL_S * task.fps)
-    with video_writer(task.path, task.codec, task.fps, (columns * width, lines * height)) as encoder:
+    with encoded_video(task.path, task.codec.fourcc, task.fps, (columns * width, lines * height)) as encoder:
         for instant in range(len(task.time_s)):
             words = f"{task.time_s[instant]:.2f} s"
             whole = np.zeros((lines * height, columns * width, 3), np.uint8)

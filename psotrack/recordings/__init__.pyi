@@ -43,7 +43,7 @@ from .video import (
     read_frames_at,
     read_near,
 )
-from .video_writing import VideoEncoder, VideoWriter, check_video_written, join_videos
+from .video_writing import VideoEncoder, VideoWriter, encoded_video, join_videos
 
 __all__ = [
     "ARRAY_FILE",
@@ -72,9 +72,9 @@ __all__ = [
     "body_trajectories",
     "check_end",
     "check_rate",
-    "check_video_written",
     "describe_recording",
     "digest_video",
+    "encoded_video",
     "find_images",
     "image_files",
     "image_of",

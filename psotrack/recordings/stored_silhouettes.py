@@ -30,7 +30,7 @@ class StoredSilhouettes:
         path: folder of the zarr array.
         num_frames: number of frames to use, at most the number of frames that are stored.
         made_of: what the silhouettes were made of: "schema", "content" (digest of the video), "num_frames" and
-            "settings"; "background" and "ignore" where the silhouettes depend on them.
+            "settings" and "background"; "ignore" where the silhouettes depend on it.
     """
 
     path: Path
@@ -49,6 +49,7 @@ class _Model(msgspec.Struct, frozen=True):
     """Identity of a background model, as of `identify`."""
 
     name: str = msgspec.field(name="class")
+    key: dict[str, Any]
 
 
 class _MadeOf(msgspec.Struct, frozen=True):
@@ -56,7 +57,7 @@ class _MadeOf(msgspec.Struct, frozen=True):
     content: str
     num_frames: int
     settings: dict[str, Any]
-    background: _Model | None = None
+    background: _Model
 
 
 class _Attributes(msgspec.Struct, frozen=True):

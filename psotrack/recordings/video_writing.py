@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -81,6 +81,31 @@ class VideoEncoder:
             self._writer.release()
 
 
+@contextlib.contextmanager
+def encoded_video(
+    path: Path, codec: str, fps: float, image_size_wh: tuple[int, int], settings: Sequence[int] = ()
+) -> Iterator[VideoEncoder]:
+    """An encoder of BGR frames to a video, which appears under its name when it is complete.
+
+    Args:
+        path: path of the file; its ending says the container.
+        codec, fps, image_size_wh, settings: as for `VideoEncoder`.
+
+    Raises:
+        OutputError: the codec does not work here, or the file cannot be written completely.
+    """
+    with atomic_write(path) as temporary:
+        try:
+            encoder = VideoEncoder(temporary, codec, fps, image_size_wh, settings)
+        except OSError as error:
+            raise OutputError(path, expected="a video that can be written", found=str(error)) from error
+        try:
+            yield encoder
+        finally:
+            encoder.close()
+        check_video_written(path, temporary, encoder.num_frames)
+
+
 class VideoWriter:
     """Writes BGR frames to an .avi file with lossy compression (MPEG-4).
 
@@ -122,11 +147,8 @@ class VideoWriter:
         self._open_until_exit = contextlib.ExitStack()
 
     def __enter__(self) -> VideoWriter:
-        with contextlib.ExitStack() as stack:
-            self._temporary = stack.enter_context(atomic_write(self._path))
-            self._encoder = _encoder(self._path, self._temporary, self._fps, self._size_wh)
-            # From here on __exit__ removes the temporary file.
-            self._open_until_exit = stack.pop_all()
+        video = encoded_video(self._path, _CODEC, self._fps, self._size_wh)
+        self._encoder = self._open_until_exit.enter_context(video)
         return self
 
     def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
@@ -142,11 +164,7 @@ class VideoWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        with self._open_until_exit:
-            self._encoder.close()
-            if error is not None:
-                raise error
-            check_video_written(self._path, self._temporary, self._encoder.num_frames)
+        self._open_until_exit.__exit__(kind, error, traceback)
 
 
 def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
@@ -170,23 +188,9 @@ def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:
             raise InputError(
                 video.path, expected=f"{_kind(first)} as in {first.path.name}", found=_kind(video)
             )
-    with atomic_write(path) as temporary:
-        encoder = _encoder(path, temporary, first.fps, first.image_size_wh, _CODED)
-        try:
-            for video in videos:
-                _copy_packets(video, encoder)
-        finally:
-            encoder.close()
-        check_video_written(path, temporary, sum(video.num_frames for video in videos))
-
-
-def _encoder(
-    path: Path, temporary: Path, fps: float, image_size_wh: tuple[int, int], settings: Sequence[int] = ()
-) -> VideoEncoder:
-    try:
-        return VideoEncoder(temporary, _CODEC, fps, image_size_wh, settings)
-    except OSError as error:
-        raise OutputError(path, expected="a video that can be written", found=str(error)) from error
+    with encoded_video(path, _CODEC, first.fps, first.image_size_wh, _CODED) as encoder:
+        for video in videos:
+            _copy_packets(video, encoder)
 
 
 def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:

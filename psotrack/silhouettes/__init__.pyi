@@ -1,14 +1,19 @@
-from .background_models import find_background
 from .blob_boxes import blob_detections
 from .blobs import border_cells, find_blobs
 from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
-from .computation import compute, scaled_settings, stored_silhouettes, tasks_of, usual_drone_px
+from .computation import (
+    compute,
+    find_background,
+    scaled_settings,
+    stored_silhouettes,
+    usual_drone_px,
+)
 from .exposures import Exposures, moved_by
 from .first_look import look_first
 from .foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
 from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
-from .masks import MaskTask, masks_out, write_masks
+from .masks import masks_out, write_masks
 from .seals import SEAL_FILE, is_whole
 from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
 from .store import Task, ignored_pixels
@@ -24,7 +29,6 @@ __all__ = [
     "ForegroundSettings",
     "Living",
     "LivingBackground",
-    "MaskTask",
     "Mog2",
     "Shadows",
     "SilhouetteSettings",
@@ -56,7 +60,6 @@ __all__ = [
     "scaled_settings",
     "stored_silhouettes",
     "summed_area_table",
-    "tasks_of",
     "usual_drone_px",
     "write_masks",
 ]

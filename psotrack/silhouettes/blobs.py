@@ -59,21 +59,16 @@ def find_blobs(
     closed = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, _CLOSING)
     # Outlines instead of labels, because most of a silhouette is empty: labels would be written to every cell of it.
     outlines, levels = cv2.findContours(closed, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    outer = (
-        []
-        if levels is None
-        else [outlines[number] for number in np.flatnonzero(levels[0, :, 3] < 0).tolist()]
-    )
-    if not outer:
-        return Blobs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool))
-    # OpenCV lists the outlines from below.
-    cells = np.concatenate(outer[::-1])[:, 0]
-    starts = np.cumsum([0, *map(len, outer[:0:-1])])
-    corner = np.minimum.reduceat(cells, starts)
-    size = np.maximum.reduceat(cells, starts) + 1 - corner
+    # OpenCV lists the outlines from below, and those of holes with the number of the blob around them.
+    boxes = [
+        cv2.boundingRect(outline)
+        for outline, (*_, around) in zip(outlines, [] if levels is None else levels[0].tolist(), strict=True)
+        if around < 0
+    ]
+    corner, size = np.array(boxes[::-1], float).reshape(-1, 2, 2).swapaxes(0, 1)
     area = size.prod(axis=-1)
     order = np.argsort(-area, kind="stable")[: np.count_nonzero(area > 1)]
-    corner, size = corner[order].astype(float), size[order].astype(float)
+    corner, size = corner[order], size[order]
     end = coverage.shape[::-1] if border is None else border
     whole = ((corner > 0) & (corner + size < end)).all(axis=-1)
     return Blobs((corner + size / 2) * reduction - 0.5, size * reduction, whole)

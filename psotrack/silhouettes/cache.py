@@ -1,12 +1,12 @@
 """What a cache folder holds: silhouettes of videos, and compiled programs; and how entries are removed.
 
 Only what psotrack itself put into the folder is an entry: a folder whose name is a key and which holds nothing but an
-array and its seal, and files of compiled programs. Everything else in the folder is left alone.
+array and its seal, such a folder that a killed process did not finish, and files of compiled programs. Everything else
+in the folder is left alone.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import shutil
@@ -17,7 +17,8 @@ from typing import Literal
 
 from psotrack.errors import InputError, OutputError
 from psotrack.recordings import ARRAY_FILE
-from psotrack.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole, lock
+from psotrack.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole
+from psotrack.support import left_over
 
 #: Name of a folder of silhouettes, and names of compiled programs: of psotrack's own store, and of JAX's cache.
 _KEY = re.compile(r"[0-9a-f]{40}")
@@ -53,10 +54,11 @@ def list_entries(cache: Path) -> list[CacheEntry]:
     """
     try:
         paths = [*cache.iterdir(), *(cache / _COMPILED).glob("*")]
+        killed = left_over(cache)
     except OSError as error:
         found = (error.strerror or f"{error}").lower()
         raise InputError(cache, expected="a cache folder", found=found) from error
-    entries = [entry for path in paths if (entry := _entry(path)) is not None]
+    entries = [entry for path in paths if (entry := _entry(path, is_left_over=path in killed)) is not None]
     return sorted(entries, key=lambda entry: entry.used_s)
 
 
@@ -93,8 +95,8 @@ def choose_to_prune(
     return chosen
 
 
-def remove_entry(entry: CacheEntry) -> bool:
-    """Remove an entry; False where a process reads the entry, which then stays.
+def remove_entry(entry: CacheEntry) -> None:
+    """Remove an entry; a process that has read it goes on without it.
 
     Raises:
         OutputError: the entry cannot be removed.
@@ -102,26 +104,22 @@ def remove_entry(entry: CacheEntry) -> bool:
     try:
         if entry.kind == "program":
             entry.path.unlink()
-            return True
-        seal = entry.path / SEAL_FILE
-        with lock(entry.path, shared=False) or contextlib.nullcontext() as held:
-            if held is None and seal.exists():
-                return False
-            # First the seal: nobody reads what is left of a folder without it.
-            seal.unlink(missing_ok=True)
-            shutil.rmtree(entry.path)
+            return
+        # First the seal: nobody reads what is left of a folder without it.
+        (entry.path / SEAL_FILE).unlink(missing_ok=True)
+        shutil.rmtree(entry.path)
     except FileNotFoundError:
-        return True  # Another process has removed the entry.
+        pass  # Another process has removed the entry.
     except OSError as error:
         found = error.strerror or f"{error}"
         raise OutputError(entry.path, expected="an entry that can be removed", found=found) from error
-    return True
 
 
-def _entry(path: Path) -> CacheEntry | None:
+def _entry(path: Path, *, is_left_over: bool) -> CacheEntry | None:
     """The entry at a path; None where there is none, or another process has just removed it."""
     is_program = path.parent.name == _COMPILED and _PROGRAM.fullmatch(path.name)
-    if path.is_symlink() or not (is_program or _KEY.fullmatch(path.name)):
+    key = path.name.split(".")[1] if is_left_over else path.name
+    if path.is_symlink() or not (is_program or _KEY.fullmatch(key)):
         return None
     try:
         if is_program:

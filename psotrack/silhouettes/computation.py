@@ -15,23 +15,20 @@ import zarr
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, looking_depths_m
-from psotrack.recordings import Recording, StoredSilhouettes, TruncatedVideoError
-from psotrack.silhouettes.background_models import find_background
-from psotrack.silhouettes.foreground import BackgroundModel
+from psotrack.recordings import FrameTimes, Recording, StoredSilhouettes, TruncatedVideoError
+from psotrack.silhouettes.foreground import BackgroundModel, Mog2
 from psotrack.silhouettes.frames import FramesOfInstants, Silhouettes
-from psotrack.silhouettes.settings import MOG2, ForegroundSettings, SilhouetteSettings, check_whole
-from psotrack.silhouettes.store import (
-    Task,
-    background_identity,
-    left_out,
-    open_sealed,
-    open_stored,
-    reduced_shape,
-    store,
-    task_of,
+from psotrack.silhouettes.living_background import Living
+from psotrack.silhouettes.settings import (
+    LIVING,
+    MOG2,
+    ForegroundSettings,
+    SilhouetteSettings,
+    check_whole,
 )
+from psotrack.silhouettes.store import LEFT_OUT, Task, open_stored, reduced_shape, store, task_of
 from psotrack.silhouettes.usable_frames import Interval, in_words
-from psotrack.support import Report, map_in_processes, no_progress
+from psotrack.support import Report, identify, make_plugin, map_in_processes, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -77,8 +74,7 @@ def compute(
             yields masks of a wrong number, type or shape, or silhouettes without a video were made with other settings.
         OutputError: the store cannot be written; the cameras that were finished stay in the store.
     """
-    jobs = jobs if jobs is not None else os.cpu_count() or 1
-    check_whole("jobs", jobs, lowest=1)
+    jobs = num_processes(jobs)
     recording = recording.usable(recording.rig.names, videos=all_videos, silhouettes=True)
     if not recording.videos and not recording.silhouettes:
         raise InputError(recording.folder, expected="at least one video", found="none")
@@ -89,7 +85,7 @@ def compute(
     for name, place in places.items():
         if name not in tasks:
             _check_made_with(name, place, scaled, model)
-    opened = {name: _opened(name, places, tasks, recording.rig) for name in places}
+    opened = {name: _opened(name, place, tasks, recording.rig, scaled) for name, place in places.items()}
     missing = {name: tasks[name] for name, array in opened.items() if array is None and name in tasks}
     for path in dict.fromkeys(places[name].path for name in missing):
         if path.exists():
@@ -99,26 +95,22 @@ def compute(
     except TruncatedVideoError as error:
         raise _counted_in_instants(error, recording) from None
     places |= {name: task.stored for name, task in missing.items()}
-    opened |= {name: _opened(name, places, tasks, recording.rig) for name in missing}
+    opened |= {name: _opened(name, places[name], tasks, recording.rig, scaled) for name in missing}
     arrays: dict[str, zarr.Array | FramesOfInstants] = {}
-    unusable: dict[str, list[Interval]] = {}
-    for name, place in places.items():
-        array = opened[name]
+    left_out: dict[str, list[Interval]] = {}
+    for name, array in opened.items():
         if array is None:
+            num_frames = places[name].made_of["num_frames"]
             raise InputError(
-                place.path,
-                expected=f"silhouettes of camera {name}: {place.made_of['num_frames']} frames of the camera's size",
+                places[name].path,
+                expected=f"silhouettes of camera {name}: {num_frames} frames of the camera's size",
                 found="none, damaged ones, or those of another camera",
             )
         arrays[name] = array
         # Without the future, whoever reads a frame decides about this frame.
-        if scaled.first_look and (intervals := left_out(array, recording.frame_times[name].num_frames)):
-            arrays[name], unusable[name] = _without(array, intervals), intervals
-            _say_left_out(recording, name, intervals)
-    shape = (
-        max(array.shape[1] for array in arrays.values()),
-        max(array.shape[2] for array in arrays.values()),
-    )
+        if scaled.first_look and (intervals := _left_out(name, array, recording.frame_times[name])):
+            arrays[name], left_out[name] = _without(array, intervals), intervals
+    shape = tuple(np.max([array.shape[1:] for array in arrays.values()], axis=0).tolist())
     nothing = np.zeros((0, *shape), np.uint8)
     return Silhouettes(
         cameras=recording.rig.names,
@@ -128,8 +120,19 @@ def compute(
         shape=shape,
         seconds=seconds,
         arrays=tuple(arrays.get(name, nothing) for name in recording.rig.names),
-        left_out=unusable,
+        left_out=left_out,
     )
+
+
+def num_processes(jobs: int | None) -> int:
+    """The number of processes that the caller allows; None is one per processor.
+
+    Raises:
+        SettingsError: the number is below 1.
+    """
+    jobs = jobs if jobs is not None else os.cpu_count() or 1
+    check_whole("jobs", jobs, lowest=1)
+    return jobs
 
 
 def tasks_of(recording: Recording, settings: SilhouetteSettings, cache: Path) -> dict[str, Task]:
@@ -163,6 +166,20 @@ def stored_silhouettes(
     return _places(recording, tasks_of(recording, settings, cache))
 
 
+def find_background(name: str, settings: ForegroundSettings) -> BackgroundModel:
+    """The background model of a name: "mog2", "living" or a plugin.
+
+    Raises:
+        SettingsError: there is no background model of this name.
+    """
+    built_in: dict[str, type[Mog2 | Living]] = {MOG2: Mog2, LIVING: Living}
+    if name in built_in:
+        return built_in[name](settings)
+    return make_plugin(
+        "background", name, settings, interface=BackgroundModel, setting="background", built_in=list(built_in)
+    )
+
+
 def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> ForegroundSettings:
     """The settings of silhouettes for the images and the rig of a recording with videos or stored silhouettes.
 
@@ -171,14 +188,14 @@ def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> Foreg
     Raises:
         InputError: this version does not know the settings with which these silhouettes were made.
     """
-    sizes_wh = [video.image_size_wh for video in recording.videos.values()]
-    alone = [name for name in recording.rig.names if name in recording.silhouettes.keys() - recording.videos]
-    sizes_wh += [_size_wh(recording.rig, name) for name in alone]
+    rig = recording.rig
+    alone = [name for name in rig.names if name in recording.silhouettes.keys() - recording.videos]
+    sizes_wh = [_size_wh(rig, name) for name in [*recording.videos, *alone]]
     if alone and settings.drone_px is None:
         made_with = _made_with(recording.silhouettes[alone[0]])
         still_open = {name: getattr(made_with, name) for name in _OPEN if getattr(settings, name) is None}
         settings = msgspec.structs.replace(settings, **still_open)
-    return settings.scaled(sizes_wh, usual_drone_px(recording.rig))
+    return settings.scaled(sizes_wh, usual_drone_px(rig))
 
 
 def usual_drone_px(rig: Rig) -> float | None:
@@ -195,12 +212,13 @@ def usual_drone_px(rig: Rig) -> float | None:
 def _tasks(
     recording: Recording, scaled: ForegroundSettings, model: BackgroundModel, cache: Path
 ) -> dict[str, Task]:
-    videos = {name: recording.videos[name] for name in recording.rig.names if name in recording.videos}
+    names = [name for name in recording.rig.names if name in recording.videos]
+
+    def task(name: str) -> Task:
+        return task_of(recording.videos[name], scaled, model, recording.ignore.get(name), cache)
+
     with ThreadPoolExecutor() as threads:  # digests of files
-        tasks = threads.map(
-            lambda name: task_of(videos[name], scaled, model, recording.ignore.get(name), cache), videos
-        )
-    return dict(zip(videos, tasks, strict=True))
+        return dict(zip(names, threads.map(task, names), strict=True))
 
 
 def _places(recording: Recording, tasks: Mapping[str, Task]) -> dict[str, StoredSilhouettes]:
@@ -218,22 +236,22 @@ def _check_made_with(
     name: str, stored: StoredSilhouettes, scaled: ForegroundSettings, model: BackgroundModel
 ) -> None:
     """Raise `SettingsError` for silhouettes without a video that were made with other settings."""
-    asked = _made_how(scaled, background_identity(model, scaled))
-    made = _made_how(_made_with(stored), stored.made_of.get("background"))
+    asked = _made_how(scaled, identify(model))
+    made = _made_how(_made_with(stored), stored.made_of["background"])
     for setting in asked:
         if asked[setting] != made[setting]:
             raise SettingsError(
                 f"silhouettes.{setting}",
-                expected=f"{made[setting]}, with which the stored silhouettes of camera {name} were made",
+                expected=f"{made[setting]}, as in {stored.path}",
                 found=f"{asked[setting]}",
-                remedy=f"other silhouettes than {stored.path} need the camera's video",
+                remedy=f"other silhouettes need the video of camera {name}",
             )
 
 
-def _made_how(settings: ForegroundSettings, background: dict[str, Any] | None) -> dict[str, Any]:
+def _made_how(settings: ForegroundSettings, background: Mapping[str, Any]) -> dict[str, Any]:
     """Settings by name, with the class and the key of the background model."""
-    model = background or {"class": MOG2}
-    return msgspec.to_builtins(settings) | {"background": model["class"], "background.key": model.get("key")}
+    model = {"background": background["class"], "background.key": background["key"]}
+    return msgspec.to_builtins(settings) | model
 
 
 def _made_with(stored: StoredSilhouettes) -> ForegroundSettings:
@@ -250,13 +268,11 @@ def _made_with(stored: StoredSilhouettes) -> ForegroundSettings:
 
 
 def _opened(
-    name: str, places: Mapping[str, StoredSilhouettes], tasks: Mapping[str, Task], rig: Rig
+    name: str, place: StoredSilhouettes, tasks: Mapping[str, Task], rig: Rig, scaled: ForegroundSettings
 ) -> zarr.Array | None:
     """The stored silhouettes of a camera; None if there are none, or they are damaged."""
-    place = places[name]
-    height, width = reduced_shape(_size_wh(rig, name), _made_with(place).reduction)
-    is_own = name in tasks and place is tasks[name].stored
-    return (open_sealed if is_own else open_stored)(place.path, (place.made_of["num_frames"], height, width))
+    shape = place.made_of["num_frames"], *reduced_shape(_size_wh(rig, name), scaled.reduction)
+    return open_stored(place.path, shape, is_sealed=name in tasks and place is tasks[name].stored)
 
 
 def _size_wh(rig: Rig, name: str) -> tuple[int, int]:
@@ -266,16 +282,14 @@ def _size_wh(rig: Rig, name: str) -> tuple[int, int]:
 
 def _make(tasks: list[Task], jobs: int, report: Report) -> dict[str, float]:
     """Make and store silhouettes; returns the seconds of each stage, summed over the workers."""
-    seconds = {"decode": 0.0, "foreground": 0.0}
     # Two cameras with the same content have the same key, so their silhouettes are made once.
     missing = list({task.stored.path: task for task in tasks}.values())
-    if not missing:
-        return seconds
-    logger.info("silhouettes: computing those of %d videos", len(missing))
-    with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
-        for taken in map_in_processes(store, missing, jobs=jobs, advance=advance):
-            seconds = {stage: seconds[stage] + taken[stage] for stage in seconds}
-    return seconds
+    taken: list[dict[str, float]] = []
+    if missing:
+        logger.info("silhouettes: computing those of %d videos", len(missing))
+        with report("silhouettes", sum(task.num_decoded for task in missing)) as advance:
+            taken = map_in_processes(store, missing, jobs=jobs, advance=advance)
+    return {stage: sum((each[stage] for each in taken), 0.0) for stage in ("decode", "foreground")}
 
 
 def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> TruncatedVideoError:
@@ -287,22 +301,25 @@ def _counted_in_instants(error: TruncatedVideoError, recording: Recording) -> Tr
     return TruncatedVideoError(error.video, error.num_readable, num_instants)
 
 
+def _left_out(name: str, array: zarr.Array, times: FrameTimes) -> list[Interval]:
+    """Intervals of a camera's frames in which the foreground makes no sense, said in a warning."""
+    stored: Any = array.attrs[LEFT_OUT]  # as JSON keeps them
+    intervals = [(start, min(stop, times.num_frames)) for start, stop in stored if start < times.num_frames]
+    if intervals:
+        logger.warning(
+            "camera %s: %d of %d frames are left out, because foreground is everywhere in the image: frames %s; "
+            "a camera that moved, or light that the background model does not follow?",
+            name,
+            sum(stop - start for start, stop in intervals),
+            times.num_frames,
+            in_words(intervals, gap_frames=max(1, round(times.fps))),
+        )
+    return intervals
+
+
 def _without(array: zarr.Array, intervals: list[Interval]) -> FramesOfInstants:
     """Stored silhouettes of which some frames show no foreground."""
     frame = np.arange(array.shape[0])
     for start, stop in intervals:
         frame[start:stop] = -1
     return FramesOfInstants(array, frame)
-
-
-def _say_left_out(recording: Recording, name: str, intervals: list[Interval]) -> None:
-    """Warn that frames of a camera are left out."""
-    times = recording.frame_times[name]
-    logger.warning(
-        "camera %s: %d of %d frames are left out, because foreground is everywhere in the image: frames %s; "
-        "a camera that moved, or light that the background model does not follow?",
-        name,
-        sum(stop - start for start, stop in intervals),
-        times.num_frames,
-        in_words(intervals, gap_frames=max(1, round(times.fps))),
-    )

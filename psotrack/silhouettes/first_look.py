@@ -58,9 +58,9 @@ def look_first(
 
 def _weights(chosen: list[int], num_frames: int) -> list[float]:
     """Number of frames that are nearest to each of the chosen ones, which are in their order."""
-    middles = [(first + second) / 2 for first, second in itertools.pairwise(chosen)]
-    borders = [0.0, *middles, float(num_frames)]
-    return [end - begin for begin, end in itertools.pairwise(borders)]
+    middles = (np.array(chosen[:-1]) + chosen[1:]) / 2
+    weights: list[float] = np.diff(middles, prepend=0.0, append=num_frames).tolist()
+    return weights
 
 
 def _all(held: deque[_Image], coming: Iterator[_Image]) -> Iterator[_Image]:

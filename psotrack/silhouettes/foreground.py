@@ -127,17 +127,8 @@ def remove_speckle(
     mask: UInt8[np.ndarray, "height width"], min_blob_px: int
 ) -> UInt8[np.ndarray, "height width"]:
     """Remove 8-connected blobs with fewer than `min_blob_px` pixels from a mask; larger blobs do not change."""
-    points = cv2.findNonZero(mask)
-    if min_blob_px <= 1 or points is None:
-        return mask
-    # Counting over foreground pixels only takes a third of the time of OpenCV's connectedComponentsWithStats.
-    count, labels = cv2.connectedComponents(mask, connectivity=8)
-    x, y = points.reshape(-1, 2).T
-    labels_of_points = labels[y, x]
-    speckle = np.bincount(labels_of_points, minlength=count) < min_blob_px
-    cleaned = mask.copy()
-    cleaned[y, x] *= ~speckle[labels_of_points]
-    return cleaned
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    return mask * (stats[:, cv2.CC_STAT_AREA] >= min_blob_px)[labels]
 
 
 def coverage(

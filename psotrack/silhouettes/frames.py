@@ -9,7 +9,7 @@ import numpy as np
 import zarr
 from jaxtyping import Int, UInt8
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import SettingsError
 from psotrack.recordings import Timeline
 from psotrack.silhouettes.exposures import Exposures
 from psotrack.silhouettes.usable_frames import Interval
@@ -60,7 +60,6 @@ class Silhouettes:
 
         Raises:
             SettingsError: the frames do not exist.
-            InputError: the store was damaged after it was opened.
         """
         if not 0 <= start <= stop <= self.num_frames:
             raise SettingsError(
@@ -68,19 +67,9 @@ class Silhouettes:
             )
         frames = np.zeros((stop - start, len(self.cameras), *self.shape), np.uint8)
         for index, array in enumerate(self.arrays):
-            try:
-                read = np.asarray(array[start:stop])
-                count, height, width = read.shape
-                frames[:count, index, :height, :width] = read
-            # A damaged size asks for any amount of memory.
-            except (OSError, ValueError, RuntimeError, MemoryError) as error:
-                reason = f"{error}" or "more than the memory"
-                raise InputError(
-                    _folder_of(array),
-                    expected="readable silhouettes",
-                    found=f"damage after they were opened ({reason})",
-                    remedy="the same command, run again, makes the silhouettes of a cache anew",
-                ) from error
+            read = np.asarray(array[start:stop])
+            count, height, width = read.shape
+            frames[:count, index, :height, :width] = read
         return frames
 
     def part(self, start: int, stop: int) -> Silhouettes:
@@ -103,33 +92,13 @@ class Silhouettes:
                 "timeline", expected=f"cameras {self.cameras}", found=f"cameras {timeline.cameras}"
             )
         assert self.exposures is None, "instants of instants have no meaning"
-        filmed = np.array([array.shape[0] > 0 for array in self.arrays])
-        whole = filmed.all() and not self.left_out
-        if timeline.is_synchronous and timeline.num_instants == self.num_frames and whole:
+        shown = [_shown(array, frame) for array, frame in zip(self.arrays, timeline.frame.T, strict=True)]
+        frame = np.stack([each.frame for each in shown], axis=1)
+        if timeline.is_synchronous and timeline.num_instants == self.num_frames and (frame >= 0).all():
             return self
-        usable = filmed & (timeline.frame >= 0)
-        for name, intervals in self.left_out.items():
-            camera = self.cameras.index(name)
-            for start, stop in intervals:
-                usable[:, camera] &= (timeline.frame[:, camera] < start) | (timeline.frame[:, camera] >= stop)
-        timeline = replace(
-            timeline,
-            frame=np.where(usable, timeline.frame, -1),
-            offset_s=np.where(usable, timeline.offset_s, 0.0),
-        )
-        arrays = tuple(
-            FramesOfInstants(array, frame) for array, frame in zip(self.arrays, timeline.frame.T, strict=True)
-        )
-        return replace(
-            self, num_frames=timeline.num_instants, arrays=arrays, exposures=exposures_of(timeline)
-        )
-
-
-def _folder_of(array: object) -> object:
-    """The folder of an array that is stored, for messages."""
-    while isinstance(array, FramesOfInstants):
-        array = array.array
-    return array.store.root if isinstance(array, zarr.Array) else "silhouettes"  # type: ignore[attr-defined]
+        offset_s = np.where(frame < 0, 0.0, timeline.offset_s)
+        exposures = exposures_of(replace(timeline, frame=frame, offset_s=offset_s))
+        return replace(self, num_frames=timeline.num_instants, arrays=tuple(shown), exposures=exposures)
 
 
 def exposures_of(timeline: Timeline) -> Exposures:
@@ -149,7 +118,7 @@ class FramesOfInstants:
         frame: (instants,), number of the frame of each instant; -1 for none, which reads as 0.
     """
 
-    array: zarr.Array | FramesOfInstants | UInt8[np.ndarray, "frames height width"]
+    array: zarr.Array | UInt8[np.ndarray, "frames height width"]
     frame: Int[np.ndarray, "instants"]
 
     @property
@@ -165,3 +134,15 @@ class FramesOfInstants:
             first, last = int(frame[there].min()), int(frame[there].max())
             frames[there] = np.asarray(self.array[first : last + 1])[frame[there] - first]
         return frames
+
+
+def _shown(
+    array: zarr.Array | FramesOfInstants | UInt8[np.ndarray, "frames height width"],
+    frame: Int[np.ndarray, "instants"],
+) -> FramesOfInstants:
+    """The frames of a camera by instants; those that the camera does not show, or does not have, are none."""
+    frames = (
+        array if isinstance(array, FramesOfInstants) else FramesOfInstants(array, np.arange(array.shape[0]))
+    )
+    numbers = np.append(frames.frame, -1)
+    return FramesOfInstants(frames.array, numbers[np.where(frame < len(frames.frame), frame, -1)])

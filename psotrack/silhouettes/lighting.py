@@ -111,16 +111,10 @@ def _log_gains(
     known = log_ratio[np.isfinite(log_ratio)]
     everywhere = float(np.median(known)) if known.size else 0.0
     parts = log_ratio.reshape(rows, -1, columns, log_ratio.shape[1] // columns).swapaxes(1, 2)
-    values = np.sort(parts.reshape(rows, columns, -1), axis=-1)  # NaN come last
-    count = np.isfinite(values).sum(axis=-1)
-    lower, upper = (
-        np.take_along_axis(values, np.maximum(index, 0)[..., None], axis=-1)[..., 0]
-        for index in ((count - 1) // 2, count // 2)
-    )
-    # Where nothing is known, the index count // 2 is 0 as well.
-    log_gain = np.where(
-        count >= max(1, _LEAST_SHARE * values.shape[-1]), (lower + upper) / 2, everywhere
-    ).astype(np.float32)
+    values = np.ma.masked_invalid(parts.reshape(rows, columns, -1))
+    enough = values.count(axis=-1) >= max(1, _LEAST_SHARE * values.shape[-1])
+    medians = np.ma.median(values, axis=-1).filled(everywhere)
+    log_gain = np.where(enough, medians, everywhere).astype(np.float32)
     # One part alone is more often an object than a lamp.
     return np.asarray(cv2.medianBlur(log_gain, 3)) if min(log_gain.shape) >= 3 else log_gain, everywhere
 

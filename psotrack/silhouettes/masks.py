@@ -6,107 +6,102 @@ A mask is what the background model yields, before it is reduced to the stored s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
-from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import VideoEncoder, VideoInfo, check_video_written
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import Recording, encoded_video
+from psotrack.silhouettes.computation import num_processes, tasks_of
+from psotrack.silhouettes.settings import SilhouetteSettings
 from psotrack.silhouettes.store import Task, foreground_of
-from psotrack.support import Advance, atomic_write, check_file_name
+from psotrack.support import (
+    Advance,
+    Report,
+    atomic_write,
+    check_file_name,
+    map_in_processes,
+    no_progress,
+    refuse_to_overwrite,
+)
 
 #: Codecs of videos of masks, by ending; that of .avi loses nothing.
-CODECS = {".mp4": "mp4v", ".avi": "FFV1"}
+_CODECS = {".mp4": "mp4v", ".avi": "FFV1"}
 
 
-@dataclass(frozen=True)
-class MaskTask:
-    """Task of writing the masks of one video.
+def write_masks(
+    recording: Recording,
+    settings: SilhouetteSettings,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    force: bool = False,
+    report: Report = no_progress,
+) -> dict[str, Path]:
+    """Write the masks of all cameras, 0 for background to 255 for foreground; returns the place of each camera's.
 
-    Attributes:
-        foreground: the video and what its foreground is made with; its cache and key are not used.
-        out: the folder of the images, or a video file with an ending of `CODECS`.
-    """
-
-    foreground: Task
-    out: Path
-
-
-def write_masks(task: MaskTask, advance: Advance) -> int:
-    """Write the masks of one video, 0 for background to 255 for foreground; returns their number.
-
-    Images are named 000000.png and so on. What is written appears at its place when it is complete, and replaces what
-    was there.
-
-    Raises:
-        InputError: the video ends early.
-        SettingsError: the background model yields masks of a wrong number, type or shape.
-        OutputError: the masks cannot be written.
-    """
-    video, reduction = task.foreground.video, task.foreground.settings.working_reduction
-    width, height = video.image_size_wh
-    if task.out.suffix.lower() in CODECS and (width % 2 or height % 2):
-        raise SettingsError(
-            "--masks",
-            expected="a folder, because a video has an even width and height",
-            found=f"{task.out.name} for {width} x {height} pixels",
-        )
-    masks = (
-        np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
-        for mask in foreground_of(task.foreground, {"decode": 0.0, "foreground": 0.0}, advance)
-    )
-    with atomic_write(task.out) as temporary:
-        if task.out.suffix.lower() in CODECS:
-            return _write_video(task.out, temporary, video, masks)
-        count = 0
-        temporary.mkdir()
-        for count, mask in enumerate(masks, 1):
-            there, coded = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-            assert there, "PNG takes every mask"
-            # Not `coded.tofile`, which reports no error where the last bytes are not written.
-            (temporary / f"{count - 1:06d}.png").write_bytes(coded.tobytes())
-    return count
-
-
-def _write_video(
-    path: Path, temporary: Path, video: VideoInfo, masks: Iterator[UInt8[np.ndarray, "height width"]]
-) -> int:
-    """Write a video to a temporary file, whose ending says the container."""
-    try:
-        encoder = VideoEncoder(temporary, CODECS[path.suffix.lower()], video.fps, video.image_size_wh)
-    except OSError as error:
-        raise OutputError(path, expected="a video that can be written", found=str(error)) from error
-    try:
-        for mask in masks:
-            encoder.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))
-    finally:
-        encoder.close()
-    check_video_written(path, temporary, encoder.num_frames)
-    return encoder.num_frames
-
-
-def masks_out(out: Path, cameras: tuple[str, ...]) -> dict[str, Path]:
-    """Where the masks of each camera are written.
+    Images are named 000000.png and so on. What is written appears at its place when it is complete.
 
     Args:
-        out: a folder, in which each camera gets a folder, or a video file.
-        cameras: names of the cameras.
+        recording: a recording with a video for each camera.
+        settings: settings of the silhouettes; `reduction` plays no part.
+        out: a folder, in which each camera gets a folder, or a video file that ends in .mp4 or .avi.
+        jobs: largest number of processes; None is one per processor.
+        force: replace what is there.
+        report: progress bar for the decoded frames of all cameras.
 
     Raises:
-        SettingsError: a video file is named for several cameras, or its ending is unknown.
-        InputError: the folder is a file.
+        SettingsError: a video file is named for several cameras or for an odd size, the background model yields masks
+            of a wrong number, type or shape, or `jobs` is below 1.
+        InputError: a video ends early, or the folder is a file.
+        OutputError: the masks are there and `force` is not set, or they cannot be written.
     """
-    if out.suffix.lower() in CODECS:
+    jobs = num_processes(jobs)
+    places = masks_out(out, list(recording.videos))
+    for path in places.values():
+        refuse_to_overwrite(path, force)
+    tasks = tasks_of(recording, settings, out)
+    with report("masks", sum(task.num_decoded for task in tasks.values())) as advance:
+        both = [(task, places[name]) for name, task in tasks.items()]
+        map_in_processes(_write_camera, both, jobs=jobs, advance=advance)
+    return places
+
+
+def masks_out(out: Path, cameras: Sequence[str]) -> dict[str, Path]:
+    """Where `write_masks` writes the masks of each camera; errors as there."""
+    if out.suffix.lower() in _CODECS:
         if len(cameras) > 1:
             found = f"{out.name} for {len(cameras)} cameras"
             raise SettingsError("--masks", expected="a folder, or one camera by --cameras", found=found)
         return {cameras[0]: out}
     if out.is_file():
-        raise InputError(
-            out, expected=f"a folder, or a file that ends in {', '.join(CODECS)}", found="another file"
-        )
+        expected = f"a folder, or a file that ends in {', '.join(_CODECS)}"
+        raise InputError(out, expected=expected, found="another file")
     return {name: out / check_file_name(name, "--cameras") for name in cameras}
+
+
+def _write_camera(both: tuple[Task, Path], advance: Advance) -> None:
+    """Write the masks of one video to a folder or a video file."""
+    task, out = both
+    (width, height), reduction = task.video.image_size_wh, task.settings.working_reduction
+    masks = (
+        np.repeat(np.repeat(mask, reduction, axis=0), reduction, axis=1)[:height, :width]
+        for mask in foreground_of(task, {"decode": 0.0}, advance)
+    )
+    codec = _CODECS.get(out.suffix.lower())
+    if codec is None:
+        with atomic_write(out) as temporary:
+            temporary.mkdir()
+            for index, mask in enumerate(masks):
+                coded = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+                # Not `coded.tofile`, which reports no error where the last bytes are not written.
+                (temporary / f"{index:06d}.png").write_bytes(coded.tobytes())
+        return
+    if width % 2 or height % 2:
+        expected = "a folder, because a video has an even width and height"
+        raise SettingsError("--masks", expected=expected, found=f"{out.name} for {width} x {height} pixels")
+    with encoded_video(out, codec, task.video.fps, (width, height)) as encoder:
+        for mask in masks:
+            encoder.write(cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR))

@@ -38,6 +38,9 @@ _SHARP_DIFFERENCE = 40.0
 #: Edges of an object at its contour, relative to the background's edges at the same place, and above them.
 _OWN_EDGES, _LEAST_EDGE = 1.3, 2.0
 _AROUND = np.ones((3, 3), np.uint8)
+#: Steps from a pixel to its eight neighbours, row by row.
+_DOWN = np.array([-1, -1, -1, 0, 0, 1, 1, 1])
+_RIGHT = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
 
 _Mask = UInt8[np.ndarray, "height width"]
 
@@ -52,7 +55,7 @@ class ObjectBlobs:
     """
 
     mask: _Mask
-    found: list[tuple[_PixelBlobs, _Contours]]
+    found: list[tuple[_PixelBlobs, _PixelBlobs]]
 
     def with_own_edges(
         self, image: UInt8[np.ndarray, "height width 3"], background: UInt8[np.ndarray, "height width 3"]
@@ -95,13 +98,13 @@ def find_objects(
             break
         contours = _contours(blobs, changed.shape)
         levels, steepness = difference.ravel()[blobs.pixels], _gradient_at(difference, contours.pixels)
-        contrast = np.minimum(blobs.sums(levels) / np.maximum(blobs.area, 1), _SHARP_DIFFERENCE)
+        contrast = np.minimum(blobs.means(levels), _SHARP_DIFFERENCE)
         is_sharp = contours.means(steepness) > _SHARP * contrast + _NOISE_GRADIENT
         # Where the difference is a step, and not the slope of a cloud.
         step = _STEEP * _ending_level(blobs, levels, share) + _NOISE_GRADIENT
         is_steep = contours.means(steepness > step[contours.blob]) >= steep_part
         # A blob that fills the image has no contour.
-        is_object = (contours.length == 0) | (is_sharp & is_steep)
+        is_object = (contours.area == 0) | (is_sharp & is_steep)
         objects = blobs.chosen(is_object)
         mask.ravel()[objects.pixels] = 255
         found.append((objects, contours))
@@ -113,7 +116,7 @@ def find_objects(
 
 @dataclass(frozen=True)
 class _PixelBlobs:
-    """Blobs as a list of pixels.
+    """Blobs, or their contours, as a list of pixels.
 
     Attributes:
         pixels: (pixels,), indices into the flat image.
@@ -128,6 +131,10 @@ class _PixelBlobs:
     def sums(self, values: Shaped[np.ndarray, "pixels"]) -> Shaped[np.ndarray, "blobs"]:
         """(blobs,), sum of the values of each blob's pixels."""
         return np.bincount(self.blob, values, minlength=len(self.area))
+
+    def means(self, values: Shaped[np.ndarray, "pixels"]) -> Float[np.ndarray, "blobs"]:
+        """(blobs,), mean of the values of each blob's pixels; 0 where a blob has none."""
+        return self.sums(values) / np.maximum(self.area, 1)
 
     def chosen(self, chosen: Bool[np.ndarray, "blobs"]) -> _PixelBlobs:
         """Some of the blobs; the others have no pixels."""
@@ -175,27 +182,11 @@ def _connected(mask: _Mask) -> _PixelBlobs:
     return _PixelBlobs(pixels, blob, np.bincount(blob, minlength=count))
 
 
-@dataclass(frozen=True)
-class _Contours:
+def _contours(blobs: _PixelBlobs, shape: tuple[int, ...]) -> _PixelBlobs:
     """Pixels on both sides of the contours of blobs.
 
-    Attributes:
-        pixels: (points,), indices into the flat image.
-        blob: (points,), blob of each pixel.
-        length: (blobs,), number of pixels at each blob's contour.
+    A pixel outside belongs to the blob with the largest number beside the pixel.
     """
-
-    pixels: Int[np.ndarray, "points"]
-    blob: Int[np.ndarray, "points"]
-    length: Int[np.ndarray, "blobs"]
-
-    def means(self, values: Shaped[np.ndarray, "points"]) -> Float[np.ndarray, "blobs"]:
-        """(blobs,), mean of the values at each blob's contour; 0 where a blob has none."""
-        return np.bincount(self.blob, values, minlength=len(self.length)) / np.maximum(self.length, 1)
-
-
-def _contours(blobs: _PixelBlobs, shape: tuple[int, ...]) -> _Contours:
-    """The contours of blobs. A pixel outside belongs to the blob with the largest number beside the pixel."""
     mask = _mask_of(blobs.pixels, shape)
     contour = cv2.morphologyEx(mask, cv2.MORPH_GRADIENT, _AROUND)
     points = np.flatnonzero(contour > 0)
@@ -203,38 +194,26 @@ def _contours(blobs: _PixelBlobs, shape: tuple[int, ...]) -> _Contours:
     labels[blobs.pixels] = blobs.blob
     blob = labels[points]
     outside = blob == 0
-    blob[outside] = np.max([labels[near] for near in _neighbours(points[outside], shape)], axis=0, initial=0)
-    return _Contours(points, blob, np.bincount(blob, minlength=len(blobs.area)))
+    blob[outside] = labels[_neighbours(points[outside], shape)].max(axis=0, initial=0)
+    return _PixelBlobs(points, blob, np.bincount(blob, minlength=len(blobs.area)))
 
 
-def _neighbours(points: Int[np.ndarray, "points"], shape: tuple[int, ...]) -> list[Int[np.ndarray, "points"]]:
+def _neighbours(
+    points: Int[np.ndarray, "points"], shape: tuple[int, ...]
+) -> Int[np.ndarray, "neighbours points"]:
     """The eight neighbours of pixels, row by row; those beyond the image's border are the pixels at the border."""
-    rows, columns = np.divmod(points, shape[1])
-    above, below = np.maximum(rows - 1, 0) * shape[1], np.minimum(rows + 1, shape[0] - 1) * shape[1]
-    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, shape[1] - 1)
-    here = rows * shape[1]
-    beside = (left, columns, right)
-    return [
-        *(above + column for column in beside),
-        here + left,
-        here + right,
-        *(below + column for column in beside),
-    ]
+    row, column = np.divmod(points, shape[1])
+    rows = np.clip(row + _DOWN[:, None], 0, shape[0] - 1)
+    columns = np.clip(column + _RIGHT[:, None], 0, shape[1] - 1)
+    return rows * shape[1] + columns
 
 
 def _gradient_at(
     image: UInt8[np.ndarray, "height width *channels"], points: Int[np.ndarray, "points"]
 ) -> Float[np.ndarray, "points"]:
     """What `gradient` is at some pixels, given as flat indices."""
-    width = image.shape[1] + 2
-    padded = cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    rows, columns = np.divmod(points, image.shape[1])
-    corners = rows * width + columns  # north-west of each pixel, in the padded image
-    steps = np.array([0, 1, 2, width, width + 2, 2 * width, 2 * width + 1, 2 * width + 2])
-    levels = padded.reshape(-1, *image.shape[2:])
-    north_west, north, north_east, west, east, south_west, south, south_east = levels[
-        corners + steps[:, None]
-    ].astype(np.float32)
+    levels = image.reshape(-1, *image.shape[2:])[_neighbours(points, image.shape)].astype(np.float32)
+    north_west, north, north_east, west, east, south_west, south, south_east = levels
     along_x = north_east - north_west + 2 * (east - west) + south_east - south_west
     along_y = south_west - north_west + 2 * (south - north) + south_east - north_east
     length = np.hypot(along_x, along_y)

@@ -35,6 +35,9 @@ _SPECKLE, _LEAST_BLOB_PX = 0.2, 4
 #: pixels. The model itself tells speckle from objects, down to this size (`object_blobs`).
 _LEAST_OBJECT_PX = 9
 
+#: Settings that the background model "living" does not use; only this model uses `first_look`.
+_UNUSED_BY_LIVING = ("learning_rate", "var_threshold", "shadows", "shadow_weight")
+
 #: Numbers of frames or pixels.
 _OneOrMore = Annotated[int, Meta(ge=1)]
 _NoneOrMore = Annotated[int, Meta(ge=0)]
@@ -134,24 +137,15 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
             check_positive("drone_px", self.drone_px)
         if self.reduction is not None and self.working_reduction is not None:
             _check_multiple(self.reduction, self.working_reduction)
-        if self.background == LIVING:
-            self._check_unused()
-        elif not self.first_look:
-            raise SettingsError(
-                "first_look",
-                expected=f"the background model {LIVING}, which learns as frames come",
-                found=self.background,
-            )
-
-    def _check_unused(self) -> None:
-        for name in ("learning_rate", "var_threshold", "shadows", "shadow_weight"):
-            default = getattr(_CommonSettings(), name)
-            if getattr(self, name) != default:
+        others = MOG2 if self.background == LIVING else LIVING
+        for name in _UNUSED_BY_LIVING if self.background == LIVING else ("first_look",):
+            default, value = getattr(_CommonSettings(), name), getattr(self, name)
+            if value != default:
                 raise SettingsError(
                     name,
-                    expected=f"{default}, because the background model {LIVING} does not use this setting",
-                    found=f"{getattr(self, name)}",
-                    remedy=f"or choose the background model {MOG2}",
+                    expected=f"{default}, because the background model {self.background} does not use this setting",
+                    found=f"{value}",
+                    remedy=f"or choose the background model {others}",
                 )
 
     def scaled(
@@ -166,10 +160,8 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         across_px = self.drone_px or max(map(max, image_sizes_wh)) / _DRONES_ACROSS
         working, reduction = self.working_reduction, self.reduction
         if working is None:
-            largest = max(1, int(across_px / _LEAST_DRONE_PX))
-            working = next(
-                factor for factor in range(largest, 0, -1) if reduction is None or reduction % factor == 0
-            )
+            factors = range(max(1, int(across_px / _LEAST_DRONE_PX)), 0, -1)
+            working = next(factor for factor in factors if reduction is None or reduction % factor == 0)
         if reduction is None:
             reduction = working * (2 if across_px >= _LEAST_STORED_PX else 1)
         given = self.drone_px is not None or self.working_reduction is not None
@@ -177,10 +169,9 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         if not given and usual_px is not None and usual_px >= wide_px:
             working = reduction
         least_px = self.min_blob_px
-        if least_px is None and self.drone_px is None and self.background == LIVING:
-            least_px = _LEAST_OBJECT_PX
-        elif least_px is None:
-            least_px = max(_LEAST_BLOB_PX, round((_SPECKLE * across_px) ** 2))
+        if least_px is None:
+            speckle_px = max(_LEAST_BLOB_PX, round((_SPECKLE * across_px) ** 2))
+            least_px = _LEAST_OBJECT_PX if self.drone_px is None and self.background == LIVING else speckle_px
         common = {name: getattr(self, name) for name in _CommonSettings.__struct_fields__}
         return ForegroundSettings(
             working_reduction=working, reduction=reduction, min_blob_px=least_px, **common

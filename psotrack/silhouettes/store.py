@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,16 +19,17 @@ import zarr
 from jaxtyping import Bool, UInt8
 from zarr.codecs import ZstdCodec
 from zarr.core.buffer import Buffer
+from zarr.core.buffer.cpu import Buffer as _Buffer
 from zarr.storage import MemoryStore
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import MADE_OF, StoredSilhouettes, VideoInfo, digest_video, read_frames, read_mask
 from psotrack.silhouettes.first_look import look_first
-from psotrack.silhouettes.foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_frame
+from psotrack.silhouettes.foreground import BackgroundModel, coverage, learning_step, reduce_frame
 from psotrack.silhouettes.living_background import Living
-from psotrack.silhouettes.seals import SEAL_FILE, is_whole, lock, seal_of
+from psotrack.silhouettes.seals import SEAL_FILE, is_whole, read_files, seal_of
 from psotrack.silhouettes.settings import ForegroundSettings
-from psotrack.silhouettes.usable_frames import LEAST_FRAMES, Interval, foreground_is_everywhere, intervals_of
+from psotrack.silhouettes.usable_frames import LEAST_FRAMES, foreground_is_everywhere, intervals_of
 from psotrack.support import Advance, atomic_write, digest_file, digest_record, identify
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
@@ -39,7 +39,7 @@ SCHEMA = 1
 CHUNK_FRAMES = 25
 
 #: Attribute of stored silhouettes: intervals of the frames in which the foreground makes no sense.
-_LEFT_OUT = "left_out"
+LEFT_OUT = "left_out"
 
 #: Brighter pixels of an image of what is ignored are ignored.
 _GREY = 127
@@ -90,19 +90,12 @@ def task_of(
         "content": digest_video(video),
         "num_frames": video.num_frames,
         "settings": msgspec.to_builtins(settings),
+        "background": identify(background),
     }
-    identity = background_identity(background, settings)
-    if identity is not None:
-        made_of["background"] = identity
     if ignore is not None:
         made_of["ignore"] = digest_file(ignore, expected="a readable image")
     stored = StoredSilhouettes(cache / digest_record(made_of), video.num_frames, made_of)
     return Task(video, settings, background, ignore, stored)
-
-
-def background_identity(background: BackgroundModel, settings: ForegroundSettings) -> dict[str, Any] | None:
-    """What silhouettes are said to be made of beside their settings; None for MOG2, which has no others."""
-    return None if background == Mog2(settings) else identify(background)
 
 
 def reduced_shape(image_size_wh: tuple[int, int], reduction: int) -> tuple[int, int]:
@@ -111,39 +104,34 @@ def reduced_shape(image_size_wh: tuple[int, int], reduction: int) -> tuple[int, 
     return -(-height // reduction), -(-width // reduction)
 
 
-def open_stored(path: Path, shape: tuple[int, int, int]) -> zarr.Array | None:
-    """Open stored silhouettes (frames, height, width); None if they do not exist or are damaged."""
+def open_stored(path: Path, shape: tuple[int, int, int], *, is_sealed: bool) -> zarr.Array | None:
+    """Read stored silhouettes (frames, height, width); None if they do not exist or are damaged.
+
+    They are in memory, compressed (about 1 kB per frame of 480 x 270 cells), so that no later change of the folder has
+    an effect.
+
+    Args:
+        path: folder of the array.
+        shape: numbers of frames, rows and columns.
+        is_sealed: whether the folder has a seal, with which every byte is compared; if not, each chunk is decompressed.
+    """
+    if is_sealed:
+        with contextlib.suppress(OSError):  # a cache that cannot be written
+            os.utime(path / SEAL_FILE)  # the time of this use
     try:
-        array = zarr.open_array(path, mode="r", zarr_format=3)
+        files = read_files(path)
+        if is_sealed and files.get(SEAL_FILE) != seal_of(files):
+            return None
+        memory: dict[str, Buffer] = {name: _Buffer.from_bytes(content) for name, content in files.items()}
+        array = zarr.open_array(MemoryStore(memory), mode="r", zarr_format=3)
+        # zarr reads a missing chunk as zeros, which would look like frames without foreground.
+        if array.shape != shape or array.nchunks_initialized < array.nchunks or LEFT_OUT not in array.attrs:
+            return None
+        for start in range(0, 0 if is_sealed else shape[0], array.chunks[0]):
+            _ = array[start]
     except Exception:  # zarr raises whatever a damaged description leads to
         return None
-    # zarr reads a missing chunk as zeros, which would look like frames without foreground.
-    whole = array.shape == shape and array.nchunks_initialized == array.nchunks and _LEFT_OUT in array.attrs
-    return array if whole else None
-
-
-def open_sealed(path: Path, shape: tuple[int, int, int]) -> zarr.Array | None:
-    """As `open_stored`, but every byte is compared with the folder's seal first.
-
-    As long as the array is in memory, other processes do not remove the folder from the cache.
-    """
-    held = lock(path, shared=True)
-    if held is None:
-        return None
-    with contextlib.suppress(OSError):  # a cache that cannot be written
-        os.utime(path / SEAL_FILE)  # the time of this use
-    array = open_stored(path, shape) if is_whole(path) else None
-    if array is None:
-        held.close()
-    else:
-        weakref.finalize(array, held.close)
     return array
-
-
-def left_out(array: zarr.Array, num_frames: int) -> list[Interval]:
-    """Intervals of the first frames of stored silhouettes in which the foreground makes no sense."""
-    intervals: Any = array.attrs[_LEFT_OUT]  # as JSON keeps them
-    return [(start, min(stop, num_frames)) for start, stop in intervals if start < num_frames]
 
 
 def store(task: Task, advance: Advance) -> dict[str, float]:
@@ -156,14 +144,13 @@ def store(task: Task, advance: Advance) -> dict[str, float]:
         SettingsError: the background model yields masks of a wrong number, type or shape.
         OutputError: the store cannot be written.
     """
-    path = task.stored.path
-    shape = (task.video.num_frames, *reduced_shape(task.video.image_size_wh, task.settings.reduction))
-    seconds = {"decode": 0.0, "foreground": 0.0}
-    with contextlib.suppress(_StoredMeanwhileError), atomic_write(path) as temporary:
+    video, seconds = task.video, {"decode": 0.0, "foreground": 0.0}
+    with contextlib.suppress(_StoredMeanwhileError), atomic_write(task.stored.path) as temporary:
+        shape = (video.num_frames, *reduced_shape(video.image_size_wh, task.settings.reduction))
         _write(temporary, shape, task, seconds, advance)
-        (temporary / SEAL_FILE).write_text(seal_of(temporary), encoding="ascii")
-        # A whole folder is not replaced, because a process that reads it would see zeros meanwhile.
-        if open_sealed(path, shape) is not None:
+        (temporary / SEAL_FILE).write_bytes(seal_of(read_files(temporary)))
+        # A whole folder is not replaced, because a process that reads it would find no files meanwhile.
+        if is_whole(task.stored.path):
             raise _StoredMeanwhileError
     return seconds
 
@@ -196,7 +183,7 @@ def _write(
             array[index + 1 - count : index + 1] = chunk[:count]
             everywhere.append(foreground_is_everywhere(chunk[:count]))
             _move_to_disk(files, folder)
-    array.update_attributes({_LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
+    array.update_attributes({LEFT_OUT: intervals_of(np.concatenate(everywhere), LEAST_FRAMES)})
     _move_to_disk(files, folder)
     seconds["foreground"] = time.perf_counter() - started - seconds["decode"]
 
@@ -240,9 +227,8 @@ def foreground_of(
         ignored = ignored_pixels(task.ignore, name, size_wh, settings.working_reduction)
     count = 0
     for count, mask in enumerate(masks, 1):
-        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.uint8 and mask.shape == shape
-        if not is_mask or count > video.num_frames:
-            kind = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        kind = f"{mask.dtype} {mask.shape}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        if kind != f"uint8 {shape}" or count > video.num_frames:
             raise _wrong_masks(task, shape, f"{kind} as mask {count - 1}")
         yield mask if ignored is None else np.where(ignored, np.uint8(0), mask)
     if count < video.num_frames:

@@ -33,17 +33,11 @@ def foreground_is_everywhere(
     Args:
         silhouettes: (frames, height, width), coverage, 0 to 255.
     """
-    num_frames, height, width = silhouettes.shape
+    height, width = silhouettes.shape[1:]
     side = max(1, -(-max(height, width) // _PARTS))
-    if not num_frames:
-        return np.zeros(0, bool)
-    # Without foreground in most rows there is none in most parts, which is told much faster.
-    rows, columns = np.arange(0, height, side), np.arange(0, width, side)
-    of_rows = np.maximum.reduceat(silhouettes.max(axis=2), rows, axis=1)
-    everywhere = (of_rows >= MIN_COVERAGE).mean(axis=1) > _MOST_PARTS
-    most = np.maximum.reduceat(np.maximum.reduceat(silhouettes[everywhere], rows, axis=1), columns, axis=2)
-    everywhere[everywhere] = (most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS
-    return everywhere
+    of_rows = np.maximum.reduceat(silhouettes, np.arange(0, height, side), axis=1)
+    most = np.maximum.reduceat(of_rows, np.arange(0, width, side), axis=2)
+    return np.asarray((most >= MIN_COVERAGE).mean(axis=(1, 2)) > _MOST_PARTS)
 
 
 def intervals_of(chosen: Bool[np.ndarray, "frames"], least_frames: int = 1) -> list[Interval]:

@@ -186,12 +186,8 @@ def _remove_left_over(output: _Output) -> None:
             _remove(path)
 
 
-@functools.lru_cache(maxsize=1000)
-def _left_over(folder: Path) -> tuple[Path, ...]:
-    """Temporary files that killed processes of this machine have left in a folder.
-
-    A process looks once: listing a folder of 10,000 results takes longer than writing one.
-    """
+def left_over(folder: Path) -> tuple[Path, ...]:
+    """Temporary files of `atomic_write` that killed processes of this machine have left in a folder."""
     with contextlib.suppress(OSError):
         found = [(path, _TEMPORARY.match(path.name)) for path in folder.glob(".*.partial*")]
         return tuple(
@@ -200,6 +196,10 @@ def _left_over(folder: Path) -> tuple[Path, ...]:
             if parts and parts[2] == _machine() and not _is_running(int(parts[3]))
         )
     return ()
+
+
+#: A process looks once: listing a folder of 10,000 results takes longer than writing one.
+_left_over = functools.lru_cache(maxsize=1000)(left_over)
 
 
 def _is_running(process: int) -> bool:
