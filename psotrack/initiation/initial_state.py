@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence import Sightings, from_silhouettes
+from psotrack.correspondence import from_silhouettes
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, looking_depths_m, project_visible, sizes_m, to_camera
 from psotrack.initiation.births import NO_DRONES, WINDOW_FRAMES, BirthRules, Births, state_at
@@ -178,7 +178,7 @@ def state_at_first_frame(tracks: Tracks) -> InitialState:
 
 def first_drones(
     rig: Rig,
-    shown: Silhouettes | Sightings,
+    silhouettes: Silhouettes,
     *,
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
@@ -189,17 +189,17 @@ def first_drones(
 
     Args:
         rig: the cameras.
-        shown: silhouettes, or detections.
+        silhouettes: silhouettes of all cameras.
         fps: instants per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         max_speed_m_s: largest speed of a drone, m/s.
         drones: number and sizes where they are known.
     """
-    count = min(_FRAMES, shown.num_frames)
-    sightings = shown if isinstance(shown, Sightings) else from_silhouettes(shown, stop=count)
+    count = min(_FRAMES, silhouettes.num_frames)
+    sightings = from_silhouettes(silhouettes, stop=count)
     births = Births(
         rig.cameras,
-        BirthRules(num_frames=shown.num_frames),
+        BirthRules(num_frames=silhouettes.num_frames),
         fps=fps,
         bounds_m=bounds_m,
         max_speed_m_s=max_speed_m_s,

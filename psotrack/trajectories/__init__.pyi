@@ -4,7 +4,7 @@ from .resampling import resample
 from .row_streams import RowStream
 from .showing import drones_html
 from .summaries import DroneSummary, summarise, summary_columns
-from .tracks import ARRAYS, Arrival, Tracks, padded, unknown_value
+from .tracks import ARRAYS, Arrival, Tracks, padded
 from .trajectories import Status, Trajectories
 
 __all__ = [
@@ -25,7 +25,6 @@ __all__ = [
     "resample",
     "summarise",
     "summary_columns",
-    "unknown_value",
     "write_ambiguity",
     "write_trajectories",
 ]
