@@ -191,6 +191,17 @@ def test_known_drones_come_first_in_the_given_order_and_others_beside_them_from_
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, tracked.position_m[0])
 
 
+def test_a_known_drone_that_is_seen_only_after_its_track_is_lost_is_found_again():
+    truth_m = circles(3)
+    velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
+    tracked = track(truth_m, count=3, known=(truth_m[0], velocity_m_s), hidden=[(1, 0, 30)])
+    (again,) = tracked.arrivals
+    assert (again.frame, again.drone, again.again) == (30, 1, True)
+    assert (tracked.status[20:30, 1] == Status.LOST).all()
+    assert (tracked.status[30:, 1] == Status.TRACKED).all()
+    np.testing.assert_allclose(tracked.position_m[-1], truth_m[-1], atol=0.01)
+
+
 def test_sizes_agree_with_the_boxes():
     tracked = track(circles(2))
     np.testing.assert_allclose(tracked.size_m, [[0.5, 0.5, 0.2]] * 2, rtol=0.02)

@@ -258,24 +258,31 @@ def tracked_frames(*rows):
 
 
 def test_lost_drones_by_hand():
-    """Six drones: tracked; lost early; lost late; never seen; doubtful; moved."""
+    """Seven drones: tracked; lost early; lost late; not there; doubtful; moved; given in frame 3, but never seen."""
     tracked = tracked_frames(
-        "xxxxxxxxxxxx", "xxx.........", "xxxxxxxxxx..", "............", "xx....xxxxxx", "xx....xxxxxx"
+        "xxxxxxxxxxxx",
+        "xxx.........",
+        "xxxxxxxxxx..",
+        "............",
+        "xx....xxxxxx",
+        "xx....xxxxxx",
+        "............",
     )
     frames = np.arange(12.0)
-    position = np.zeros((12, 6, 3))
+    position = np.zeros((12, 7, 3))
     position[..., 0] = frames[:, None]
+    position[:, 3] = position[:3, 6] = np.nan
     position[:, 4] = (1.0, 2.0, 0.1)
     gone = find_lost_tracks(
-        position, position / 2, tracked, np.full((6, 3), 0.5), instant=np.arange(12), fps=2.0
+        position, position / 2, tracked, np.full((7, 3), 0.5), instant=np.arange(12), fps=2.0
     )
-    assert gone.drone.tolist() == [1, 2, 4]
-    # The last frames in which these drones were tracked are 2, 9 and 1.
-    np.testing.assert_array_equal(gone.position_m[:, 0], [2.0, 9.0, 1.0])
-    # The last drone stands still, so its velocity is 0, although its state has another.
-    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [1.0, 4.5, 0.0])
-    np.testing.assert_array_equal(gone.instant, [2, 9, 1])
-    assert gone.doubtful.tolist() == [False, False, True]
+    assert gone.drone.tolist() == [1, 2, 4, 6]
+    # The last frames in which these drones were tracked are 2, 9 and 1; the last drone was given in frame 3.
+    np.testing.assert_array_equal(gone.position_m[:, 0], [2.0, 9.0, 1.0, 3.0])
+    # The third drone stands still, so its velocity is 0, although its state has another.
+    np.testing.assert_array_equal(gone.velocity_m_s[:, 0], [1.0, 4.5, 0.0, 1.5])
+    np.testing.assert_array_equal(gone.instant, [2, 9, 1, 3])
+    assert gone.doubtful.tolist() == [False, False, True, False]
 
 
 def test_a_track_that_never_moved_where_a_drone_was_is_false():

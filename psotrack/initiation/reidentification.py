@@ -56,7 +56,7 @@ class LostTracks:
         drone: (lost,), index of the drone.
         position_m, velocity_m_s: (lost, 3), state when last seen; for a drone that stood still, its place and 0.
         instant: (lost,), the instant when last seen.
-        size_m: (lost, 3), full lengths along the world's axes.
+        size_m: (lost, 3), full lengths along the world's axes; NaN where they are not known.
         doubtful: (lost,), whether the drone is tracked again, but only at the place where it was lost, without moving
             since. This track may follow a ghost. Such a drone is only assigned to a candidate that departs from there.
         left_m: (places, 3), all places where drones stood still when they were lost. Ghosts may be at these places.
@@ -111,6 +111,8 @@ def find_lost_tracks(
 ) -> LostTracks:
     """Find the drones that are lost in the last frame, or were, and may be found again; false tracks are left out.
 
+    A drone whose first position is given, and that no frame has shown, was last seen at this position.
+
     Args:
         position_m, velocity_m_s: (frames, drones, 3), states in all frames so far.
         tracked: (frames, drones), whether the drone was found, and not only predicted.
@@ -119,10 +121,12 @@ def find_lost_tracks(
         fps: instants per second.
     """
     drones, last, places, velocities, doubtful, left = [], [], [], [], [], []
-    for drone in np.flatnonzero(
-        tracked.any(axis=0) & ~find_false_tracks(position_m, tracked, size_m)
-    ).tolist():
+    is_there = np.isfinite(position_m).all(axis=-1)
+    is_false = find_false_tracks(position_m, tracked, size_m)
+    for drone in np.flatnonzero(is_there.any(axis=0) & ~is_false).tolist():
         seen = np.flatnonzero(tracked[:, drone])
+        if not len(seen):
+            seen = np.flatnonzero(is_there[:, drone])[:1]
         losses = seen[np.flatnonzero(np.diff(seen, append=len(tracked)) > 1)]
         if not len(losses):
             continue
@@ -236,6 +240,8 @@ def _log_likelihood(
 ) -> float:
     """Log likelihood of a lost drone being the candidate: a density over position, velocity and span."""
     place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
+    if not np.isfinite(span):
+        span = float(candidate.size_m.max())
     log_span = log_normal(np.log(candidate.size_m.max(keepdims=True) / span), SPAN_STD**2)
     variance = (SPEED_SHARE * max_speed_m_s) ** 2
     log_stayed = -np.inf
