@@ -129,6 +129,19 @@ def test_hard_edges_are_whole_pixels():
     assert score_at(silhouette(DRONE), 0.75, HARD) == pytest.approx(19 / 21, abs=HAND)
 
 
+def test_whole_cells_of_a_whole_image_are_whole_pixels():
+    """A search reads whole cells of its windows; those of a whole image are the silhouette's pixels."""
+    cameras = make_unnamed_rig(far_camera(**FAR)).cameras
+    tables = summed_area_table(silhouette(DRONE))
+    soft, hard = (
+        score_inputs(cameras, SIZE_M, tables, SoftIoU(whole_pixels=hard, min_cameras=1), reduction=1)
+        for hard in (False, True)
+    )
+    soft = replace(soft, patches=replace(soft.patches, whole_cells=True))
+    position_m = np.array([[[x_px * PIXEL_M, 0, 0]] for x_px in np.linspace(-12.3, 12.3, 40)], np.float32)
+    np.testing.assert_allclose(drone_fitness(soft, position_m), drone_fitness(hard, position_m), atol=1e-6)
+
+
 def test_reduced_silhouettes_score_the_same():
     """Each pixel of the silhouette represents 4 x 4 pixels of the image."""
     rig = make_unnamed_rig(far_camera(image_size_wh=(256, 192), pixels_per_m=80))

@@ -27,8 +27,8 @@ def area_weighted_sum(image, x0, y0, x1, y1):
 
 
 def box_sums(images, camera, boxes):
-    """`box_sum` of (sets, boxes, 4) boxes."""
-    edges = (jnp.asarray(boxes[..., i], jnp.float32) for i in range(4))
+    """`box_sum` of (sets, boxes, 4) boxes: fractional ones, or int32 ones with whole edges."""
+    edges = (jnp.asarray(boxes[..., i], None if boxes.dtype == np.int32 else jnp.float32) for i in range(4))
     return np.asarray(sum_of(table_of(images), jnp.asarray(camera, jnp.int32), *edges))
 
 
@@ -42,7 +42,8 @@ def test_table_is_the_cumulative_sum_with_a_border_of_zeros(shape, dtype):
     np.testing.assert_array_equal(table, expected.swapaxes(0, 1))
 
 
-def test_whole_boxes_are_slice_sums():
+@pytest.mark.parametrize("dtype", [np.float32, np.int32])
+def test_whole_boxes_are_slice_sums(dtype):
     """All boxes with whole edges in a 5 x 7 image are exact, for several cameras at once."""
     images = random_images((2, 5, 7))
     edges = [
@@ -50,7 +51,12 @@ def test_whole_boxes_are_slice_sums():
     ]
     boxes = np.array(edges)[:, None, :].repeat(2, axis=1)
     expected = [[images[c, y0:y1, x0:x1].sum(dtype=int) for c in range(2)] for x0, y0, x1, y1 in edges]
-    np.testing.assert_array_equal(box_sums(images, np.arange(2), boxes), expected)
+    np.testing.assert_array_equal(box_sums(images, np.arange(2), boxes.astype(dtype)), expected)
+    # Edges beyond the image, and in the wrong order.
+    beyond = np.array([[[-3, -2, 9, 8]] * 2, [[4, 3, 2, 1]] * 2], dtype)
+    np.testing.assert_array_equal(
+        box_sums(images, np.arange(2), beyond), [images.sum(axis=(1, 2), dtype=int), [0, 0]]
+    )
 
 
 box_edges = st.tuples(*[st.floats(-5, 25, width=32)] * 4)

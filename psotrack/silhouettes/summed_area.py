@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Int, Integer, Num
 
 from psotrack._typing import Array
 
@@ -64,10 +64,10 @@ def pack(low: Integer[Array, "*image"], high: Bool[Array, "*image"]) -> Int[Arra
 def box_sum(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
-    x0: Float[Array, "*#boxes"],
-    y0: Float[Array, "*#boxes"],
-    x1: Float[Array, "*#boxes"],
-    y1: Float[Array, "*#boxes"],
+    x0: Num[Array, "*#boxes"],
+    y0: Num[Array, "*#boxes"],
+    x1: Num[Array, "*#boxes"],
+    y1: Num[Array, "*#boxes"],
 ) -> Float[Array, "*boxes"]:
     """Sums over fractional boxes, each box in the table of its camera.
 
@@ -80,7 +80,7 @@ def box_sum(
     Args:
         tables: (height + 1, cameras, width + 1), from `summed_area_table`.
         camera: index of the table that each box reads.
-        x0, y0, x1, y1: edges in pixels of the image, half-open.
+        x0, y0, x1, y1: edges in pixels of the image, half-open; whole numbers take a quarter of the reads.
 
     Returns:
         Sums, float32, in units of the image times pixels.
@@ -92,10 +92,10 @@ def box_sum(
 def packed_box_sums(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
-    x0: Float[Array, "*#boxes"],
-    y0: Float[Array, "*#boxes"],
-    x1: Float[Array, "*#boxes"],
-    y1: Float[Array, "*#boxes"],
+    x0: Num[Array, "*#boxes"],
+    y0: Num[Array, "*#boxes"],
+    x1: Num[Array, "*#boxes"],
+    y1: Num[Array, "*#boxes"],
 ) -> tuple[Float[Array, "*boxes"], Float[Array, "*boxes"]]:
     """Sums of two images that are packed into one table; boxes as in `box_sum`.
 
@@ -117,34 +117,42 @@ def _unpacked(total: Array) -> tuple[Array, Array]:
 def _box_sums(
     tables: Int[Array, "height1 cameras width1"],
     camera: Int[Array, "*#boxes"],
-    edges: tuple[Float[Array, "*#boxes"], ...],
+    edges: tuple[Num[Array, "*#boxes"], ...],
     unpacked: Callable[[Array], tuple[Array, ...]],
 ) -> tuple[Float[Array, "*boxes"], ...]:
     """Sums of boxes; `unpacked` splits whole sums into those of the images that share the tables."""
     x0, y0, x1, y1 = edges
     height1, num_cameras, width1 = tables.shape
 
-    def split(edge: Array, last: int) -> tuple[Array, Array]:
-        # The cell of the edge, and the share of the cell before the edge; at the last border this is 1.
-        edge = jnp.clip(edge, 0, last)
-        cell = jnp.minimum(edge.astype(jnp.int32), last - 1)
-        return cell, edge - cell.astype(edge.dtype)
-
-    (i0, fx0), (i1, fx1) = split(x0, width1 - 1), split(jnp.maximum(x0, x1), width1 - 1)
-    (j0, fy0), (j1, fy1) = split(y0, height1 - 1), split(jnp.maximum(y0, y1), height1 - 1)
-
-    def read(j: Array, i: Array) -> list[Array]:
-        """The table at a cell's corner, right of it, below it, and across."""
+    def read(j: Array, i: Array, steps: tuple[tuple[int, int], ...]) -> list[Array]:
+        """The table at some corners, by their steps down and right from the corner (j, i)."""
         if isinstance(tables, jax.Ref):
             of_box = jnp.broadcast_to(camera, j.shape)
-            return [tables[j + down, of_box, i + right] for down in (0, 1) for right in (0, 1)]
+            return [tables[j + down, of_box, i + right] for down, right in steps]
         # Indices are in bounds by construction, and a check in the tracker's innermost loop would cost time.
         flat, row = jnp.reshape(tables, -1), num_cameras * width1
         index = camera * width1 + j * row + i
         return [
-            flat.at[index + step].get(mode="promise_in_bounds", wrap_negative_indices=False)
-            for step in (0, 1, row, row + 1)
+            flat.at[index + down * row + right].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            for down, right in steps
         ]
+
+    def ends(low: Array, high: Array, last: int) -> tuple[Array, Array]:
+        return jnp.clip(low, 0, last), jnp.clip(jnp.maximum(low, high), 0, last)
+
+    (x0, x1), (y0, y1) = ends(x0, x1, width1 - 1), ends(y0, y1, height1 - 1)
+    if jnp.issubdtype(x0.dtype, jnp.integer):
+        corners = ((y0, x0), (y0, x1), (y1, x0), (y1, x1))
+        c00, c10, c01, c11 = (read(y, x, ((0, 0),))[0] for y, x in corners)
+        return tuple(part.astype(jnp.float32) for part in unpacked((c11 - c01) - (c10 - c00)))
+
+    def split(edge: Array, last: int) -> tuple[Array, Array]:
+        # The cell of the edge, and the share of the cell before the edge; at the last border this is 1.
+        cell = jnp.minimum(edge.astype(jnp.int32), last - 1)
+        return cell, edge - cell.astype(edge.dtype)
+
+    (i0, fx0), (i1, fx1) = split(x0, width1 - 1), split(x1, width1 - 1)
+    (j0, fy0), (j1, fy1) = split(y0, height1 - 1), split(y1, height1 - 1)
 
     def floats(total: Array) -> tuple[Array, ...]:
         return tuple(part.astype(x0.dtype) for part in unpacked(total))
@@ -153,7 +161,7 @@ def _box_sums(
         # The table at the cell's corner, and the part that bilinear interpolation adds. Integers are subtracted before
         # the conversion to float32, because the sums of a 1080p image exceed 2^24. Each difference is the sum over a
         # box, so `unpacked` can split the difference.
-        here, right, below, across = read(j, i)
+        here, right, below, across = read(j, i, ((0, 0), (0, 1), (1, 0), (1, 1)))
         steps = (floats(step) for step in (right - here, below - here, across - below - right + here))
         added = tuple(
             fx * right + fy * below + (fx * fy) * across for right, below, across in zip(*steps, strict=True)

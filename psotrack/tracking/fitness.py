@@ -276,15 +276,19 @@ def _foreground_and_area(
             # Whole pixels of the silhouettes, however coarse the window is.
             ends = [patches.reduction * jnp.round(end / patches.reduction) for end in ends]
         low, high = ((end - first_px) / patches.pixel_px for end in ends)
-        return low, high
+        return (_whole(low), _whole(high)) if patches.whole_cells else (low, high)
 
     x0, x1 = interval(boxes.x_middle, boxes.x_half, patches.size_wh_px[0], patches.x_px)
     y0, y1 = interval(boxes.y_middle, boxes.y_half, patches.size_wh_px[1], patches.y_px)
-    area = (x1 - x0) * (y1 - y0)
+    area = ((x1 - x0) * (y1 - y0)).astype(boxes.x_middle.dtype)
     if not patches.packed:
         return box_sum(patches.tables, patches.number, x0, y0, x1, y1) / FULL, area
     foreground, occluded = packed_box_sums(patches.tables, patches.number, x0, y0, x1, y1)
     return foreground / FULL, jnp.maximum(area - occluded, LEAST_AREA * area)
+
+
+def _whole(edge: Array) -> Array:
+    return jnp.round(edge).astype(jnp.int32)
 
 
 def _share_in_image(patches: Patches, boxes: Boxes) -> Float[Array, "*batch drones cameras"]:

@@ -177,7 +177,7 @@ def _with_more_cameras(inputs: ScoreInputs) -> ScoreInputs:
         patches,
         tables=jnp.pad(patches.tables, [(0, 0), more, (0, 0)]),
         clear=jnp.pad(patches.clear, more),
-        **of_cameras(patches, "tables", "clear", "reduction", "packed"),
+        **of_cameras(patches, "tables", "clear", "reduction", "packed", "whole_cells"),
     )
     return replace(inputs, extents=replace(seen, **of_cameras(seen, "size_m")), patches=patches)
 
