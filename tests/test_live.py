@@ -495,7 +495,7 @@ def test_a_video_that_is_gone_when_the_session_begins(
     session = LiveSession(recording, cameras, settings, most_drones=4)
     result = session.run([], longest_s=1.0)
     assert result.instants > 0
-    assert result.counts[gone.name].frames == 0
+    assert result.cameras[gone.name].counts.frames == 0
     assert [
         line for line in caplog.messages if line.startswith(f"camera {gone.name}: ") and "gone.avi" in line
     ]

@@ -31,8 +31,7 @@ import psutil
 
 from psotrack.datasets import open_recording
 from psotrack.geometry import project
-from psotrack.live import LiveSession, ReplayedVideo, live_cameras
-from psotrack.live.sources import SourceFrame
+from psotrack.live import LiveSession, ReplayedVideo, SourceFrame, live_cameras
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
@@ -239,10 +238,10 @@ def _with_stops(recording: Recording, camera: str) -> dict[str, int]:
     session = LiveSession(recording, cameras, TrackSettings())
     with tempfile.TemporaryDirectory() as out:
         with RowStream(Path(out) / "tracks.csv") as rows:
-            result = session.run([rows])
+            result = session.run([rows.write])
         found = read_trajectories(Path(out) / "tracks.csv")
     return _lost(recording, found, camera) | {
-        "stops": result.counts[camera].stops,
+        "stops": result.cameras[camera].counts.stops,
         "instants": result.instants,
         "instants_left_out": result.left_out,
         "drones": len(result.drones),

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,7 @@ from psotrack.settings import TrackSettings
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.live import LiveResult, LiveSession
+    from psotrack.live import LiveResult, LiveSession, RowsOutput
     from psotrack.recordings import Recording
     from psotrack.viewer import LiveView
 
@@ -144,12 +145,13 @@ def live(
     from psotrack.datasets import open_recording
     from psotrack.live import (
         WAIT_S,
-        JsonLines,
+        CameraRecorder,
         LiveSession,
         RecordingFolder,
         UdpLines,
         WebSocketLines,
         live_cameras,
+        write_lines,
     )
     from psotrack.pipeline import warn_of_missing_drones, with_real_time
     from psotrack.support import keep_compiled
@@ -174,7 +176,7 @@ def live(
     kept = None
     if record is not None:
         kept = RecordingFolder(record, recording, [camera.name for camera in used], force=force)
-        used = [replace(camera, recorder=kept.recorder(camera.name, camera.fps)) for camera in used]
+        used = [replace(each, recorder=CameraRecorder(record, each.name, each.fps)) for each in used]
     first_s = float(recording.timeline().time_s[0]) if replay else 0.0
     session = LiveSession(
         recording,
@@ -186,33 +188,33 @@ def live(
         wait_s=WAIT_S / min(1.0, speed) if replay else WAIT_S,
     )
     with contextlib.ExitStack() as stack:
-        outputs: list[Any] = [JsonLines(sys.stdout)] if lines else []
+        outputs: list[RowsOutput] = [partial(write_lines, sys.stdout)] if lines else []
         if udp is not None:
-            outputs.append(stack.enter_context(contextlib.closing(UdpLines(udp))))
+            outputs.append(stack.enter_context(contextlib.closing(UdpLines(udp))).write)
         server = (
             None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
         )
         if server is not None:
-            outputs.append(server)
+            outputs.append(server.write)
             if not quiet:
                 click.echo(f"rows are sent to clients of {server.address}", err=True)
         if kept is not None:
             kept.begin()
             stack.callback(kept.end)
-        rows = []
         if out is not None:
-            rows.append(stack.enter_context(RowStream(out, force=force, record=out.with_suffix(".json"))))
+            rows = stack.enter_context(RowStream(out, force=force, record=out.with_suffix(".json")))
+            outputs.insert(0, rows.write)
         shown = None if viewer is None else stack.enter_context(_open_view(viewer, recording, quiet or lines))
-        outputs += [] if shown is None else [shown]
+        outputs += [] if shown is None else [shown.write]
         table = stack.enter_context(_Table(quiet or lines, shown))
         stack.enter_context(_ended_by_ctrl_c(session))
 
-        def show(result: LiveResult, films: list[bool]) -> None:
+        def show(result: LiveResult) -> None:
             if result.instants == 1:
                 stack.enter_context(unhurried_end())
-            table.show(result, films)
+            table.show(result)
 
-        result = session.run([*rows, *outputs], show, longest_s=seconds or float("inf"))
+        result = session.run(outputs, show, longest_s=seconds or float("inf"))
     warn_of_missing_drones(chosen, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
@@ -260,7 +262,7 @@ def _record(result: LiveResult) -> dict[str, Any]:
         "frames": result.instants,
         "frames_left_out": result.left_out,
         "late_searches": None,
-        "camera_frames": {name: dict(vars(counts)) for name, counts in result.counts.items()},
+        "camera_frames": {name: dict(vars(each.counts)) for name, each in result.cameras.items()},
         "recorded": {name: dict(vars(counts)) for name, counts in result.recorded.items()},
         "drones": len(result.drones),
         "delay_s": {
@@ -293,7 +295,7 @@ class _Table:
         if self._live is not None:
             self._live.stop()
 
-    def show(self, result: LiveResult, films: list[bool]) -> None:
+    def show(self, result: LiveResult) -> None:
         """Show what the session has done so far."""
         if self._view is not None:
             self._view.show_delay(result.delay_s[-1])
@@ -311,10 +313,9 @@ class _Table:
         )
         for column in ("camera", "", "frames", "missing", "late", "twice", "left out", "stops"):
             table.add_column(column, justify="left" if column in ("camera", "") else "right")
-        for (name, counts), there in zip(result.counts.items(), films, strict=True):
-            table.add_row(
-                name, "films" if there else "silent", *(f"{value}" for value in vars(counts).values())
-            )
+        for name, camera in result.cameras.items():
+            counts = (f"{value}" for value in vars(camera.counts).values())
+            table.add_row(name, "films" if camera.films else "silent", *counts)
         self._live.update(table, refresh=True)
 
 

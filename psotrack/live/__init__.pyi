@@ -1,8 +1,8 @@
 from .cameras import LiveCamera, live_cameras
 from .meeting import CameraCounts, Instant, Meeting
-from .messages import JsonLines, UdpLines, lines_of
+from .messages import UdpLines, lines_of, write_lines
 from .recorder import CameraRecorder, RecordedCounts, RecordingFolder
-from .session import WAIT_S, LiveResult, LiveSession
+from .session import WAIT_S, LiveResult, LiveSession, RowsOutput
 from .sources import CameraStream, LiveSource, ReplayedVideo, SourceFrame
 from .stream_clock import StreamClock
 from .websocket import WebSocketLines
@@ -13,7 +13,6 @@ __all__ = [
     "CameraRecorder",
     "CameraStream",
     "Instant",
-    "JsonLines",
     "LiveCamera",
     "LiveResult",
     "LiveSession",
@@ -22,10 +21,12 @@ __all__ = [
     "RecordedCounts",
     "RecordingFolder",
     "ReplayedVideo",
+    "RowsOutput",
     "SourceFrame",
     "StreamClock",
     "UdpLines",
     "WebSocketLines",
     "lines_of",
     "live_cameras",
+    "write_lines",
 ]

@@ -8,8 +8,6 @@ import socket
 import sys
 from urllib.parse import urlsplit
 
-from psotrack.support import whole_number
-
 #: How long a stream may take to answer and to bring a frame, seconds.
 ANSWER_S = 5.0
 _PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443, "rtmp": 1935}
@@ -22,8 +20,7 @@ def device_of(address: str) -> int | str | None:
     if not address.startswith(_DEVICE):
         return None
     device = address.removeprefix(_DEVICE)
-    number = whole_number(device)
-    return device if number is None else number
+    return int(device) if device.isdecimal() else device
 
 
 def shown_address(address: str) -> str:
@@ -49,11 +46,8 @@ def why_silent(address: str, took_s: float) -> str:
         return "that it does not answer"
     try:
         socket.create_connection((parts.hostname, port), ANSWER_S).close()
-    except socket.gaierror:
-        return f"that it does not answer: no host {parts.hostname} is known"
     except OSError as error:
-        reason = os.strerror(error.errno).lower() if error.errno else "timed out"
-        return f"that it does not answer: {reason}"
+        return f"that it does not answer: {error.strerror or error}".lower()
     return "no video there; are path, user name and password right?"
 
 
@@ -67,5 +61,5 @@ def _why_no_device(path: str) -> str:
     except PermissionError:
         return f"no permission for {path}; is this user in the group that owns it, mostly `video`?"
     except OSError as error:
-        return f"{os.strerror(error.errno or 0).lower()} ({path})"
+        return f"{error.strerror} ({path})"
     return f"no camera at {path}, or another program that uses it"

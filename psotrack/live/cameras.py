@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError
+from psotrack.geometry import chosen_cameras
 from psotrack.live.recorder import CameraRecorder
 from psotrack.live.sources import CameraStream, LiveSource, ReplayedVideo
 from psotrack.recordings import Recording
@@ -55,25 +56,21 @@ def live_cameras(
 
     Raises:
         InputError: fewer than two cameras have a source.
-        SettingsError: a name is unknown.
+        SettingsError: a name fits no camera, or a camera is named twice.
     """
-    unknown = sorted(set(names or ()) - set(recording.rig.names))
-    if unknown:
-        raise SettingsError("cameras", expected=f"some of {', '.join(recording.rig.names)}", found=unknown[0])
-    sizes_wh = dict(zip(recording.rig.names, recording.rig.cameras.image_size_wh, strict=True))
+    rig = recording.rig if names is None else recording.rig.select(chosen_cameras(names, recording.rig.names))
     found = []
-    for name in (each for each in recording.rig.names if names is None or each in names):
+    for name, (width, height) in zip(rig.names, rig.cameras.image_size_wh.tolist(), strict=True):
         times = recording.frame_times.get(name)
-        fps = _USUAL_HZ if times is None else times.fps
         source: LiveSource
-        if replay and name in recording.videos:
-            source = ReplayedVideo(recording.videos[name], recording.frame_times[name].time_s, speed, loops)
+        if replay and times is not None and name in recording.videos:
+            source = ReplayedVideo(recording.videos[name], times.time_s, speed, loops)
         elif not replay and name in recording.streams:
-            width, height = map(int, sizes_wh[name])
             source = CameraStream(recording.streams[name], (width, height))
         else:
             continue
         line_time_s, ignore = recording.line_time_s.get(name, 0.0), recording.ignore.get(name)
+        fps = times.fps if times is not None else _USUAL_HZ
         found.append(LiveCamera(name, source, fps, line_time_s, ignore))
     if len(found) < 2:
         what = "videos" if replay else "the address of a stream or the number of a device as `video`"

@@ -11,17 +11,16 @@ import itertools
 import logging
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 
 from psotrack.live.addresses import ANSWER_S
 from psotrack.live.cameras import LiveCamera
-from psotrack.live.meeting import CameraCounts, Instant, Meeting
+from psotrack.live.meeting import Instant, Meeting, MeetingCamera
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import SourceFrame
 from psotrack.silhouettes import ForegroundSettings, LivingBackground, coverage, ignored_pixels, reduce_frame
@@ -41,7 +40,7 @@ _END_S = 10.0 + ANSWER_S + CLOSE_S
 
 
 class FrontEnd:
-    """Cameras that film, as a context manager: `begin` lets them, and `instants` are what they show.
+    """Cameras that film, and the instants that they show.
 
     Args:
         cameras: the cameras.
@@ -52,7 +51,10 @@ class FrontEnd:
             the delay does not grow.
 
     Attributes:
-        errors: errors that have ended cameras.
+        cameras: state of each camera, by name.
+        began_s: time at which the recording's clock shows 0, `time.monotonic`; infinite until the cameras film.
+        num_left_out: number of complete instants that were left out, because the tracker was too slow.
+        errors: errors that have ended cameras, by the camera's index.
         recorded: what happened to the frames that are kept, by the camera's name; complete at the end.
     """
 
@@ -67,78 +69,62 @@ class FrontEnd:
     ) -> None:
         self._cameras, self._settings, self._wait_s = cameras, settings, wait_s
         self._meeting = Meeting([each.fps for each in cameras], rate_hz, wait_s=wait_s, first_s=first_s)
+        self.cameras: dict[str, MeetingCamera] = {
+            camera.name: state for camera, state in zip(cameras, self._meeting.cameras, strict=True)
+        }
         self._changed = threading.Condition()
+        self._ready = threading.Semaphore(0)
         # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
         self._is_stopped = False
-        self._began_s: float | None = None
-        self._ready: set[int] = set()
-        #: Cameras that have never filmed, as they say, or will not film again.
-        self._missing: set[int] = set()
         self._said = [""] * len(cameras)
-        self.errors: list[Exception] = []
+        self.began_s = np.inf
+        self.num_left_out = 0
+        self.errors: dict[int, Exception] = {}
         self.recorded: dict[str, RecordedCounts] = {}
 
-    def __enter__(self) -> FrontEnd:
-        # As many threads as cameras: more for each of them would only wait.
-        self._num_opencv_threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        self._threads = [
-            threading.Thread(target=self._film, args=each, daemon=True) for each in enumerate(self._cameras)
-        ]
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.stop()
-        with self._changed:
-            self._changed.notify_all()
-        ends_s = time.monotonic() + _END_S
-        for thread in self._threads:
-            thread.join(max(0.0, ends_s - time.monotonic()))
-        cv2.setNumThreads(self._num_opencv_threads)
+    @property
+    def num_able(self) -> int:
+        """Number of cameras that film, or have filmed and may come back, or have said nothing so far."""
+        states = zip(self._meeting.cameras, self._said, strict=True)
+        is_able = [state.has_filmed or not said for state, said in states]
+        return sum(able and index not in self.errors for index, able in enumerate(is_able))
 
     def stop(self) -> None:
         """Let the cameras end; from any thread or signal handler."""
         self._is_stopped = True
 
-    def begin(self, longest_s: float) -> float:
-        """Wait until all sources are ready, and let the cameras film.
+    def instants(self, longest_s: float) -> Generator[Instant]:
+        """Let the cameras film, and yield the instants that are complete; to be closed, which ends the cameras.
 
         Args:
             longest_s: time after which there are no more instants, seconds.
-
-        Returns:
-            The time at which the recording's clock shows 0, `time.monotonic`.
         """
-        with self._changed:
-            self._changed.wait_for(lambda: len(self._ready) == len(self._cameras))
-            self._began_s = self._meeting.began_s = time.monotonic() + _LEAD_S
-            self._ends_s = self._began_s + longest_s
-            self._changed.notify_all()
-        return self._began_s
+        num_opencv_threads = cv2.getNumThreads()
+        # As many threads as cameras: more for each of them would only wait.
+        cv2.setNumThreads(1)
+        threads = [
+            threading.Thread(target=self._film, args=each, daemon=True) for each in enumerate(self._cameras)
+        ]
+        for thread in threads:
+            thread.start()
+        try:
+            for _ in threads:
+                self._ready.acquire()
+            with self._changed:
+                self.began_s = self._meeting.began_s = time.monotonic() + _LEAD_S
+                self._changed.notify_all()
+            yield from self._complete(self.began_s + longest_s)
+        finally:
+            self.stop()
+            with self._changed:
+                self._changed.notify_all()
+            ends_s = time.monotonic() + _END_S
+            for thread in threads:
+                thread.join(max(0.0, ends_s - time.monotonic()))
+            cv2.setNumThreads(num_opencv_threads)
 
-    @property
-    def counts(self) -> dict[str, CameraCounts]:
-        """Counts of each camera, by name."""
-        return {
-            camera.name: each.counts
-            for camera, each in zip(self._cameras, self._meeting.cameras, strict=True)
-        }
-
-    @property
-    def films(self) -> list[bool]:
-        """Whether each camera films."""
-        return [camera.films for camera in self._meeting.cameras]
-
-    @property
-    def num_able(self) -> int:
-        """Number of cameras that film, or have filmed and may come back."""
-        return len(self._cameras) - len(self._missing)
-
-    def instants(self) -> Iterator[tuple[Instant, int]]:
-        """Yield instants that are complete, and how many were left out before each."""
-        while not self._is_stopped and self.num_able >= 2 and time.monotonic() < self._ends_s:
+    def _complete(self, ends_s: float) -> Iterator[Instant]:
+        while not self._is_stopped and self.num_able >= 2 and time.monotonic() < ends_s:
             with self._changed:
                 now_s = time.monotonic()
                 self._tell_stopped(now_s)
@@ -147,10 +133,8 @@ class FrontEnd:
                     if self._meeting.has_ended:
                         return
                     self._changed.wait(_LOOK_S)
-            num_left_out = max(0, len(ready) - _MOST_WAITING)
-            for instant in ready[num_left_out:]:
-                yield instant, num_left_out
-                num_left_out = 0
+            self.num_left_out += max(0, len(ready) - _MOST_WAITING)
+            yield from ready[-_MOST_WAITING:]
 
     def _tell_stopped(self, now_s: float) -> None:
         for index in self._meeting.stopped(now_s):
@@ -164,11 +148,9 @@ class FrontEnd:
 
     def _film(self, index: int, camera: LiveCamera) -> None:
         """Frames to silhouettes."""
+        silhouettes = CameraSilhouettes(self._settings, camera)
         try:
-            CameraSilhouettes(self._settings, camera.name, None).warm_up()
-            silhouettes = CameraSilhouettes(self._settings, camera.name, camera.ignore)
-            begin, stopped = partial(self._wait_to_begin, index), lambda: self._is_stopped
-            with contextlib.closing(camera.source.frames(begin, stopped)) as frames:
+            with contextlib.closing(camera.source.frames(self._begin, lambda: self._is_stopped)) as frames:
                 for frame in itertools.takewhile(lambda _: not self._is_stopped, frames):
                     if isinstance(frame, str):
                         self._say(index, frame)
@@ -176,52 +158,45 @@ class FrontEnd:
                         self._take(index, frame, silhouettes)
         except Exception as error:
             logger.warning("camera %s: %s", camera.name, error)
-            self.errors.append(error)
-            self._missing.add(index)
+            self.errors[index] = error
         finally:
+            self._ready.release()  # where it ended before it was ready
             with self._changed:
-                self._ready.add(index)
                 self._meeting.end(index)
                 self._changed.notify_all()
             if camera.recorder is not None:
                 self.recorded[camera.name] = camera.recorder.close()
 
-    def _wait_to_begin(self, index: int) -> float:
+    def _begin(self) -> float:
+        """Wait until all sources are ready."""
+        self._ready.release()
         with self._changed:
-            self._ready.add(index)
-            self._changed.notify_all()
-            self._changed.wait_for(lambda: self._began_s is not None or self._is_stopped)
-        return self._began_s or 0.0
+            self._changed.wait_for(lambda: self.began_s < np.inf or self._is_stopped)
+        return self.began_s
 
     def _say(self, index: int, line: str) -> None:
         with self._changed:
             if line != self._said[index]:
                 logger.warning("camera %s: %s", self._cameras[index].name, line)
             self._said[index] = line
-            if not self._meeting.cameras[index].has_filmed:
-                self._missing.add(index)
 
     def _take(self, index: int, frame: SourceFrame, silhouettes: CameraSilhouettes) -> None:
         """A frame: what the tracker waits for comes first."""
         camera, meeting = self._cameras[index], self._meeting
         with self._changed:
             self._said[index] = ""
-            self._missing.discard(index)
             again = " again" if meeting.cameras[index].has_filmed else ""
             if meeting.announce(index, frame.time_s, time.monotonic()):
                 logger.warning("camera %s films%s", camera.name, again)
-        image = None
-        if time.monotonic() - frame.arrived_s > self._wait_s:
-            silhouettes.leave_out()
-        else:
-            image = silhouettes.look(frame.image)
+        is_late = time.monotonic() - frame.arrived_s > self._wait_s
+        image = silhouettes.look(None if is_late else frame.image)
         with self._changed:
             meeting.put(index, frame.time_s, image, frame.arrived_s)
             self._changed.notify_all()
-            if image is not None:
+            if not is_late:
                 # Silhouettes of other cameras come first, which the tracker waits for.
                 self._changed.wait_for(lambda: not meeting.has_work, _LONGEST_TURN_S)
-        if image is not None:
+        if not is_late:
             silhouettes.learn()
         if camera.recorder is not None:
             camera.recorder.write(frame.image, frame.time_s)
@@ -232,43 +207,36 @@ class CameraSilhouettes:
 
     Args:
         settings: settings of the silhouettes.
-        name: name of the camera, for messages.
-        ignore: image that is white where nothing counts as foreground; None for no such image.
+        camera: the camera.
     """
 
-    def __init__(self, settings: ForegroundSettings, name: str, ignore: Path | None) -> None:
-        self._settings, self._name, self._ignore = settings, name, ignore
-        self._ignored: Bool[np.ndarray, "rows columns"] | None = None
+    def __init__(self, settings: ForegroundSettings, camera: LiveCamera) -> None:
+        self._settings, self._camera = settings, camera
         self._background: LivingBackground | None = None
-        self._num_frames = 1
+        self._num_frames = 0
 
-    def leave_out(self) -> None:
-        """The next frame is not seen."""
+    def look(
+        self, frame: UInt8[np.ndarray, "height width 3"] | None
+    ) -> UInt8[np.ndarray, "rows columns"] | None:
+        """The silhouette of the next frame; None for a frame that is left out. `learn` comes before the frame after."""
         self._num_frames += 1
-
-    def look(self, frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns"]:
-        """The silhouette of the next frame; `learn` is to be called before the frame after it."""
-        image = reduce_frame(frame, self._settings)
+        if frame is None:
+            return None
+        settings, ignore = self._settings, self._camera.ignore
+        image = reduce_frame(frame, settings)
         if self._background is None:
-            self._background = LivingBackground(self._settings, image)
-            if self._ignore is not None:
+            self._background = LivingBackground(settings, image)
+            self._ignored = None
+            if ignore is not None:
                 size_wh = frame.shape[1], frame.shape[0]
-                self._ignored = ignored_pixels(
-                    self._ignore, self._name, size_wh, self._settings.working_reduction
-                )
+                self._ignored = ignored_pixels(ignore, self._camera.name, size_wh, settings.working_reduction)
         mask = self._background.look(image, num_frames=self._num_frames)
-        self._num_frames = 1
+        self._num_frames = 0
         if self._ignored is not None:
             mask = np.where(self._ignored, np.uint8(0), mask)
-        return coverage(mask, self._settings.reduction // self._settings.working_reduction)
+        return coverage(mask, settings.reduction // settings.working_reduction)
 
     def learn(self) -> None:
         """Learn from the last frame."""
         assert self._background is not None
         self._background.learn()
-
-    def warm_up(self) -> None:
-        """Do once what is slow the first time."""
-        for level in (0, 9):
-            self.look(np.full((270, 480, 3), level, np.uint8))
-            self.learn()

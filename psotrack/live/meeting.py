@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -65,6 +66,12 @@ class Instant:
     arrived_s: float
 
 
+class _Frame(NamedTuple):
+    time_s: float
+    coverage: UInt8[np.ndarray, "height width"]
+    arrived_s: float
+
+
 @dataclass
 class MeetingCamera:
     """A camera's last frames, and its state.
@@ -75,7 +82,7 @@ class MeetingCamera:
         films: whether it films, or is waited for because it may.
         has_filmed: whether it has filmed.
         has_ended: whether it will never film again.
-        frames: time, silhouette and arrival of the frames that later instants may show.
+        frames: frames that later instants may show.
         in_work_s: time of the frame that is in work; None for no frame.
         last_time_s: time of the last frame.
         last_came_s: when the last frame came, on the caller's clock.
@@ -86,14 +93,15 @@ class MeetingCamera:
     films: bool = True
     has_filmed: bool = False
     has_ended: bool = False
-    frames: deque[tuple[float, UInt8[np.ndarray, "height width"], float]] = field(default_factory=deque)
+    frames: deque[_Frame] = field(default_factory=deque)
     in_work_s: float | None = None
     last_time_s: float = -np.inf
     last_came_s: float = -np.inf
 
-    def near(self, at_s: float) -> list[tuple[float, UInt8[np.ndarray, "height width"], float]]:
-        """The frames that an instant may show."""
-        return [frame for frame in self.frames if self.reaches(frame[0], at_s)]
+    def nearest(self, at_s: float) -> _Frame | None:
+        """The frame that an instant shows; None where it has none so far."""
+        near = [frame for frame in self.frames if self.reaches(frame.time_s, at_s)]
+        return min(near, key=lambda frame: abs(frame.time_s - at_s), default=None)
 
     def reaches(self, time_s: float | None, at_s: float) -> bool:
         """Whether an instant may show a frame of a time."""
@@ -136,7 +144,7 @@ class Meeting:
             Whether the camera was not waited for until now.
         """
         camera = self.cameras[index]
-        is_back = not camera.films and not camera.has_ended
+        is_back = not camera.films
         camera.films, camera.has_filmed = True, True
         camera.last_came_s, camera.in_work_s = now_s, time_s
         return is_back
@@ -164,7 +172,7 @@ class Meeting:
             counts.late += 1
         else:
             counts.frames += 1
-            camera.frames.append((time_s, coverage, arrived_s))
+            camera.frames.append(_Frame(time_s, coverage, arrived_s))
 
     def end(self, index: int) -> None:
         """A camera has ended for good: it is not waited for."""
@@ -193,43 +201,30 @@ class Meeting:
 
     def take(self, now_s: float) -> Instant | None:
         """The next instant, if it is complete or has waited long enough; instants that no camera films are passed."""
-        while True:
-            at_s = self._next_s
-            came_s = [frame[2] for camera in self.cameras for frame in camera.near(at_s)]
-            if came_s:
-                break
-            if not self._is_over(at_s):
+        while not any(shown := [camera.nearest(self._next_s) for camera in self.cameras]):
+            if not self._is_over(self._next_s):
                 return None
             self._next += 1
-        if any(camera.reaches(camera.in_work_s, at_s) for camera in self.cameras):
-            return None
+        at_s, period_s = self._next_s, 1 / self._rate_hz
+        arrived_s = [frame.arrived_s for frame in shown if frame]
         is_decided = all(camera.is_decided(at_s) for camera in self.cameras)
-        return self._taken(at_s) if is_decided or now_s - min(came_s) >= self._wait_s else None
+        is_in_work = any(camera.reaches(camera.in_work_s, at_s) for camera in self.cameras)
+        if is_in_work or not (is_decided or now_s - min(arrived_s) >= self._wait_s):
+            return None
+        for camera, frame in zip(self.cameras, shown, strict=True):
+            camera.counts.missing += camera.films and not frame
+            # The next instant needs no frame that is too far before it.
+            while camera.frames and camera.frames[0].time_s + REACH * camera.interval_s < at_s + period_s:
+                camera.frames.popleft()
+        self._next += 1
+        offset_s = np.array([frame.time_s - at_s if frame else 0.0 for frame in shown])
+        offset_s[np.abs(offset_s) < 1e-6 * period_s] = 0.0
+        coverage = [frame.coverage if frame else None for frame in shown]
+        return Instant(self._next - 1, at_s, coverage, offset_s, max(arrived_s))
 
     def _is_over(self, at_s: float) -> bool:
         """Whether a later frame shows that an instant that no frame shows will stay without frames."""
-        later = any(camera.frames and camera.frames[0][0] > at_s for camera in self.cameras)
-        return later and all(
+        return any(camera.frames and camera.frames[0].time_s > at_s for camera in self.cameras) and all(
             not camera.films or camera.last_time_s > at_s + REACH * camera.interval_s
             for camera in self.cameras
         )
-
-    def _taken(self, at_s: float) -> Instant:
-        coverage: list[UInt8[np.ndarray, "height width"] | None] = []
-        offset_s, arrived_s, period_s = np.zeros(len(self.cameras)), -np.inf, 1 / self._rate_hz
-        for index, camera in enumerate(self.cameras):
-            near = camera.near(at_s)
-            if near:
-                time_s, image, came_s = min(near, key=lambda frame: abs(frame[0] - at_s))
-                coverage.append(image)
-                off_s = time_s - at_s
-                offset_s[index] = off_s if abs(off_s) >= 1e-6 * period_s else 0.0
-                arrived_s = max(arrived_s, came_s)
-            else:
-                coverage.append(None)
-                camera.counts.missing += camera.films
-            # The next instant needs no frame that is too far before it.
-            while camera.frames and camera.frames[0][0] + REACH * camera.interval_s < at_s + period_s:
-                camera.frames.popleft()
-        self._next += 1
-        return Instant(self._next - 1, at_s, coverage, offset_s, float(arrived_s))

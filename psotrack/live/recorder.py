@@ -15,7 +15,7 @@ import queue
 import shutil
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,7 +53,7 @@ _LEAST_FREE_BYTES = 256 * 10**6
 CLOSE_S = 5.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class RecordedCounts:
     """What happened to a camera's frames in its recording.
 
@@ -73,83 +73,67 @@ class CameraRecorder:
         folder: existing folder of the recording.
         name: name of the camera, and of its files.
         fps: frames per second that the video states; the file of times is exact.
-        image_size_wh: width and height of the frames, even numbers, pixels.
         least_free_bytes: free space of the disk at which recording ends.
 
     Attributes:
-        counts: what happened to the frames, complete when the recorder is closed.
         video, times: paths of the video and of the file of times.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        name: str,
-        fps: float,
-        image_size_wh: tuple[int, int],
-        *,
-        least_free_bytes: int = _LEAST_FREE_BYTES,
+        self, folder: Path, name: str, fps: float, *, least_free_bytes: int = _LEAST_FREE_BYTES
     ) -> None:
-        self._folder, self._fps, self._image_size_wh = folder, fps, image_size_wh
-        self._least_free_bytes = least_free_bytes
+        self._folder, self._fps, self._least_free_bytes = folder, fps, least_free_bytes
         self.video, self.times = (folder / file for file in _files_of(name))
-        self.counts = RecordedCounts()
-        self._num_taken, self._last_s = 0, -np.inf
+        self._num_frames, self._num_taken, self._last_s = 0, 0, -np.inf
         self._is_late = self._has_failed = False
         self._waiting: queue.SimpleQueue[tuple[np.ndarray, float] | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
 
     def write(self, image: UInt8[np.ndarray, "height width 3"], time_s: float) -> None:
         """Hand over the next frame; does not wait. Where the recording leaves out frames or ends, a line says so, once.
 
         Args:
-            image: BGR; must not be changed afterwards.
+            image: BGR, with even numbers of pixels; must not be changed afterwards.
             time_s: when it was filmed, on the recording's clock, seconds.
         """
         if time_s <= self._last_s:  # the same frame again
             return
         self._last_s = time_s
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._encode, daemon=True)
+        if not self._num_frames:
+            self._thread = threading.Thread(target=self._encode, args=image.shape[1::-1], daemon=True)
             self._thread.start()
+        self._num_frames += 1
         if not self._has_failed and self._waiting.qsize() < _MOST_WAITING:
             self._num_taken += 1
             self._waiting.put((image, time_s))
-            return
-        self.counts.left_out += 1
-        if not (self._has_failed or self._is_late):
+        elif not (self._has_failed or self._is_late):
             self._is_late = True
             text = "%s: frames are left out of the recording, because the computer is too slow"
             logger.warning(text, self._folder)
 
     def close(self) -> RecordedCounts:
         """Finish the files, for some seconds at most; the frames that wait are encoded first."""
-        self._last_s = np.inf
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            self._waiting.put(None)
-            thread.join(CLOSE_S)
-            # Counted in the file: FFmpeg does not report what did not reach the disk.
-            self.counts.frames = _readable_frames(self.video)
-            num_lost = self._num_taken - self.counts.frames
-            self.counts.left_out += num_lost
-            if num_lost and not self._has_failed:
-                text = "%s: expected %d frames, found %d; is the disk full, or too slow?"
-                logger.warning(text, self.video, self._num_taken, self.counts.frames)
-        return self.counts
+        if not self._num_frames:
+            return RecordedCounts()
+        self._waiting.put(None)
+        self._thread.join(CLOSE_S)
+        # Counted in the file: FFmpeg does not report what did not reach the disk.
+        found = _readable_frames(self.video)
+        if found < self._num_taken and not self._has_failed:
+            text = "%s: expected %d frames, found %d; is the disk full, or too slow?"
+            logger.warning(text, self.video, self._num_taken, found)
+        return RecordedCounts(found, self._num_frames - found)
 
-    def _encode(self) -> None:
+    def _encode(self, width: int, height: int) -> None:
         if sys.platform == "linux":  # where threads have priorities of their own
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
-            encoder = VideoEncoder(self.video, _CODEC, self._fps, self._image_size_wh)
+            encoder = VideoEncoder(self.video, _CODEC, self._fps, (width, height))
             with self.times.open("w", encoding="utf-8", newline="") as times, contextlib.closing(encoder):
                 times.write("frame,time_s\n")
-                while (frame := self._waiting.get()) is not None:
+                for image, time_s in iter(self._waiting.get, None):
                     if shutil.disk_usage(self._folder).free < self._least_free_bytes:
                         raise OSError(f"less than {self._least_free_bytes // 10**6} MB of free disk space")
-                    image, time_s = frame
                     # The row first: if the program is killed, times without a frame are left aside when the recording
                     # is opened.
                     times.write(f"{encoder.num_frames},{time_s!r}\n")
@@ -195,34 +179,20 @@ class RecordingFolder:
         self, folder: Path, recording: Recording, names: Sequence[str], *, force: bool = False
     ) -> None:
         self._folder, self._recording = folder, recording
-        self._rig = recording.rig.select([name for name in recording.rig.names if name in names])
-        self._tables: dict[str, CameraTable] = {}
+        self._rig = recording.rig.select(names)
         if folder.resolve() == recording.folder.resolve():
             found = "that of the cameras' recording.toml"
             raise SettingsError("--record", expected="another folder", found=found)
-        for name in self._rig.names:
-            width, height = self._size_wh(name)
+        for name, (width, height) in zip(names, self._rig.cameras.image_size_wh.tolist(), strict=True):
             if width % 2 or height % 2:
                 expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
-                raise SettingsError(
-                    "--record", expected=expected, found=f"{width} x {height} of camera {name}"
-                )
-            video, times = _files_of(name)
-            ignore = recording.ignore.get(name)
-            self._tables[name] = CameraTable(
-                video=video,
-                timestamps=times,
-                ignore=None if ignore is None else f"{name}_ignore{ignore.suffix}",
-                line_time_s=recording.line_time_s.get(name, 0.0),
-            )
+                found = f"{width} x {height} of camera {name}"
+                raise SettingsError("--record", expected=expected, found=found)
+        self._tables = {name: self._table(name) for name in names}
         if not force and folder.is_dir() and any(folder.iterdir()):
             expected, found = "a new or an empty folder", "a folder with files"
             remedy = "pass --force to replace an earlier recording in it"
             raise OutputError(folder, expected=expected, found=found, remedy=remedy)
-
-    def recorder(self, name: str, fps: float) -> CameraRecorder:
-        """The recorder of a camera."""
-        return CameraRecorder(self._folder, name, fps, self._size_wh(name))
 
     def begin(self) -> None:
         """Write the rig, the images of what is ignored, and a recording.toml with all cameras.
@@ -241,7 +211,7 @@ class RecordingFolder:
             expected, found = "a folder that can be written", error.strerror or f"{error}"
             raise OutputError(self._folder, expected=expected, found=found) from error
         write_rig(self._folder / _RIG_FILE, self._rig, force=True)
-        self._write(self._rig.names)
+        self._write(self._tables)
 
     def end(self) -> None:
         """Leave cameras out of the recording.toml that have no two frames; where no camera has, remove all files.
@@ -249,18 +219,23 @@ class RecordingFolder:
         Raises:
             OutputError: the recording.toml cannot be written; then it still names all cameras.
         """
-        there = [name for name in self._tables if _readable_frames(self._folder / _files_of(name)[0]) >= 2]
+        there = {
+            name: table
+            for name, table in self._tables.items()
+            if _readable_frames(self._folder / f"{table.video}") >= 2
+        }
         if there:
             self._write(there)
         else:
             # So that the folder can be used again.
             with contextlib.suppress(OSError):
                 self._remove_files()
-                self._folder.rmdir()
 
-    def _size_wh(self, name: str) -> tuple[int, int]:
-        width, height = self._rig.cameras.image_size_wh[self._rig.names.index(name)]
-        return int(width), int(height)
+    def _table(self, name: str) -> CameraTable:
+        video, times = _files_of(name)
+        ignore, line_time_s = self._recording.ignore.get(name), self._recording.line_time_s.get(name, 0.0)
+        copied = None if ignore is None else f"{name}_ignore{ignore.suffix}"
+        return CameraTable(video=video, timestamps=times, ignore=copied, line_time_s=line_time_s)
 
     def _remove_files(self) -> None:
         """Remove the files of this recording, or of an earlier one."""
@@ -269,9 +244,8 @@ class RecordingFolder:
             if file is not None:
                 (self._folder / f"{file}").unlink(missing_ok=True)
 
-    def _write(self, names: Sequence[str]) -> None:
+    def _write(self, tables: Mapping[str, CameraTable]) -> None:
         bounds_m = self._recording.bounds_m
         world = WorldTable() if bounds_m is None else WorldTable(bounds_m=(bounds_m[0::2], bounds_m[1::2]))
-        tables = {name: self._tables[name] for name in names}
         content = RecordingFile(version=1, calibration=_RIG_FILE, cameras=tables, world=world)
         write_recording_file(self._folder / RECORDING_FILE, content)

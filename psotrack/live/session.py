@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.live.cameras import LiveCamera
 from psotrack.live.front_end import FrontEnd
-from psotrack.live.meeting import CameraCounts, Instant
+from psotrack.live.meeting import Instant, MeetingCamera
 from psotrack.live.recorder import RecordedCounts
 from psotrack.pipeline import causal_settings, causal_tracker
 from psotrack.recordings import Recording
@@ -28,13 +28,8 @@ logger = logging.getLogger(__name__)
 WAIT_S = 0.1
 
 
-@runtime_checkable
-class RowsOutput(Protocol):
-    """What takes the rows of each instant: a file, a stream, a socket."""
-
-    def write(self, rows: Trajectories) -> None:
-        """Take the rows of an instant."""
-        ...
+#: Takes the rows of each instant: writes them to a file or a stream, or sends them.
+RowsOutput = Callable[[Trajectories], object]
 
 
 @dataclass
@@ -42,22 +37,22 @@ class LiveResult:
     """What a session has done.
 
     Attributes:
+        cameras: state of each camera, and what happened to its frames, by name.
+        recorded: what happened to the frames that are kept, by the camera's name; complete at the end.
         instants: number of instants that were tracked.
         left_out: number of instants that were left out, because the computer was too slow.
         delay_s: delay of each instant, from the arrival of its last frame to its rows; of the last hour at most.
-        counts: counts of each camera, by name.
-        recorded: what happened to the frames that are kept, by the camera's name.
         failed_outputs: errors of outputs that were given up while others went on.
         drones: names of all drones.
         compile_s: wall time in which programs are compiled before the first frame, seconds.
         seconds: wall time from then on, seconds.
     """
 
+    cameras: dict[str, MeetingCamera]
+    recorded: dict[str, RecordedCounts]
     instants: int = 0
     left_out: int = 0
     delay_s: list[float] = field(default_factory=list)
-    counts: dict[str, CameraCounts] = field(default_factory=dict)
-    recorded: dict[str, RecordedCounts] = field(default_factory=dict)
     failed_outputs: list[OutputError] = field(default_factory=list)
     drones: set[str] = field(default_factory=set)
     compile_s: float = 0.0
@@ -108,7 +103,7 @@ class LiveSession:
             shape=(height, width),
             most_drones=most_drones,
         )
-        self.result = LiveResult(counts=self._front_end.counts)
+        self.result = LiveResult(self._front_end.cameras, self._front_end.recorded)
 
     def stop(self) -> None:
         """End the session after the present instant; from any thread or signal handler."""
@@ -117,7 +112,7 @@ class LiveSession:
     def run(
         self,
         outputs: Sequence[RowsOutput],
-        on_instant: Callable[[LiveResult, list[bool]], None] | None = None,
+        on_instant: Callable[[LiveResult], None] | None = None,
         *,
         longest_s: float = float("inf"),
     ) -> LiveResult:
@@ -125,42 +120,40 @@ class LiveSession:
 
         Args:
             outputs: what takes the rows. One that fails is given up with a warning, and the others go on.
-            on_instant: is told of the result so far, and which cameras film, after each instant.
+            on_instant: is told of the result so far after each instant.
             longest_s: time after which the session ends, seconds.
 
         Raises:
             InputError: fewer than two cameras can film, or no frame came.
             OutputError: the last output has failed.
         """
-        outputs, result = list(outputs), self.result
+        outputs, result, front_end = list(outputs), self.result, self._front_end
+        compiling_s = time.monotonic()
+        self._tracker.compile()
+        result.compile_s = time.monotonic() - compiling_s
+        # What was made so far is not searched for garbage again and again, which takes as long as a frame.
+        gc.collect()
+        gc.freeze()
         try:
-            with self._front_end as front_end:
-                compiling_s = time.monotonic()
-                self._tracker.compile()
-                result.compile_s = time.monotonic() - compiling_s
-                # What was made so far is not searched for garbage again and again, which takes as long as a frame.
-                gc.collect()
-                gc.freeze()
-                began_s = front_end.begin(longest_s)
-                for instant, num_left_out in front_end.instants():
+            with contextlib.closing(front_end.instants(longest_s)) as instants:
+                for instant in instants:
                     self._track(instant, outputs)
-                    result.left_out += num_left_out
-                    result.seconds = time.monotonic() - began_s
+                    result.left_out = front_end.num_left_out
+                    result.seconds = time.monotonic() - front_end.began_s
                     if on_instant is not None:
-                        on_instant(result, front_end.films)
+                        on_instant(result)
                     self._tracker.look_ahead()
         finally:
             gc.unfreeze()
-        result.recorded = self._front_end.recorded
         self._check()
         return result
 
     def _check(self) -> None:
         """Raise the error of a session without a result."""
-        for error in self._front_end.errors:
+        for error in self._front_end.errors.values():
             if not isinstance(error, PsotrackError):
                 raise error
-        count, num_able = len(self.result.counts), self._front_end.num_able
+        count, num_able = len(self.result.cameras), self._front_end.num_able
         if num_able < 2 or not self.result.instants:
             expected, found = "at least two cameras that film", f"{num_able} of {count}"
             if num_able >= 2:
@@ -180,7 +173,7 @@ class LiveSession:
         result = self.result
         for output in list(outputs):
             try:
-                output.write(rows)
+                output(rows)
             except OutputError as error:
                 outputs.remove(output)
                 if not outputs:

@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -84,22 +85,18 @@ class ReplayedVideo:
     def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """See `LiveSource`: a frame arrives when its time has come."""
         length_s = float(self.time_s[-1] - self.time_s[0]) * (1 + 1 / max(1, len(self.time_s) - 1))
-        images = read_frames(self.video)
+        images = itertools.chain.from_iterable(read_frames(self.video) for _ in range(self.loops))
         # As if the camera had filmed before: to open a video takes as long as several frames.
-        first = next(images)
+        images = itertools.chain([next(images)], images)
         began_s = begin()
-        for loop in range(self.loops):
-            images = read_frames(self.video) if loop else itertools.chain([first], images)
-            for frame_s in self.time_s.tolist():
-                time_s = frame_s + loop * length_s
-                arrives_s = began_s + time_s / self.speed
-                while (left_s := arrives_s - time.monotonic()) > 0:
-                    if stopped():
-                        return
-                    time.sleep(min(left_s, 0.1))
-                if stopped():
-                    return
-                yield SourceFrame(time_s, next(images), arrives_s)
+        for loop, frame_s in itertools.product(range(self.loops), self.time_s.tolist()):
+            time_s = frame_s + loop * length_s
+            arrives_s = began_s + time_s / self.speed
+            while (left_s := arrives_s - time.monotonic()) > 0 and not stopped():
+                time.sleep(min(left_s, 0.1))
+            if stopped():
+                return
+            yield SourceFrame(time_s, next(images), arrives_s)
 
 
 @dataclass(frozen=True)
@@ -117,71 +114,61 @@ class CameraStream:
 
     def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """See `LiveSource`: frames are read when they arrive, by a thread of its own, and wait until they are taken."""
-        began_s = begin()
-        is_over = threading.Event()
-        waiting: queue.SimpleQueue[SourceFrame | str | Exception | None] = queue.SimpleQueue()
+        began_s, is_over = begin(), threading.Event()
+        waiting: queue.SimpleQueue[SourceFrame | str | None] = queue.SimpleQueue()
 
         def read() -> None:
             try:
                 for frame in self._read(began_s, lambda: is_over.is_set() or stopped()):
                     waiting.put(frame)
-            except Exception as error:
-                waiting.put(error)
-            waiting.put(None)
+            finally:
+                waiting.put(None)
 
-        reader = threading.Thread(target=read, daemon=True)
-        reader.start()
-        try:
-            while (frame := waiting.get()) is not None:
-                if isinstance(frame, Exception):
-                    raise frame
-                yield frame
-        finally:
-            is_over.set()
-            reader.join()
+        with ThreadPoolExecutor(1) as threads:
+            reader = threads.submit(read)
+            try:
+                while (frame := waiting.get()) is not None:
+                    yield frame
+            finally:
+                is_over.set()
+            reader.result()
 
     def _read(self, began_s: float, stopped: Callable[[], bool]) -> Iterator[SourceFrame | str]:
         """The frames as they arrive, from one connection after the other."""
-        said: set[bool] = set()
+        shown, said = shown_address(self.address), set[bool]()
         while not stopped():
-            asked_s = time.monotonic()
+            asked_s, clock = time.monotonic(), StreamClock()
             capture = self._opened()
-            if not capture.isOpened():
+            is_open = capture.isOpened()
+            if not is_open:
                 why = why_silent(self.address, time.monotonic() - asked_s)
-                yield f"expected frames of {shown_address(self.address)}, found {why}; it is tried again every second"
-            else:
-                try:
-                    yield from self._read_from(capture, began_s, stopped, said)
-                finally:
-                    capture.release()
-                if not stopped():
-                    yield f"{shown_address(self.address)} has broken off; it is tried again every second"
-            for _ in range(10):
-                if not stopped():
-                    time.sleep(_AGAIN_S / 10)
-
-    def _read_from(
-        self, capture: cv2.VideoCapture, began_s: float, stopped: Callable[[], bool], said: set[bool]
-    ) -> Iterator[SourceFrame | str]:
-        clock = StreamClock()
-        while not stopped() and capture.grab():
-            arrived_s = time.monotonic()
-            filmed_s = clock.time_s(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, arrived_s)
-            there, image = capture.retrieve()
-            if not there:
-                continue
-            if image.shape[1::-1] != self.image_size_wh:
-                expected = "images of {} x {} pixels, as the rig says".format(*self.image_size_wh)
-                found = f"{image.shape[1]} x {image.shape[0]}"
-                remedy = "let the camera send this size, or calibrate the camera at the size that it sends"
-                raise InputError(shown_address(self.address), expected=expected, found=found, remedy=remedy)
-            yield SourceFrame(filmed_s - began_s, image, arrived_s)
-            if clock.is_used is not None and clock.is_used not in said:
+                yield f"expected frames of {shown}, found {why}; it is tried again every second"
+            while not stopped() and capture.grab():
+                arrived_s = time.monotonic()
+                filmed_s = clock.time_s(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, arrived_s)
+                there, image = capture.retrieve()
+                if not there:
+                    continue
+                self._check_size(image)
+                yield SourceFrame(filmed_s - began_s, image, arrived_s)
+                if clock.is_used is None or clock.is_used in said:
+                    continue
                 said.add(clock.is_used)
                 if clock.is_used:
-                    logger.info("%s: frames are timed by the stream", shown_address(self.address))
+                    logger.info("%s: frames are timed by the stream", shown)
                 else:
                     yield _BY_ARRIVAL
+            capture.release()
+            if is_open and not stopped():
+                yield f"{shown} has broken off; it is tried again every second"
+            time.sleep(_AGAIN_S)
+
+    def _check_size(self, image: UInt8[np.ndarray, "height width 3"]) -> None:
+        if image.shape[1::-1] != self.image_size_wh:
+            expected = "images of {} x {} pixels, as the rig says".format(*self.image_size_wh)
+            found = f"{image.shape[1]} x {image.shape[0]}"
+            remedy = "let the camera send this size, or calibrate the camera at the size that it sends"
+            raise InputError(shown_address(self.address), expected=expected, found=found, remedy=remedy)
 
     def _opened(self) -> cv2.VideoCapture:
         with silence_opencv():

@@ -70,8 +70,6 @@ class WebSocketLines:
         self.num_clients = 0
         self._broadcast = broadcast
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
-        self._thread.start()
 
         async def listen() -> Server:
             return await serve(
@@ -89,11 +87,13 @@ class WebSocketLines:
             )
 
         try:
-            self._server = asyncio.run_coroutine_threadsafe(listen(), self._loop).result()
+            self._server = self._loop.run_until_complete(listen())
         except OSError as error:
-            self._end_thread()
+            self._loop.close()
             expected, found = "an address of this computer that is free", f"{error.strerror or error}".lower()
             raise OutputError(f"--websocket {address}", expected=expected, found=found) from error
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
 
     def write(self, rows: Trajectories) -> None:
         """Hand over the rows of an instant; does not wait for any client."""
@@ -101,10 +101,11 @@ class WebSocketLines:
 
     def close(self) -> None:
         """Let clients take the last rows, for a second at most, and end the server."""
-        if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._server.close)
-            asyncio.run_coroutine_threadsafe(self._server.wait_closed(), self._loop).result()
-            self._end_thread()
+        self._loop.call_soon_threadsafe(self._server.close)
+        asyncio.run_coroutine_threadsafe(self._server.wait_closed(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
     def _send(self, lines: list[str]) -> None:
         for line in lines:
@@ -113,8 +114,3 @@ class WebSocketLines:
     async def _talk(self, connection: ServerConnection) -> None:
         self.num_clients += 1
         await connection.wait_closed()
-
-    def _end_thread(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
