@@ -191,6 +191,26 @@ def test_known_drones_come_first_in_the_given_order_and_others_beside_them_from_
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, tracked.position_m[0])
 
 
+@pytest.mark.parametrize("max_coasting_std_m", [0.5, 0.01])
+def test_a_given_drone_that_is_seen_late_keeps_its_number(max_coasting_std_m):
+    """No camera shows the first drone until its track is lost at its given place."""
+    truth_m = circles(3)
+    velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
+    tracked = track_detections(
+        RIG.cameras,
+        from_detections(simulate_detections(truth_m, jitter=0.03, hidden=[(0, 0, 30)]), RIG, FRAMES),
+        line_settings(3, max_coasting_std_m=max_coasting_std_m),
+        fps=FPS,
+        bounds_m=ROOM_M,
+        known=(truth_m[0], velocity_m_s),
+    )
+    (again,) = tracked.arrivals
+    assert (again.frame, again.drone, again.again) == (30, 0, True)
+    assert (tracked.status[20:30, 0] == Status.LOST).all()
+    assert (tracked.status[30:] == Status.TRACKED).all()
+    assert np.linalg.norm(tracked.position_m[40:] - truth_m[40:], axis=-1).max() < 0.06
+
+
 def test_sizes_agree_with_the_boxes():
     tracked = track(circles(2))
     np.testing.assert_allclose(tracked.size_m, [[0.5, 0.5, 0.2]] * 2, rtol=0.02)

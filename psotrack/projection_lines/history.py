@@ -108,12 +108,15 @@ class History:
         return spans[:, [0, 0, 1]]
 
     def lost(self, num_drones: int, frame: int, fps: float) -> LostTracks:
-        """The drones that may be found again after a frame."""
+        """The drones that may be found again after a frame; `size_m` is NaN where none of their boxes was seen yet."""
         until = np.s_[: frame + 1, :num_drones]
+        found = self._arrays["status"][until] == Status.TRACKED
+        # A drone that was never found was given: it was at its given position in frame 0.
+        found[0] |= ~found.any(axis=0)
         return find_lost_tracks(
             self._arrays["position_m"][until],
             self._arrays["velocity_m_s"][until],
-            self._arrays["status"][until] == Status.TRACKED,
+            found,
             self.sizes_m(num_drones),
             np.arange(frame + 1),
             fps,

@@ -137,8 +137,9 @@ class _Tracker:
         covariance_m2 = np.square(self._settings.spread_m) * np.eye(3)
         for position, velocity in zip(position_m, velocity_m_s, strict=True):
             std_m_s = self._settings.motion.velocity_std_m_s
-            before_m = position - velocity / self._fps
-            self._motion.place(self._new_drone(), before_m, velocity, covariance_m2, std_m_s)
+            before_m, number = position - velocity / self._fps, self._new_drone()
+            self._motion.place(number, before_m, velocity, covariance_m2, std_m_s)
+            self._history.note((0, number), position, velocity, covariance_m2, None, 0)
 
     def step(self, frame: int) -> None:
         """One frame: predict, match, correct, end tracks and begin new ones."""
@@ -307,6 +308,9 @@ class _Tracker:
             return
         count, known = self._settings.drones.count, len(self._drones)
         lost = self._history.lost(known, frame, self._fps)
+        # A drone of which no box was seen is taken to be as large as the candidates.
+        usual_m = np.median([candidate.size_m for candidate in candidates], axis=0)
+        lost = replace(lost, size_m=np.where(np.isnan(lost.size_m), usual_m, lost.size_m))
         assignment = reidentify(
             candidates,
             lost,
