@@ -48,10 +48,14 @@ def observe(rig, drones, rng, *, noise_px, missed=0.0, false=0):
     return points, owners
 
 
-def match_points(rig, points, noise_px, **options):
-    """Match detections that all have the same noise."""
-    noise = [np.full(len(detections), float(noise_px)) for detections in points]
-    return match(rig.cameras, points, noise, bounds_m=BOUNDS_M, **options)
+def match_points(rig, points, noise_px, bounds_m=BOUNDS_M, **options):
+    """Match detections, per camera; all have the same noise, or there is one noise for each."""
+    counts = list(map(len, points))
+    there = np.arange(max(counts)) < np.array(counts)[:, None]
+    points_px, noise = np.full((*there.shape, 2), np.nan), np.full(there.shape, np.nan)
+    points_px[there] = np.concatenate(points)
+    noise[there] = noise_px if np.isscalar(noise_px) else np.concatenate(noise_px)
+    return match(rig.cameras, points_px, noise, bounds_m=bounds_m, **options)
 
 
 def groups_of(matches):
@@ -214,7 +218,7 @@ def test_positions_and_costs():
     drones = separate_points(3, rng)
     points, owners = observe(rig, drones, rng, noise_px=1.5)
     noise = [rng.uniform(1.0, 4.0, len(detections)) for detections in points]
-    matches = match(rig.cameras, points, noise, bounds_m=BOUNDS_M)
+    matches = match_points(rig, points, noise)
     assert len(matches.position_m) == 3
     for position, row, cost in zip(matches.position_m, matches.detection, matches.cost, strict=True):
         squared = []
@@ -365,9 +369,8 @@ def test_drones_out_of_bounds_are_ignored():
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 2.0]])
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
-    noise = [np.ones(2)] * 5
     upper = np.array([[-4.0, -4.0, 1.5], [4.0, 4.0, 4.0]])
-    matches = match(rig.cameras, points, noise, bounds_m=upper)
+    matches = match_points(rig, points, 1.0, bounds_m=upper)
     assert matches.detection.tolist() == [[1] * 5]
 
 
@@ -478,9 +481,8 @@ def test_order_and_world_frame_do_not_matter(seed):
     R = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     shift_m = rng.uniform(-5, 5, 3)
     wide = np.stack([shift_m - 6.0, shift_m + 6.0])
-    noise = [np.full(len(detections), 2.0) for detections in points]
-    there = match(move_world(rig, R, shift_m).cameras, points, noise, bounds_m=wide)
-    here = match(rig.cameras, points, noise, bounds_m=wide - shift_m)
+    there = match_points(move_world(rig, R, shift_m), points, 2.0, bounds_m=wide)
+    here = match_points(rig, points, 2.0, bounds_m=wide - shift_m)
     assert groups_of(there) == groups_of(here)
 
 

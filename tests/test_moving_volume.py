@@ -214,7 +214,7 @@ def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
     place_m = np.array([[3.0, 80.0, 60.0]])
     pixels = np.asarray(project(pair, place_m[:, None])[0])[0]
     room_m = np.array([[-300.0, -300.0, -300.0], [300.0, 300.0, 303.0]])
-    found = match(pair, [pixels[[0]], pixels[[1]]], [np.ones(1), np.ones(1)], bounds_m=room_m, min_views=None)
+    found = match(pair, pixels[:, None], np.ones((2, 1)), bounds_m=room_m, min_views=None)
     np.testing.assert_allclose(found.position_m, place_m, atol=0.1)
 
 

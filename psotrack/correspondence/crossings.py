@@ -99,19 +99,18 @@ def crossings(
     scale = np.sqrt(max(1.0, dispersion[-1]))
     groups = match(
         cameras,
-        view.found(view.centre_px),
-        [scale * noise_px for noise_px in view.found(view.noise_px)],
+        view.centre_px,
+        scale * view.noise_px,
         bounds_m=bounds_m,
         min_views=min_views,
         expected_m=drones.position_m,
         expected_covariance_m2=drones.covariance_m2,
     )
-    centre_px, size_px, noise_px = (
-        view.grouped(values, groups.detection) for values in (view.centre_px, view.size_px, view.noise_px)
-    )
+    shown = view.grouped(groups.detection)
+    centre_px, size_px = shown.centre_px, shown.size_px
     several = _shared(groups.detection)
     hidden_px = np.where(several, SHARED_SHARE * np.sqrt(size_px.prod(axis=-1)), 0.0)
-    noise_px = np.hypot(noise_px, hidden_px)
+    noise_px = np.hypot(shown.noise_px, hidden_px)
     # The dispersion of a drone alone in its box says nothing about a box that it shares.
     scale = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
     known_px = np.maximum(noise_px * scale, LEAST_NOISE_PX)
@@ -133,7 +132,7 @@ def crossings(
         position_m=position_m,
         covariance_m2=lines.covariance_m2[kept],
         seen=seen,
-        box=_boxes(view, groups.detection[kept]),
+        box=groups.detection[kept],
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
         ambiguity=groups.ambiguity[kept],
@@ -155,17 +154,6 @@ def _surplus_px(
     ratio = np.ones_like(span_m)
     ratio[there] = span_m[there] / np.nanmedian(span_m[there], axis=-1, keepdims=True)
     return np.where(ratio > SEVERAL_SIZE, size_px.max(axis=-1) * (1 - 1 / ratio) / 2, 0.0)
-
-
-def _boxes(
-    view: CameraSightings, detection: Int[np.ndarray, "groups cameras"]
-) -> Int[np.ndarray, "groups cameras"]:
-    """Places among the boxes of detections that are counted without padding; -1 for none."""
-    boxes = np.full(detection.shape, -1)
-    for camera, noise_px in enumerate(view.noise_px):
-        there = detection[:, camera] >= 0
-        boxes[there, camera] = np.flatnonzero(np.isfinite(noise_px))[detection[there, camera]]
-    return boxes
 
 
 def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:

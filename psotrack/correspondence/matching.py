@@ -42,8 +42,8 @@ class Matches:
 
 def match(
     cameras: Camera,
-    points_px: list[Float[np.ndarray, "_ 2"]],
-    noise_px: list[Float[np.ndarray, "_"]],
+    points_px: Float[np.ndarray, "cameras boxes 2"],
+    noise_px: Float[np.ndarray, "cameras boxes"],
     *,
     bounds_m: Float[np.ndarray, "2 3"],
     min_views: int | None = 3,
@@ -58,9 +58,8 @@ def match(
 
     Args:
         cameras: cameras with one leading axis.
-        points_px: for each camera (n, 2), middles of the detections, pixels; n may be 0. A row that is not finite is
-            no detection.
-        noise_px: for each camera (n,), standard deviations of the middles along each axis, pixels.
+        points_px: (cameras, boxes, 2), middles of the detections, pixels; NaN for no detection.
+        noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels; NaN for no detection.
         bounds_m: (2, 3), corners of the region where drones can be, metres.
         min_views: smallest number of viewpoints (see `psotrack.geometry.viewpoints`), 2 or more; None: three where at
             least three viewpoints have the place in view, else two.
@@ -79,10 +78,10 @@ def match(
         raise SettingsError("min_views", expected="2 or more", found=f"{min_views}")
     if expected_m is None or expected_covariance_m2 is None:
         expected_m, expected_covariance_m2 = np.empty((0, 3)), np.empty((0, 3, 3))
-    unambiguous = len(expected_m) < 2 and max(map(len, points_px), default=0) < 2
+    padded = pad_sightings(cameras, points_px, noise_px)
+    unambiguous = len(expected_m) < 2 and np.isfinite(padded.variance).sum(axis=1).max(initial=0) < 2
     least = 2 if unambiguous else BY_PLACE if min_views is None else min_views
     priors = make_priors(bounds_m, expected_m, expected_covariance_m2, least)
-    padded = pad_sightings(cameras, points_px, noise_px)
     proposed = propose_groups(padded, priors, bounds_m)
     return _matches(padded, assign_groups(padded, proposed, priors, bounds_m), proposed)
 

@@ -71,24 +71,18 @@ class CameraSightings:
             values[camera, box] = np.nan
         return replace(self, centre_px=centre_px, size_px=size_px, noise_px=noise_px)
 
-    def found(self, values: Float[np.ndarray, "cameras boxes *rest"]) -> list[np.ndarray]:
-        """Select the values of each camera's sightings, without padding: an array (sightings, ...) per camera."""
-        return [row[present] for row, present in zip(values, np.isfinite(self.noise_px), strict=True)]
-
-    def grouped(
-        self, values: Float[np.ndarray, "cameras boxes *rest"], detection: Int[np.ndarray, "groups cameras"]
-    ) -> Float[np.ndarray, "groups cameras *rest"]:
-        """Select the values of each group's sightings; NaN where the group has no sighting.
+    def grouped(self, box: Int[np.ndarray, "groups cameras"]) -> CameraSightings:
+        """The sightings with groups in place of cameras, and cameras in place of boxes.
 
         Args:
-            values: (cameras, boxes, ...), a value per sighting.
-            detection: (groups, cameras), index of the sighting among the camera's sightings without padding; -1 for
-                no sighting.
+            box: (groups, cameras), which of the camera's boxes is of the group; -1 for no sighting.
         """
-        padded = np.full((values.shape[0], values.shape[1] + 1, *values.shape[2:]), np.nan)
-        for camera, found in enumerate(self.found(values)):
-            padded[camera, : len(found)] = found
-        return padded[np.arange(len(values)), detection]
+        there, of = box >= 0, (np.arange(box.shape[1]), box)
+        return CameraSightings(
+            np.where(there[..., None], self.centre_px[of], np.nan),
+            np.where(there[..., None], self.size_px[of], np.nan),
+            np.where(there, self.noise_px[of], np.nan),
+        )
 
 
 @dataclass(frozen=True)

@@ -69,10 +69,10 @@ def measure_agreement(
     noises: list[np.ndarray] = []
     for frame in frames.tolist():
         view = sightings.at(frame)
-        found = _matched(rig, view, bounds_m)
-        numbers.append(np.full(len(found), frame))
-        centres.append(view.grouped(view.centre_px, found))
-        noises.append(view.grouped(view.noise_px, found))
+        found = view.grouped(_matched(rig, view, bounds_m))
+        numbers.append(np.full(len(found.centre_px), frame))
+        centres.append(found.centre_px)
+        noises.append(found.noise_px)
     frame_of, centre_px, all_noise_px = (np.concatenate(values) for values in (numbers, centres, noises))
     lines = reconstruct(rig.cameras, centre_px, noise_px=np.nan_to_num(all_noise_px, nan=1.0))
     kept = num_viewpoints(rig.cameras, lines.used) >= MIN_VIEWPOINTS
@@ -94,12 +94,9 @@ def _matched(
     """Indices of the sightings of each point; no points if the rig is so wrong that the equations are singular."""
     try:
         with np.errstate(all="ignore"):
-            found = match(
-                rig.cameras, view.found(view.centre_px), view.found(view.noise_px), bounds_m=bounds_m
-            )
+            return match(rig.cameras, view.centre_px, view.noise_px, bounds_m=bounds_m).detection
     except np.linalg.LinAlgError:
         return np.empty((0, len(rig)), int)
-    return found.detection
 
 
 def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:

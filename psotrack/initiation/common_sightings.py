@@ -44,9 +44,8 @@ def count_common(rig: Rig, found: Sightings | Silhouettes) -> CommonSightings:
         else:
             sightings = from_silhouettes(found, first=frame, stop=frame + 1).at(0)
         view = sightings.largest(_MOST_SIGHTINGS)
-        centre_px, noise_px = view.found(view.centre_px), view.found(view.noise_px)
-        if len({point for point, pixels in zip(viewpoint, centre_px, strict=True) if len(pixels)}) < 2:
+        if len(np.unique(viewpoint[np.isfinite(view.noise_px).any(axis=-1)])) < 2:
             continue
         seen += 1
-        met += bool(len(match(rig.cameras, centre_px, noise_px, bounds_m=wide_m).position_m))
+        met += bool(len(match(rig.cameras, view.centre_px, view.noise_px, bounds_m=wide_m).position_m))
     return CommonSightings(seen, met)
