@@ -9,7 +9,7 @@ from helpers import ROOM_M, draw_coverage, float32, make_unnamed_rig, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.correspondence import NOISE_PX, CameraSightings
+from psotrack.correspondence import NOISE_PX, Sightings
 from psotrack.geometry import Rig, make_extents, project, project_boxes
 from psotrack.initiation import (
     NEW,
@@ -420,7 +420,7 @@ def test_the_order_of_cameras_and_of_blobs_does_not_matter(order, random):
         for frame, images in enumerate(three_drones()[:, rows]):
             view = unexplained(FrameBlobs.of(images, REDUCTION, borders), np.empty((0, 5, 4)))
             boxes = arrange(range(view.noise_px.shape[1]))
-            view = CameraSightings(view.centre_px[:, boxes], view.size_px[:, boxes], view.noise_px[:, boxes])
+            view = Sightings(view.centre_px[:, boxes], view.size_px[:, boxes], view.noise_px[:, boxes])
             births.step(frame, view, NONE)
         return sorted(births.candidates(), key=lambda one: one.position_m[0])
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.clocks import clocks_of_tracks, fit_clocks, places_of_tracks
-from psotrack.correspondence import NOISE_PX, NOISE_SHARE, CameraSightings, Sightings, moved_to_instant
+from psotrack.correspondence import NOISE_PX, NOISE_SHARE, Sightings, moved_to_instant
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_extents, project, project_boxes
 from psotrack.initiation import Births, KnownDrones
@@ -241,7 +241,7 @@ def test_drones_are_found_by_cameras_with_times_of_their_own():
     def errors_m(sightings):
         births = Births(RIG.cameras, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0)
         for instant in range(sightings.num_frames):
-            births.step(instant, sightings.at(instant), KnownDrones(np.empty((0, 3)), np.empty((0, 3))))
+            births.step(instant, sightings[instant], KnownDrones(np.empty((0, 3)), np.empty((0, 3))))
         found = births.candidates()
         assert len(found) == 2
         truth_m = positions(timeline.time_s)
@@ -294,7 +294,7 @@ def test_boxes_are_where_the_drones_are_when_the_cameras_rows_are_exposed():
 def test_detections_are_moved_to_the_instant():
     position_m, velocity_m_s = positions(0.4), np.array([[1.2, -0.5, 0.3], [-0.7, 1.5, 0.0]])
     pixels = pixels_at_exposure(position_m, velocity_m_s).swapaxes(0, 1)
-    view = CameraSightings(pixels, np.full(pixels.shape, 120.0), np.ones(pixels.shape[:2]), NOW)
+    view = Sightings(pixels, np.full(pixels.shape, 120.0), np.ones(pixels.shape[:2]), NOW)
     moved = moved_to_instant(RIG.cameras, view, position_m, velocity_m_s, np.full(2, 0.1), 1.0)
     expected, _ = project(RIG.cameras, position_m[:, None])
     np.testing.assert_allclose(moved.centre_px, expected.swapaxes(0, 1), atol=0.05)
@@ -358,6 +358,6 @@ def test_a_camera_that_is_not_there_has_no_sightings():
     there = np.isfinite(shown.noise_px[:, 3]).all(axis=-1)
     assert there.tolist() == [False] * 2 + [True] * 4 + [False] * 4
     assert shown.exposures.is_there[:, 3].tolist() == there.tolist()
-    one = shown.at(3)
+    one = shown[3]
     assert one.exposures.offset_s.shape == (5,)
     assert replace(one, exposures=None).noise_px.shape == one.noise_px.shape

@@ -3,7 +3,7 @@
 import numpy as np
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import CameraSightings, from_detections
+from psotrack.correspondence import Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project
 from psotrack.projection_lines import LineSettings, track_detections
@@ -35,7 +35,7 @@ def sightings_of(*boxes, noise_px=3.0):
     """Sightings from arrays of boxes, each (cameras, 4)."""
     boxes = np.stack(boxes, axis=1)
     noise = np.full(boxes.shape[:2], noise_px)
-    return CameraSightings((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
+    return Sightings((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
 
 
 def boxes_in_camera(view, camera):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import CameraSightings, from_detections
+from psotrack.correspondence import Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import make_rig, project
 from psotrack.initiation import state_at_first_frame
@@ -280,7 +280,7 @@ def test_a_single_view_must_be_much_more_probable_than_a_false_alarm():
     centre_px = np.full((8, 2, 2), np.nan)
     centre_px[2] = pixel[2] + np.array([[3.0, -2.0], [60.0, 0.0]])
     noise_px = np.where(np.isfinite(centre_px[..., 0]), 2.0, np.nan)
-    view = CameraSightings(centre_px, np.where(np.isfinite(centre_px), 60.0, np.nan), noise_px)
+    view = Sightings(centre_px, np.where(np.isfinite(centre_px), 60.0, np.nan), noise_px)
     area_px2 = np.asarray(RIG.cameras.image_size_wh, float).prod(axis=-1)
 
     def found(std_m, per_frame, free):

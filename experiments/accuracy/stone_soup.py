@@ -60,7 +60,7 @@ def points_of(
     """Points in which the lines of sight of detections meet, in each frame alone."""
     points = []
     for frame in range(sightings.num_frames):
-        view = sightings.at(frame)
+        view = sightings[frame]
         found = match(rig.cameras, view.centre_px, view.noise_px, bounds_m=bounds_m, min_views=min_views)
         shown = view.grouped(found.detection)
         lines = reconstruct(rig.cameras, shown.centre_px, noise_px=np.nan_to_num(shown.noise_px, nan=1.0))

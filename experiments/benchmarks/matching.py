@@ -91,7 +91,9 @@ def main(  # noqa: PLR0913  # A click command has one parameter per option.
 
 
 def _timed(
-    rig: Rig, points: Float[np.ndarray, "cameras detections 2"], noise: Float[np.ndarray, "cameras detections"]
+    rig: Rig,
+    points: Float[np.ndarray, "cameras detections 2"],
+    noise: Float[np.ndarray, "cameras detections"],
 ) -> tuple[float, Matches]:
     start = time.perf_counter()
     matches = match(rig.cameras, points, noise, bounds_m=_BOUNDS_M)

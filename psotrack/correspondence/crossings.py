@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence.matching import match
-from psotrack.correspondence.sightings import CUT_SHARE, CameraSightings
+from psotrack.correspondence.sightings import CUT_SHARE, Sightings
 from psotrack.geometry import Camera, reconstruct, sizes_m, to_camera
 
 #: Least standard deviation of a detection's middle, pixels, however well the cameras agree.
@@ -78,7 +78,7 @@ class Expected:
 
 def crossings(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     bounds_m: Float[np.ndarray, "2 3"],
     drones: Expected,
     min_views: int | None = None,

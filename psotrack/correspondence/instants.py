@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence.sightings import CameraSightings
+from psotrack.correspondence.sightings import Sightings
 from psotrack.geometry import NEAR_M, Camera, project
 
 #: A detection is moved with the drone whose expected box, this many times larger, holds its middle.
@@ -16,12 +16,12 @@ _REACH = 1.5
 
 def moved_to_instant(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     expected_m: Float[np.ndarray, "drones 3"],
     velocity_m_s: Float[np.ndarray, "drones 3"],
     velocity_std_m_s: Float[np.ndarray, "drones"],
     unknown_std_m_s: float,
-) -> CameraSightings:
+) -> Sightings:
     """The detections as they would be if all frames had been exposed at the instant.
 
     A detection near an expected drone is moved by the drone's motion in the image between exposure and instant, and is

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import CameraSightings, Sightings, match
+from psotrack.correspondence import Sightings, match
 from psotrack.geometry import Camera, Rig, reconstruct, viewpoints
 
 #: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
@@ -68,7 +68,7 @@ def measure_agreement(
     centres: list[np.ndarray] = []
     noises: list[np.ndarray] = []
     for frame in frames.tolist():
-        view = sightings.at(frame)
+        view = sightings[frame]
         found = view.grouped(_matched(rig, view, bounds_m))
         numbers.append(np.full(len(found.centre_px), frame))
         centres.append(found.centre_px)
@@ -89,7 +89,7 @@ def measure_agreement(
 
 
 def _matched(
-    rig: Rig, view: CameraSightings, bounds_m: Float[np.ndarray, "2 3"]
+    rig: Rig, view: Sightings, bounds_m: Float[np.ndarray, "2 3"]
 ) -> Int[np.ndarray, "points cameras"]:
     """Indices of the sightings of each point; no points if the rig is so wrong that the equations are singular."""
     try:

@@ -82,7 +82,7 @@ def find_common_points(
     numbers, centres, sizes = [], [], []
     used, total = np.zeros(len(rig)), np.zeros(len(rig))
     for frame in frames.tolist():
-        view = sightings.at(frame)
+        view = sightings[frame]
         total += np.isfinite(view.noise_px).sum(axis=1)
         try:
             with np.errstate(all="ignore"):
@@ -95,7 +95,7 @@ def find_common_points(
         alone = view.grouped(_without_shared(detection))
         size_px = alone.size_px
         centre_px = np.where(_is_cut(rig, alone.centre_px, size_px)[..., None], np.nan, alone.centre_px)
-        there = np.isfinite(centre_px).all(axis=-1)
+        there = np.all(np.isfinite(centre_px), axis=-1)
         enough = num_viewpoints(rig.cameras, there) >= MIN_VIEWPOINTS
         numbers.append(np.full(int(enough.sum()), frame))
         centres.append(centre_px[enough])

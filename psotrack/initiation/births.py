@@ -20,9 +20,9 @@ from psotrack.correspondence import (
     NOISE_PX,
     NOISE_SHARE,
     SEPARATION_M,
-    CameraSightings,
     Crossings,
     Expected,
+    Sightings,
     crossings,
     moved_to_instant,
 )
@@ -245,7 +245,7 @@ class Births:
         return len(self._paths)
 
     def step(
-        self, instant: int, view: CameraSightings, known: KnownDrones, usual_dispersion: float = 1.0
+        self, instant: int, view: Sightings, known: KnownDrones, usual_dispersion: float = 1.0
     ) -> Int[np.ndarray, "crossings cameras"]:
         """Take the next frame.
 
@@ -305,7 +305,7 @@ class Births:
             path.missed += 1
 
     def _find(
-        self, instant: int, view: CameraSightings, known: KnownDrones, usual_dispersion: float
+        self, instant: int, view: Sightings, known: KnownDrones, usual_dispersion: float
     ) -> Int[np.ndarray, "crossings cameras"]:
         velocity_std = np.sqrt(self._covariance[:, 3:, 3:].trace(axis1=1, axis2=2) / 3)
         speed_std_m_s = SPEED_SHARE * self._max_speed_m_s
@@ -362,7 +362,7 @@ class Births:
             self._covariance = np.concatenate([self._covariance, covariance[None]])
         return crossed.box[counts]
 
-    def _crossings(self, view: CameraSightings, usual_dispersion: float) -> Crossings:
+    def _crossings(self, view: Sightings, usual_dispersion: float) -> Crossings:
         """Crossings of the lines of sight: of places on which enough viewpoints agreed once, then of the others.
 
         Lines of two viewpoints cross by chance, where more viewpoints have the place in view. Such crossings are looked
@@ -373,7 +373,7 @@ class Births:
         )
         dispersion = np.array([path.dispersion for path in self._paths])
 
-        def crossed_by(view: CameraSightings, of: Int[np.ndarray, "some"], least: int | None) -> Crossings:
+        def crossed_by(view: Sightings, of: Int[np.ndarray, "some"], least: int | None) -> Crossings:
             expected = Expected(
                 self._mean[of, :3], self._covariance[of, :3, :3], dispersion[of], usual_dispersion
             )
@@ -392,7 +392,7 @@ class Births:
     def _cameras_that_see(
         self,
         crossed: Crossings,
-        view: CameraSightings,
+        view: Sightings,
         in_view: Bool[np.ndarray, "crossings cameras"],
         known: KnownDrones,
     ) -> tuple[Int[np.ndarray, "crossings"], Int[np.ndarray, "crossings"]]:

@@ -40,9 +40,9 @@ def count_common(rig: Rig, found: Sightings | Silhouettes) -> CommonSightings:
     spread = np.linspace(0, found.num_frames - 1, min(found.num_frames, _FRAMES))
     for frame in np.unique(spread.round().astype(int)).tolist():
         if isinstance(found, Sightings):
-            sightings = found.at(frame)
+            sightings = found[frame]
         else:
-            sightings = from_silhouettes(found, first=frame, stop=frame + 1).at(0)
+            sightings = from_silhouettes(found, first=frame, stop=frame + 1)[0]
         view = sightings.largest(_MOST_SIGHTINGS)
         if len(np.unique(viewpoint[np.isfinite(view.noise_px).any(axis=-1)])) < 2:
             continue

@@ -6,13 +6,13 @@ which the boxes of the blobs show: only a blob that reaches out of an ellipse is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.correspondence import CUT_SHARE, NOISE_PX, NOISE_SHARE, CameraSightings
+from psotrack.correspondence import Sightings, from_boxes
 from psotrack.silhouettes import Exposures, find_blobs
 
 #: A known drone's ellipse is enlarged by this factor and by this number of cells, because outlines are no ellipses, and
@@ -66,7 +66,7 @@ class FrameBlobs:
         return cls(coverage, low, high, whole, camera, reduction, exposures)
 
 
-def unexplained(blobs: FrameBlobs, box_px: Float[np.ndarray, "drones cameras 4"]) -> CameraSightings:
+def unexplained(blobs: FrameBlobs, box_px: Float[np.ndarray, "drones cameras 4"]) -> Sightings:
     """What no known drone explains in a frame.
 
     A blob that a known drone hides in part has a middle that is less certain, as that of a blob at the border.
@@ -95,7 +95,10 @@ def unexplained(blobs: FrameBlobs, box_px: Float[np.ndarray, "drones cameras 4"]
             )
         first, last, whole, of = _boxes(cells, end - corner, corner, camera)
         parts.append((first, last, np.zeros_like(whole), of))
-    return _sightings(_joined(parts), len(blobs.coverage), blobs.reduction, blobs.exposures)
+    first, last, whole, of = _joined(parts)
+    size_px, centre_px = (last - first) * blobs.reduction, (first + last) / 2 * blobs.reduction - 0.5
+    found = from_boxes(of, centre_px, size_px, ~whole, num_images=len(blobs.coverage))
+    return replace(found, exposures=blobs.exposures)
 
 
 #: Corners of blobs, cells; whether each is whole; their cameras.
@@ -119,21 +122,3 @@ def _joined(parts: list[_Boxes]) -> _Boxes:
     none = np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool), np.empty(0, int)
     low, high, whole, camera = (np.concatenate(columns) for columns in zip(none, *parts, strict=True))
     return low, high, whole, camera
-
-
-def _sightings(
-    boxes: _Boxes, num_cameras: int, reduction: int, exposures: Exposures | None
-) -> CameraSightings:
-    """Blobs as sightings, padded to the largest number of one camera."""
-    low, high, whole, camera = boxes
-    order = np.argsort(camera, kind="stable")
-    camera = camera[order]
-    place = np.arange(len(camera)) - np.searchsorted(camera, camera)
-    shape = (num_cameras, int(place.max(initial=0)) + 1)
-    centre_px, size_px = np.full((2, *shape, 2), np.nan)
-    noise_px = np.full(shape, np.nan)
-    centre_px[camera, place] = (low + high)[order] / 2 * reduction - 0.5
-    size_px[camera, place] = (high - low)[order] * reduction
-    side_px = np.sqrt(size_px[camera, place].prod(axis=-1))
-    noise_px[camera, place] = NOISE_PX + np.where(whole[order], NOISE_SHARE, CUT_SHARE) * side_px
-    return CameraSightings(centre_px, size_px, noise_px, exposures)

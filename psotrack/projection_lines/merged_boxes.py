@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import CameraSightings
+from psotrack.correspondence import Sightings
 from psotrack.geometry import NEAR_M, Camera, project_visible, sizes_px, to_camera
 
 #: Additional standard deviation of a middle that follows from one edge and the drone's size, as a share of the box's
@@ -44,10 +44,10 @@ class _Outlines:
 
 def split_merged_boxes(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     expected_m: Float[np.ndarray, "drones 3"],
     span_m: Float[np.ndarray, "drones 2"],
-) -> CameraSightings:
+) -> Sightings:
     """The frame's boxes, with boxes of several drones replaced by one box for each drone whose place is known.
 
     A box is of several drones if several drones are expected in it, and if the box around all these drones fits it
@@ -91,7 +91,7 @@ def split_merged_boxes(
 
 def _expected(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     expected_m: Float[np.ndarray, "drones 3"],
     span_m: Float[np.ndarray, "drones 2"],
 ) -> tuple[_Outlines, Bool[np.ndarray, "drones cameras boxes"]]:
@@ -104,12 +104,12 @@ def _expected(
 
 
 def _with(
-    view: CameraSightings,
+    view: Sightings,
     camera: Int[np.ndarray, "more"],
     centre_px: Float[np.ndarray, "more 2"],
     size_px: Float[np.ndarray, "more 2"],
     noise_px: Float[np.ndarray, "more"],
-) -> CameraSightings:
+) -> Sightings:
     """The frame's boxes and some more; `camera` is in ascending order."""
     place = np.arange(len(camera)) - np.searchsorted(camera, camera)
     room = int(place.max(initial=-1)) + 1

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.correspondence import CameraSightings
+from psotrack.correspondence import Sightings
 from psotrack.geometry import NEAR_M, Camera, project_with_jacobian
 
 #: A detection is taken for a drone's if this is at least as many times as probable as a detection of anything else at
@@ -38,7 +38,7 @@ class SingleViews:
 
 def find_single_views(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     free: Bool[np.ndarray, "cameras boxes"],
     density_px2: Float[np.ndarray, "cameras"],
     expected_m: Float[np.ndarray, "drones 3"],

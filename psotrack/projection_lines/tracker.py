@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence import (
     SEPARATION_M,
-    CameraSightings,
     Crossings,
     Expected,
     Sightings,
@@ -144,7 +143,7 @@ class _Tracker:
     def step(self, frame: int) -> None:
         """One frame: predict, match, correct, end tracks and begin new ones."""
         self._motion.predict()
-        measured, seen_by_one = self._measure(frame, self._sightings.at(frame))
+        measured, seen_by_one = self._measure(frame, self._sightings[frame])
         self._correct(measured, seen_by_one)
         for number in self._followed():
             self._note(frame, number, self._motion, number, measured.get(number))
@@ -166,7 +165,7 @@ class _Tracker:
             self._history.grow(len(self._motion))
         return len(self._drones) - 1
 
-    def _measure(self, frame: int, view: CameraSightings) -> tuple[dict[int, Measurement], SingleViews]:
+    def _measure(self, frame: int, view: Sightings) -> tuple[dict[int, Measurement], SingleViews]:
         """The frame's measurements by drone, and the views of drones that have none."""
         numbers = self._followed()
         shown, view = view, self._at_instant(view, numbers)
@@ -236,7 +235,7 @@ class _Tracker:
         return int(surprise.argmin()) if surprise.min(initial=np.inf) < SURPRISING else -1
 
     def _seen_by_one(
-        self, rest: CameraSightings, others: Int[np.ndarray, "crossings cameras"], missed: list[int]
+        self, rest: Sightings, others: Int[np.ndarray, "crossings cameras"], missed: list[int]
     ) -> SingleViews:
         """The views of drones that have no measurement, among the detections that are of no other drone."""
         state = self._motion.state
@@ -251,7 +250,7 @@ class _Tracker:
         )
         return replace(views, drone=np.array(missed, int)[views.drone])
 
-    def _at_instant(self, view: CameraSightings, numbers: list[int]) -> CameraSightings:
+    def _at_instant(self, view: Sightings, numbers: list[int]) -> Sightings:
         """The detections as they would be if all frames had been exposed at the instant."""
         if view.exposures is None:
             return view
