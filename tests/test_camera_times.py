@@ -15,7 +15,7 @@ from psotrack.correspondence import NOISE_PX, NOISE_SHARE, Sightings, moved_to_i
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_extents, project, project_boxes
 from psotrack.initiation import Births, KnownDrones
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures, Silhouettes
@@ -26,7 +26,6 @@ RIG = ring_rig(5, image_size_wh=(1920, 1080))
 #: Width and height of a drone, metres.
 SPAN_M = 0.4
 SETTINGS = track_settings()
-LINES = LineSettings(SETTINGS.motion, SETTINGS.drones, SETTINGS.status, SETTINGS.swarm.spread_m)
 
 
 def positions(time_s, num_drones=2):
@@ -190,7 +189,9 @@ def lines_errors(times, given=None, **options):
     timeline = make_timeline(given or times)
     shown = sightings_of(times, **options).at_instants(timeline)
     known = positions(timeline.time_s[0]), np.zeros((2, 3))
-    tracks = track_detections(RIG.cameras, shown, LINES, fps=timeline.rate_hz, bounds_m=ROOM_M, known=known)
+    tracks = track_detections(
+        RIG.cameras, shown, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M, known=known
+    )
     settled = slice(20, timeline.num_instants - 5)
     error_m = (tracks.position_m[:, :2] - positions(timeline.time_s))[settled]
     covariance_m2 = tracks.covariance_m2[:, :2][settled]
@@ -226,7 +227,7 @@ def test_a_drone_that_comes_later_is_found_by_cameras_with_times_of_their_own():
     noise_px[:20, :, 1] = np.nan
     timeline = make_timeline(times)
     given = replace(shown, noise_px=noise_px).at_instants(timeline)
-    tracks = track_detections(RIG.cameras, given, LINES, fps=timeline.rate_hz, bounds_m=ROOM_M)
+    tracks = track_detections(RIG.cameras, given, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M)
     (new,) = tracks.arrivals
     assert abs(timeline.time_s[new.frame] - 20 / FPS) <= 2 / FPS
     # At the last instant, only some of the cameras are there.

@@ -20,10 +20,10 @@ from psotrack.initiation import (
     room_bounds,
 )
 from psotrack.pipeline import track_recording
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.recordings import Detections, write_detections
 from psotrack.rig_files import write_rig
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
+from psotrack.settings import MotionSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status
 
 FORMULA = runpy.run_path(str(Path(__file__).parents[1] / "experiments" / "accuracy" / "formula_flights.py"))
@@ -71,7 +71,7 @@ def sightings_of(rig, truth_m, seed=0, clutter=1, hidden=()):
 
 def tracked(rig, sightings, volume, **status):
     motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
-    settings = LineSettings(motion, DroneSettings(), StatusSettings(**status), spread_m=0.05)
+    settings = TrackSettings(motion=motion, status=StatusSettings(**status))
     return track_detections(rig.cameras, sightings, settings, fps=FPS, bounds_m=volume.bounds_m)
 
 

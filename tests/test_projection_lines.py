@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import Sightings, from_detections
+from psotrack.correspondence import Expected, Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import make_rig, project
 from psotrack.initiation import state_at_first_frame
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.projection_lines.single_views import find_single_views
 from psotrack.recordings import Detections
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
+from psotrack.settings import DroneSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0
@@ -59,7 +59,7 @@ def simulate_detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, se
 
 
 def line_settings(count=None, **status):
-    return LineSettings(MotionSettings(), DroneSettings(count=count), StatusSettings(**status), spread_m=0.05)
+    return TrackSettings(drones=DroneSettings(count=count), status=StatusSettings(**status))
 
 
 def track(truth_m, count=None, known=None, **noise):
@@ -285,18 +285,16 @@ def test_a_single_view_must_be_much_more_probable_than_a_false_alarm():
 
     def found(std_m, per_frame, free):
         covariance_m2 = std_m**2 * np.eye(3)[None]
-        return find_single_views(
-            RIG.cameras, view, free, per_frame / area_px2, place_m, covariance_m2, np.ones(1)
-        )
+        expected = Expected(place_m, covariance_m2, np.ones(1))
+        return find_single_views(RIG.cameras, free, per_frame / area_px2, expected)
 
-    everything = np.isfinite(noise_px)
-    near = found(0.02, 1.0, everything)
+    near = found(0.02, 1.0, view)
     assert near.drone.tolist() == [0]
     np.testing.assert_allclose(near.off_px, [[3.0, -2.0]], atol=1e-6)
     # One pixel is about 5 mm here. A vague prediction has many places for a false alarm, and so have many false alarms.
-    assert len(found(0.3, 1.0, everything).drone) == 0
-    assert len(found(0.02, 500.0, everything).drone) == 0
-    assert len(found(0.02, 1.0, np.zeros_like(noise_px, bool)).drone) == 0
+    assert len(found(0.3, 1.0, view).drone) == 0
+    assert len(found(0.02, 500.0, view).drone) == 0
+    assert len(found(0.02, 1.0, view.without(*np.nonzero(np.isfinite(noise_px)))).drone) == 0
 
 
 @pytest.mark.parametrize(("seed", "beside_m"), [(2, 0.15), (4, 0.10)])

@@ -75,6 +75,11 @@ class Expected:
     dispersion: Float[np.ndarray, "drones"]
     usual_dispersion: float = 1.0
 
+    @property
+    def usual(self) -> float:
+        """The ratio for detections of a drone that is not expected: the same noise as that of the known drones."""
+        return float(np.median(self.dispersion)) if len(self.dispersion) else self.usual_dispersion
+
 
 def crossings(
     cameras: Camera,
@@ -92,9 +97,7 @@ def crossings(
         drones: where drones are expected.
         min_views: smallest number of viewpoints of a drone that was not expected (see `match`).
     """
-    # Detections of an unexpected drone have the same noise as detections of known drones.
-    usual = float(np.median(drones.dispersion)) if len(drones.dispersion) else drones.usual_dispersion
-    dispersion = np.append(drones.dispersion, usual)
+    dispersion = np.append(drones.dispersion, drones.usual)
     # At least the stated noise is used for matching: the groups are judged after they are triangulated.
     scale = np.sqrt(max(1.0, dispersion[-1]))
     groups = match(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -33,7 +33,7 @@ from psotrack.projection_lines.history import SPAN_FRAMES, History, TrackedDrone
 from psotrack.projection_lines.merged_boxes import split_merged_boxes
 from psotrack.projection_lines.single_views import SingleViews, find_single_views
 from psotrack.projection_lines.track_motion import TrackMotion
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
+from psotrack.settings import TrackSettings
 from psotrack.support import Report, no_progress
 from psotrack.tracking import DISPERSION_FRAMES
 from psotrack.trajectories import Tracks
@@ -43,25 +43,10 @@ from psotrack.trajectories import Tracks
 SURPRISING = 2 * GATE_999
 
 
-@dataclass(frozen=True)
-class LineSettings:
-    """The parts of the settings that the projection lines read (see `psotrack.settings`).
-
-    Attributes:
-        motion, drones, status: parts of `TrackSettings`.
-        spread_m: standard deviation of a new track's position, metres.
-    """
-
-    motion: MotionSettings
-    drones: DroneSettings
-    status: StatusSettings
-    spread_m: float
-
-
 def track_detections(
     cameras: Camera,
     sightings: Sightings,
-    settings: LineSettings,
+    settings: TrackSettings,
     *,
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
@@ -76,7 +61,7 @@ def track_detections(
     Args:
         cameras: cameras with one leading axis.
         sightings: detections of all cameras.
-        settings: the parts of the settings that the projection lines read.
+        settings: motion, number of drones, and status; `swarm.spread_m` is the standard deviation of known positions.
         fps: frames per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         known: positions and velocities of the drones at frame 0, (known, 3) each, metres and m/s; None finds the
@@ -108,7 +93,7 @@ class _Tracker:
         self,
         cameras: Camera,
         sightings: Sightings,
-        settings: LineSettings,
+        settings: TrackSettings,
         fps: float,
         bounds_m: Float[np.ndarray, "2 3"],
     ) -> None:
@@ -133,7 +118,7 @@ class _Tracker:
         self, position_m: Float[np.ndarray, "known 3"], velocity_m_s: Float[np.ndarray, "known 3"]
     ) -> None:
         """Start tracks of drones that will be at these positions in the next frame."""
-        covariance_m2 = np.square(self._settings.spread_m) * np.eye(3)
+        covariance_m2 = np.square(self._settings.swarm.spread_m) * np.eye(3)
         for position, velocity in zip(position_m, velocity_m_s, strict=True):
             std_m_s = self._settings.motion.velocity_std_m_s
             before_m, number = position - velocity / self._fps, self._new_drone()
@@ -168,15 +153,11 @@ class _Tracker:
     def _measure(self, frame: int, view: Sightings) -> tuple[dict[int, Measurement], SingleViews]:
         """The frame's measurements by drone, and the views of drones that have none."""
         numbers = self._followed()
-        shown, view = view, self._at_instant(view, numbers)
-        expected = Expected(
-            np.asarray(self._motion.state.apparent_m[numbers]),
-            np.asarray(self._motion.state.covariance[numbers, :3, :3]),
-            np.array([self._drones[number].dispersion for number in numbers]),
-        )
+        expected = self._expected(numbers)
         lately = slice(max(frame - SPAN_FRAMES, 0), frame)
         span_m = np.array([self._history.span_m(number, lately) for number in numbers]).reshape(-1, 2)
-        view = split_merged_boxes(self._cameras, view, expected.position_m, span_m)
+        expected_px = _boxes_px(self._cameras, expected.position_m, span_m)
+        shown, view = view, split_merged_boxes(self._at_instant(view, numbers), expected_px)
         required = self._settings.status.min_cameras_to_begin
         crossed = crossings(self._cameras, view, self._bounds_m, expected, required)
         measured: dict[int, Measurement] = {}
@@ -207,13 +188,14 @@ class _Tracker:
                 surprising,
             )
         rest = view.without(*_camera_and_box(crossed.box[taken]))
-        there_m = np.where(np.isin(numbers, [*measured])[:, None], expected.position_m, np.nan)
-        known = KnownDrones(there_m, span_m[:, [0, 0, 1]], _boxes_px(self._cameras, there_m, span_m))
-        usual = float(np.median(expected.dispersion)) if numbers else 1.0
+        found = np.isin(numbers, [*measured])[:, None]
+        # The corner of the image is the origin of the boxes of known drones.
+        known_px = np.where(found[..., None], expected_px + np.array([0.5, 0.5, 0.0, 0.0]), np.nan)
+        known = KnownDrones(np.where(found, expected.position_m, np.nan), span_m[:, [0, 0, 1]], known_px)
         # As the cameras showed them: what is born has a motion of its own. Parts of split boxes are of known drones.
         num_boxes = shown.noise_px.shape[1]
         unexplained = shown.without(*np.nonzero(np.isnan(rest.noise_px[:, :num_boxes])))
-        others = self._births.step(frame, unexplained, known, usual)
+        others = self._births.step(frame, unexplained, known, expected.usual)
         missed = [number for number in numbers if number not in measured]
         return measured, self._seen_by_one(rest, others, missed)
 
@@ -238,22 +220,20 @@ class _Tracker:
         self, rest: Sightings, others: Int[np.ndarray, "crossings cameras"], missed: list[int]
     ) -> SingleViews:
         """The views of drones that have no measurement, among the detections that are of no other drone."""
-        state = self._motion.state
-        views = find_single_views(
-            self._cameras,
-            rest,
-            np.isfinite(rest.without(*_camera_and_box(others)).noise_px),
-            self._density_px2,
-            np.asarray(state.apparent_m[missed]),
-            np.asarray(state.covariance[missed, :3, :3]),
-            np.array([self._drones[number].dispersion for number in missed]),
-        )
+        free = rest.without(*_camera_and_box(others))
+        views = find_single_views(self._cameras, free, self._density_px2, self._expected(missed))
         return replace(views, drone=np.array(missed, int)[views.drone])
+
+    def _expected(self, numbers: list[int]) -> Expected:
+        """Where drones are expected."""
+        return Expected(
+            np.asarray(self._motion.state.apparent_m[numbers]),
+            np.asarray(self._motion.state.covariance[numbers, :3, :3]),
+            np.array([self._drones[number].dispersion for number in numbers]),
+        )
 
     def _at_instant(self, view: Sightings, numbers: list[int]) -> Sightings:
         """The detections as they would be if all frames had been exposed at the instant."""
-        if view.exposures is None:
-            return view
         state = self._motion.state
         variance = np.asarray(state.covariance[numbers, 3:6, 3:6]).trace(axis1=-2, axis2=-1) / 3
         return moved_to_instant(
@@ -342,7 +322,7 @@ class _Tracker:
             motion.correct({} if one is None else {0: one}, np.empty(0, int), np.zeros(len(motion), bool))
             drone.missed = drone.unseen = 0 if one is not None else drone.missed + 1
             self._note(instant, number, motion, 0, one)
-        self._motion.take(number, motion, 0)
+        self._motion.put(number, motion.state)
 
 
 def _camera_and_box(
@@ -356,10 +336,10 @@ def _camera_and_box(
 def _boxes_px(
     cameras: Camera, position_m: Float[np.ndarray, "drones 3"], span_m: Float[np.ndarray, "drones 2"]
 ) -> Float[np.ndarray, "drones cameras 4"]:
-    """Boxes of drones as in `KnownDrones`; NaN where a drone's place or width is not known, or has no image."""
+    """Middles and half lengths of drones' boxes; NaN where a drone's size is not known, or its place has no image."""
     pixels, _ = project_visible(cameras, position_m[:, None])
     half_px = sizes_px(cameras, np.asarray(to_camera(cameras, position_m[:, None])), span_m[:, None]) / 2
-    return np.concatenate([pixels + 0.5, np.broadcast_to(half_px, pixels.shape)], axis=-1)
+    return np.concatenate([pixels, half_px], axis=-1)
 
 
 def _surprise(crossed: Crossings, row: int, expected: Expected) -> Float[np.ndarray, "drones"]:
