@@ -1,5 +1,5 @@
 from .assignment import SEPARATION_M
-from .crossings import Crossings, Expected, crossings
+from .crossings import Crossings, Expected, Measurement, crossings
 from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
 from .instants import moved_to_instant
@@ -28,6 +28,7 @@ __all__ = [
     "Crossings",
     "Expected",
     "Matches",
+    "Measurement",
     "Sightings",
     "by_image",
     "crossings",

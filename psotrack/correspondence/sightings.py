@@ -85,14 +85,8 @@ class Sightings:
         row = np.arange(len(kept))[:, None]
         return self.with_arrays(lambda values: values[row, kept], self.exposures)
 
-    def without(self, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]) -> Sightings:
-        """The sightings of one frame without some of them; the places of the others among the boxes stay.
-
-        Args:
-            camera, box: (gone,), cameras and boxes of the sightings to leave out.
-        """
-        kept = np.ones(self.noise_px.shape, bool)
-        kept[camera, box] = False
+    def where(self, kept: Bool[np.ndarray, "*frames cameras boxes"]) -> Sightings:
+        """The sightings for which `kept` is True; their places among the boxes stay."""
         return self.with_arrays(lambda values: _where(kept, values), self.exposures)
 
     def grouped(self, box: Int[np.ndarray, "groups cameras"]) -> Sightings:
@@ -102,6 +96,11 @@ class Sightings:
             box: (groups, cameras), which of the camera's boxes is of the group; -1 for no sighting.
         """
         return self.with_arrays(lambda values: _where(box >= 0, values[np.arange(box.shape[1]), box]), None)
+
+    def ungrouped(self, box: Int[np.ndarray, "groups cameras"]) -> Sightings:
+        """The sightings of one frame that are in no group; `box` as in `grouped`."""
+        grouped = (np.arange(self.noise_px.shape[1]) == box[..., None]).any(axis=0)
+        return self.where(~grouped)
 
 
 def _where(there: Bool[np.ndarray, "*some"], values: np.ndarray) -> np.ndarray:

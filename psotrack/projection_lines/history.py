@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.initiation import LostTracks, Measurement, find_lost_tracks
+from psotrack.correspondence import Measurement
+from psotrack.initiation import LostTracks, find_lost_tracks
 from psotrack.trajectories import ARRAYS, Arrival, Status, Tracks, padded
 
 #: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.

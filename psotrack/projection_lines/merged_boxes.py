@@ -59,7 +59,9 @@ def split_merged_boxes(view: Sightings, expected_px: Float[np.ndarray, "drones c
     from_first, from_last = seen_px[0][row] + size_px / 2, seen_px[1][row] - size_px / 2
     placed_px = np.where(first & last, (from_first + from_last) / 2, np.where(first, from_first, from_last))
     noise_px = np.hypot(view.noise_px[camera, box][row], PART_SHARE * np.sqrt(size_px.prod(axis=-1)))
-    rest = view.without(camera[several], box[several])
+    kept = np.ones(view.noise_px.shape, bool)
+    kept[camera[several], box[several]] = False
+    rest = view.where(kept)
 
     def with_placed(values: np.ndarray, more: np.ndarray) -> np.ndarray:
         return np.concatenate([values, by_image(camera[row], more, len(values))], axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack._typing import Array
-from psotrack.initiation import Measurement
+from psotrack.correspondence import Measurement
 from psotrack.motion import MotionParams, MotionState, kalman, motion_params
 from psotrack.settings import MotionSettings
 

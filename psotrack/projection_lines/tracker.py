@@ -12,19 +12,20 @@ from psotrack.correspondence import (
     SEPARATION_M,
     Crossings,
     Expected,
+    Measurement,
     Sightings,
     crossings,
     moved_to_instant,
 )
-from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera, viewpoints
+from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera
 from psotrack.initiation import (
     NEW,
+    NO_DRONE,
     SPEED_SHARE,
     TRUSTED_VIEWPOINTS,
     BirthRules,
     Births,
     KnownDrones,
-    Measurement,
     TrackCandidate,
     reidentify,
 )
@@ -100,7 +101,6 @@ class _Tracker:
         self._cameras, self._sightings, self._settings = cameras, sightings, settings
         self._fps, self._bounds_m = fps, bounds_m
         self._density_px2 = _density_px2(cameras, sightings)
-        self._viewpoint = viewpoints(cameras)
         self._max_speed_m_s = settings.motion.speed_limit_m_s
         self._motion = TrackMotion(settings.motion, fps, bounds_m)
         self._births = Births(
@@ -164,9 +164,8 @@ class _Tracker:
         taken: list[int] = []
         # Expected drones first: an unexpected position may be a part of an expected drone.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
-            seen = crossed.seen[row]
-            num_viewpoints = len(set(self._viewpoint[seen].tolist()))
-            if seen.sum() < max(self._settings.status.min_cameras, 2) or num_viewpoints < 2:
+            one = crossed.measurement(row)
+            if one.num_cameras < self._settings.status.min_cameras or one.num_viewpoints < 2:
                 continue
             place = int(crossed.expected[row])
             if place < 0:
@@ -176,25 +175,17 @@ class _Tracker:
                 continue
             taken.append(row)
             surprising = bool(_surprise(crossed, row, expected)[place] >= SURPRISING)
-            if numbers[place] in measured or (surprising and num_viewpoints < TRUSTED_VIEWPOINTS):
+            if numbers[place] in measured or (surprising and one.num_viewpoints < TRUSTED_VIEWPOINTS):
                 continue
-            measured[numbers[place]] = Measurement(
-                crossed.position_m[row],
-                crossed.covariance_m2[row],
-                float(crossed.disagreement[row]),
-                int(seen.sum()),
-                num_viewpoints,
-                crossed.span_m[row],
-                surprising,
-            )
-        rest = view.without(*_camera_and_box(crossed.box[taken]))
+            measured[numbers[place]] = replace(one, surprising=surprising)
+        rest = view.ungrouped(crossed.box[taken])
         found = np.isin(numbers, [*measured])[:, None]
         # The corner of the image is the origin of the boxes of known drones.
         known_px = np.where(found[..., None], expected_px + np.array([0.5, 0.5, 0.0, 0.0]), np.nan)
         known = KnownDrones(np.where(found, expected.position_m, np.nan), span_m[:, [0, 0, 1]], known_px)
         # As the cameras showed them: what is born has a motion of its own. Parts of split boxes are of known drones.
         num_boxes = shown.noise_px.shape[1]
-        unexplained = shown.without(*np.nonzero(np.isnan(rest.noise_px[:, :num_boxes])))
+        unexplained = shown.where(np.isfinite(rest.noise_px[:, :num_boxes]))
         others = self._births.step(frame, unexplained, known, expected.usual)
         missed = [number for number in numbers if number not in measured]
         return measured, self._seen_by_one(rest, others, missed)
@@ -211,7 +202,7 @@ class _Tracker:
         distance_m = np.linalg.norm(expected.position_m - crossed.position_m[row], axis=-1)
         if distance_m.min(initial=np.inf) < SEPARATION_M:
             return int(distance_m.argmin())
-        if len(set(self._viewpoint[crossed.seen[row]].tolist())) < TRUSTED_VIEWPOINTS:
+        if crossed.num_viewpoints[row] < TRUSTED_VIEWPOINTS:
             return -1
         surprise = np.where(is_open, _surprise(crossed, row, expected), np.inf)
         return int(surprise.argmin()) if surprise.min(initial=np.inf) < SURPRISING else -1
@@ -220,8 +211,9 @@ class _Tracker:
         self, rest: Sightings, others: Int[np.ndarray, "crossings cameras"], missed: list[int]
     ) -> SingleViews:
         """The views of drones that have no measurement, among the detections that are of no other drone."""
-        free = rest.without(*_camera_and_box(others))
-        views = find_single_views(self._cameras, free, self._density_px2, self._expected(missed))
+        views = find_single_views(
+            self._cameras, rest.ungrouped(others), self._density_px2, self._expected(missed)
+        )
         return replace(views, drone=np.array(missed, int)[views.drone])
 
     def _expected(self, numbers: list[int]) -> Expected:
@@ -298,14 +290,12 @@ class _Tracker:
             max_speed_m_s=self._max_speed_m_s,
             max_births=None if count is None else max(count - known, 0),
         )
-        self._births.take(
-            each for each, row in zip(candidates, assignment, strict=True) if row >= 0 or row == NEW
-        )
-        for candidate, row in zip(candidates, assignment.tolist(), strict=True):
-            if row >= 0 or row == NEW:
-                number = int(lost.drone[row]) if row >= 0 else self._new_drone()
-                self._history.begins(candidate.instant, number, again=row >= 0)
-                self._start(candidate, number, frame)
+        begun = [each for each in zip(candidates, assignment.tolist(), strict=True) if each[1] != NO_DRONE]
+        self._births.take(candidate for candidate, _ in begun)
+        for candidate, row in begun:
+            number = self._new_drone() if row == NEW else int(lost.drone[row])
+            self._history.begins(candidate.instant, number, again=row != NEW)
+            self._start(candidate, number, frame)
 
     def _start(self, candidate: TrackCandidate, number: int, frame: int) -> None:
         """Start a track at the frame in which the candidate was first seen, and follow it to the present frame."""
@@ -323,14 +313,6 @@ class _Tracker:
             drone.missed = drone.unseen = 0 if one is not None else drone.missed + 1
             self._note(instant, number, motion, 0, one)
         self._motion.put(number, motion.state)
-
-
-def _camera_and_box(
-    box: Int[np.ndarray, "crossings cameras"],
-) -> tuple[Int[np.ndarray, "used"], Int[np.ndarray, "used"]]:
-    """(used,), cameras and boxes of the detections in crossings."""
-    row, camera = np.nonzero(box >= 0)
-    return camera, box[row, camera]
 
 
 def _boxes_px(
