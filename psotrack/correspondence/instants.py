@@ -19,7 +19,7 @@ def moved_to_instant(
     view: Sightings,
     expected_m: Float[np.ndarray, "drones 3"],
     velocity_m_s: Float[np.ndarray, "drones 3"],
-    velocity_std_m_s: Float[np.ndarray, "drones"],
+    velocity_covariance: Float[np.ndarray, "drones 3 3"],
     unknown_std_m_s: float,
 ) -> Sightings:
     """The detections as they would be if all frames had been exposed at the instant.
@@ -32,7 +32,7 @@ def moved_to_instant(
         cameras: cameras with one leading axis.
         view: detections of the frames, and when the frames were exposed.
         expected_m, velocity_m_s: (drones, 3), expected positions at the instant, metres, and velocities, m/s.
-        velocity_std_m_s: (drones,), standard deviations of the velocities.
+        velocity_covariance: (drones, 3, 3), covariances of the velocities, m²/s².
         unknown_std_m_s: standard deviation of the velocity of a drone that is not expected.
     """
     if view.exposures is None:
@@ -62,7 +62,8 @@ def moved_to_instant(
     near = off.min(axis=0) <= _REACH
     camera = np.arange(len(offset_s))[:, None]
     moved_px = (at_instant - at_exposure)[drone, camera]
-    error_px = velocity_std_m_s[drone] * (focal_px * np.abs(offset_s))[:, None] / depth[drone, camera]
+    variance = np.maximum(velocity_covariance.trace(axis1=-2, axis2=-1) / 3, 0.0)
+    error_px = np.sqrt(variance)[drone] * (focal_px * np.abs(offset_s))[:, None] / depth[drone, camera]
     return replace(
         view,
         centre_px=np.where(near[..., None], view.centre_px + moved_px, view.centre_px),

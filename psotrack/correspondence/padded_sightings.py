@@ -65,10 +65,8 @@ class PaddedSightings:
         by_place = min_viewpoints == BY_PLACE
         if not by_place.any():
             return min_viewpoints
-        in_view = in_images(self.cameras, point[by_place])
-        required = min_viewpoints.copy()
-        required[by_place] = np.clip(self.num_viewpoints(in_view), 2, 3)
-        return required
+        num_in_view = self.num_viewpoints(in_images(self.cameras, point))
+        return np.where(by_place, np.clip(num_in_view, 2, 3), min_viewpoints)
 
 
 def pad_sightings(

@@ -286,10 +286,9 @@ class Births:
     def _find(
         self, instant: int, view: Sightings, known: KnownDrones, usual_dispersion: float
     ) -> Int[np.ndarray, "crossings cameras"]:
-        velocity_std = np.sqrt(self._covariance[:, 3:, 3:].trace(axis1=1, axis2=2) / 3)
-        speed_std_m_s = SPEED_SHARE * self._max_speed_m_s
+        speed_std_m_s, covariance = SPEED_SHARE * self._max_speed_m_s, self._covariance[:, 3:, 3:]
         view = moved_to_instant(
-            self._cameras, view, self._mean[:, :3], self._mean[:, 3:], velocity_std, speed_std_m_s
+            self._cameras, view, self._mean[:, :3], self._mean[:, 3:], covariance, speed_std_m_s
         )
         crossed = self._crossings(view, usual_dispersion)
         in_view = in_images(self._cameras, crossed.position_m)

@@ -227,13 +227,12 @@ class _Tracker:
     def _at_instant(self, view: Sightings, numbers: list[int]) -> Sightings:
         """The detections as they would be if all frames had been exposed at the instant."""
         state = self._motion.state
-        variance = np.asarray(state.covariance[numbers, 3:6, 3:6]).trace(axis1=-2, axis2=-1) / 3
         return moved_to_instant(
             self._cameras,
             view,
             np.asarray(state.apparent_m[numbers]),
             np.asarray(state.velocity_m_s[numbers]),
-            np.sqrt(np.maximum(variance, 0.0)),
+            np.asarray(state.covariance[numbers, 3:6, 3:6]),
             self._settings.motion.velocity_std_m_s,
         )
 
