@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
 from psotrack.correspondence import Measurement
@@ -65,18 +66,12 @@ class TrackMotion:
         """Go on to the next frame."""
         self.state = _on_host(_predict(self.state, self._limits["dt_s"], self._params))
 
-    def correct(
-        self,
-        measured: dict[int, Measurement],
-        seen_by_one: Int[np.ndarray, "seen"],
-        lost: Bool[np.ndarray, "slots"],
-    ) -> None:
-        """Correct by the measured positions, within the room and the largest speed; lost tracks are at rest.
+    def correct(self, measured: dict[int, Measurement], seen_by_one: Sequence[int] = ()) -> None:
+        """Correct by the measured positions, within the room and the largest speed.
 
         Args:
             measured: measurements by slot.
-            seen_by_one: (seen,), slots of tracks that one camera alone sees.
-            lost: (slots,), tracks that are lost.
+            seen_by_one: slots of tracks that one camera alone sees.
         """
         measured_m, covariance_m2 = np.zeros((len(self), 3)), np.tile(np.eye(3), (len(self), 1, 1))
         was_measured = np.zeros(len(self), bool)
@@ -84,8 +79,9 @@ class TrackMotion:
             measured_m[slot], covariance_m2[slot] = one.position_m, one.covariance_m2
         was_measured[[*measured]] = True
         unseen = ~was_measured
-        unseen[seen_by_one] = False
-        limits = {"unseen": unseen, "lost": lost, **self._limits}
+        unseen[list(seen_by_one)] = False
+        # A lost track has no place until it begins again.
+        limits = {"unseen": unseen, "lost": np.zeros_like(unseen), **self._limits}
         measurements = (measured_m, covariance_m2, was_measured)
         self.state = _on_host(_correct(self.state, measurements, limits, self._params))
 

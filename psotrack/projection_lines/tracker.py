@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from psotrack.correspondence import (
     SEPARATION_M,
@@ -188,7 +188,10 @@ class _Tracker:
         unexplained = shown.where(np.isfinite(rest.noise_px[:, :num_boxes]))
         others = self._births.step(frame, unexplained, known, expected.usual)
         missed = [number for number in numbers if number not in measured]
-        return measured, self._seen_by_one(rest, others, missed)
+        views = find_single_views(
+            self._cameras, rest.ungrouped(others), self._density_px2, self._expected(missed)
+        )
+        return measured, replace(views, drone=np.array(missed, int)[views.drone])
 
     def _nearly_expected(
         self, crossed: Crossings, row: int, expected: Expected, is_open: Bool[np.ndarray, "drones"]
@@ -206,15 +209,6 @@ class _Tracker:
             return -1
         surprise = np.where(is_open, _surprise(crossed, row, expected), np.inf)
         return int(surprise.argmin()) if surprise.min(initial=np.inf) < SURPRISING else -1
-
-    def _seen_by_one(
-        self, rest: Sightings, others: Int[np.ndarray, "crossings cameras"], missed: list[int]
-    ) -> SingleViews:
-        """The views of drones that have no measurement, among the detections that are of no other drone."""
-        views = find_single_views(
-            self._cameras, rest.ungrouped(others), self._density_px2, self._expected(missed)
-        )
-        return replace(views, drone=np.array(missed, int)[views.drone])
 
     def _expected(self, numbers: list[int]) -> Expected:
         """Where drones are expected."""
@@ -238,16 +232,14 @@ class _Tracker:
 
     def _correct(self, measured: dict[int, Measurement], seen_by_one: SingleViews) -> None:
         """Correct the motion model by the measurements, and by the views of drones that have none."""
-        lost = np.zeros(len(self._motion), bool)
         for number, drone in enumerate(self._drones):
             drone.missed = 0 if number in measured else drone.missed + 1
             drone.unseen = 0 if number in measured or number in seen_by_one.drone else drone.unseen + 1
-            lost[number] = drone.unseen > self._max_coasting_frames
         predicted_m_s = np.asarray(self._motion.state.velocity_m_s)
         for index, number in enumerate(seen_by_one.drone.tolist()):
             view = seen_by_one.jacobian[index], seen_by_one.off_px[index], seen_by_one.noise_px[index]
             self._motion.correct_in_image(number, *view)
-        self._motion.correct(measured, seen_by_one.drone, lost)
+        self._motion.correct(measured, seen_by_one.drone.tolist())
         for number, one in measured.items():
             if one.surprising:
                 # The filter would treat the position as an outlier for a second, but all viewpoints agree on it.
@@ -308,7 +300,7 @@ class _Tracker:
         for instant in range(candidate.instant + 1, frame + 1):
             motion.predict()
             one = candidate.path.get(instant)
-            motion.correct({} if one is None else {0: one}, np.empty(0, int), np.zeros(len(motion), bool))
+            motion.correct({} if one is None else {0: one})
             drone.missed = drone.unseen = 0 if one is not None else drone.missed + 1
             self._note(instant, number, motion, 0, one)
         self._motion.put(number, motion.state)
