@@ -12,7 +12,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from psotrack.correspondence import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST, epipolar_distance, match
-from psotrack.errors import SettingsError
 from psotrack.geometry import project
 
 BOUNDS_M = np.array([[-4.0, -4.0, -1.0], [4.0, 4.0, 4.0]])
@@ -440,15 +439,6 @@ def test_two_boxes_of_one_drone_are_not_ambiguous():
     matches = match_points(rig, points, 2.0)
     assert groups_of(matches) >= {(0,) * 5, (1,) * 5}
     assert not matches.ambiguity.any()
-
-
-def test_invalid_settings_are_refused():
-    rig = ring_rig(3)
-    nothing = [np.empty((0, 2))] * 3
-    with pytest.raises(SettingsError, match="noise_px: expected numbers above 0"):
-        match_points(rig, [np.zeros((1, 2)), *nothing[1:]], 0.0)
-    with pytest.raises(SettingsError, match="min_views: expected 2 or more, found 1"):
-        match_points(rig, nothing, 1.0, min_views=1)
 
 
 # --- properties

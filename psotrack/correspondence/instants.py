@@ -40,8 +40,6 @@ def moved_to_instant(
     offset_s, line_time_s = (
         np.asarray(value, np.float64) for value in (view.exposures.offset_s, view.exposures.line_time_s)
     )
-    if not (offset_s.any() or line_time_s.any()):
-        return view
     focal_px = np.sqrt(np.abs(cameras.K[:, 0, 0] * cameras.K[:, 1, 1]))
     # Distance of a drone that is not expected: that of the point at which the cameras look, roughly.
     centre_m = cameras.centre_world

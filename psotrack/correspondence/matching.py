@@ -11,7 +11,6 @@ from psotrack.correspondence.assignment import apply_exchanges, assign_groups, p
 from psotrack.correspondence.groups import UNEXPLAINED_COST, Groups
 from psotrack.correspondence.padded_sightings import BY_PLACE, PaddedSightings, make_priors, pad_sightings
 from psotrack.correspondence.proposals import propose_groups
-from psotrack.errors import SettingsError
 from psotrack.geometry import Camera, Rig, triangulate_linearly
 
 #: Drones are searched up to this many times the distance between the outermost cameras, metres at least.
@@ -57,18 +56,14 @@ def match(
     Args:
         cameras: cameras with one leading axis.
         points_px: (cameras, boxes, 2), middles of the detections, pixels; NaN for no detection.
-        noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels; NaN for no detection.
+        noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels; above 0, or NaN for
+            no detection.
         bounds_m: (2, 3), corners of the region where drones can be, metres.
         min_views: smallest number of viewpoints (see `psotrack.geometry.viewpoints`), 2 or more; None: three where at
             least three viewpoints have the place in view, else two.
         expected: predicted positions of drones in the world, (known, 3), metres, and their covariances, (known, 3, 3),
             square metres.
-
-    Raises:
-        SettingsError: a noise is not above 0, or `min_views` is below 2.
     """
-    if min_views is not None and min_views < 2:
-        raise SettingsError("min_views", expected="2 or more", found=f"{min_views}")
     padded = pad_sightings(cameras, points_px, noise_px)
     unambiguous = len(expected[0]) < 2 and np.isfinite(padded.variance).sum(axis=1).max(initial=0) < 2
     least = 2 if unambiguous else BY_PLACE if min_views is None else min_views

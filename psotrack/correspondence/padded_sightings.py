@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.errors import SettingsError
 from psotrack.geometry import (
     NEAR_M,
     Camera,
@@ -74,9 +73,7 @@ def pad_sightings(
     points_px: Float[np.ndarray, "cameras boxes 2"],
     noise_px: Float[np.ndarray, "cameras boxes"],
 ) -> PaddedSightings:
-    """The detections of all cameras, with one column of padding at least. Arguments and errors: see `match`."""
-    if (noise_px <= 0).any():
-        raise SettingsError("noise_px", expected="numbers above 0", found="0, or below")
+    """The detections of all cameras, with one column of padding at least. Arguments: see `match`."""
     detected = np.isfinite(points_px).all(axis=-1) & np.isfinite(noise_px)
     # Columns without a detection at the end cost time.
     count = int(np.flatnonzero(detected.any(axis=0)).max(initial=-1)) + 1
