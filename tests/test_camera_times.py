@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.clocks import clocks_of_tracks, fit_clocks, places_of_tracks
-from psotrack.correspondence import NOISE_PX, NOISE_SHARE, CameraSightings, Sightings, moved_to_instant
+from psotrack.correspondence import NOISE_PX, NOISE_SHARE, Sightings, moved_to_instant
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_extents, project, project_boxes
 from psotrack.initiation import Births, KnownDrones
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Exposures, Silhouettes
@@ -26,7 +26,6 @@ RIG = ring_rig(5, image_size_wh=(1920, 1080))
 #: Width and height of a drone, metres.
 SPAN_M = 0.4
 SETTINGS = track_settings()
-LINES = LineSettings(SETTINGS.motion, SETTINGS.drones, SETTINGS.status, SETTINGS.swarm.spread_m)
 
 
 def positions(time_s, num_drones=2):
@@ -190,7 +189,9 @@ def lines_errors(times, given=None, **options):
     timeline = make_timeline(given or times)
     shown = sightings_of(times, **options).at_instants(timeline)
     known = positions(timeline.time_s[0]), np.zeros((2, 3))
-    tracks = track_detections(RIG.cameras, shown, LINES, fps=timeline.rate_hz, bounds_m=ROOM_M, known=known)
+    tracks = track_detections(
+        RIG.cameras, shown, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M, known=known
+    )
     settled = slice(20, timeline.num_instants - 5)
     error_m = (tracks.position_m[:, :2] - positions(timeline.time_s))[settled]
     covariance_m2 = tracks.covariance_m2[:, :2][settled]
@@ -226,7 +227,7 @@ def test_a_drone_that_comes_later_is_found_by_cameras_with_times_of_their_own():
     noise_px[:20, :, 1] = np.nan
     timeline = make_timeline(times)
     given = replace(shown, noise_px=noise_px).at_instants(timeline)
-    tracks = track_detections(RIG.cameras, given, LINES, fps=timeline.rate_hz, bounds_m=ROOM_M)
+    tracks = track_detections(RIG.cameras, given, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M)
     (new,) = tracks.arrivals
     assert abs(timeline.time_s[new.frame] - 20 / FPS) <= 2 / FPS
     # At the last instant, only some of the cameras are there.
@@ -241,7 +242,7 @@ def test_drones_are_found_by_cameras_with_times_of_their_own():
     def errors_m(sightings):
         births = Births(RIG.cameras, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0)
         for instant in range(sightings.num_frames):
-            births.step(instant, sightings.at(instant), KnownDrones(np.empty((0, 3)), np.empty((0, 3))))
+            births.step(instant, sightings[instant], KnownDrones(np.empty((0, 3)), np.empty((0, 3))))
         found = births.candidates()
         assert len(found) == 2
         truth_m = positions(timeline.time_s)
@@ -294,14 +295,15 @@ def test_boxes_are_where_the_drones_are_when_the_cameras_rows_are_exposed():
 def test_detections_are_moved_to_the_instant():
     position_m, velocity_m_s = positions(0.4), np.array([[1.2, -0.5, 0.3], [-0.7, 1.5, 0.0]])
     pixels = pixels_at_exposure(position_m, velocity_m_s).swapaxes(0, 1)
-    view = CameraSightings(pixels, np.full(pixels.shape, 120.0), np.ones(pixels.shape[:2]), NOW)
-    moved = moved_to_instant(RIG.cameras, view, position_m, velocity_m_s, np.full(2, 0.1), 1.0)
+    view = Sightings(pixels, np.full(pixels.shape, 120.0), np.ones(pixels.shape[:2]), NOW)
+    covariance = 0.1**2 * np.tile(np.eye(3), (2, 1, 1))
+    moved = moved_to_instant(RIG.cameras, view, position_m, velocity_m_s, covariance, 1.0)
     expected, _ = project(RIG.cameras, position_m[:, None])
     np.testing.assert_allclose(moved.centre_px, expected.swapaxes(0, 1), atol=0.05)
     assert (moved.noise_px[0] == 1.0).all()
     assert (moved.noise_px[1] > 1.0).all()
     far = replace(view, centre_px=view.centre_px + 500.0)
-    stays = moved_to_instant(RIG.cameras, far, position_m, velocity_m_s, np.full(2, 0.1), 1.0)
+    stays = moved_to_instant(RIG.cameras, far, position_m, velocity_m_s, covariance, 1.0)
     assert (stays.centre_px == far.centre_px).all()
     assert (stays.noise_px[1] > moved.noise_px[1]).all()
 
@@ -364,6 +366,6 @@ def test_a_camera_that_is_not_there_has_no_sightings():
     there = np.isfinite(shown.noise_px[:, 3]).all(axis=-1)
     assert there.tolist() == [False] * 2 + [True] * 4 + [False] * 4
     assert shown.exposures.is_there[:, 3].tolist() == there.tolist()
-    one = shown.at(3)
+    one = shown[3]
     assert one.exposures.offset_s.shape == (5,)
     assert replace(one, exposures=None).noise_px.shape == one.noise_px.shape

@@ -3,13 +3,13 @@
 import numpy as np
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import CameraSightings, from_detections
+from psotrack.correspondence import Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.projection_lines.merged_boxes import PART_SHARE, split_merged_boxes
 from psotrack.recordings import Detections
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
+from psotrack.settings import TrackSettings
 from psotrack.trajectories import Trajectories
 
 RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
@@ -35,7 +35,14 @@ def sightings_of(*boxes, noise_px=3.0):
     """Sightings from arrays of boxes, each (cameras, 4)."""
     boxes = np.stack(boxes, axis=1)
     noise = np.full(boxes.shape[:2], noise_px)
-    return CameraSightings((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
+    return Sightings((boxes[..., :2] + boxes[..., 2:]) / 2, boxes[..., 2:] - boxes[..., :2], noise)
+
+
+def split(view, expected_m, span_m):
+    """The frame's boxes after merged boxes are split, with drones expected at these places."""
+    corners = true_boxes(expected_m, span_m)
+    middle_px, half_px = (corners[..., :2] + corners[..., 2:]) / 2, (corners[..., 2:] - corners[..., :2]) / 2
+    return split_merged_boxes(view, np.concatenate([middle_px, half_px], axis=-1))
 
 
 def boxes_in_camera(view, camera):
@@ -57,7 +64,7 @@ def test_a_drone_in_a_merged_box_gets_its_own_box_if_edges_of_the_merged_box_are
     drones_m = two_drones()
     own = true_boxes(drones_m)
     whole = enclosing_box(own)
-    seen = split_merged_boxes(RIG.cameras, sightings_of(whole), drones_m, SPAN_M)
+    seen = split(sightings_of(whole), drones_m, SPAN_M)
     num_placed = []
     for camera in range(len(RIG)):
         edges = own[:, camera] == whole[camera]
@@ -76,7 +83,7 @@ def test_the_expected_positions_hardly_change_the_boxes():
     drones_m = np.array([0.0, 0.0, 1.2]) + np.array([np.zeros(3), 0.35 * right + 0.25 * down])
     own = true_boxes(drones_m)
     expected_m = drones_m + 0.03 * np.array([[1.0, -1.0, 0.5], [-1.0, 0.5, 1.0]])
-    seen = split_merged_boxes(RIG.cameras, sightings_of(enclosing_box(own)), expected_m, SPAN_M)
+    seen = split(sightings_of(enclosing_box(own)), expected_m, SPAN_M)
     # An error of 5 cm at about 4 m is 1.3 % of 150 px, and half of the size goes into the centre.
     middle_px = (own[:, 0, :2] + own[:, 0, 2:]) / 2
     np.testing.assert_allclose(seen.centre_px[0, 1:], middle_px, atol=1.0)
@@ -85,7 +92,7 @@ def test_the_expected_positions_hardly_change_the_boxes():
 def test_overlapping_boxes_of_one_drone_each_do_not_change():
     own = true_boxes(two_drones())
     view = sightings_of(*own)
-    seen = split_merged_boxes(RIG.cameras, view, two_drones(), SPAN_M)
+    seen = split(view, two_drones(), SPAN_M)
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
     np.testing.assert_array_equal(seen.noise_px, view.noise_px)
 
@@ -95,7 +102,7 @@ def test_a_drone_in_the_middle_of_a_merged_box_is_hidden():
     drones_m = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 1.1], [0.0, 0.0, 1.3]])
     span_m = np.tile(SPAN_M[0], (3, 1))
     own = true_boxes(drones_m, span_m)
-    seen = split_merged_boxes(RIG.cameras, sightings_of(enclosing_box(own)), drones_m, span_m)
+    seen = split(sightings_of(enclosing_box(own)), drones_m, span_m)
     for camera in range(len(RIG)):
         high = boxes_in_camera(seen, camera)[:, 1]
         assert own[1, camera, 1] not in high
@@ -105,7 +112,7 @@ def test_a_drone_in_the_middle_of_a_merged_box_is_hidden():
 def test_drones_of_unknown_size_split_no_box():
     own = true_boxes(two_drones())
     view = sightings_of(enclosing_box(own))
-    seen = split_merged_boxes(RIG.cameras, view, two_drones(), np.full((2, 2), np.nan))
+    seen = split(view, two_drones(), np.full((2, 2), np.nan))
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
 
 
@@ -149,7 +156,7 @@ def test_drones_whose_boxes_merge_keep_their_tracks():
     tracked = track_detections(
         rig.cameras,
         from_detections(detections, rig, len(truth_m)),
-        LineSettings(MotionSettings(), DroneSettings(), StatusSettings(), spread_m=0.05),
+        TrackSettings(),
         fps=FPS,
         bounds_m=ROOM_M,
         known=(truth_m[0], (truth_m[1] - truth_m[0]) * FPS),

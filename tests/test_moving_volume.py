@@ -20,10 +20,10 @@ from psotrack.initiation import (
     room_bounds,
 )
 from psotrack.pipeline import track_recording
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.recordings import Detections, write_detections
 from psotrack.rig_files import write_rig
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
+from psotrack.settings import MotionSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status
 
 FORMULA = runpy.run_path(str(Path(__file__).parents[1] / "experiments" / "accuracy" / "formula_flights.py"))
@@ -71,7 +71,7 @@ def sightings_of(rig, truth_m, seed=0, clutter=1, hidden=()):
 
 def tracked(rig, sightings, volume, **status):
     motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
-    settings = LineSettings(motion, DroneSettings(), StatusSettings(**status), spread_m=0.05)
+    settings = TrackSettings(motion=motion, status=StatusSettings(**status))
     return track_detections(rig.cameras, sightings, settings, fps=FPS, bounds_m=volume.bounds_m)
 
 
@@ -214,7 +214,7 @@ def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
     place_m = np.array([[3.0, 80.0, 60.0]])
     pixels = np.asarray(project(pair, place_m[:, None])[0])[0]
     room_m = np.array([[-300.0, -300.0, -300.0], [300.0, 300.0, 303.0]])
-    found = match(pair, [pixels[[0]], pixels[[1]]], [np.ones(1), np.ones(1)], bounds_m=room_m, min_views=None)
+    found = match(pair, pixels[:, None], np.ones((2, 1)), bounds_m=room_m, min_views=None)
     np.testing.assert_allclose(found.position_m, place_m, atol=0.1)
 
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import CameraSightings, from_detections
+from psotrack.correspondence import Expected, Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import make_rig, project
 from psotrack.initiation import state_at_first_frame
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.projection_lines.single_views import find_single_views
 from psotrack.recordings import Detections
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
+from psotrack.settings import DroneSettings, StatusSettings, TrackSettings
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0
@@ -59,7 +59,7 @@ def simulate_detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, se
 
 
 def line_settings(count=None, **status):
-    return LineSettings(MotionSettings(), DroneSettings(count=count), StatusSettings(**status), spread_m=0.05)
+    return TrackSettings(drones=DroneSettings(count=count), status=StatusSettings(**status))
 
 
 def track(truth_m, count=None, known=None, **noise):
@@ -191,15 +191,24 @@ def test_known_drones_come_first_in_the_given_order_and_others_beside_them_from_
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, tracked.position_m[0])
 
 
-def test_a_known_drone_that_is_seen_only_after_its_track_is_lost_is_found_again():
+@pytest.mark.parametrize("max_coasting_std_m", [0.5, 0.01])
+def test_a_given_drone_that_is_seen_late_keeps_its_number(max_coasting_std_m):
+    """No camera shows the first drone until its track is lost at its given place."""
     truth_m = circles(3)
     velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
-    tracked = track(truth_m, count=3, known=(truth_m[0], velocity_m_s), hidden=[(1, 0, 30)])
+    tracked = track_detections(
+        RIG.cameras,
+        from_detections(simulate_detections(truth_m, jitter=0.03, hidden=[(0, 0, 30)]), RIG, FRAMES),
+        line_settings(3, max_coasting_std_m=max_coasting_std_m),
+        fps=FPS,
+        bounds_m=ROOM_M,
+        known=(truth_m[0], velocity_m_s),
+    )
     (again,) = tracked.arrivals
-    assert (again.frame, again.drone, again.again) == (30, 1, True)
-    assert (tracked.status[20:30, 1] == Status.LOST).all()
-    assert (tracked.status[30:, 1] == Status.TRACKED).all()
-    np.testing.assert_allclose(tracked.position_m[-1], truth_m[-1], atol=0.01)
+    assert (again.frame, again.drone, again.again) == (30, 0, True)
+    assert (tracked.status[20:30, 0] == Status.LOST).all()
+    assert (tracked.status[30:] == Status.TRACKED).all()
+    assert np.linalg.norm(tracked.position_m[40:] - truth_m[40:], axis=-1).max() < 0.06
 
 
 def test_sizes_agree_with_the_boxes():
@@ -271,23 +280,21 @@ def test_a_single_view_must_be_much_more_probable_than_a_false_alarm():
     centre_px = np.full((8, 2, 2), np.nan)
     centre_px[2] = pixel[2] + np.array([[3.0, -2.0], [60.0, 0.0]])
     noise_px = np.where(np.isfinite(centre_px[..., 0]), 2.0, np.nan)
-    view = CameraSightings(centre_px, np.where(np.isfinite(centre_px), 60.0, np.nan), noise_px)
+    view = Sightings(centre_px, np.where(np.isfinite(centre_px), 60.0, np.nan), noise_px)
     area_px2 = np.asarray(RIG.cameras.image_size_wh, float).prod(axis=-1)
 
     def found(std_m, per_frame, free):
         covariance_m2 = std_m**2 * np.eye(3)[None]
-        return find_single_views(
-            RIG.cameras, view, free, per_frame / area_px2, place_m, covariance_m2, np.ones(1)
-        )
+        expected = Expected(place_m, covariance_m2, np.ones(1))
+        return find_single_views(RIG.cameras, free, per_frame / area_px2, expected)
 
-    everything = np.isfinite(noise_px)
-    near = found(0.02, 1.0, everything)
+    near = found(0.02, 1.0, view)
     assert near.drone.tolist() == [0]
     np.testing.assert_allclose(near.off_px, [[3.0, -2.0]], atol=1e-6)
     # One pixel is about 5 mm here. A vague prediction has many places for a false alarm, and so have many false alarms.
-    assert len(found(0.3, 1.0, everything).drone) == 0
-    assert len(found(0.02, 500.0, everything).drone) == 0
-    assert len(found(0.02, 1.0, np.zeros_like(noise_px, bool)).drone) == 0
+    assert len(found(0.3, 1.0, view).drone) == 0
+    assert len(found(0.02, 500.0, view).drone) == 0
+    assert len(found(0.02, 1.0, view.where(np.zeros_like(noise_px, bool))).drone) == 0
 
 
 @pytest.mark.parametrize(("seed", "beside_m"), [(2, 0.15), (4, 0.10)])

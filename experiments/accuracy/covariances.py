@@ -35,7 +35,7 @@ from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
 from psotrack.geometry import Rig, project
 from psotrack.pipeline import track_runs
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.silhouettes import Silhouettes
@@ -184,7 +184,7 @@ def labelled(rig: Rig, case: str, seed: int, num_frames: int) -> dict[str, Any]:
     tracks = track_detections(
         stated.cameras,
         sightings,
-        LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m),
+        settings,
         fps=FPS,
         bounds_m=np.array([[-4.0, -4.0, 0.0], [4.0, 4.0, 4.0]]),
     )

@@ -60,16 +60,10 @@ def points_of(
     """Points in which the lines of sight of detections meet, in each frame alone."""
     points = []
     for frame in range(sightings.num_frames):
-        view = sightings.at(frame)
-        found = match(
-            rig.cameras,
-            view.found(view.centre_px),
-            view.found(view.noise_px),
-            bounds_m=bounds_m,
-            min_views=min_views,
-        )
-        noise_px = np.nan_to_num(view.grouped(view.noise_px, found.detection), nan=1.0)
-        lines = reconstruct(rig.cameras, view.grouped(view.centre_px, found.detection), noise_px=noise_px)
+        view = sightings[frame]
+        found = match(rig.cameras, view.centre_px, view.noise_px, bounds_m=bounds_m, min_views=min_views)
+        shown = view.grouped(found.detection)
+        lines = reconstruct(rig.cameras, shown.centre_px, noise_px=np.nan_to_num(shown.noise_px, nan=1.0))
         kept = np.isfinite(lines.covariance_m2).all(axis=(1, 2))
         points.append((lines.position_m[kept], lines.covariance_m2[kept]))
     return points

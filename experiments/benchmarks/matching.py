@@ -66,7 +66,7 @@ def main(  # noqa: PLR0913  # A click command has one parameter per option.
     for _ in range(frames):
         truth = _draw_positions_m(drones, rng)
         points = _detections(rig, truth, detections, noise_px, missed, rng)
-        noise = [np.full(len(one), noise_px) for one in points]
+        noise = np.full(points.shape[:2], noise_px)
         times, matches = zip(*(_timed(rig, points, noise) for _ in range(repeats)), strict=True)
         least_ms.append(1e3 * min(times))
         distance = np.linalg.norm(matches[0].position_m[:, None] - truth, axis=-1)
@@ -91,7 +91,9 @@ def main(  # noqa: PLR0913  # A click command has one parameter per option.
 
 
 def _timed(
-    rig: Rig, points: list[Float[np.ndarray, "_ 2"]], noise: list[Float[np.ndarray, "_"]]
+    rig: Rig,
+    points: Float[np.ndarray, "cameras detections 2"],
+    noise: Float[np.ndarray, "cameras detections"],
 ) -> tuple[float, Matches]:
     start = time.perf_counter()
     matches = match(rig.cameras, points, noise, bounds_m=_BOUNDS_M)
@@ -127,14 +129,14 @@ def _detections(
     noise_px: float,
     missed: float,
     rng: np.random.Generator,
-) -> list[Float[np.ndarray, "_ 2"]]:
-    """For each camera (`count`, 2): drones that are not missed, also outside the image, and false detections."""
+) -> Float[np.ndarray, "cameras count 2"]:
+    """(cameras, count, 2): drones that are not missed, also outside the image, and false detections."""
     points = []
     for pixels in project(rig.cameras, drones[:, None])[0].swapaxes(0, 1):
         seen = pixels[rng.random(len(drones)) >= missed][:count]
         false = rng.uniform((0, 0), _SIZE_WH, (count - len(seen), 2))
         points.append(rng.permutation(np.vstack([seen + noise_px * rng.standard_normal(seen.shape), false])))
-    return points
+    return np.stack(points)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 from .assignment import SEPARATION_M
-from .crossings import Crossings, Expected, crossings
+from .crossings import Crossings, Expected, Measurement, crossings
 from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
 from .instants import moved_to_instant
@@ -9,8 +9,9 @@ from .sightings import (
     CUT_SHARE,
     NOISE_PX,
     NOISE_SHARE,
-    CameraSightings,
     Sightings,
+    by_image,
+    from_boxes,
     from_detections,
     from_silhouettes,
 )
@@ -24,13 +25,15 @@ __all__ = [
     "SEPARATION_M",
     "SHARED_COST",
     "UNEXPLAINED_COST",
-    "CameraSightings",
     "Crossings",
     "Expected",
     "Matches",
+    "Measurement",
     "Sightings",
+    "by_image",
     "crossings",
     "epipolar_distance",
+    "from_boxes",
     "from_detections",
     "from_silhouettes",
     "match",

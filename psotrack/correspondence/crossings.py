@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.correspondence.matching import match
-from psotrack.correspondence.sightings import CUT_SHARE, CameraSightings
-from psotrack.geometry import Camera, reconstruct, sizes_m, to_camera
+from psotrack.correspondence.sightings import CUT_SHARE, Sightings
+from psotrack.geometry import Camera, reconstruct, sizes_m, to_camera, viewpoints
 
 #: Least standard deviation of a detection's middle, pixels, however well the cameras agree.
 LEAST_NOISE_PX = 0.1
@@ -22,6 +22,28 @@ SEVERAL_SIZE = 1.5
 
 
 @dataclass(frozen=True)
+class Measurement:
+    """What one frame alone shows of a drone.
+
+    Attributes:
+        position_m: (3,), metres.
+        covariance_m2: (3, 3), of the position.
+        disagreement: squared reprojection errors over the noise, per degree of freedom.
+        num_cameras, num_viewpoints: cameras whose sightings count, and their viewpoints.
+        span_m: (2,), width and height of the sightings at the drone's distance, metres.
+        surprising: whether the position is too far from the expected one to be an error of measurement.
+    """
+
+    position_m: Float[np.ndarray, "3"]
+    covariance_m2: Float[np.ndarray, "3 3"]
+    disagreement: float
+    num_cameras: int
+    num_viewpoints: int
+    span_m: Float[np.ndarray, "2"]
+    surprising: bool = False
+
+
+@dataclass(frozen=True)
 class Crossings:
     """Positions where lines of sight of one drone's detections cross.
 
@@ -30,6 +52,7 @@ class Crossings:
         position_m: (crossings, 3), metres.
         covariance_m2: (crossings, 3, 3), from the noise of the detections.
         seen: (crossings, cameras), cameras whose detections count.
+        num_viewpoints: (crossings,), viewpoints of these cameras.
         box: (crossings, cameras), which of the camera's boxes counts; -1 for none.
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
@@ -41,10 +64,22 @@ class Crossings:
     position_m: Float[np.ndarray, "crossings 3"]
     covariance_m2: Float[np.ndarray, "crossings 3 3"]
     seen: Bool[np.ndarray, "crossings cameras"]
+    num_viewpoints: Int[np.ndarray, "crossings"]
     box: Int[np.ndarray, "crossings cameras"]
     disagreement: Float[np.ndarray, "crossings"]
     span_m: Float[np.ndarray, "crossings 2"]
     ambiguity: Float[np.ndarray, "crossings"]
+
+    def measurement(self, row: int) -> Measurement:
+        """What one crossing shows."""
+        return Measurement(
+            self.position_m[row],
+            self.covariance_m2[row],
+            float(self.disagreement[row]),
+            int(self.seen[row].sum()),
+            int(self.num_viewpoints[row]),
+            self.span_m[row],
+        )
 
     def numbered(self, drones: Int[np.ndarray, "expected"]) -> Crossings:
         """The crossings with other numbers for the expected drones."""
@@ -53,11 +88,8 @@ class Crossings:
 
     def joined(self, other: Crossings) -> Crossings:
         """The crossings of both."""
-        both = {
-            each.name: np.concatenate([getattr(self, each.name), getattr(other, each.name)])
-            for each in fields(self)
-        }
-        return Crossings(**both)
+        both = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Crossings(*map(np.concatenate, both))
 
 
 @dataclass(frozen=True)
@@ -75,10 +107,15 @@ class Expected:
     dispersion: Float[np.ndarray, "drones"]
     usual_dispersion: float = 1.0
 
+    @property
+    def usual(self) -> float:
+        """The ratio for detections of a drone that is not expected: the same noise as that of the known drones."""
+        return float(np.median(self.dispersion)) if len(self.dispersion) else self.usual_dispersion
+
 
 def crossings(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     bounds_m: Float[np.ndarray, "2 3"],
     drones: Expected,
     min_views: int | None = None,
@@ -92,26 +129,22 @@ def crossings(
         drones: where drones are expected.
         min_views: smallest number of viewpoints of a drone that was not expected (see `match`).
     """
-    # Detections of an unexpected drone have the same noise as detections of known drones.
-    usual = float(np.median(drones.dispersion)) if len(drones.dispersion) else drones.usual_dispersion
-    dispersion = np.append(drones.dispersion, usual)
+    dispersion = np.append(drones.dispersion, drones.usual)
     # At least the stated noise is used for matching: the groups are judged after they are triangulated.
     scale = np.sqrt(max(1.0, dispersion[-1]))
     groups = match(
         cameras,
-        view.found(view.centre_px),
-        [scale * noise_px for noise_px in view.found(view.noise_px)],
+        view.centre_px,
+        scale * view.noise_px,
         bounds_m=bounds_m,
         min_views=min_views,
-        expected_m=drones.position_m,
-        expected_covariance_m2=drones.covariance_m2,
+        expected=(drones.position_m, drones.covariance_m2),
     )
-    centre_px, size_px, noise_px = (
-        view.grouped(values, groups.detection) for values in (view.centre_px, view.size_px, view.noise_px)
-    )
+    shown = view.grouped(groups.detection)
+    centre_px, size_px = shown.centre_px, shown.size_px
     several = _shared(groups.detection)
     hidden_px = np.where(several, SHARED_SHARE * np.sqrt(size_px.prod(axis=-1)), 0.0)
-    noise_px = np.hypot(noise_px, hidden_px)
+    noise_px = np.hypot(shown.noise_px, hidden_px)
     # The dispersion of a drone alone in its box says nothing about a box that it shares.
     scale = np.where(several, 1.0, np.sqrt(dispersion[groups.expected])[:, None])
     known_px = np.maximum(noise_px * scale, LEAST_NOISE_PX)
@@ -123,7 +156,7 @@ def crossings(
     if surplus_px.any():
         noise_px, known_px = np.hypot(noise_px, surplus_px), np.hypot(known_px, surplus_px)
         lines = reconstruct(cameras, centre_px, noise_px=np.nan_to_num(known_px, nan=1.0))
-    kept = lines.used.any(axis=-1)
+    kept, label = lines.used.any(axis=-1), viewpoints(cameras)
     position_m, seen = lines.position_m[kept], lines.used[kept]
     squared = np.where(seen, lines.reprojection_px[kept] / noise_px[kept], 0.0) ** 2
     span_m = sizes_m(cameras, np.asarray(to_camera(cameras, position_m[:, None])), size_px[kept])
@@ -133,7 +166,8 @@ def crossings(
         position_m=position_m,
         covariance_m2=lines.covariance_m2[kept],
         seen=seen,
-        box=_boxes(view, groups.detection[kept]),
+        num_viewpoints=np.array([len(np.unique(label[row])) for row in seen], int),
+        box=groups.detection[kept],
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
         ambiguity=groups.ambiguity[kept],
@@ -155,17 +189,6 @@ def _surplus_px(
     ratio = np.ones_like(span_m)
     ratio[there] = span_m[there] / np.nanmedian(span_m[there], axis=-1, keepdims=True)
     return np.where(ratio > SEVERAL_SIZE, size_px.max(axis=-1) * (1 - 1 / ratio) / 2, 0.0)
-
-
-def _boxes(
-    view: CameraSightings, detection: Int[np.ndarray, "groups cameras"]
-) -> Int[np.ndarray, "groups cameras"]:
-    """Places among the boxes of detections that are counted without padding; -1 for none."""
-    boxes = np.full(detection.shape, -1)
-    for camera, noise_px in enumerate(view.noise_px):
-        there = detection[:, camera] >= 0
-        boxes[there, camera] = np.flatnonzero(np.isfinite(noise_px))[detection[there, camera]]
-    return boxes
 
 
 def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence.sightings import CameraSightings
+from psotrack.correspondence.sightings import Sightings
 from psotrack.geometry import NEAR_M, Camera, project
 
 #: A detection is moved with the drone whose expected box, this many times larger, holds its middle.
@@ -16,12 +16,12 @@ _REACH = 1.5
 
 def moved_to_instant(
     cameras: Camera,
-    view: CameraSightings,
+    view: Sightings,
     expected_m: Float[np.ndarray, "drones 3"],
     velocity_m_s: Float[np.ndarray, "drones 3"],
-    velocity_std_m_s: Float[np.ndarray, "drones"],
+    velocity_covariance: Float[np.ndarray, "drones 3 3"],
     unknown_std_m_s: float,
-) -> CameraSightings:
+) -> Sightings:
     """The detections as they would be if all frames had been exposed at the instant.
 
     A detection near an expected drone is moved by the drone's motion in the image between exposure and instant, and is
@@ -32,7 +32,7 @@ def moved_to_instant(
         cameras: cameras with one leading axis.
         view: detections of the frames, and when the frames were exposed.
         expected_m, velocity_m_s: (drones, 3), expected positions at the instant, metres, and velocities, m/s.
-        velocity_std_m_s: (drones,), standard deviations of the velocities.
+        velocity_covariance: (drones, 3, 3), covariances of the velocities, m²/s².
         unknown_std_m_s: standard deviation of the velocity of a drone that is not expected.
     """
     if view.exposures is None:
@@ -40,8 +40,6 @@ def moved_to_instant(
     offset_s, line_time_s = (
         np.asarray(value, np.float64) for value in (view.exposures.offset_s, view.exposures.line_time_s)
     )
-    if not (offset_s.any() or line_time_s.any()):
-        return view
     focal_px = np.sqrt(np.abs(cameras.K[:, 0, 0] * cameras.K[:, 1, 1]))
     # Distance of a drone that is not expected: that of the point at which the cameras look, roughly.
     centre_m = cameras.centre_world
@@ -62,7 +60,8 @@ def moved_to_instant(
     near = off.min(axis=0) <= _REACH
     camera = np.arange(len(offset_s))[:, None]
     moved_px = (at_instant - at_exposure)[drone, camera]
-    error_px = velocity_std_m_s[drone] * (focal_px * np.abs(offset_s))[:, None] / depth[drone, camera]
+    variance = np.maximum(velocity_covariance.trace(axis1=-2, axis2=-1) / 3, 0.0)
+    error_px = np.sqrt(variance)[drone] * (focal_px * np.abs(offset_s))[:, None] / depth[drone, camera]
     return replace(
         view,
         centre_px=np.where(near[..., None], view.centre_px + moved_px, view.centre_px),

@@ -8,14 +8,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.correspondence.assignment import apply_exchanges, assign_groups, propose_exchanges
-from psotrack.correspondence.groups import SHARED_COST, UNEXPLAINED_COST, Groups
+from psotrack.correspondence.groups import UNEXPLAINED_COST, Groups
 from psotrack.correspondence.padded_sightings import BY_PLACE, PaddedSightings, make_priors, pad_sightings
 from psotrack.correspondence.proposals import propose_groups
-from psotrack.errors import SettingsError
 from psotrack.geometry import Camera, Rig, triangulate_linearly
 
 #: Drones are searched up to this many times the distance between the outermost cameras, metres at least.
 REACH, LEAST_REACH_M = 20.0, 20.0
+#: No drone is expected.
+NOTHING_EXPECTED = np.empty((0, 3)), np.empty((0, 3, 3))
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,6 @@ class Matches:
         position_m: (drones, 3), positions in the world, computed by `triangulate_linearly`, metres.
         detection: (drones, cameras), index of the drone's detection in each camera; -1 for no detection. Two drones
             that overlap in an image may share a detection.
-        cost: (drones,), mean squared distance of the drone's detections from its projections, in squared standard
-            deviations: about 2 - 3 / n for n detections.
         ambiguity: (drones,), from 0 to 1: likelihood, relative to this assignment, of the best other assignment that
             was found and in which some of the drone's detections belong to a drone at another place.
         expected: (drones,), index of the expected drone; -1 for a drone that was not expected.
@@ -35,20 +34,18 @@ class Matches:
 
     position_m: Float[np.ndarray, "drones 3"]
     detection: Int[np.ndarray, "drones cameras"]
-    cost: Float[np.ndarray, "drones"]
     ambiguity: Float[np.ndarray, "drones"]
     expected: Int[np.ndarray, "drones"]
 
 
 def match(
     cameras: Camera,
-    points_px: list[Float[np.ndarray, "_ 2"]],
-    noise_px: list[Float[np.ndarray, "_"]],
+    points_px: Float[np.ndarray, "cameras boxes 2"],
+    noise_px: Float[np.ndarray, "cameras boxes"],
     *,
     bounds_m: Float[np.ndarray, "2 3"],
     min_views: int | None = 3,
-    expected_m: Float[np.ndarray, "known 3"] | None = None,
-    expected_covariance_m2: Float[np.ndarray, "known 3 3"] | None = None,
+    expected: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3 3"]] = NOTHING_EXPECTED,
 ) -> Matches:
     """Find the groups of detections that have the smallest total cost (see `psotrack.correspondence`).
 
@@ -58,31 +55,19 @@ def match(
 
     Args:
         cameras: cameras with one leading axis.
-        points_px: for each camera (n, 2), middles of the detections, pixels; n may be 0. A row that is not finite is
+        points_px: (cameras, boxes, 2), middles of the detections, pixels; NaN for no detection.
+        noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels; above 0, or NaN for
             no detection.
-        noise_px: for each camera (n,), standard deviations of the middles along each axis, pixels.
         bounds_m: (2, 3), corners of the region where drones can be, metres.
         min_views: smallest number of viewpoints (see `psotrack.geometry.viewpoints`), 2 or more; None: three where at
             least three viewpoints have the place in view, else two.
-        expected_m: (known, 3), predicted positions of drones in the world, metres.
-        expected_covariance_m2: (known, 3, 3), covariances of the predictions, square metres.
-
-    Raises:
-        SettingsError: a noise is not above 0, predictions have no covariances or the reverse, or `min_views` is below
-            2.
+        expected: predicted positions of drones in the world, (known, 3), metres, and their covariances, (known, 3, 3),
+            square metres.
     """
-    if (expected_m is None) != (expected_covariance_m2 is None):
-        raise SettingsError(
-            "expected_m", expected="predictions with covariances", found="one without the other"
-        )
-    if min_views is not None and min_views < 2:
-        raise SettingsError("min_views", expected="2 or more", found=f"{min_views}")
-    if expected_m is None or expected_covariance_m2 is None:
-        expected_m, expected_covariance_m2 = np.empty((0, 3)), np.empty((0, 3, 3))
-    unambiguous = len(expected_m) < 2 and max(map(len, points_px), default=0) < 2
-    least = 2 if unambiguous else BY_PLACE if min_views is None else min_views
-    priors = make_priors(bounds_m, expected_m, expected_covariance_m2, least)
     padded = pad_sightings(cameras, points_px, noise_px)
+    unambiguous = len(expected[0]) < 2 and np.isfinite(padded.variance).sum(axis=1).max(initial=0) < 2
+    least = 2 if unambiguous else BY_PLACE if min_views is None else min_views
+    priors = make_priors(bounds_m, *expected, least)
     proposed = propose_groups(padded, priors, bounds_m)
     return _matches(padded, assign_groups(padded, proposed, priors, bounds_m), proposed)
 
@@ -92,13 +77,11 @@ def _matches(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Match
     x = np.where(groups.seen[..., None], padded.x[views], np.nan)
     weights = 1 / (padded.variance[views] * padded.depth(groups.point) ** 2)
     position = triangulate_linearly(padded.straight, x, weights)
-    squared = np.where(groups.seen, UNEXPLAINED_COST - SHARED_COST * groups.shared - groups.gain, 0.0)
     # Two rays may be parallel: then the group has no position.
     there = np.isfinite(position).all(axis=-1)
     return Matches(
         position_m=position[there],
         detection=groups.detection[there],
-        cost=(squared.sum(axis=-1) / groups.seen.sum(axis=-1))[there],
         ambiguity=_ambiguity(padded, groups, proposed)[there],
         expected=groups.prior[there],
     )

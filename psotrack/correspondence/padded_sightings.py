@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.errors import SettingsError
 from psotrack.geometry import (
     NEAR_M,
     Camera,
@@ -65,25 +64,24 @@ class PaddedSightings:
         by_place = min_viewpoints == BY_PLACE
         if not by_place.any():
             return min_viewpoints
-        in_view = in_images(self.cameras, point[by_place])
-        required = min_viewpoints.copy()
-        required[by_place] = np.clip(self.num_viewpoints(in_view), 2, 3)
-        return required
+        num_in_view = self.num_viewpoints(in_images(self.cameras, point))
+        return np.where(by_place, np.clip(num_in_view, 2, 3), min_viewpoints)
 
 
 def pad_sightings(
-    cameras: Camera, points_px: list[Float[np.ndarray, "_ 2"]], noise_px: list[Float[np.ndarray, "_"]]
+    cameras: Camera,
+    points_px: Float[np.ndarray, "cameras boxes 2"],
+    noise_px: Float[np.ndarray, "cameras boxes"],
 ) -> PaddedSightings:
-    """Put the detections of all cameras into padded arrays. Arguments and errors: see `match`."""
-    counts = list(map(len, points_px))
-    pixels = np.full((max(counts, default=0) + 1, len(counts), 2), np.nan)
-    variance = np.full((len(counts), len(pixels)), np.inf)
+    """The detections of all cameras, with one column of padding at least. Arguments: see `match`."""
+    detected = np.isfinite(points_px).all(axis=-1) & np.isfinite(noise_px)
+    # Columns without a detection at the end cost time.
+    count = int(np.flatnonzero(detected.any(axis=0)).max(initial=-1)) + 1
+    pixels = np.full((count + 1, len(detected), 2), np.nan)
+    pixels[:count] = np.where(detected[..., None], points_px, np.nan)[:, :count].swapaxes(0, 1)
+    variance = np.full((len(detected), count + 1), np.inf)
     focal_px = np.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
-    for camera, count in enumerate(counts):
-        pixels[:count, camera] = np.where(np.isfinite(points_px[camera]), points_px[camera], np.nan)
-        variance[camera, :count] = (noise_px[camera] / focal_px[camera]) ** 2
-    if not (variance > 0).all():
-        raise SettingsError("noise_px", expected="numbers above 0", found="0, NaN, or below")
+    variance[:, :count] = np.where(detected, (noise_px / focal_px[:, None]) ** 2, np.inf)[:, :count]
     straight = replace(
         cameras, K=np.broadcast_to(np.eye(3), cameras.K.shape), dist=cameras.dist[:, :0], fisheye=None
     )

@@ -49,44 +49,32 @@ def propose_groups(padded: PaddedSightings, priors: Priors, bounds_m: Float[np.n
 def _pair_points(
     padded: PaddedSightings, priors: Priors
 ) -> tuple[Float[np.ndarray, "pairs 3"], Float[np.ndarray, "pairs 3 3"]]:
-    """Points of pairs of detections that are near each other's epipolar lines, and covariances of the points.
+    """Points in which the rays of two detections nearly meet, and covariances of the points.
 
-    Only pairs are kept with which enough other cameras agree.
+    The detections are near each other's epipolar lines. Only pairs are kept with which enough other cameras agree.
     """
-    min_viewpoints = int(priors.min_viewpoints[-1])
-    by_place = min_viewpoints == BY_PLACE
+    by_place = priors.min_viewpoints[-1] == BY_PLACE
+    least = 3 if by_place else int(priors.min_viewpoints[-1])
     close = squared_epipolar_distances(padded) < UNEXPLAINED_COST
-    first, second, i, j = np.nonzero(close & _proposing_camera_pairs(padded, min_viewpoints)[..., None, None])
-    camera, detection = np.stack([first, second], axis=-1), np.stack([i, j], axis=-1)
+    proposing = _proposing_camera_pairs(padded, least)
+    tried = _proposing_camera_pairs(padded, 2) if by_place else proposing
+    first, second, i, j = np.nonzero(close & tried[..., None, None])
     # Another camera agrees if it has a detection near the epipolar lines of both detections.
     others = np.any(close[first, :, i] & close[second, :, j], axis=-1)
-    if by_place:
-        kept = _proposing_camera_pairs(padded, 3)[first, second] & (padded.num_viewpoints(others) >= 1)
-    else:
-        kept = padded.num_viewpoints(others) >= min_viewpoints - 2
-    point, covariance = _points_of_pairs(padded, priors, camera[kept], detection[kept])
-    if not by_place or kept.all():
-        return point, covariance
-    # Where only two viewpoints have the place in view, no other camera can agree.
-    alone, covariance_alone = _points_of_pairs(padded, priors, camera[~kept], detection[~kept])
-    two = padded.required_viewpoints(alone, np.full(len(alone), BY_PLACE)) == 2
-    return np.concatenate([point, alone[two]]), np.concatenate([covariance, covariance_alone[two]])
-
-
-def _points_of_pairs(
-    padded: PaddedSightings,
-    priors: Priors,
-    camera: Int[np.ndarray, "pairs 2"],
-    detection: Int[np.ndarray, "pairs 2"],
-) -> tuple[Float[np.ndarray, "pairs 3"], Float[np.ndarray, "pairs 3 3"]]:
-    """Points in which the rays of two detections nearly meet, and covariances of the points."""
+    kept = proposing[first, second] & (padded.num_viewpoints(others) >= least - 2)
+    camera, detection = np.stack([first, second], axis=-1), np.stack([i, j], axis=-1)
+    if not by_place:
+        camera, detection, kept = camera[kept], detection[kept], kept[kept]
     room, middle = priors.equations(np.array([-1]))
     depth = padded.depth(priors.mean[-1])[camera]
     for _ in range(2):
         normal, right = normal_equations(padded, camera, detection, depth)
         point, covariance = solve_points(normal.sum(axis=1) + room, right.sum(axis=1) + middle)
         depth = np.take_along_axis(padded.depth(point), camera, axis=-1)
-    return point, covariance
+    if by_place:
+        # Where only two viewpoints have the place in view, no other camera can agree.
+        kept |= padded.required_viewpoints(point, np.full(len(point), BY_PLACE)) == 2
+    return point[kept], covariance[kept]
 
 
 def _proposing_camera_pairs(

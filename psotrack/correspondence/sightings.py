@@ -5,11 +5,11 @@ Both kinds become the same arrays, from which the correspondence and the project
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from psotrack.geometry import Rig
 from psotrack.recordings import Detections, Timeline
@@ -26,76 +26,15 @@ BORDER_PX = 1.5
 #: Number of frames of silhouettes that are read together.
 _CHUNK_FRAMES = 25
 
-#: Frame, camera, middles, widths and heights, and whether the border cuts each box.
-_Image = tuple[int, int, np.ndarray, np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True)
-class CameraSightings:
-    """Sightings of one frame in all cameras; NaN for no sighting.
-
-    Attributes:
-        centre_px: (cameras, boxes, 2), middles of the boxes, pixels.
-        size_px: (cameras, boxes, 2), widths and heights, pixels.
-        noise_px: (cameras, boxes), standard deviations of the middles along each axis, pixels.
-        exposures: when the cameras' frames were exposed; None where all were exposed together.
-    """
-
-    centre_px: Float[np.ndarray, "cameras boxes 2"]
-    size_px: Float[np.ndarray, "cameras boxes 2"]
-    noise_px: Float[np.ndarray, "cameras boxes"]
-    exposures: Exposures | None = None
-
-    def largest(self, count: int) -> CameraSightings:
-        """The largest sightings of each camera, at most `count` of each."""
-        if self.noise_px.shape[1] <= count:
-            return self
-        area = np.where(np.isfinite(self.noise_px), self.size_px.prod(axis=-1), -1.0)
-        kept = np.argsort(-area, axis=1, kind="stable")[:, :count]
-        row = np.arange(len(kept))[:, None]
-        return replace(
-            self,
-            centre_px=self.centre_px[row, kept],
-            size_px=self.size_px[row, kept],
-            noise_px=self.noise_px[row, kept],
-        )
-
-    def without(self, camera: Int[np.ndarray, "gone"], box: Int[np.ndarray, "gone"]) -> CameraSightings:
-        """The sightings without some of them; the places of the others among the boxes stay.
-
-        Args:
-            camera, box: (gone,), cameras and boxes of the sightings to leave out.
-        """
-        centre_px, size_px, noise_px = self.centre_px.copy(), self.size_px.copy(), self.noise_px.copy()
-        for values in (centre_px, size_px, noise_px):
-            values[camera, box] = np.nan
-        return replace(self, centre_px=centre_px, size_px=size_px, noise_px=noise_px)
-
-    def found(self, values: Float[np.ndarray, "cameras boxes *rest"]) -> list[np.ndarray]:
-        """Select the values of each camera's sightings, without padding: an array (sightings, ...) per camera."""
-        return [row[present] for row, present in zip(values, np.isfinite(self.noise_px), strict=True)]
-
-    def grouped(
-        self, values: Float[np.ndarray, "cameras boxes *rest"], detection: Int[np.ndarray, "groups cameras"]
-    ) -> Float[np.ndarray, "groups cameras *rest"]:
-        """Select the values of each group's sightings; NaN where the group has no sighting.
-
-        Args:
-            values: (cameras, boxes, ...), a value per sighting.
-            detection: (groups, cameras), index of the sighting among the camera's sightings without padding; -1 for
-                no sighting.
-        """
-        padded = np.full((values.shape[0], values.shape[1] + 1, *values.shape[2:]), np.nan)
-        for camera, found in enumerate(self.found(values)):
-            padded[camera, : len(found)] = found
-        return padded[np.arange(len(values)), detection]
+#: Images, middles, widths and heights of boxes, and whether each holds only a part.
+_Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Sightings in all frames of all cameras; NaN for no sighting.
+    """Sightings of one frame, or of several frames, in all cameras; NaN for no sighting.
 
-    The axis of boxes is as long as the largest number of sightings in one image.
+    The axis of boxes is as long as the largest number of sightings in one image. One frame has no axis of frames.
 
     Attributes:
         centre_px: (frames, cameras, boxes, 2), middles of the boxes, pixels; pixel centres are at whole numbers.
@@ -104,25 +43,26 @@ class Sightings:
         exposures: when the frames were exposed; None where frame i of every camera is instant i.
     """
 
-    centre_px: Float[np.ndarray, "frames cameras boxes 2"]
-    size_px: Float[np.ndarray, "frames cameras boxes 2"]
-    noise_px: Float[np.ndarray, "frames cameras boxes"]
+    centre_px: Float[np.ndarray, "*frames cameras boxes 2"]
+    size_px: Float[np.ndarray, "*frames cameras boxes 2"]
+    noise_px: Float[np.ndarray, "*frames cameras boxes"]
     exposures: Exposures | None = None
 
     @property
     def num_frames(self) -> int:
-        """Number of frames of the recording."""
+        """Number of frames."""
         return len(self.centre_px)
 
-    def at(self, frame: int) -> CameraSightings:
-        """The sightings of one frame."""
-        exposures = None if self.exposures is None else self.exposures[frame]
-        return CameraSightings(self.centre_px[frame], self.size_px[frame], self.noise_px[frame], exposures)
-
-    def in_frames(self, frames: Int[np.ndarray, "chosen"]) -> Sightings:
-        """The sightings of some frames."""
+    def __getitem__(self, frames: int | slice | Int[np.ndarray, "chosen"]) -> Sightings:
+        """The sightings of one frame, or of some."""
         exposures = None if self.exposures is None else self.exposures[frames]
-        return Sightings(self.centre_px[frames], self.size_px[frames], self.noise_px[frames], exposures)
+        return self.with_arrays(lambda values: values[frames], exposures)
+
+    def with_arrays(
+        self, change: Callable[[np.ndarray], np.ndarray], exposures: Exposures | None
+    ) -> Sightings:
+        """Sightings whose arrays are `change(array)` for each array of these."""
+        return Sightings(change(self.centre_px), change(self.size_px), change(self.noise_px), exposures)
 
     def at_instants(self, timeline: Timeline) -> Sightings:
         """These sightings with instants instead of frames: each camera shows its frame nearest to the instant.
@@ -132,14 +72,73 @@ class Sightings:
         """
         if timeline.is_synchronous and timeline.num_instants == self.num_frames:
             return self
-        cameras = np.arange(timeline.frame.shape[1])
         there = (timeline.frame >= 0) & (timeline.frame < self.num_frames)
-        frame = np.where(there, timeline.frame, 0)
-        centre_px, size_px, noise_px = (
-            np.where(there.reshape(*there.shape, *[1] * (values.ndim - 2)), values[frame, cameras], np.nan)
-            for values in (self.centre_px, self.size_px, self.noise_px)
-        )
-        return Sightings(centre_px, size_px, noise_px, exposures_of(timeline))
+        shown = np.where(there, timeline.frame, 0), np.arange(timeline.frame.shape[1])
+        return self.with_arrays(lambda values: _where(there, values[shown]), exposures_of(timeline))
+
+    def largest(self, count: int) -> Sightings:
+        """The largest sightings of each camera in one frame, at most `count` of each."""
+        if self.noise_px.shape[1] <= count:
+            return self
+        area = np.where(np.isfinite(self.noise_px), self.size_px.prod(axis=-1), -1.0)
+        kept = np.argsort(-area, axis=1, kind="stable")[:, :count]
+        row = np.arange(len(kept))[:, None]
+        return self.with_arrays(lambda values: values[row, kept], self.exposures)
+
+    def where(self, kept: Bool[np.ndarray, "*frames cameras boxes"]) -> Sightings:
+        """The sightings for which `kept` is True; their places among the boxes stay."""
+        return self.with_arrays(lambda values: _where(kept, values), self.exposures)
+
+    def grouped(self, box: Int[np.ndarray, "groups cameras"]) -> Sightings:
+        """The sightings of one frame with groups in place of cameras, and cameras in place of boxes.
+
+        Args:
+            box: (groups, cameras), which of the camera's boxes is of the group; -1 for no sighting.
+        """
+        return self.with_arrays(lambda values: _where(box >= 0, values[np.arange(box.shape[1]), box]), None)
+
+    def ungrouped(self, box: Int[np.ndarray, "groups cameras"]) -> Sightings:
+        """The sightings of one frame that are in no group; `box` as in `grouped`."""
+        grouped = (np.arange(self.noise_px.shape[1]) == box[..., None]).any(axis=0)
+        return self.where(~grouped)
+
+
+def _where(there: Bool[np.ndarray, "*some"], values: np.ndarray) -> np.ndarray:
+    """Values (*some, ...), NaN where there are none."""
+    return np.where(there.reshape(*there.shape, *[1] * (values.ndim - there.ndim)), values, np.nan)
+
+
+def from_boxes(
+    image: Int[np.ndarray, "rows"],
+    centre_px: Float[np.ndarray, "rows 2"],
+    size_px: Float[np.ndarray, "rows 2"],
+    is_part: Bool[np.ndarray, "rows"],
+    num_images: int,
+) -> Sightings:
+    """Make sightings from a list of boxes, with images in place of cameras.
+
+    Args:
+        image: (rows,), number of the image in which the box is.
+        centre_px, size_px: (rows, 2), as in `Sightings`.
+        is_part: (rows,), whether the image's border, or something else, cuts what is in the box.
+        num_images: number of images.
+    """
+    noise_px = NOISE_PX + np.where(is_part, CUT_SHARE, NOISE_SHARE) * np.sqrt(size_px.prod(axis=-1))
+    columns = centre_px, size_px, noise_px
+    centre_px, size_px, noise_px = (by_image(image, values, num_images) for values in columns)
+    return Sightings(centre_px, size_px, noise_px)
+
+
+def by_image(
+    image: Int[np.ndarray, "rows"], values: Float[np.ndarray, "rows *rest"], num_images: int
+) -> Float[np.ndarray, "images boxes *rest"]:
+    """Arrange the rows of a list by image; NaN where an image has no more. The axis of boxes has at least one entry."""
+    order = np.argsort(image, kind="stable")
+    row = image[order]
+    place = np.arange(len(row)) - np.searchsorted(row, row)
+    arranged = np.full((num_images, int(place.max(initial=0)) + 1, *values.shape[1:]), np.nan)
+    arranged[row, place] = values[order]
+    return arranged
 
 
 def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: int) -> Sightings:
@@ -150,19 +149,17 @@ def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: 
         rig: the cameras.
         num_frames: number of frames of the videos; detections in later frames are ignored.
     """
-    images: list[_Image] = []
+    rows: list[_Rows] = []
     for index, name in enumerate(rig.names):
-        boxes = detections.get(name)
-        if boxes is None:
-            continue
-        width_height = rig.cameras.image_size_wh[index]
-        for frame, start, stop in _runs(boxes.frame):
-            if 0 <= frame < num_frames:
-                xyxy = boxes.xyxy[start:stop]
-                # Pixel centres are at whole numbers, so an edge at 0 is half a pixel before the first centre.
-                cut = np.any((xyxy[:, :2] < BORDER_PX) | (xyxy[:, 2:] > width_height - BORDER_PX), axis=-1)
-                images.append((frame, index, (xyxy[:, :2] + xyxy[:, 2:]) / 2 - 0.5, _sides(xyxy), cut))
-    return _arrays(images, num_frames, len(rig))
+        if name in detections:
+            boxes = detections[name]
+            used = (boxes.frame >= 0) & (boxes.frame < num_frames)
+            low, high = boxes.xyxy[used, :2], boxes.xyxy[used, 2:]
+            # Pixel centres are at whole numbers, so an edge at 0 is half a pixel before the first centre.
+            width_height = rig.cameras.image_size_wh[index]
+            cut = np.any((low < BORDER_PX) | (high > width_height - BORDER_PX), axis=-1)
+            rows.append((boxes.frame[used] * len(rig) + index, (low + high) / 2 - 0.5, high - low, cut))
+    return _of_video(rows, num_frames, len(rig))
 
 
 def from_silhouettes(
@@ -176,41 +173,27 @@ def from_silhouettes(
         first, stop: first frame, and frame before which to stop; None: all. The sightings begin with frame `first`.
     """
     stop = silhouettes.num_frames if stop is None else stop
-    images: list[_Image] = []
+    num_cameras, rows = len(silhouettes.cameras), list[_Rows]()
     with report("blobs", stop - first) as advance:
         for begin in range(first, stop, _CHUNK_FRAMES):
             chunk = silhouettes.read(begin, min(begin + _CHUNK_FRAMES, stop))
             for frame, views in enumerate(chunk, begin - first):
-                for camera, image in enumerate(views):
-                    blobs = find_blobs(image, silhouettes.reduction, silhouettes.borders[camera])
-                    images.append((frame, camera, blobs.centre_px, blobs.size_px, ~blobs.whole))
+                for camera, cells in enumerate(views):
+                    blobs = find_blobs(cells, silhouettes.reduction, silhouettes.borders[camera])
+                    image = np.full(len(blobs.whole), frame * num_cameras + camera)
+                    rows.append((image, blobs.centre_px, blobs.size_px, ~blobs.whole))
             advance(len(chunk))
     exposures = silhouettes.exposures
-    return replace(
-        _arrays(images, stop - first, len(silhouettes.cameras)),
-        exposures=None if exposures is None else exposures[first:stop],
+    return _of_video(rows, stop - first, num_cameras, None if exposures is None else exposures[first:stop])
+
+
+def _of_video(
+    rows: list[_Rows], num_frames: int, num_cameras: int, exposures: Exposures | None = None
+) -> Sightings:
+    """Sightings from lists of boxes; image i is of frame i // `num_cameras`."""
+    none = np.empty(0, int), np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool)
+    image, centre_px, size_px, is_part = (np.concatenate(parts) for parts in zip(none, *rows, strict=True))
+    found = from_boxes(image, centre_px, size_px, is_part, num_frames * num_cameras)
+    return found.with_arrays(
+        lambda values: values.reshape(num_frames, num_cameras, *values.shape[1:]), exposures
     )
-
-
-def _runs(frame: np.ndarray) -> Iterable[tuple[int, int, int]]:
-    """Frame numbers, each with the first row of the frame and the first row after the frame."""
-    values, starts, counts = np.unique(frame, return_index=True, return_counts=True)
-    return zip(values.tolist(), starts.tolist(), (starts + counts).tolist(), strict=True)
-
-
-def _sides(xyxy: Float[np.ndarray, "boxes 4"]) -> Float[np.ndarray, "boxes 2"]:
-    return xyxy[:, 2:] - xyxy[:, :2]
-
-
-def _arrays(images: list[_Image], num_frames: int, num_cameras: int) -> Sightings:
-    """Put the boxes of all images into arrays; the axis of boxes has at least one entry."""
-    max_boxes = max([1, *(len(centre) for _, _, centre, _, _ in images)])
-    shape = (num_frames, num_cameras, max_boxes)
-    centre_px, size_px = np.full((2, *shape, 2), np.nan)
-    noise_px = np.full(shape, np.nan)
-    for frame, camera, centre, size, cut in images:
-        rows = (frame, camera, slice(len(centre)))
-        centre_px[rows], size_px[rows] = centre, size
-        side_px = np.sqrt(size.prod(axis=-1))
-        noise_px[rows] = NOISE_PX + np.where(cut, CUT_SHARE, NOISE_SHARE) * side_px
-    return Sightings(centre_px, size_px, noise_px)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.correspondence import CameraSightings, Sightings, match
+from psotrack.correspondence import Sightings, match
 from psotrack.geometry import Camera, Rig, reconstruct, viewpoints
 
 #: Smallest number of viewpoints of a point: two viewpoints often agree by chance.
@@ -68,11 +68,11 @@ def measure_agreement(
     centres: list[np.ndarray] = []
     noises: list[np.ndarray] = []
     for frame in frames.tolist():
-        view = sightings.at(frame)
-        found = _matched(rig, view, bounds_m)
-        numbers.append(np.full(len(found), frame))
-        centres.append(view.grouped(view.centre_px, found))
-        noises.append(view.grouped(view.noise_px, found))
+        view = sightings[frame]
+        found = view.grouped(_matched(rig, view, bounds_m))
+        numbers.append(np.full(len(found.centre_px), frame))
+        centres.append(found.centre_px)
+        noises.append(found.noise_px)
     frame_of, centre_px, all_noise_px = (np.concatenate(values) for values in (numbers, centres, noises))
     lines = reconstruct(rig.cameras, centre_px, noise_px=np.nan_to_num(all_noise_px, nan=1.0))
     kept = num_viewpoints(rig.cameras, lines.used) >= MIN_VIEWPOINTS
@@ -89,17 +89,14 @@ def measure_agreement(
 
 
 def _matched(
-    rig: Rig, view: CameraSightings, bounds_m: Float[np.ndarray, "2 3"]
+    rig: Rig, view: Sightings, bounds_m: Float[np.ndarray, "2 3"]
 ) -> Int[np.ndarray, "points cameras"]:
     """Indices of the sightings of each point; no points if the rig is so wrong that the equations are singular."""
     try:
         with np.errstate(all="ignore"):
-            found = match(
-                rig.cameras, view.found(view.centre_px), view.found(view.noise_px), bounds_m=bounds_m
-            )
+            return match(rig.cameras, view.centre_px, view.noise_px, bounds_m=bounds_m).detection
     except np.linalg.LinAlgError:
         return np.empty((0, len(rig)), int)
-    return found.detection
 
 
 def num_viewpoints(cameras: Camera, seen: Bool[np.ndarray, "points cameras"]) -> Int[np.ndarray, "points"]:

@@ -82,22 +82,20 @@ def find_common_points(
     numbers, centres, sizes = [], [], []
     used, total = np.zeros(len(rig)), np.zeros(len(rig))
     for frame in frames.tolist():
-        view = sightings.at(frame)
+        view = sightings[frame]
         total += np.isfinite(view.noise_px).sum(axis=1)
         try:
             with np.errstate(all="ignore"):
                 noise_px = np.hypot(view.noise_px, loose_px[:, None])
-                detection = match(
-                    rig.cameras, view.found(view.centre_px), view.found(noise_px), bounds_m=bounds_m
-                ).detection
+                detection = match(rig.cameras, view.centre_px, noise_px, bounds_m=bounds_m).detection
         except np.linalg.LinAlgError:
             # A rig can be so wrong that the equations are singular.
             continue
         used += [len(np.unique(of[of >= 0])) for of in detection.T]
-        alone = _without_shared(detection)
-        centre_px, size_px = view.grouped(view.centre_px, alone), view.grouped(view.size_px, alone)
-        centre_px = np.where(_is_cut(rig, centre_px, size_px)[..., None], np.nan, centre_px)
-        there = np.isfinite(centre_px).all(axis=-1)
+        alone = view.grouped(_without_shared(detection))
+        size_px = alone.size_px
+        centre_px = np.where(_is_cut(rig, alone.centre_px, size_px)[..., None], np.nan, alone.centre_px)
+        there = np.all(np.isfinite(centre_px), axis=-1)
         enough = num_viewpoints(rig.cameras, there) >= MIN_VIEWPOINTS
         numbers.append(np.full(int(enough.sum()), frame))
         centres.append(centre_px[enough])

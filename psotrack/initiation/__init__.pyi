@@ -5,7 +5,6 @@ from .births import (
     BirthRules,
     Births,
     KnownDrones,
-    Measurement,
     TrackCandidate,
     state_at,
 )
@@ -24,6 +23,7 @@ from .initial_state import (
 from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
 from .reidentification import (
     NEW,
+    NO_DRONE,
     STAYED_SPANS,
     LostTracks,
     find_false_tracks,
@@ -34,6 +34,7 @@ from .residual import FrameBlobs, unexplained
 
 __all__ = [
     "NEW",
+    "NO_DRONE",
     "SPEED_SHARE",
     "STAYED_SPANS",
     "TRUSTED_VIEWPOINTS",
@@ -46,7 +47,6 @@ __all__ = [
     "InitialState",
     "KnownDrones",
     "LostTracks",
-    "Measurement",
     "MovingPoints",
     "StartSource",
     "TrackCandidate",

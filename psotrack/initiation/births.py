@@ -21,9 +21,10 @@ from psotrack.correspondence import (
     NOISE_PX,
     NOISE_SHARE,
     SEPARATION_M,
-    CameraSightings,
     Crossings,
     Expected,
+    Measurement,
+    Sightings,
     crossings,
     moved_to_instant,
 )
@@ -83,28 +84,6 @@ ACCELERATION_STD_M_S2 = 5.0
 SPEED_SHARE = 1 / 3
 #: Number of frames over which the disagreement of the cameras is averaged.
 _DISPERSION_FRAMES = 25
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """What one frame alone shows of a drone.
-
-    Attributes:
-        position_m: (3,), metres.
-        covariance_m2: (3, 3), of the position.
-        disagreement: squared reprojection errors over the noise, per degree of freedom.
-        num_cameras, num_viewpoints: cameras whose sightings count, and their viewpoints.
-        span_m: (2,), width and height of the sightings at the drone's distance, metres.
-        surprising: whether the position is too far from the expected one to be an error of measurement.
-    """
-
-    position_m: Float[np.ndarray, "3"]
-    covariance_m2: Float[np.ndarray, "3 3"]
-    disagreement: float
-    num_cameras: int
-    num_viewpoints: int
-    span_m: Float[np.ndarray, "2"]
-    surprising: bool = False
 
 
 @dataclass(frozen=True)
@@ -261,7 +240,7 @@ class Births:
         return one
 
     def step(
-        self, instant: int, view: CameraSightings, known: KnownDrones, usual_dispersion: float = 1.0
+        self, instant: int, view: Sightings, known: KnownDrones, usual_dispersion: float = 1.0
     ) -> Int[np.ndarray, "crossings cameras"]:
         """Take the next frame.
 
@@ -316,12 +295,11 @@ class Births:
             path.missed += 1
 
     def _find(
-        self, instant: int, view: CameraSightings, known: KnownDrones, usual_dispersion: float
+        self, instant: int, view: Sightings, known: KnownDrones, usual_dispersion: float
     ) -> Int[np.ndarray, "crossings cameras"]:
-        velocity_std = np.sqrt(self._covariance[:, 3:, 3:].trace(axis1=1, axis2=2) / 3)
-        speed_std_m_s = SPEED_SHARE * self._max_speed_m_s
+        speed_std_m_s, covariance = SPEED_SHARE * self._max_speed_m_s, self._covariance[:, 3:, 3:]
         view = moved_to_instant(
-            self._cameras, view, self._mean[:, :3], self._mean[:, 3:], velocity_std, speed_std_m_s
+            self._cameras, view, self._mean[:, :3], self._mean[:, 3:], covariance, speed_std_m_s
         )
         crossed = self._crossings(view, usual_dispersion)
         in_view = in_images(self._cameras, crossed.position_m)
@@ -329,20 +307,13 @@ class Births:
         # A place that is followed may be hidden for some frames: see `_is_drone`.
         seen_enough = (crossed.expected >= 0) | (num_seeing >= MIN_SEEING_SHARE * num_should_see)
         counts = seen_enough & self._counts(crossed, known)
-        required, num_viewpoints = self._required_viewpoints(in_view), self._num_viewpoints(crossed.seen)
+        required = self._required_viewpoints(in_view)
         begun: list[tuple[_Path, Measurement]] = []
         # Followed places first: a new position may be a part of one of them.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
             if not counts[row]:
                 continue
-            one = Measurement(
-                crossed.position_m[row],
-                crossed.covariance_m2[row],
-                float(crossed.disagreement[row]),
-                int(crossed.seen[row].sum()),
-                int(num_viewpoints[row]),
-                crossed.span_m[row],
-            )
+            one = crossed.measurement(row)
             number = int(crossed.expected[row])
             if number < 0 and (distance_m := self._distances_m(one)).min(initial=np.inf) < SEPARATION_M:
                 # The covariance was too small, as when a drone turns sharply.
@@ -374,7 +345,7 @@ class Births:
             self._covariance = np.concatenate([self._covariance, covariance[None]])
         return crossed.box[counts]
 
-    def _crossings(self, view: CameraSightings, usual_dispersion: float) -> Crossings:
+    def _crossings(self, view: Sightings, usual_dispersion: float) -> Crossings:
         """Crossings of the lines of sight: of places on which enough viewpoints agreed once, then of the others.
 
         Lines of two viewpoints cross by chance, where more viewpoints have the place in view. Such crossings are looked
@@ -385,7 +356,7 @@ class Births:
         )
         dispersion = np.array([path.dispersion for path in self._paths])
 
-        def crossed_by(view: CameraSightings, of: Int[np.ndarray, "some"], least: int | None) -> Crossings:
+        def crossed_by(view: Sightings, of: Int[np.ndarray, "some"], least: int | None) -> Crossings:
             expected = Expected(
                 self._mean[of, :3], self._covariance[of, :3, :3], dispersion[of], usual_dispersion
             )
@@ -395,8 +366,7 @@ class Births:
         first = crossed_by(view, np.flatnonzero(sure), self._rules.min_viewpoints)
         if self._rules.min_viewpoints is not None:
             return first
-        row, camera = np.nonzero(first.box >= 0)
-        rest = view.without(camera, first.box[row, camera])
+        rest = view.ungrouped(first.box)
         if np.isfinite(rest.noise_px).any(axis=-1).sum() < 2:
             return first
         return first.joined(crossed_by(rest, np.flatnonzero(~sure), 2))
@@ -404,7 +374,7 @@ class Births:
     def _cameras_that_see(
         self,
         crossed: Crossings,
-        view: CameraSightings,
+        view: Sightings,
         in_view: Bool[np.ndarray, "crossings cameras"],
         known: KnownDrones,
     ) -> tuple[Int[np.ndarray, "crossings"], Int[np.ndarray, "crossings"]]:
@@ -437,7 +407,7 @@ class Births:
             & (span_m <= limits[1])
             & (apart >= MIN_DISTANCE)
             & ((self._num_viewpoints(whole) >= 2) | (len(spans_m) == 0))
-            & ((crossed.ambiguity < AMBIGUOUS) | (self._num_viewpoints(seen) >= TRUSTED_VIEWPOINTS))
+            & ((crossed.ambiguity < AMBIGUOUS) | (crossed.num_viewpoints >= TRUSTED_VIEWPOINTS))
             & ~((crossed.expected < 0) & better.any(axis=1))
         )
 

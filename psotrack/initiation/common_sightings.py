@@ -40,13 +40,12 @@ def count_common(rig: Rig, found: Sightings | Silhouettes) -> CommonSightings:
     spread = np.linspace(0, found.num_frames - 1, min(found.num_frames, _FRAMES))
     for frame in np.unique(spread.round().astype(int)).tolist():
         if isinstance(found, Sightings):
-            sightings = found.at(frame)
+            sightings = found[frame]
         else:
-            sightings = from_silhouettes(found, first=frame, stop=frame + 1).at(0)
+            sightings = from_silhouettes(found, first=frame, stop=frame + 1)[0]
         view = sightings.largest(_MOST_SIGHTINGS)
-        centre_px, noise_px = view.found(view.centre_px), view.found(view.noise_px)
-        if len({point for point, pixels in zip(viewpoint, centre_px, strict=True) if len(pixels)}) < 2:
+        if len(np.unique(viewpoint[np.isfinite(view.noise_px).any(axis=-1)])) < 2:
             continue
         seen += 1
-        met += bool(len(match(rig.cameras, centre_px, noise_px, bounds_m=wide_m).position_m))
+        met += bool(len(match(rig.cameras, view.centre_px, view.noise_px, bounds_m=wide_m).position_m))
     return CommonSightings(seen, met)

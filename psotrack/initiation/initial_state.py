@@ -205,7 +205,7 @@ def first_drones(
         max_speed_m_s=max_speed_m_s,
     )
     for frame in range(count):
-        births.step(frame, sightings.at(frame), NO_DRONES)
+        births.step(frame, sightings[frame], NO_DRONES)
     found = [each for each in births.candidates() if each.instant < WINDOW_FRAMES][: drones.count]
     states = [state_at(each.path, 0, fps, max_speed_m_s) for each in found]
     sizes = [each.size_m if drones.size_m is None else np.array(drones.size_m) for each in found]

@@ -162,7 +162,7 @@ def moving_detections(rig: Rig, sightings: Sightings, fps: float) -> MovingPoint
     by_viewpoint = np.stack([seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)], axis=-1)
     frames = np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2)
     # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
-    return _find(rig, sightings.in_frames, frames, fps, min_viewpoints=2)
+    return _find(rig, lambda some: sightings[some], frames, fps, min_viewpoints=2)
 
 
 def moving_blobs(rig: Rig, silhouettes: Silhouettes, fps: float) -> MovingPoints:
@@ -170,7 +170,7 @@ def moving_blobs(rig: Rig, silhouettes: Silhouettes, fps: float) -> MovingPoints
 
     def read(frames: Int[np.ndarray, "chosen"]) -> Sightings:
         first, last = int(frames[0]), int(frames[-1])
-        return from_silhouettes(silhouettes, first=first, stop=last + 1).in_frames(frames - first)
+        return from_silhouettes(silhouettes, first=first, stop=last + 1)[frames - first]
 
     return _find(rig, read, np.arange(silhouettes.num_frames), fps)
 
@@ -207,7 +207,7 @@ def _find(
             max_speed_m_s=FASTEST_M_S,
         )
         for number in range(sightings.num_frames):
-            births.step(number, sightings.at(number).largest(MOST_SIGHTINGS), NO_DRONES)
+            births.step(number, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
         points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]
     table = np.array([point for point in points if point is not None]).reshape(-1, 5)
     return MovingPoints(table[:, :3], table[:, 3], table[:, 4])

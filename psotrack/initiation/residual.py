@@ -6,14 +6,13 @@ which the boxes of the blobs show: only a blob that reaches out of an ellipse is
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.correspondence import CUT_SHARE, NOISE_PX, NOISE_SHARE, CameraSightings
+from psotrack.correspondence import Sightings, from_boxes
 from psotrack.silhouettes import Exposures, find_blobs
 
 #: A known drone's ellipse is enlarged by this factor and by this number of cells, because outlines are no ellipses, and
@@ -68,10 +67,8 @@ class FrameBlobs:
         return cls(coverage, low, high, whole, frame, camera, reduction, exposures)
 
 
-def unexplained(
-    blobs: FrameBlobs, box_px: Float[np.ndarray, "frames drones cameras 4"]
-) -> Iterator[CameraSightings]:
-    """What no known drone explains, frame by frame.
+def unexplained(blobs: FrameBlobs, box_px: Float[np.ndarray, "frames drones cameras 4"]) -> Sightings:
+    """What no known drone explains.
 
     A blob that a known drone hides in part has a middle that is less certain, as that of a blob at the border.
 
@@ -101,11 +98,14 @@ def unexplained(
             cv2.ellipse(cells, (x, y), axes, 0, 0, 360, 0, cv2.FILLED, shift=4)
         first, last, whole, *number = _boxes(cells, end - corner, corner, *at)
         parts.append((first, last, np.zeros_like(whole), *number))
-    boxes = _joined(parts)
-    for frame in range(len(blobs.coverage)):
-        exposures = None if blobs.exposures is None else blobs.exposures[frame]
-        of_frame = tuple(column[boxes[3] == frame] for column in boxes)
-        yield _sightings(of_frame, blobs.coverage.shape[1], blobs.reduction, exposures)
+    first, last, whole, frame, camera = _joined(parts)
+    size_px, centre_px = (last - first) * blobs.reduction, (first + last) / 2 * blobs.reduction - 0.5
+    num_frames, num_cameras = blobs.coverage.shape[:2]
+    image = num_cameras * frame + camera
+    found = from_boxes(image, centre_px, size_px, ~whole, num_images=num_frames * num_cameras)
+    return found.with_arrays(
+        lambda values: values.reshape(num_frames, num_cameras, *values.shape[1:]), blobs.exposures
+    )
 
 
 #: Corners of blobs, cells; whether each is whole; their frames and cameras.
@@ -129,21 +129,3 @@ def _boxes(
 def _joined(parts: list[_Boxes]) -> _Boxes:
     none = np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool), np.empty(0, int), np.empty(0, int)
     return tuple(np.concatenate(columns) for columns in zip(none, *parts, strict=True))
-
-
-def _sightings(
-    boxes: _Boxes, num_cameras: int, reduction: int, exposures: Exposures | None
-) -> CameraSightings:
-    """Blobs of one frame as sightings, padded to the largest number of one camera."""
-    low, high, whole, _, camera = boxes
-    order = np.argsort(camera, kind="stable")
-    camera = camera[order]
-    place = np.arange(len(camera)) - np.searchsorted(camera, camera)
-    shape = (num_cameras, int(place.max(initial=0)) + 1)
-    centre_px, size_px = np.full((2, *shape, 2), np.nan)
-    noise_px = np.full(shape, np.nan)
-    centre_px[camera, place] = (low + high)[order] / 2 * reduction - 0.5
-    size_px[camera, place] = (high - low)[order] * reduction
-    side_px = np.sqrt(size_px[camera, place].prod(axis=-1))
-    noise_px[camera, place] = NOISE_PX + np.where(whole[order], NOISE_SHARE, CUT_SHARE) * side_px
-    return CameraSightings(centre_px, size_px, noise_px, exposures)

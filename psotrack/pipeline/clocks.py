@@ -38,7 +38,7 @@ def estimate_clocks(run: Run, tracks: Tracks, most: int | None = None) -> Camera
     if shown is not None and count < timeline.num_instants:  # else they stay on the disk
         shown = shown.part(first, first + count)
     if run.sightings is not None:
-        sightings = run.sightings.in_frames(rows)
+        sightings = run.sightings[rows]
         shown = shown if run.settings.detections == BLOBS else None
     else:
         assert shown is not None, "a run has silhouettes or sightings"

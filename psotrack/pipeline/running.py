@@ -40,7 +40,7 @@ from psotrack.pipeline.results import (
     finish,
     with_real_time,
 )
-from psotrack.projection_lines import LineSettings, track_detections
+from psotrack.projection_lines import track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
 from psotrack.silhouettes import Living, Silhouettes, compute, find_background, scaled_settings
@@ -232,7 +232,7 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
     tracks = track_detections(
         rig.cameras,
         run.sightings,
-        LineSettings(settings.motion, settings.drones, settings.status, settings.swarm.spread_m),
+        settings,
         fps=run.recording.fps,
         bounds_m=run.volume.bounds_m,
         known=known_motion(run.source, settings.drones, run.recording.fps),

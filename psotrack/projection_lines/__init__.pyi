@@ -1,6 +1,5 @@
-from .tracker import LineSettings, track_detections
+from .tracker import track_detections
 
 __all__ = [
-    "LineSettings",
     "track_detections",
 ]

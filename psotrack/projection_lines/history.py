@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.initiation import LostTracks, Measurement, find_lost_tracks
+from psotrack.correspondence import Measurement
+from psotrack.initiation import LostTracks, find_lost_tracks
 from psotrack.trajectories import ARRAYS, Arrival, Status, Tracks, padded
 
 #: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.
@@ -108,7 +109,7 @@ class History:
         return spans[:, [0, 0, 1]]
 
     def lost(self, num_drones: int, frame: int, fps: float) -> LostTracks:
-        """The drones that may be found again after a frame."""
+        """The drones that may be found again after a frame; `size_m` is NaN where none of their boxes was seen yet."""
         until = np.s_[: frame + 1, :num_drones]
         return find_lost_tracks(
             self._arrays["position_m"][until],

@@ -6,48 +6,20 @@ side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from psotrack.correspondence import CameraSightings
-from psotrack.geometry import NEAR_M, Camera, project_visible, sizes_px, to_camera
+from psotrack.correspondence import Sightings, by_image
 
 #: Additional standard deviation of a middle that follows from one edge and the drone's size, as a share of the box's
 #: sides: the size changes as the drone turns.
 PART_SHARE = 0.1
 
 
-@dataclass(frozen=True)
-class _Outlines:
-    """Boxes by their corners; pixel centres are at whole numbers.
-
-    Attributes:
-        lower_px, upper_px: (..., 2), corners of smallest and largest x and y.
-    """
-
-    lower_px: Float[np.ndarray, "*boxes 2"]
-    upper_px: Float[np.ndarray, "*boxes 2"]
-
-    @property
-    def size_px(self) -> Float[np.ndarray, "*boxes 2"]:
-        """(..., 2), widths and heights."""
-        return self.upper_px - self.lower_px
-
-    def iou(self, other: _Outlines) -> Float[np.ndarray, "*boxes"]:
-        """Intersection over union, of boxes that broadcast."""
-        lower = np.maximum(self.lower_px, other.lower_px)
-        shared = np.maximum(np.minimum(self.upper_px, other.upper_px) - lower, 0.0).prod(axis=-1)
-        return shared / (self.size_px.prod(axis=-1) + other.size_px.prod(axis=-1) - shared)
-
-
-def split_merged_boxes(
-    cameras: Camera,
-    view: CameraSightings,
-    expected_m: Float[np.ndarray, "drones 3"],
-    span_m: Float[np.ndarray, "drones 2"],
-) -> CameraSightings:
+def split_merged_boxes(view: Sightings, expected_px: Float[np.ndarray, "drones cameras 4"]) -> Sightings:
     """The frame's boxes, with boxes of several drones replaced by one box for each drone whose place is known.
 
     A box is of several drones if several drones are expected in it, and if the box around all these drones fits it
@@ -55,73 +27,55 @@ def split_merged_boxes(
     and its size. The places of the other drones are not known: they are hidden.
 
     Args:
-        cameras: cameras with one leading axis.
         view: boxes of the frame.
-        expected_m: (drones, 3), expected positions, metres.
-        span_m: (drones, 2), widths and heights of the drones, metres; NaN where they are not known: then no box is
-            split.
+        expected_px: (drones, cameras, 4), middles and half lengths of the drones' expected boxes, pixel centres at
+            whole numbers; NaN where a drone has no image, or its size is not known: then it is in no box.
     """
-    outlines, inside = _expected(cameras, view, expected_m, span_m)
+    middle_px, half_px = expected_px[..., :2], expected_px[..., 2:]
+    # (drones, cameras, boxes): comparisons with NaN are false.
+    inside = (np.abs(middle_px[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1)
+    inside &= np.isfinite(half_px).all(axis=-1)[..., None]
     camera, box = np.nonzero(inside.sum(axis=0) > 1)
     if not len(camera):
         return view
-    half_px = view.size_px[camera, box] / 2
-    seen = _Outlines(view.centre_px[camera, box] - half_px, view.centre_px[camera, box] + half_px)
+    centre_px, seen_half_px = view.centre_px[camera, box], view.size_px[camera, box] / 2
+    seen_px = centre_px - seen_half_px, centre_px + seen_half_px
     # (boxes, drones, 2): only drones that are expected in the box can have its edges.
     members = inside[:, camera, box].T
-    lower_px = np.where(members[..., None], outlines.lower_px[:, camera].swapaxes(0, 1), np.inf)
-    upper_px = np.where(members[..., None], outlines.upper_px[:, camera].swapaxes(0, 1), -np.inf)
-    alone = np.full(members.shape, -1.0)
-    row, drone = np.nonzero(members)
-    each = _Outlines(lower_px[row, drone], upper_px[row, drone])
-    alone[row, drone] = each.iou(_Outlines(seen.lower_px[row], seen.upper_px[row]))
-    together = _Outlines(lower_px.min(axis=1), upper_px.max(axis=1)).iou(seen)
-    several = together > alone.max(axis=-1)
+    lower_px, upper_px = (
+        edges[:, camera].swapaxes(0, 1) for edges in (middle_px - half_px, middle_px + half_px)
+    )
+    alone = np.where(members, _iou((lower_px, upper_px), [edges[:, None] for edges in seen_px]), -1.0)
+    first_px = np.where(members[..., None], lower_px, np.inf)
+    last_px = np.where(members[..., None], upper_px, -np.inf)
+    several = _iou((first_px.min(axis=1), last_px.max(axis=1)), seen_px) > alone.max(axis=-1)
+    row, drone = np.nonzero(members & several[:, None])
     # Whether the lower and the upper edge of the box are this drone's.
-    first = several[row, None] & (lower_px.argmin(axis=1)[row] == drone[:, None])
-    last = several[row, None] & (upper_px.argmax(axis=1)[row] == drone[:, None])
+    first = first_px.argmin(axis=1)[row] == drone[:, None]
+    last = last_px.argmax(axis=1)[row] == drone[:, None]
     placed = (first | last).all(axis=-1)
-    row, first, last, size_px = row[placed], first[placed], last[placed], each.size_px[placed]
-    from_first, from_last = seen.lower_px[row] + size_px / 2, seen.upper_px[row] - size_px / 2
-    middle_px = np.where(first & last, (from_first + from_last) / 2, np.where(first, from_first, from_last))
-    off_px = PART_SHARE * np.sqrt(size_px.prod(axis=-1))
-    noise_px = np.hypot(view.noise_px[camera, box][row], off_px)
-    return _with(view.without(camera[several], box[several]), camera[row], middle_px, size_px, noise_px)
+    row, drone, first, last = row[placed], drone[placed], first[placed], last[placed]
+    size_px = (upper_px - lower_px)[row, drone]
+    from_first, from_last = seen_px[0][row] + size_px / 2, seen_px[1][row] - size_px / 2
+    placed_px = np.where(first & last, (from_first + from_last) / 2, np.where(first, from_first, from_last))
+    noise_px = np.hypot(view.noise_px[camera, box][row], PART_SHARE * np.sqrt(size_px.prod(axis=-1)))
+    kept = np.ones(view.noise_px.shape, bool)
+    kept[camera[several], box[several]] = False
+    rest = view.where(kept)
 
-
-def _expected(
-    cameras: Camera,
-    view: CameraSightings,
-    expected_m: Float[np.ndarray, "drones 3"],
-    span_m: Float[np.ndarray, "drones 2"],
-) -> tuple[_Outlines, Bool[np.ndarray, "drones cameras boxes"]]:
-    """The expected boxes (drones, cameras, 2), and in which of the frame's boxes the drones are expected."""
-    pixels, depth = (np.asarray(part) for part in project_visible(cameras, expected_m[:, None]))
-    half_px = sizes_px(cameras, np.asarray(to_camera(cameras, expected_m[:, None])), span_m[:, None]) / 2
-    known = np.isfinite(half_px).all(axis=-1) & (depth > NEAR_M)
-    inside = (np.abs(pixels[:, :, None] - view.centre_px) < view.size_px / 2).all(axis=-1)
-    return _Outlines(pixels - half_px, pixels + half_px), inside & known[..., None]
-
-
-def _with(
-    view: CameraSightings,
-    camera: Int[np.ndarray, "more"],
-    centre_px: Float[np.ndarray, "more 2"],
-    size_px: Float[np.ndarray, "more 2"],
-    noise_px: Float[np.ndarray, "more"],
-) -> CameraSightings:
-    """The frame's boxes and some more; `camera` is in ascending order."""
-    place = np.arange(len(camera)) - np.searchsorted(camera, camera)
-    room = int(place.max(initial=-1)) + 1
-
-    def longer(values: np.ndarray, more: np.ndarray) -> np.ndarray:
-        added = np.full((len(values), room, *values.shape[2:]), np.nan)
-        added[camera, place] = more
-        return np.concatenate([values, added], axis=1)
+    def with_placed(values: np.ndarray, more: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, by_image(camera[row], more, len(values))], axis=1)
 
     return replace(
-        view,
-        centre_px=longer(view.centre_px, centre_px),
-        size_px=longer(view.size_px, size_px),
-        noise_px=longer(view.noise_px, noise_px),
+        rest,
+        centre_px=with_placed(rest.centre_px, placed_px),
+        size_px=with_placed(rest.size_px, size_px),
+        noise_px=with_placed(rest.noise_px, noise_px),
     )
+
+
+def _iou(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> np.ndarray:
+    """Intersection over union of boxes (..., 2) that broadcast, each given by its lower and its upper corners."""
+    sides = np.minimum(one[1], other[1]) - np.maximum(one[0], other[0])
+    shared = np.maximum(sides, 0.0).prod(axis=-1)
+    return shared / ((one[1] - one[0]).prod(axis=-1) + (other[1] - other[0]).prod(axis=-1) - shared)

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from psotrack.correspondence import CameraSightings
+from psotrack.correspondence import Expected, Sightings
 from psotrack.geometry import NEAR_M, Camera, project_with_jacobian
 
 #: A detection is taken for a drone's if this is at least as many times as probable as a detection of anything else at
@@ -38,12 +38,9 @@ class SingleViews:
 
 def find_single_views(
     cameras: Camera,
-    view: CameraSightings,
-    free: Bool[np.ndarray, "cameras boxes"],
+    free: Sightings,
     density_px2: Float[np.ndarray, "cameras"],
-    expected_m: Float[np.ndarray, "drones 3"],
-    expected_covariance_m2: Float[np.ndarray, "drones 3 3"],
-    dispersion: Float[np.ndarray, "drones"],
+    expected: Expected,
 ) -> SingleViews:
     """The most probable free detection of each drone in each camera, if it is probable enough (`LEAST_ODDS`).
 
@@ -51,18 +48,16 @@ def find_single_views(
 
     Args:
         cameras: cameras with one leading axis.
-        view: detections of the frame.
-        free: (cameras, boxes), detections that are of no other drone.
+        free: detections of the frame that are of no other drone.
         density_px2: (cameras,), mean number of detections per frame and square pixel.
-        expected_m, expected_covariance_m2: (drones, 3) and (drones, 3, 3), expected positions and their covariances.
-        dispersion: (drones,), ratio of the variance of each drone's detections so far and `view.noise_px`².
+        expected: where the drones are expected.
     """
-    pixels, depth, jacobian = project_with_jacobian(cameras, expected_m[:, None])
-    noise_px = view.noise_px * np.sqrt(np.maximum(dispersion, 1.0))[:, None, None]
-    off_px = view.centre_px - pixels[:, :, None]
-    spread = jacobian @ expected_covariance_m2[:, None] @ jacobian.swapaxes(-1, -2)
+    pixels, depth, jacobian = project_with_jacobian(cameras, expected.position_m[:, None])
+    noise_px = free.noise_px * np.sqrt(np.maximum(expected.dispersion, 1.0))[:, None, None]
+    off_px = free.centre_px - pixels[:, :, None]
+    spread = jacobian @ expected.covariance_m2[:, None] @ jacobian.swapaxes(-1, -2)
     spread = spread[:, :, None] + noise_px[..., None, None] ** 2 * np.eye(2)
-    usable = free & np.isfinite(off_px).all(axis=-1) & (depth >= NEAR_M)[..., None]
+    usable = np.isfinite(off_px).all(axis=-1) & (depth >= NEAR_M)[..., None]
     usable &= np.isfinite(spread).all(axis=(-1, -2))
     spread = np.where(usable[..., None, None], spread, np.eye(2))
     off_px = np.where(usable[..., None], off_px, 0.0)

@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from psotrack._typing import Array
-from psotrack.initiation import Measurement
+from psotrack.correspondence import Measurement
 from psotrack.motion import MotionParams, MotionState, kalman, motion_params
 from psotrack.settings import MotionSettings
 
 #: The arrays' length is a multiple of this number: each length is compiled once.
 ROOM = 16
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class _Limits:
-    """Seconds between frames, corners of the room (2, 3), and a drone's largest speed."""
-
-    dt_s: Float[Array, ""]
-    bounds_m: Float[Array, "2 3"]
-    max_speed_m_s: Float[Array, ""]
 
 
 class TrackMotion:
@@ -37,7 +28,11 @@ class TrackMotion:
 
     def __init__(self, settings: MotionSettings, fps: float, bounds_m: Float[np.ndarray, "2 3"]) -> None:
         self._settings = settings
-        self._limits = _Limits(np.array(1 / fps), bounds_m, np.array(settings.speed_limit_m_s))
+        self._limits = {
+            "dt_s": np.array(1 / fps),
+            "bounds_m": bounds_m,
+            "max_speed_m_s": np.array(settings.speed_limit_m_s),
+        }
         self._params = _params(settings, 0)
         self.state = _states_at_origin(0, self._params)
 
@@ -60,44 +55,35 @@ class TrackMotion:
     ) -> None:
         """Start the motion of a track, or start it anew."""
         params = replace(_params(self._settings, 1), velocity_std_m_s=jnp.float64(velocity_std_m_s))
-        begun = kalman.init(position_m[None], velocity_m_s[None], covariance_m2[None], params)
+        self.put(slot, kalman.init(position_m[None], velocity_m_s[None], covariance_m2[None], params))
+
+    def put(self, slot: int, first: MotionState) -> None:
+        """Put the first of some states into a slot."""
         for each in fields(MotionState):
-            getattr(self.state, each.name)[slot] = np.asarray(getattr(begun, each.name))[0]
+            getattr(self.state, each.name)[slot] = getattr(first, each.name)[0]
 
     def predict(self) -> None:
         """Go on to the next frame."""
-        self.state = _on_host(_predict(self.state, self._limits.dt_s, self._params))
+        self.state = _on_host(_predict(self.state, self._limits["dt_s"], self._params))
 
-    def take(self, slot: int, other: TrackMotion, other_slot: int) -> None:
-        """Take over a track from another motion model."""
-        for each in fields(MotionState):
-            getattr(self.state, each.name)[slot] = getattr(other.state, each.name)[other_slot]
-
-    def correct(
-        self,
-        measured: dict[int, Measurement],
-        seen_by_one: Int[np.ndarray, "seen"],
-        lost: Bool[np.ndarray, "slots"],
-    ) -> None:
-        """Correct by the measured positions, within the room and the largest speed; lost tracks are at rest.
+    def correct(self, measured: dict[int, Measurement], seen_by_one: Sequence[int] = ()) -> None:
+        """Correct by the measured positions, within the room and the largest speed.
 
         Args:
             measured: measurements by slot.
-            seen_by_one: (seen,), slots of tracks that one camera alone sees.
-            lost: (slots,), tracks that are lost.
+            seen_by_one: slots of tracks that one camera alone sees.
         """
         measured_m, covariance_m2 = np.zeros((len(self), 3)), np.tile(np.eye(3), (len(self), 1, 1))
         was_measured = np.zeros(len(self), bool)
         for slot, one in measured.items():
-            measured_m[slot], covariance_m2[slot], was_measured[slot] = (
-                one.position_m,
-                one.covariance_m2,
-                True,
-            )
+            measured_m[slot], covariance_m2[slot] = one.position_m, one.covariance_m2
+        was_measured[[*measured]] = True
         unseen = ~was_measured
-        unseen[seen_by_one] = False
+        unseen[list(seen_by_one)] = False
+        # A lost track has no place until it begins again.
+        limits = {"unseen": unseen, "lost": np.zeros_like(unseen), **self._limits}
         measurements = (measured_m, covariance_m2, was_measured)
-        self.state = _on_host(_correct(self.state, measurements, (unseen, lost), self._limits, self._params))
+        self.state = _on_host(_correct(self.state, measurements, limits, self._params))
 
     def correct_in_image(
         self,
@@ -121,12 +107,9 @@ class TrackMotion:
         spread = observed @ covariance @ observed.T + noise_px2
         gain = np.linalg.solve(spread, observed @ covariance).T
         rest = np.eye(len(covariance)) - gain @ observed
-        state.covariance[slot] = rest @ covariance @ rest.T + gain @ noise_px2 @ gain.T
+        after = rest @ covariance @ rest.T + gain @ noise_px2 @ gain.T
         moved = np.asarray(state.mean[slot]) + gain @ off_px
-        for name, part in zip(
-            ("apparent_m", "velocity_m_s", "acceleration_m_s2", "error_m"), np.split(moved, 4), strict=True
-        ):
-            getattr(state, name)[slot] = part
+        self.put(slot, kalman.state_from_mean(moved[None], after[None], state.noise_m2[[slot]]))
 
 
 def _params(settings: MotionSettings, room: int) -> MotionParams:
@@ -143,25 +126,15 @@ def _on_host(state: MotionState) -> MotionState:
     return jax.tree.map(np.array, state)
 
 
-@jax.jit
-def _predict(state: MotionState, dt_s: Float[Array, ""], params: MotionParams) -> MotionState:
-    return kalman.predict(state, dt_s, params)
+_predict = jax.jit(kalman.predict)
 
 
 @jax.jit
 def _correct(
     state: MotionState,
     measurements: tuple[Float[Array, "drones 3"], Float[Array, "drones 3 3"], Bool[Array, "drones"]],
-    unseen_and_lost: tuple[Bool[Array, "drones"], Bool[Array, "drones"]],
-    limits: _Limits,
+    limits: dict[str, Array],
     params: MotionParams,
 ) -> MotionState:
-    measured_m, covariance_m2, was_measured = measurements
-    state, _ = kalman.update(state, measured_m, covariance_m2, was_measured, params)
-    return kalman.limit_motion(
-        state,
-        *unseen_and_lost,
-        dt_s=limits.dt_s,
-        bounds_m=limits.bounds_m,
-        max_speed_m_s=limits.max_speed_m_s,
-    )
+    state, _ = kalman.update(state, *measurements, params)
+    return kalman.limit_motion(state, **limits)

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from psotrack.correspondence import (
     SEPARATION_M,
-    CameraSightings,
     Crossings,
     Expected,
+    Measurement,
     Sightings,
     crossings,
     moved_to_instant,
 )
-from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera, viewpoints
+from psotrack.geometry import Camera, in_images, project_visible, sizes_px, to_camera
 from psotrack.initiation import (
     NEW,
+    NO_DRONE,
     SPEED_SHARE,
     TRUSTED_VIEWPOINTS,
     BirthRules,
     Births,
     KnownDrones,
-    Measurement,
     TrackCandidate,
     reidentify,
 )
@@ -34,7 +34,7 @@ from psotrack.projection_lines.history import SPAN_FRAMES, History, TrackedDrone
 from psotrack.projection_lines.merged_boxes import split_merged_boxes
 from psotrack.projection_lines.single_views import SingleViews, find_single_views
 from psotrack.projection_lines.track_motion import TrackMotion
-from psotrack.settings import DroneSettings, MotionSettings, StatusSettings
+from psotrack.settings import TrackSettings
 from psotrack.support import Report, no_progress
 from psotrack.tracking import DISPERSION_FRAMES
 from psotrack.trajectories import Tracks
@@ -44,25 +44,10 @@ from psotrack.trajectories import Tracks
 SURPRISING = 2 * GATE_999
 
 
-@dataclass(frozen=True)
-class LineSettings:
-    """The parts of the settings that the projection lines read (see `psotrack.settings`).
-
-    Attributes:
-        motion, drones, status: parts of `TrackSettings`.
-        spread_m: standard deviation of a new track's position, metres.
-    """
-
-    motion: MotionSettings
-    drones: DroneSettings
-    status: StatusSettings
-    spread_m: float
-
-
 def track_detections(
     cameras: Camera,
     sightings: Sightings,
-    settings: LineSettings,
+    settings: TrackSettings,
     *,
     fps: float,
     bounds_m: Float[np.ndarray, "2 3"],
@@ -77,7 +62,7 @@ def track_detections(
     Args:
         cameras: cameras with one leading axis.
         sightings: detections of all cameras.
-        settings: the parts of the settings that the projection lines read.
+        settings: motion, number of drones, and status; `swarm.spread_m` is the standard deviation of known positions.
         fps: frames per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         known: positions and velocities of the drones at frame 0, (known, 3) each, metres and m/s; None finds the
@@ -109,14 +94,13 @@ class _Tracker:
         self,
         cameras: Camera,
         sightings: Sightings,
-        settings: LineSettings,
+        settings: TrackSettings,
         fps: float,
         bounds_m: Float[np.ndarray, "2 3"],
     ) -> None:
         self._cameras, self._sightings, self._settings = cameras, sightings, settings
         self._fps, self._bounds_m = fps, bounds_m
         self._density_px2 = _density_px2(cameras, sightings)
-        self._viewpoint = viewpoints(cameras)
         self._max_speed_m_s = settings.motion.speed_limit_m_s
         self._motion = TrackMotion(settings.motion, fps, bounds_m)
         self._births = Births(
@@ -134,16 +118,17 @@ class _Tracker:
         self, position_m: Float[np.ndarray, "known 3"], velocity_m_s: Float[np.ndarray, "known 3"]
     ) -> None:
         """Start tracks of drones that will be at these positions in the next frame."""
-        covariance_m2 = np.square(self._settings.spread_m) * np.eye(3)
+        covariance_m2 = np.square(self._settings.swarm.spread_m) * np.eye(3)
         for position, velocity in zip(position_m, velocity_m_s, strict=True):
             std_m_s = self._settings.motion.velocity_std_m_s
-            before_m = position - velocity / self._fps
-            self._motion.place(self._new_drone(), before_m, velocity, covariance_m2, std_m_s)
+            before_m, number = position - velocity / self._fps, self._new_drone()
+            self._motion.place(number, before_m, velocity, covariance_m2, std_m_s)
+            self._history.note((0, number), position, velocity, covariance_m2, None, 0)
 
     def step(self, frame: int) -> None:
         """One frame: predict, match, correct, end tracks and begin new ones."""
         self._motion.predict()
-        measured, seen_by_one = self._measure(frame, self._sightings.at(frame))
+        measured, seen_by_one = self._measure(frame, self._sightings[frame])
         self._correct(measured, seen_by_one)
         for number in self._followed():
             self._note(frame, number, self._motion, number, measured.get(number))
@@ -165,27 +150,22 @@ class _Tracker:
             self._history.grow(len(self._motion))
         return len(self._drones) - 1
 
-    def _measure(self, frame: int, view: CameraSightings) -> tuple[dict[int, Measurement], SingleViews]:
+    def _measure(self, frame: int, view: Sightings) -> tuple[dict[int, Measurement], SingleViews]:
         """The frame's measurements by drone, and the views of drones that have none."""
         numbers = self._followed()
-        shown, view = view, self._at_instant(view, numbers)
-        expected = Expected(
-            np.asarray(self._motion.state.apparent_m[numbers]),
-            np.asarray(self._motion.state.covariance[numbers, :3, :3]),
-            np.array([self._drones[number].dispersion for number in numbers]),
-        )
+        expected = self._expected(numbers)
         lately = slice(max(frame - SPAN_FRAMES, 0), frame)
         span_m = np.array([self._history.span_m(number, lately) for number in numbers]).reshape(-1, 2)
-        view = split_merged_boxes(self._cameras, view, expected.position_m, span_m)
+        expected_px = _boxes_px(self._cameras, expected.position_m, span_m)
+        shown, view = view, split_merged_boxes(self._at_instant(view, numbers), expected_px)
         required = self._settings.status.min_cameras_to_begin
         crossed = crossings(self._cameras, view, self._bounds_m, expected, required)
         measured: dict[int, Measurement] = {}
         taken: list[int] = []
         # Expected drones first: an unexpected position may be a part of an expected drone.
         for row in np.argsort(crossed.expected < 0, kind="stable").tolist():
-            seen = crossed.seen[row]
-            num_viewpoints = len(set(self._viewpoint[seen].tolist()))
-            if seen.sum() < max(self._settings.status.min_cameras, 2) or num_viewpoints < 2:
+            one = crossed.measurement(row)
+            if one.num_cameras < self._settings.status.min_cameras or one.num_viewpoints < 2:
                 continue
             place = int(crossed.expected[row])
             if place < 0:
@@ -195,27 +175,23 @@ class _Tracker:
                 continue
             taken.append(row)
             surprising = bool(_surprise(crossed, row, expected)[place] >= SURPRISING)
-            if numbers[place] in measured or (surprising and num_viewpoints < TRUSTED_VIEWPOINTS):
+            if numbers[place] in measured or (surprising and one.num_viewpoints < TRUSTED_VIEWPOINTS):
                 continue
-            measured[numbers[place]] = Measurement(
-                crossed.position_m[row],
-                crossed.covariance_m2[row],
-                float(crossed.disagreement[row]),
-                int(seen.sum()),
-                num_viewpoints,
-                crossed.span_m[row],
-                surprising,
-            )
-        rest = view.without(*_camera_and_box(crossed.box[taken]))
-        there_m = np.where(np.isin(numbers, [*measured])[:, None], expected.position_m, np.nan)
-        known = KnownDrones(there_m, span_m[:, [0, 0, 1]], _boxes_px(self._cameras, there_m, span_m))
-        usual = float(np.median(expected.dispersion)) if numbers else 1.0
+            measured[numbers[place]] = replace(one, surprising=surprising)
+        rest = view.ungrouped(crossed.box[taken])
+        found = np.isin(numbers, [*measured])[:, None]
+        # The corner of the image is the origin of the boxes of known drones.
+        known_px = np.where(found[..., None], expected_px + np.array([0.5, 0.5, 0.0, 0.0]), np.nan)
+        known = KnownDrones(np.where(found, expected.position_m, np.nan), span_m[:, [0, 0, 1]], known_px)
         # As the cameras showed them: what is born has a motion of its own. Parts of split boxes are of known drones.
         num_boxes = shown.noise_px.shape[1]
-        unexplained = shown.without(*np.nonzero(np.isnan(rest.noise_px[:, :num_boxes])))
-        others = self._births.step(frame, unexplained, known, usual)
+        unexplained = shown.where(np.isfinite(rest.noise_px[:, :num_boxes]))
+        others = self._births.step(frame, unexplained, known, expected.usual)
         missed = [number for number in numbers if number not in measured]
-        return measured, self._seen_by_one(rest, others, missed)
+        views = find_single_views(
+            self._cameras, rest.ungrouped(others), self._density_px2, self._expected(missed)
+        )
+        return measured, replace(views, drone=np.array(missed, int)[views.drone])
 
     def _nearly_expected(
         self, crossed: Crossings, row: int, expected: Expected, is_open: Bool[np.ndarray, "drones"]
@@ -229,54 +205,41 @@ class _Tracker:
         distance_m = np.linalg.norm(expected.position_m - crossed.position_m[row], axis=-1)
         if distance_m.min(initial=np.inf) < SEPARATION_M:
             return int(distance_m.argmin())
-        if len(set(self._viewpoint[crossed.seen[row]].tolist())) < TRUSTED_VIEWPOINTS:
+        if crossed.num_viewpoints[row] < TRUSTED_VIEWPOINTS:
             return -1
         surprise = np.where(is_open, _surprise(crossed, row, expected), np.inf)
         return int(surprise.argmin()) if surprise.min(initial=np.inf) < SURPRISING else -1
 
-    def _seen_by_one(
-        self, rest: CameraSightings, others: Int[np.ndarray, "crossings cameras"], missed: list[int]
-    ) -> SingleViews:
-        """The views of drones that have no measurement, among the detections that are of no other drone."""
-        state = self._motion.state
-        views = find_single_views(
-            self._cameras,
-            rest,
-            np.isfinite(rest.without(*_camera_and_box(others)).noise_px),
-            self._density_px2,
-            np.asarray(state.apparent_m[missed]),
-            np.asarray(state.covariance[missed, :3, :3]),
-            np.array([self._drones[number].dispersion for number in missed]),
+    def _expected(self, numbers: list[int]) -> Expected:
+        """Where drones are expected."""
+        return Expected(
+            np.asarray(self._motion.state.apparent_m[numbers]),
+            np.asarray(self._motion.state.covariance[numbers, :3, :3]),
+            np.array([self._drones[number].dispersion for number in numbers]),
         )
-        return replace(views, drone=np.array(missed, int)[views.drone])
 
-    def _at_instant(self, view: CameraSightings, numbers: list[int]) -> CameraSightings:
+    def _at_instant(self, view: Sightings, numbers: list[int]) -> Sightings:
         """The detections as they would be if all frames had been exposed at the instant."""
-        if view.exposures is None:
-            return view
         state = self._motion.state
-        variance = np.asarray(state.covariance[numbers, 3:6, 3:6]).trace(axis1=-2, axis2=-1) / 3
         return moved_to_instant(
             self._cameras,
             view,
             np.asarray(state.apparent_m[numbers]),
             np.asarray(state.velocity_m_s[numbers]),
-            np.sqrt(np.maximum(variance, 0.0)),
+            np.asarray(state.covariance[numbers, 3:6, 3:6]),
             self._settings.motion.velocity_std_m_s,
         )
 
     def _correct(self, measured: dict[int, Measurement], seen_by_one: SingleViews) -> None:
         """Correct the motion model by the measurements, and by the views of drones that have none."""
-        lost = np.zeros(len(self._motion), bool)
         for number, drone in enumerate(self._drones):
             drone.missed = 0 if number in measured else drone.missed + 1
             drone.unseen = 0 if number in measured or number in seen_by_one.drone else drone.unseen + 1
-            lost[number] = drone.unseen > self._max_coasting_frames
         predicted_m_s = np.asarray(self._motion.state.velocity_m_s)
         for index, number in enumerate(seen_by_one.drone.tolist()):
             view = seen_by_one.jacobian[index], seen_by_one.off_px[index], seen_by_one.noise_px[index]
             self._motion.correct_in_image(number, *view)
-        self._motion.correct(measured, seen_by_one.drone, lost)
+        self._motion.correct(measured, seen_by_one.drone.tolist())
         for number, one in measured.items():
             if one.surprising:
                 # The filter would treat the position as an outlier for a second, but all viewpoints agree on it.
@@ -315,14 +278,12 @@ class _Tracker:
             max_speed_m_s=self._max_speed_m_s,
             max_births=None if count is None else max(count - known, 0),
         )
-        self._births.take(
-            each for each, row in zip(candidates, assignment, strict=True) if row >= 0 or row == NEW
-        )
-        for candidate, row in zip(candidates, assignment.tolist(), strict=True):
-            if row >= 0 or row == NEW:
-                number = int(lost.drone[row]) if row >= 0 else self._new_drone()
-                self._history.begins(candidate.instant, number, again=row >= 0)
-                self._start(candidate, number, frame)
+        begun = [each for each in zip(candidates, assignment.tolist(), strict=True) if each[1] != NO_DRONE]
+        self._births.take(candidate for candidate, _ in begun)
+        for candidate, row in begun:
+            number = self._new_drone() if row == NEW else int(lost.drone[row])
+            self._history.begins(candidate.instant, number, again=row != NEW)
+            self._start(candidate, number, frame)
 
     def _start(self, candidate: TrackCandidate, number: int, frame: int) -> None:
         """Start a track at the frame in which the candidate was first seen, and follow it to the present frame."""
@@ -336,27 +297,19 @@ class _Tracker:
         for instant in range(candidate.instant + 1, frame + 1):
             motion.predict()
             one = candidate.path.get(instant)
-            motion.correct({} if one is None else {0: one}, np.empty(0, int), np.zeros(len(motion), bool))
+            motion.correct({} if one is None else {0: one})
             drone.missed = drone.unseen = 0 if one is not None else drone.missed + 1
             self._note(instant, number, motion, 0, one)
-        self._motion.take(number, motion, 0)
-
-
-def _camera_and_box(
-    box: Int[np.ndarray, "crossings cameras"],
-) -> tuple[Int[np.ndarray, "used"], Int[np.ndarray, "used"]]:
-    """(used,), cameras and boxes of the detections in crossings."""
-    row, camera = np.nonzero(box >= 0)
-    return camera, box[row, camera]
+        self._motion.put(number, motion.state)
 
 
 def _boxes_px(
     cameras: Camera, position_m: Float[np.ndarray, "drones 3"], span_m: Float[np.ndarray, "drones 2"]
 ) -> Float[np.ndarray, "drones cameras 4"]:
-    """Boxes of drones as in `KnownDrones`; NaN where a drone's place or width is not known, or has no image."""
+    """Middles and half lengths of drones' boxes; NaN where a drone's size is not known, or its place has no image."""
     pixels, _ = project_visible(cameras, position_m[:, None])
     half_px = sizes_px(cameras, np.asarray(to_camera(cameras, position_m[:, None])), span_m[:, None]) / 2
-    return np.concatenate([pixels + 0.5, np.broadcast_to(half_px, pixels.shape)], axis=-1)
+    return np.concatenate([pixels, half_px], axis=-1)
 
 
 def _surprise(crossed: Crossings, row: int, expected: Expected) -> Float[np.ndarray, "drones"]:

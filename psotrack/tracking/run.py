@@ -305,9 +305,9 @@ class SwarmRun:
         box_px = np.asarray(rows.box_px, np.float64)
         explains = np.asarray(np.isfinite(box_px).all(axis=-1).any(axis=-1))
         position_m = np.where(explains[..., None], np.asarray(rows.position_m, np.float64), np.nan)
-        for frame, view in enumerate(unexplained(block.blobs, box_px)):
-            known = KnownDrones(position_m[frame], size_m, box_px[frame])
-            births.step(int(block.instant[frame]), view, known)
+        shown = unexplained(block.blobs, box_px)
+        for frame, instant in enumerate(block.instant.tolist()):
+            births.step(instant, shown[frame], KnownDrones(position_m[frame], size_m, box_px[frame]))
         found = births.candidates()
         if is_first:
             block.births[key] = found, births.copy()
