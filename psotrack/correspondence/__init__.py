@@ -1,7 +1,7 @@
 """Correspondence: which detections of several cameras are of the same drone (paper, figure 8), in float64.
 
 In: detections of one frame in all cameras, and expected positions of drones. Out: `Matches`, groups of detections with
-their 3D points. `Sightings` holds the boxes of a detector, or the blobs of silhouettes, of a whole recording in arrays.
+their 3D points. `Sightings` holds the boxes of a detector, or the blobs of silhouettes, in arrays.
 Other rooms may use every name in `__init__.pyi`.
 
 `match` searches for the assignment with the smallest total cost. A detection in a group costs its squared distance from
