@@ -16,7 +16,7 @@ from helpers import ring_rig
 
 from psotrack.datasets import open_recording
 from psotrack.errors import OutputError, SettingsError
-from psotrack.live import CameraRecorder, RecordingFolder
+from psotrack.live import CameraRecorder, recording_folder
 from psotrack.recordings import Recording, read_frames
 
 SIZE_WH = (320, 240)
@@ -62,16 +62,14 @@ def wait_for_row(times: Path, count: int) -> None:
 
 def test_what_was_filmed_is_a_recording(laboratory: Recording, tmp_path: Path) -> None:
     folder = tmp_path / "flight"
-    kept = RecordingFolder(folder, laboratory, RIG.names)
-    kept.begin()
-    recorders = [CameraRecorder(folder, name, 25.0) for name in RIG.names]
-    # A camera that starts later; and one that never films.
-    keep(recorders[0], 30)
-    keep(recorders[1], 20, first=5)
-    assert vars(recorders[0].close()) == {"frames": 30, "left_out": 0}
-    assert vars(recorders[1].close()) == {"frames": 20, "left_out": 0}
-    assert vars(recorders[2].close()) == {"frames": 0, "left_out": 0}
-    kept.end()
+    with recording_folder(folder, laboratory, RIG.names):
+        recorders = [CameraRecorder(folder, name, 25.0) for name in RIG.names]
+        # A camera that starts later; and one that never films.
+        keep(recorders[0], 30)
+        keep(recorders[1], 20, first=5)
+        assert vars(recorders[0].close()) == {"frames": 30, "left_out": 0}
+        assert vars(recorders[1].close()) == {"frames": 20, "left_out": 0}
+        assert vars(recorders[2].close()) == {"frames": 0, "left_out": 0}
     found = open_recording(folder / "recording.toml")
     assert found.rig.names == RIG.names[:2]
     assert np.allclose(found.rig.cameras.T_cam_world, RIG.cameras.T_cam_world[:2], atol=1e-6)
@@ -130,7 +128,6 @@ def run(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
 
 def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path) -> None:
     folder = tmp_path / "flight"
-    RecordingFolder(folder, laboratory, RIG.names).begin()
     script = """
         for index in range(60):
             for recorder in recorders:
@@ -139,8 +136,9 @@ def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path)
         time.sleep(0.5)
         os.kill(os.getpid(), 9)
     """
-    assert run(script, folder, *RIG.names).returncode == -9
-    found = open_recording(folder)
+    with recording_folder(folder, laboratory, RIG.names):
+        assert run(script, folder, *RIG.names).returncode == -9
+        found = open_recording(folder)
     for name in RIG.names:
         # 32 KiB and the last frame are lost: these frames of noise take 20 KiB and more.
         assert 55 <= found.videos[name].num_frames < 60
@@ -167,24 +165,34 @@ class TestFolder:
         folder.mkdir()
         (folder / "notes.txt").write_text("mine")
         (folder / f"{RIG.names[0]}.avi").write_bytes(b"an earlier video")
-        with pytest.raises(OutputError, match="expected a new or an empty folder, found a folder with files"):
-            RecordingFolder(folder, laboratory, RIG.names)
-        RecordingFolder(folder, laboratory, RIG.names, force=True).begin()
+        refused = "expected a new or an empty folder, found a folder with files"
+        with pytest.raises(OutputError, match=refused), recording_folder(folder, laboratory, RIG.names):
+            pass
+        with recording_folder(folder, laboratory, RIG.names, force=True):
+            assert not (folder / f"{RIG.names[0]}.avi").exists()
         assert (folder / "notes.txt").read_text() == "mine"
-        assert not (folder / f"{RIG.names[0]}.avi").exists()
+
+    def test_of_cameras_that_never_film_nothing_stays(self, laboratory: Recording, tmp_path: Path) -> None:
+        for _ in range(2):  # the second session is not refused
+            with recording_folder(tmp_path / "flight", laboratory, RIG.names):
+                assert (tmp_path / "flight" / "recording.toml").exists()
+        assert not list((tmp_path / "flight").iterdir())
 
     def test_the_cameras_own_folder_is_refused(self, laboratory: Recording) -> None:
-        with pytest.raises(SettingsError, match="--record: expected another folder"):
-            RecordingFolder(laboratory.folder, laboratory, RIG.names, force=True)
+        check_refused(SettingsError, "--record: expected another folder", laboratory, laboratory.folder)
 
     def test_odd_sizes_are_refused(self, laboratory: Recording, tmp_path: Path) -> None:
         odd = replace(laboratory, rig=ring_rig(3, image_size_wh=(321, 240)))
-        with pytest.raises(SettingsError, match=r"even numbers of pixels, .* found 321 x 240 of camera"):
-            RecordingFolder(tmp_path / "flight", odd, odd.rig.names)
+        expected = r"even numbers of pixels, .* found 321 x 240 of camera"
+        check_refused(SettingsError, expected, odd, tmp_path / "flight")
 
     def test_a_folder_that_cannot_be_made_is_one_line(self, laboratory: Recording, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
-        with pytest.raises(OutputError, match="expected a folder that can be written"):
-            RecordingFolder(tmp_path / "file" / "flight", laboratory, RIG.names).begin()
-        with pytest.raises(OutputError, match="expected a folder that can be written, found File exists"):
-            RecordingFolder(tmp_path / "file", laboratory, RIG.names).begin()
+        expected = "expected a folder that can be written"
+        check_refused(OutputError, expected, laboratory, tmp_path / "file" / "flight")
+        check_refused(OutputError, f"{expected}, found File exists", laboratory, tmp_path / "file")
+
+
+def check_refused(error: type[Exception], words: str, recording: Recording, folder: Path) -> None:
+    with pytest.raises(error, match=words), recording_folder(folder, recording, RIG.names, force=True):
+        pass

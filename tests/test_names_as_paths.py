@@ -17,7 +17,7 @@ from psotrack.detection import LabelSettings, write_data_set
 from psotrack.errors import InputError, PsotrackError
 from psotrack.exchange import Footage, export_tracks
 from psotrack.flights import TrackedFlight
-from psotrack.live import RecordingFolder
+from psotrack.live import recording_folder
 from psotrack.overlay import OverlayOptions, write_overlays
 from psotrack.recordings import Recording
 from psotrack.silhouettes import masks_out
@@ -178,8 +178,9 @@ def test_names_of_cameras_in_boxes_of_motchallenge(evil_recording, tmp_path):
 
 
 def test_names_of_cameras_in_a_recording_of_a_live_session(evil_recording, tmp_path):
-    with pytest.raises(InputError, match=r"found '\.\./evil'"):
-        RecordingFolder(tmp_path / "in" / "out", evil_recording, evil_recording.rig.names).begin()
+    out, names = tmp_path / "in" / "out", evil_recording.rig.names
+    with pytest.raises(InputError, match=r"found '\.\./evil'"), recording_folder(out, evil_recording, names):
+        pass
     assert not list(tmp_path.rglob("*evil*"))
 
 

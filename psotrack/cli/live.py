@@ -147,10 +147,10 @@ def live(
         WAIT_S,
         CameraRecorder,
         LiveSession,
-        RecordingFolder,
         UdpLines,
         WebSocketLines,
         live_cameras,
+        recording_folder,
         write_lines,
     )
     from psotrack.pipeline import warn_of_missing_drones, with_real_time
@@ -173,9 +173,7 @@ def live(
     if replay:
         recording = recording.usable(camera_names(cameras))
     used = live_cameras(recording, camera_names(cameras), replay=replay, speed=speed, loops=loops)
-    kept = None
     if record is not None:
-        kept = RecordingFolder(record, recording, [camera.name for camera in used], force=force)
         used = [replace(each, recorder=CameraRecorder(record, each.name, each.fps)) for each in used]
     first_s = float(recording.timeline().time_s[0]) if replay else 0.0
     session = LiveSession(
@@ -188,6 +186,9 @@ def live(
         wait_s=WAIT_S / min(1.0, speed) if replay else WAIT_S,
     )
     with contextlib.ExitStack() as stack:
+        if record is not None:
+            names = [camera.name for camera in used]
+            stack.enter_context(recording_folder(record, recording, names, force=force))
         outputs: list[RowsOutput] = [partial(write_lines, sys.stdout)] if lines else []
         if udp is not None:
             outputs.append(stack.enter_context(contextlib.closing(UdpLines(udp))).write)
@@ -198,9 +199,6 @@ def live(
             outputs.append(server.write)
             if not quiet:
                 click.echo(f"rows are sent to clients of {server.address}", err=True)
-        if kept is not None:
-            kept.begin()
-            stack.callback(kept.end)
         if out is not None:
             rows = stack.enter_context(RowStream(out, force=force, record=out.with_suffix(".json")))
             outputs.insert(0, rows.write)

@@ -1,7 +1,7 @@
 from .cameras import LiveCamera, live_cameras
 from .meeting import CameraCounts, Instant, Meeting
 from .messages import UdpLines, lines_of, write_lines
-from .recorder import CameraRecorder, RecordedCounts, RecordingFolder
+from .recorder import CameraRecorder, RecordedCounts, recording_folder
 from .session import WAIT_S, LiveResult, LiveSession, RowsOutput
 from .sources import CameraStream, LiveSource, ReplayedVideo, SourceFrame
 from .stream_clock import StreamClock
@@ -19,7 +19,6 @@ __all__ = [
     "LiveSource",
     "Meeting",
     "RecordedCounts",
-    "RecordingFolder",
     "ReplayedVideo",
     "RowsOutput",
     "SourceFrame",
@@ -28,5 +27,6 @@ __all__ = [
     "WebSocketLines",
     "lines_of",
     "live_cameras",
+    "recording_folder",
     "write_lines",
 ]

@@ -60,7 +60,7 @@ def live_cameras(
     """
     rig = recording.rig if names is None else recording.rig.select(chosen_cameras(names, recording.rig.names))
     found = []
-    for name, (width, height) in zip(rig.names, rig.cameras.image_size_wh.tolist(), strict=True):
+    for name, (width, height) in zip(rig.names, rig.cameras.image_size_wh.astype(int).tolist(), strict=True):
         times = recording.frame_times.get(name)
         source: LiveSource
         if replay and times is not None and name in recording.videos:

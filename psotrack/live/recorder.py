@@ -15,7 +15,7 @@ import queue
 import shutil
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -160,8 +160,14 @@ def _readable_frames(video: Path) -> int:
         return 0
 
 
-class RecordingFolder:
-    """The folder of a recording that is made while the cameras film.
+@contextlib.contextmanager
+def recording_folder(
+    folder: Path, recording: Recording, names: Sequence[str], *, force: bool = False
+) -> Iterator[None]:
+    """Write what belongs to a recording beside videos and times, which cameras make during the block.
+
+    At its beginning the folder gets the rig, the images of what is ignored, and a recording.toml with all cameras. At
+    its end cameras without two frames are left out of the recording.toml; where no camera has two, nothing stays.
 
     Args:
         folder: the folder; it is created.
@@ -170,82 +176,68 @@ class RecordingFolder:
         force: write into a folder that is not empty.
 
     Raises:
-        OutputError: the folder is not empty and `force` is not set.
+        OutputError: the folder is not empty and `force` is not set, or it cannot be written.
         SettingsError: it is the folder of the recording that names the cameras, or the images of a camera have an odd
             size.
     """
-
-    def __init__(
-        self, folder: Path, recording: Recording, names: Sequence[str], *, force: bool = False
-    ) -> None:
-        self._folder, self._recording = folder, recording
-        self._rig = recording.rig.select(names)
-        if folder.resolve() == recording.folder.resolve():
-            found = "that of the cameras' recording.toml"
-            raise SettingsError("--record", expected="another folder", found=found)
-        for name, (width, height) in zip(names, self._rig.cameras.image_size_wh.tolist(), strict=True):
-            if width % 2 or height % 2:
-                expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
-                found = f"{width} x {height} of camera {name}"
-                raise SettingsError("--record", expected=expected, found=found)
-        self._tables = {name: self._table(name) for name in names}
-        if not force and folder.is_dir() and any(folder.iterdir()):
-            expected, found = "a new or an empty folder", "a folder with files"
-            remedy = "pass --force to replace an earlier recording in it"
-            raise OutputError(folder, expected=expected, found=found, remedy=remedy)
-
-    def begin(self) -> None:
-        """Write the rig, the images of what is ignored, and a recording.toml with all cameras.
-
-        Raises:
-            OutputError: the folder cannot be written.
-        """
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            # Otherwise the files of an earlier recording would be taken for those of a camera that stays silent.
-            self._remove_files()
-            for name, table in self._tables.items():
-                if table.ignore is not None:
-                    shutil.copyfile(self._recording.ignore[name], self._folder / table.ignore)
-        except OSError as error:
-            expected, found = "a folder that can be written", error.strerror or f"{error}"
-            raise OutputError(self._folder, expected=expected, found=found) from error
-        write_rig(self._folder / _RIG_FILE, self._rig, force=True)
-        self._write(self._tables)
-
-    def end(self) -> None:
-        """Leave cameras out of the recording.toml that have no two frames; where no camera has, remove all files.
-
-        Raises:
-            OutputError: the recording.toml cannot be written; then it still names all cameras.
-        """
+    rig = recording.rig.select(names)
+    _check_folder(folder, recording, force)
+    for name, (width, height) in zip(names, rig.cameras.image_size_wh.astype(int).tolist(), strict=True):
+        if width % 2 or height % 2:
+            expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
+            raise SettingsError("--record", expected=expected, found=f"{width} x {height} of camera {name}")
+    tables = {name: _table(recording, name) for name in names}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Otherwise the files of an earlier recording would be taken for those of a camera that stays silent.
+        _remove_files(folder, tables)
+        for name, table in tables.items():
+            if table.ignore is not None:
+                shutil.copyfile(recording.ignore[name], folder / table.ignore)
+    except OSError as error:
+        expected, found = "a folder that can be written", error.strerror or f"{error}"
+        raise OutputError(folder, expected=expected, found=found) from error
+    write_rig(folder / _RIG_FILE, rig, force=True)
+    _write_tables(folder, tables, recording)
+    try:
+        yield
+    finally:
         there = {
-            name: table
-            for name, table in self._tables.items()
-            if _readable_frames(self._folder / f"{table.video}") >= 2
+            name: table for name, table in tables.items() if _readable_frames(folder / f"{table.video}") >= 2
         }
         if there:
-            self._write(there)
+            _write_tables(folder, there, recording)
         else:
-            # So that the folder can be used again.
-            with contextlib.suppress(OSError):
-                self._remove_files()
+            _remove_files(folder, tables)
 
-    def _table(self, name: str) -> CameraTable:
-        video, times = _files_of(name)
-        ignore, line_time_s = self._recording.ignore.get(name), self._recording.line_time_s.get(name, 0.0)
-        copied = None if ignore is None else f"{name}_ignore{ignore.suffix}"
-        return CameraTable(video=video, timestamps=times, ignore=copied, line_time_s=line_time_s)
 
-    def _remove_files(self) -> None:
-        """Remove the files of this recording, or of an earlier one."""
-        of_cameras = [(each.video, each.timestamps, each.ignore) for each in self._tables.values()]
-        for file in (_RIG_FILE, RECORDING_FILE, *itertools.chain(*of_cameras)):
-            if file is not None:
-                (self._folder / f"{file}").unlink(missing_ok=True)
+def _check_folder(folder: Path, recording: Recording, force: bool) -> None:
+    if folder.resolve() == recording.folder.resolve():
+        found = "that of the cameras' recording.toml"
+        raise SettingsError("--record", expected="another folder", found=found)
+    if not force and folder.is_dir() and any(folder.iterdir()):
+        expected, found = "a new or an empty folder", "a folder with files"
+        remedy = "pass --force to replace an earlier recording in it"
+        raise OutputError(folder, expected=expected, found=found, remedy=remedy)
 
-    def _write(self, tables: Mapping[str, CameraTable]) -> None:
-        bounds_m = self._recording.bounds_m
-        world = WorldTable() if bounds_m is None else WorldTable(bounds_m=(bounds_m[0::2], bounds_m[1::2]))
-        content = RecordingFile(version=1, calibration=_RIG_FILE, cameras=tables, world=world)
-        write_recording_file(self._folder / RECORDING_FILE, content)
+
+def _table(recording: Recording, name: str) -> CameraTable:
+    video, times = _files_of(name)
+    ignore, line_time_s = recording.ignore.get(name), recording.line_time_s.get(name, 0.0)
+    copied = None if ignore is None else f"{name}_ignore{ignore.suffix}"
+    return CameraTable(video=video, timestamps=times, ignore=copied, line_time_s=line_time_s)
+
+
+def _remove_files(folder: Path, tables: Mapping[str, CameraTable]) -> None:
+    """Remove the files of a recording."""
+    of_cameras = [(each.video, each.timestamps, each.ignore) for each in tables.values()]
+    for file in (_RIG_FILE, RECORDING_FILE, *itertools.chain(*of_cameras)):
+        if file is not None:
+            (folder / f"{file}").unlink(missing_ok=True)
+
+
+def _write_tables(folder: Path, tables: Mapping[str, CameraTable], recording: Recording) -> None:
+    bounds_m = recording.bounds_m
+    world = WorldTable() if bounds_m is None else WorldTable(bounds_m=(bounds_m[0::2], bounds_m[1::2]))
+    content = RecordingFile(version=1, calibration=_RIG_FILE, cameras=tables, world=world)
+    write_recording_file(folder / RECORDING_FILE, content)

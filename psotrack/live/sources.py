@@ -12,7 +12,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -115,23 +114,27 @@ class CameraStream:
     def frames(self, begin: Callable[[], float], stopped: Callable[[], bool]) -> Generator[SourceFrame | str]:
         """See `LiveSource`: frames are read when they arrive, by a thread of its own, and wait until they are taken."""
         began_s, is_over = begin(), threading.Event()
-        waiting: queue.SimpleQueue[SourceFrame | str | None] = queue.SimpleQueue()
+        waiting: queue.SimpleQueue[SourceFrame | str | Exception | None] = queue.SimpleQueue()
 
         def read() -> None:
             try:
                 for frame in self._read(began_s, lambda: is_over.is_set() or stopped()):
                     waiting.put(frame)
-            finally:
                 waiting.put(None)
+            except Exception as error:
+                waiting.put(error)
 
-        with ThreadPoolExecutor(1) as threads:
-            reader = threads.submit(read)
-            try:
-                while (frame := waiting.get()) is not None:
-                    yield frame
-            finally:
-                is_over.set()
-            reader.result()
+        # A daemon: the program ends also where nobody closes the generator.
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        try:
+            while (frame := waiting.get()) is not None:
+                if isinstance(frame, Exception):
+                    raise frame
+                yield frame
+        finally:
+            is_over.set()
+            reader.join()
 
     def _read(self, began_s: float, stopped: Callable[[], bool]) -> Iterator[SourceFrame | str]:
         """The frames as they arrive, from one connection after the other."""
@@ -159,7 +162,9 @@ class CameraStream:
                 else:
                     yield _BY_ARRIVAL
             capture.release()
-            if is_open and not stopped():
+            if stopped():
+                return
+            if is_open:
                 yield f"{shown} has broken off; it is tried again every second"
             time.sleep(_AGAIN_S)
 
