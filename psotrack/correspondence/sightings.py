@@ -113,20 +113,26 @@ def from_boxes(
     centre_px: Float[np.ndarray, "rows 2"],
     size_px: Float[np.ndarray, "rows 2"],
     is_part: Bool[np.ndarray, "rows"],
-    num_images: int,
+    num_frames: int,
+    num_cameras: int,
+    exposures: Exposures | None = None,
 ) -> Sightings:
-    """Make sightings from a list of boxes, with images in place of cameras.
+    """Make sightings from a list of boxes.
 
     Args:
-        image: (rows,), number of the image in which the box is.
+        image: (rows,), number of the image in which the box is: frame * `num_cameras` + camera.
         centre_px, size_px: (rows, 2), as in `Sightings`.
         is_part: (rows,), whether the image's border, or something else, cuts what is in the box.
-        num_images: number of images.
+        num_frames, num_cameras: numbers of frames and of cameras.
+        exposures: as in `Sightings`.
     """
     noise_px = NOISE_PX + np.where(is_part, CUT_SHARE, NOISE_SHARE) * np.sqrt(size_px.prod(axis=-1))
-    columns = centre_px, size_px, noise_px
-    centre_px, size_px, noise_px = (by_image(image, values, num_images) for values in columns)
-    return Sightings(centre_px, size_px, noise_px)
+
+    def arranged(values: np.ndarray) -> np.ndarray:
+        by_number = by_image(image, values, num_frames * num_cameras)
+        return by_number.reshape(num_frames, num_cameras, *by_number.shape[1:])
+
+    return Sightings(arranged(centre_px), arranged(size_px), arranged(noise_px), exposures)
 
 
 def by_image(
@@ -159,7 +165,7 @@ def from_detections(detections: Mapping[str, Detections], rig: Rig, num_frames: 
             width_height = rig.cameras.image_size_wh[index]
             cut = np.any((low < BORDER_PX) | (high > width_height - BORDER_PX), axis=-1)
             rows.append((boxes.frame[used] * len(rig) + index, (low + high) / 2 - 0.5, high - low, cut))
-    return _of_video(rows, num_frames, len(rig))
+    return from_boxes(*_joined(rows), num_frames, len(rig))
 
 
 def from_silhouettes(
@@ -183,17 +189,11 @@ def from_silhouettes(
                     image = np.full(len(blobs.whole), frame * num_cameras + camera)
                     rows.append((image, blobs.centre_px, blobs.size_px, ~blobs.whole))
             advance(len(chunk))
-    exposures = silhouettes.exposures
-    return _of_video(rows, stop - first, num_cameras, None if exposures is None else exposures[first:stop])
+    exposures = None if silhouettes.exposures is None else silhouettes.exposures[first:stop]
+    return from_boxes(*_joined(rows), stop - first, num_cameras, exposures)
 
 
-def _of_video(
-    rows: list[_Rows], num_frames: int, num_cameras: int, exposures: Exposures | None = None
-) -> Sightings:
-    """Sightings from lists of boxes; image i is of frame i // `num_cameras`."""
+def _joined(rows: list[_Rows]) -> _Rows:
     none = np.empty(0, int), np.empty((0, 2)), np.empty((0, 2)), np.empty(0, bool)
     image, centre_px, size_px, is_part = (np.concatenate(parts) for parts in zip(none, *rows, strict=True))
-    found = from_boxes(image, centre_px, size_px, is_part, num_frames * num_cameras)
-    return found.with_arrays(
-        lambda values: values.reshape(num_frames, num_cameras, *values.shape[1:]), exposures
-    )
+    return image, centre_px, size_px, is_part

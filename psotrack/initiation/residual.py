@@ -102,10 +102,7 @@ def unexplained(blobs: FrameBlobs, box_px: Float[np.ndarray, "frames drones came
     size_px, centre_px = (last - first) * blobs.reduction, (first + last) / 2 * blobs.reduction - 0.5
     num_frames, num_cameras = blobs.coverage.shape[:2]
     image = num_cameras * frame + camera
-    found = from_boxes(image, centre_px, size_px, ~whole, num_images=num_frames * num_cameras)
-    return found.with_arrays(
-        lambda values: values.reshape(num_frames, num_cameras, *values.shape[1:]), blobs.exposures
-    )
+    return from_boxes(image, centre_px, size_px, ~whole, num_frames, num_cameras, blobs.exposures)
 
 
 #: Corners of blobs, cells; whether each is whole; their frames and cameras.

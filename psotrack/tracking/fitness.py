@@ -70,7 +70,8 @@ class Score(Protocol):
         """Scores in [0, 1] of every drone in every camera, and the weight of each camera in [0, 1].
 
         The fitness of a drone is the mean of its scores, weighted by these weights (see `drone_fitness`). The tracker
-        also fits a paraboloid through the scores, so a score that changes smoothly gives better positions.
+        also fits a paraboloid through the scores, so a score that changes smoothly gives better positions. For the
+        search before it, `psotrack.tracking.foreground_and_area` rounds the edges of boxes to the pixels that it reads.
 
         Args:
             inputs: extents of the drones and silhouettes of one frame. `psotrack.geometry.project_boxes` gives the

@@ -176,6 +176,7 @@ class SwarmRun:
         self.fps, self.max_speed_m_s = setting.fps, settings.motion.speed_limit_m_s
         self.program = tracker_program(settings, setting.reduction, on_cpu=on_cpu)
         self._most = settings.drones.count or most_drones
+        # What is followed now, and what was followed before the block that was searched last.
         self._births = self._births_before = Births(
             setting.rig.cameras,
             BirthRules(
