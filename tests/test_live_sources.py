@@ -11,11 +11,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import ring_rig
 
-from psotrack.live import CameraStream, SourceFrame, StreamClock
+from psotrack.live import CameraStream, SourceFrame, StreamClock, live_cameras
+from psotrack.recordings import Recording
 
 SIZE_WH = (64, 48)
 FPS = 25.0
+
+
+def test_cameras_have_the_short_names_of_other_commands() -> None:
+    rig = ring_rig(3, image_size_wh=SIZE_WH)
+    streams = {name: f"rtsp://camera/{name}" for name in rig.names}
+    recording = Recording("laboratory", Path("laboratory"), rig, {}, streams=streams)
+    cameras = live_cameras(recording, ["0", "2"], replay=False)
+    assert [camera.name for camera in cameras] == [rig.names[0], rig.names[2]]
+    assert cameras[1].source == CameraStream(streams[rig.names[2]], SIZE_WH)
 
 
 def clock_times(stream_s: np.ndarray, arrived_s: np.ndarray) -> tuple[np.ndarray, list[bool | None]]:

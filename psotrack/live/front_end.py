@@ -183,15 +183,17 @@ class FrontEnd:
     def _take(self, index: int, frame: SourceFrame, silhouettes: CameraSilhouettes) -> None:
         """A frame: what the tracker waits for comes first."""
         camera, meeting = self._cameras[index], self._meeting
+        # That of the middle row of a rolling shutter, as in a recording.
+        time_s = frame.time_s + camera.line_time_s * frame.image.shape[0] / 2
         with self._changed:
             self._said[index] = ""
             again = " again" if meeting.cameras[index].has_filmed else ""
-            if meeting.announce(index, frame.time_s, time.monotonic()):
+            if meeting.announce(index, time_s, time.monotonic()):
                 logger.warning("camera %s films%s", camera.name, again)
         is_late = time.monotonic() - frame.arrived_s > self._wait_s
         image = silhouettes.look(None if is_late else frame.image)
         with self._changed:
-            meeting.put(index, frame.time_s, image, frame.arrived_s)
+            meeting.put(index, time_s, image, frame.arrived_s)
             self._changed.notify_all()
             if not is_late:
                 # Silhouettes of other cameras come first, which the tracker waits for.
