@@ -29,7 +29,9 @@ def _put(meeting: Meeting, camera: int, number: int, time_s: float, now_s: float
 
 
 def _meeting(count: int = 3, fps: float = 25.0) -> Meeting:
-    return Meeting([fps] * count, fps, wait_s=WAIT_S)
+    meeting = Meeting([fps] * count, fps, wait_s=WAIT_S)
+    meeting.began_s = 0.0
+    return meeting
 
 
 def _all(meeting: Meeting, now_s: float) -> list[Instant]:

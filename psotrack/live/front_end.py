@@ -20,7 +20,7 @@ from jaxtyping import UInt8
 
 from psotrack.live.addresses import ANSWER_S
 from psotrack.live.cameras import LiveCamera
-from psotrack.live.meeting import Instant, Meeting, MeetingCamera
+from psotrack.live.meeting import Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import SourceFrame
 from psotrack.silhouettes import ForegroundSettings, LivingBackground, coverage, ignored_pixels, reduce_frame
@@ -45,39 +45,22 @@ class FrontEnd:
     Args:
         cameras: the cameras.
         settings: settings of the silhouettes.
-        rate_hz: instants per second.
-        first_s: time of the first instant on the recording's clock, seconds.
-        wait_s: how long an instant waits for cameras, seconds. A frame that has waited for longer is left out, so that
-            the delay does not grow.
+        meeting: brings their frames together. A frame that has waited for longer than an instant does is left out, so
+            that the delay does not grow.
 
     Attributes:
-        cameras: state of each camera, by name.
-        began_s: time at which the recording's clock shows 0, `time.monotonic`; infinite until the cameras film.
         num_left_out: number of complete instants that were left out, because the tracker was too slow.
         errors: errors that have ended cameras, by the camera's index.
         recorded: what happened to the frames that are kept, by the camera's name; complete at the end.
     """
 
-    def __init__(
-        self,
-        cameras: Sequence[LiveCamera],
-        settings: ForegroundSettings,
-        rate_hz: float,
-        *,
-        first_s: float,
-        wait_s: float,
-    ) -> None:
-        self._cameras, self._settings, self._wait_s = cameras, settings, wait_s
-        self._meeting = Meeting([each.fps for each in cameras], rate_hz, wait_s=wait_s, first_s=first_s)
-        self.cameras: dict[str, MeetingCamera] = {
-            camera.name: state for camera, state in zip(cameras, self._meeting.cameras, strict=True)
-        }
+    def __init__(self, cameras: Sequence[LiveCamera], settings: ForegroundSettings, meeting: Meeting) -> None:
+        self._cameras, self._settings, self._meeting = cameras, settings, meeting
         self._changed = threading.Condition()
         self._ready = threading.Semaphore(0)
         # No `threading.Event`: a signal handler that interrupts `set` and calls it again would wait for ever.
         self._is_stopped = False
         self._said = [""] * len(cameras)
-        self.began_s = np.inf
         self.num_left_out = 0
         self.errors: dict[int, Exception] = {}
         self.recorded: dict[str, RecordedCounts] = {}
@@ -111,9 +94,9 @@ class FrontEnd:
             for _ in threads:
                 self._ready.acquire()
             with self._changed:
-                self.began_s = self._meeting.began_s = time.monotonic() + _LEAD_S
+                self._meeting.began_s = time.monotonic() + _LEAD_S
                 self._changed.notify_all()
-            yield from self._complete(self.began_s + longest_s)
+            yield from self._complete(self._meeting.began_s + longest_s)
         finally:
             self.stop()
             with self._changed:
@@ -171,8 +154,8 @@ class FrontEnd:
         """Wait until all sources are ready."""
         self._ready.release()
         with self._changed:
-            self._changed.wait_for(lambda: self.began_s < np.inf or self._is_stopped)
-        return self.began_s
+            self._changed.wait_for(lambda: self._meeting.began_s < np.inf or self._is_stopped)
+        return self._meeting.began_s
 
     def _say(self, index: int, line: str) -> None:
         with self._changed:
@@ -190,7 +173,7 @@ class FrontEnd:
             again = " again" if meeting.cameras[index].has_filmed else ""
             if meeting.announce(index, time_s, time.monotonic()):
                 logger.warning("camera %s films%s", camera.name, again)
-        is_late = time.monotonic() - frame.arrived_s > self._wait_s
+        is_late = time.monotonic() - frame.arrived_s > meeting.wait_s
         image = silhouettes.look(None if is_late else frame.image)
         with self._changed:
             meeting.put(index, time_s, image, frame.arrived_s)

@@ -123,13 +123,14 @@ class Meeting:
 
     Attributes:
         cameras: state of each camera.
-        began_s: when the cameras began, on the caller's clock: none has stopped before.
+        wait_s: how long an instant waits.
+        began_s: when the cameras began, on the caller's clock, infinite before: none has stopped then.
     """
 
     def __init__(self, fps: list[float], rate_hz: float, *, wait_s: float, first_s: float = 0.0) -> None:
         self.cameras = [MeetingCamera(1 / each) for each in fps]
-        self.began_s = 0.0
-        self._rate_hz, self._wait_s, self._first_s = rate_hz, wait_s, first_s
+        self.wait_s, self.began_s = wait_s, np.inf
+        self._rate_hz, self._first_s = rate_hz, first_s
         self._next = 0
 
     @property
@@ -209,7 +210,7 @@ class Meeting:
         arrived_s = [frame.arrived_s for frame in shown if frame]
         is_decided = all(camera.is_decided(at_s) for camera in self.cameras)
         is_in_work = any(camera.reaches(camera.in_work_s, at_s) for camera in self.cameras)
-        if is_in_work or not (is_decided or now_s - min(arrived_s) >= self._wait_s):
+        if is_in_work or not (is_decided or now_s - min(arrived_s) >= self.wait_s):
             return None
         for camera, frame in zip(self.cameras, shown, strict=True):
             camera.counts.missing += camera.films and not frame

@@ -14,7 +14,7 @@ import numpy as np
 from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.live.cameras import LiveCamera
 from psotrack.live.front_end import FrontEnd
-from psotrack.live.meeting import Instant, MeetingCamera
+from psotrack.live.meeting import Instant, Meeting, MeetingCamera
 from psotrack.live.recorder import RecordedCounts
 from psotrack.pipeline import causal_settings, causal_tracker
 from psotrack.recordings import Recording
@@ -90,8 +90,10 @@ class LiveSession:
         sizes_wh = [(int(width), int(height)) for width, height in rig.cameras.image_size_wh]
         scaled = settings.silhouettes.scaled(sizes_wh, usual_drone_px(recording.rig))
         width, height = (-(-np.array(sizes_wh) // scaled.reduction)).max(axis=0).tolist()
-        self._rate_hz = settings.rate_hz or max(camera.fps for camera in cameras)
-        self._front_end = FrontEnd(cameras, scaled, self._rate_hz, first_s=first_s, wait_s=wait_s)
+        fps = [camera.fps for camera in cameras]
+        self._rate_hz = settings.rate_hz or max(fps)
+        self._meeting = Meeting(fps, self._rate_hz, wait_s=wait_s, first_s=first_s)
+        self._front_end = FrontEnd(cameras, scaled, self._meeting)
         self._shape = len(cameras), height, width
         self._line_time_s = np.array([camera.line_time_s for camera in cameras], np.float32)
         self._tracker, self.record = causal_tracker(
@@ -103,7 +105,8 @@ class LiveSession:
             shape=(height, width),
             most_drones=most_drones,
         )
-        self.result = LiveResult(self._front_end.cameras, self._front_end.recorded)
+        states = dict(zip(rig.names, self._meeting.cameras, strict=True))
+        self.result = LiveResult(states, self._front_end.recorded)
 
     def stop(self) -> None:
         """End the session after the present instant; from any thread or signal handler."""
@@ -139,7 +142,7 @@ class LiveSession:
                 for instant in instants:
                     self._track(instant, outputs)
                     result.left_out = front_end.num_left_out
-                    result.seconds = time.monotonic() - front_end.began_s
+                    result.seconds = time.monotonic() - self._meeting.began_s
                     if on_instant is not None:
                         on_instant(result)
                     self._tracker.look_ahead()
