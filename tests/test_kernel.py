@@ -98,4 +98,4 @@ def test_the_tracks_are_those_of_the_swarm():
         return tracks.position_m
 
     # Where rounding puts an edge into the next pixel of a window, the searches end at different corners.
-    np.testing.assert_allclose(tracked("pso-kernel"), tracked("pso"), atol=5e-4)
+    np.testing.assert_allclose(tracked("pso-kernel"), tracked("pso"), atol=1e-4)

@@ -29,8 +29,8 @@ EFFORT = {"particles": 20, "iterations": 15}
 ENTERS = 20
 
 #: Rounding changes which particle is the best, and then the whole search. The vertex of the score, to which each search
-#: converges, stays the same: to a twentieth of a silhouette's cell, which is 2 cm.
-MEDIAN_M = 1e-3
+#: converges, stays the same: to a fortieth of a silhouette's cell, which is 2 cm.
+MEDIAN_M = 0.5e-3
 
 
 def paths():

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -533,8 +534,7 @@ def _run_program(
     """Run a program that computes the silhouettes of a folder in two worker processes.
 
     The program runs the statement `action` itself after `after_frames` reported frames, because a test that watched the
-    program from outside might react too late. `run` waits until stderr is closed, that is until the program and its
-    workers have ended.
+    program from outside might react too late. The program and its workers have ended when this function returns.
     """
     program = f"""
         import contextlib, os, signal, sys
@@ -562,13 +562,19 @@ def _run_program(
             _make_recording(Path({str(folder)!r})), {settings}, cache=Path({str(cache)!r}), jobs=2, report=report
         )
     """
-    return subprocess.run(
+    running = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(program)],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        check=False,
     )
+    # Workers close stderr shortly before the system removes them: until then, what they write is not left over.
+    _, stderr = running.communicate()
+    with contextlib.suppress(ProcessLookupError):
+        while True:
+            os.killpg(running.pid, 0)
+            time.sleep(0.01)
+    return subprocess.CompletedProcess(running.args, running.returncode, None, stderr)
 
 
 def _stored_keys(cache: Path) -> list[str]:

@@ -265,9 +265,11 @@ def step(
     )
     inputs = ScoreInputs(extents, patches, program.score)
     first = _first_particles(key_spread, expected, slots, params, program)
-    # Whole pixels are enough for the search, because the vertex is not bound to the corner that the search finds.
+    # Whole pixels are enough for the search, because a paraboloid about the first vertex gives the position.
     of_search = replace(inputs, patches=replace(patches, whole_cells=program.vertex))
     best = _search(key_search, of_search, first, region, slots, params, program)
+    if program.vertex:
+        best = find_vertex(inputs, best, slots.size_m).position_m
     vertex = find_vertex(inputs, best, slots.size_m, None if exposures is None else exposures.share)
     found = jnp.clip(vertex.position_m, region.low, region.high) if program.vertex else best
     fitness = drone_fitness(inputs, found)
