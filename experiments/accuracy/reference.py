@@ -239,6 +239,8 @@ def main() -> None:
         if any(f"{name}:{method}".startswith(word) for word in options.only)
     )
     table = _runs.save_rows(run, rows, options.data, options.out)
+    if table.empty:
+        parser.error(f"--only: expected names of rows, such as 'S01_D2_A 0:swarm', found {options.only}")
     print(table.to_string(index=False, float_format="{:.3f}".format, na_rep="-"))
     if options.against is not None:
         both = compared(table, pd.read_csv(options.against / "reference.csv"))
