@@ -1,6 +1,7 @@
 """Bounds and speed limit from what moves, two views that begin a track, and the warning of a track that is cut off."""
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -69,9 +70,10 @@ def sightings_of(rig, truth_m, seed=0, clutter=1, hidden=()):
     return Sightings(centre, np.where(np.isfinite(centre), 12.0, np.nan), noise)
 
 
-def tracked(rig, sightings, volume, **status):
+def tracked(rig, sightings, volume, size_m=None, **status):
     motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
     settings = TrackSettings(motion=motion, status=StatusSettings(**status))
+    settings = settings.changed({"drones.size_m": size_m})
     return track_detections(rig.cameras, sightings, settings, fps=FPS, bounds_m=volume.bounds_m)
 
 
@@ -85,6 +87,20 @@ def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
     # The margin beyond the highest drone is a metre; false alarms do not widen the volume.
     assert 16.5 < volume.bounds_m[1, 2] < 20
     assert 11.0 < volume.max_speed_m_s < 2 * 11.0
+
+
+def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
+    """Balls of 5 cm: 2 px wide in the cameras, 28 m away."""
+    rig, truth_m, size_m = ground_rig(4), flights(60, (4.0, 11.0)), (0.05, 0.05, 0.05)
+    drones = sightings_of(rig, truth_m)
+    balls = replace(drones, size_px=drones.size_px / 6.5)
+    assert not len(moving_detections(rig, balls, FPS))
+    volume = flight_volume(rig, moving_detections(rig, balls, FPS, size_m))
+    assert volume.bounds_from == "cameras and moving points"
+    assert tracked(rig, balls, volume).num_drones == 0
+    assert tracked(rig, balls, volume, size_m).num_drones == 2
+    # A given size that is wrong hides no usual drone.
+    assert tracked(rig, drones, volume, size_m).num_drones == 2
 
 
 def test_given_values_win():

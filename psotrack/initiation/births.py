@@ -64,7 +64,7 @@ MAX_HEIGHT_SHARE = 0.3
 #: Smallest height of a drone, as a share of its width: flat drones seen from above determine it badly.
 MIN_HEIGHT_SHARE = 0.1
 #: Largest ratio between the spans of a candidate and of the known drones; limits of the span without known drones,
-#: metres.
+#: metres, which a given size extends.
 SIZE_RATIO, SPANS_M = 2.0, (0.1, 1.5)
 #: A candidate may be faster than the limit by this factor: a line then says that it flies at the limit.
 FASTER = 1.5
@@ -186,11 +186,13 @@ class BirthRules:
             the background was learned; None for sightings that have no ghosts.
         num_frames: number of frames of the recording; None for a recording without end. In a recording of fewer than
             `WINDOW_FRAMES` frames, four fifths of them are enough.
+        size_m: full lengths of the drones, metres; None where they are not given.
     """
 
     min_viewpoints: int | None = None
     ghosts_from: int | None = None
     num_frames: int | None = None
+    size_m: tuple[float, ...] | None = None
 
     @property
     def min_found(self) -> int:
@@ -198,6 +200,14 @@ class BirthRules:
         if self.num_frames is None:
             return MIN_FOUND
         return min(MIN_FOUND, math.ceil(MIN_FOUND / WINDOW_FRAMES * self.num_frames))
+
+    @property
+    def spans_m(self) -> tuple[float, float]:
+        """Smallest and largest span of a drone where none is known, metres."""
+        if self.size_m is None:
+            return SPANS_M
+        span_m = max(self.size_m)
+        return min(SPANS_M[0], span_m / SIZE_RATIO), max(SPANS_M[1], span_m * SIZE_RATIO)
 
 
 class Births:
@@ -391,7 +401,9 @@ class Births:
         points_m, seen = crossed.position_m, crossed.seen
         is_found = np.isfinite(known.position_m).all(axis=-1)
         spans_m = known.size_m[is_found & np.isfinite(known.size_m).all(axis=-1)].max(axis=-1)
-        limits = (spans_m.min() / SIZE_RATIO, spans_m.max() * SIZE_RATIO) if len(spans_m) else SPANS_M
+        limits = self._rules.spans_m
+        if len(spans_m):
+            limits = spans_m.min() / SIZE_RATIO, spans_m.max() * SIZE_RATIO
         span_m = crossed.span_m.max(axis=-1)
         size_m = crossed.span_m[:, [0, 0, 1]]
         # A known drone of unknown size is taken to be as large as the candidate.

@@ -155,24 +155,35 @@ def _extended(rig: Rig, room_m: Float[np.ndarray, "2 3"], points: MovingPoints) 
     return np.stack([low_m, high_m])
 
 
-def moving_detections(rig: Rig, sightings: Sightings, fps: float) -> MovingPoints:
-    """Points that move, from detections; windows begin where at least two viewpoints have detections."""
+def moving_detections(
+    rig: Rig, sightings: Sightings, fps: float, size_m: tuple[float, ...] | None = None
+) -> MovingPoints:
+    """Points that move, from detections; windows begin where at least two viewpoints have detections.
+
+    Args:
+        rig: the cameras.
+        sightings: the detections of all frames.
+        fps: frames per second.
+        size_m: full lengths of the drones, metres, where they are given.
+    """
     seen = np.isfinite(sightings.noise_px).any(axis=-1)
     viewpoint = viewpoints(rig.cameras)
     by_viewpoint = np.stack([seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)], axis=-1)
     frames = np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2)
     # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
-    return _find(rig, lambda some: sightings[some], frames, fps, min_viewpoints=2)
+    return _find(rig, lambda some: sightings[some], frames, fps, BirthRules(2, size_m=size_m))
 
 
-def moving_blobs(rig: Rig, silhouettes: Silhouettes, fps: float) -> MovingPoints:
-    """Points that move, from the blobs of silhouettes."""
+def moving_blobs(
+    rig: Rig, silhouettes: Silhouettes, fps: float, size_m: tuple[float, ...] | None = None
+) -> MovingPoints:
+    """Points that move, from the blobs of silhouettes; arguments as for `moving_detections`."""
 
     def read(frames: Int[np.ndarray, "chosen"]) -> Sightings:
         first, last = int(frames[0]), int(frames[-1])
         return from_silhouettes(silhouettes, first=first, stop=last + 1)[frames - first]
 
-    return _find(rig, read, np.arange(silhouettes.num_frames), fps)
+    return _find(rig, read, np.arange(silhouettes.num_frames), fps, BirthRules(size_m=size_m))
 
 
 def _find(
@@ -180,7 +191,7 @@ def _find(
     read: Callable[[Int[np.ndarray, "chosen"]], Sightings],
     frames: Int[np.ndarray, "frames"],
     fps: float,
-    min_viewpoints: int | None = None,
+    rules: BirthRules,
 ) -> MovingPoints:
     """Points that move, in windows that are spread over the frames: drones that are born there.
 
@@ -190,7 +201,7 @@ def _find(
         frames: (frames,), numbers of the frames from which windows may begin, ascending; the last window ends at the
             last of them.
         fps: frames per second.
-        min_viewpoints: as in `Births`.
+        rules: what is asked of a drone.
     """
     step = max(1, round(STEP_S * fps))
     last = 0 if not len(frames) else int(frames[-1])
@@ -201,7 +212,7 @@ def _find(
         sightings = read(np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step))
         births = Births(
             rig.cameras,
-            BirthRules(min_viewpoints),
+            rules,
             fps=fps / step,
             bounds_m=wide_bounds(rig),
             max_speed_m_s=FASTEST_M_S,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from psotrack.clocks import CameraClocks
 from psotrack.correspondence import Sightings, from_detections, from_silhouettes
@@ -166,7 +167,7 @@ class Run:
 def prepare(
     recording: Recording,
     silhouettes: Silhouettes | None,
-    points: dict[str, MovingPoints],
+    points: dict[Any, MovingPoints],
     settings: TrackSettings,
     parts: Parts,
     report: Report = no_progress,
@@ -175,7 +176,8 @@ def prepare(
 
     Args:
         recording, silhouettes: those at the instants of the run.
-        points: moving points in them by the source of the detections; what is found here is added for other runs.
+        points: moving points in them by the source of the detections and the given size of the drones; what is found
+            here is added for other runs.
         settings: settings of the run.
         parts: parts that the caller brings.
         report: shows the progress in frames.
@@ -188,12 +190,14 @@ def prepare(
         sightings, keys = read_sightings(recording, silhouettes, source, report)
     read_s = time.perf_counter() - began
     bounds_m, speed_m_s = settings.bounds_m or recording.bounds_m, settings.motion.max_speed_m_s
-    if source not in points and (bounds_m is None or speed_m_s is None):
+    size_m = settings.drones.size_m
+    key = source, size_m
+    if key not in points and (bounds_m is None or speed_m_s is None):
         if sightings is not None:
-            points[source] = moving_detections(recording.rig, sightings, recording.fps)
+            points[key] = moving_detections(recording.rig, sightings, recording.fps, size_m)
         elif silhouettes is not None:
-            points[source] = moving_blobs(recording.rig, silhouettes, recording.fps)
-    volume = flight_volume(recording.rig, points.get(source), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
+            points[key] = moving_blobs(recording.rig, silhouettes, recording.fps, size_m)
+    volume = flight_volume(recording.rig, points.get(key), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)
     return Run(recording, silhouettes, settings, parts, start, volume, plugin, sightings, keys, read_s)

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from psotrack.camera_errors import TrackErrors
 from psotrack.errors import InputError
 from psotrack.identity import Identities, postprocess
-from psotrack.initiation import count_common, find_cut_off, find_outside, state_at_first_frame
+from psotrack.initiation import BirthRules, count_common, find_cut_off, find_outside, state_at_first_frame
 from psotrack.pipeline.inputs import Run
 from psotrack.settings import TrackSettings, flatten
 from psotrack.support import html_block, html_lines, identify
@@ -189,8 +189,10 @@ def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:
 def _no_drones(run: Run) -> InputError:
     """The error that says why no drone was found, as far as that is known."""
     found = "none in any frame"
+    least_m, most_m = BirthRules(size_m=run.settings.drones.size_m).spans_m
     remedy = (
-        "look at what the cameras see (`psotrack silhouettes`), or give the drones' first positions (init)"
+        "look at what the cameras see (`psotrack silhouettes`), give the drones' first positions (--init), "
+        f"or their size (--drone-size) if they are not {least_m:.2g} to {most_m:.2g} m wide"
     )
     recording = run.recording
     detected = run.silhouettes if run.sightings is None else run.sightings

@@ -157,7 +157,7 @@ def _track(
     """Each run and the result of its method; where clocks are to be estimated, of a second pass with these clocks."""
 
     @cache
-    def at_rate(rate_hz: float | None) -> tuple[Recording, Silhouettes | None, dict[str, MovingPoints]]:
+    def at_rate(rate_hz: float | None) -> tuple[Recording, Silhouettes | None, dict[Any, MovingPoints]]:
         part = recording.at_rate(rate_hz)
         return part, None if silhouettes is None else silhouettes.at_instants(part.timeline()), {}
 

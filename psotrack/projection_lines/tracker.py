@@ -105,7 +105,11 @@ class _Tracker:
         self._motion = TrackMotion(settings.motion, fps, bounds_m)
         self._births = Births(
             cameras,
-            BirthRules(settings.status.min_cameras_to_begin, num_frames=sightings.num_frames),
+            BirthRules(
+                settings.status.min_cameras_to_begin,
+                num_frames=sightings.num_frames,
+                size_m=settings.drones.size_m,
+            ),
             fps=fps,
             bounds_m=bounds_m,
             max_speed_m_s=self._max_speed_m_s,
