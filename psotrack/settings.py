@@ -168,6 +168,11 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     learn_sizes: bool = True
     body_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    @property
+    def lengths_m(self) -> tuple[float, ...] | None:
+        """`size_m` as a tuple, which Python callers may give as a list or an array."""
+        return None if self.size_m is None else tuple(float(length) for length in self.size_m)
+
 
 class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """When a drone counts as found in a frame, and when it is lost.

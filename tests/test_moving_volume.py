@@ -100,7 +100,7 @@ def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
     assert tracked(rig, balls, volume).num_drones == 0
     assert tracked(rig, balls, volume, size_m).num_drones == 2
     # A given size that is wrong hides no usual drone.
-    assert tracked(rig, drones, volume, size_m).num_drones == 2
+    assert tracked(rig, drones, volume, list(size_m)).num_drones == 2
 
 
 def test_given_values_win():
