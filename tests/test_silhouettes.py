@@ -568,10 +568,11 @@ def _run_program(
         text=True,
         start_new_session=True,
     )
-    # Workers close stderr shortly before the system removes them: until then, what they write is not left over.
     _, stderr = running.communicate()
+    # Workers close stderr shortly before the system removes them: until then, what they write is not left over.
+    until_s = time.monotonic() + 30
     with contextlib.suppress(ProcessLookupError):
-        while True:
+        while time.monotonic() < until_s:
             os.killpg(running.pid, 0)
             time.sleep(0.01)
     return subprocess.CompletedProcess(running.args, running.returncode, None, stderr)
