@@ -33,9 +33,9 @@ sys.path[:0] = [str(HERE), str(ROOT)]
 import figures  # noqa: E402
 
 #: Order of the rooms in the Python reference; rooms that are not listed follow in alphabetical order.
-FIRST_ROOMS = ["settings", "pipeline", "recordings", "datasets", "trajectories", "evaluation"]
+FIRST_ROOMS = ["settings", "pipeline", "recordings", "recordings.datasets", "trajectories", "evaluation"]
 #: Parts of the package without a public Python interface.
-HIDDEN = {"__main__", "_typing", "cli", "demo"}
+HIDDEN = {"__main__", "cli", "demo"}
 #: Pictures that pages show, by folder below the repository's root.
 PICTURES = ("experiments/pictures", "experiments/table5/results")
 
@@ -58,9 +58,13 @@ def how_to_pages() -> list[Any]:
 
 
 def rooms() -> list[str]:
-    """Names of the rooms and modules of the package that have a page in the Python reference."""
+    """Names of the rooms and modules of the package that have a page in the Python reference.
+
+    A room inside of a room has a page if other rooms use names of it.
+    """
     found = {path.stem for path in PACKAGE.glob("*.py")} | {
-        path.parent.name for path in PACKAGE.glob("*/__init__.py")
+        ".".join(path.relative_to(PACKAGE).parts[:-1])
+        for path in (*PACKAGE.glob("*/__init__.py"), *PACKAGE.glob("*/*/__init__.pyi"))
     }
     names = sorted(found - HIDDEN - {"__init__"})
     return [name for name in FIRST_ROOMS if name in names] + [
@@ -83,12 +87,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def api_page(name: str) -> str:
     """The page of a room: its docstring, and its public names."""
-    folder = PACKAGE if name == "psotrack" else PACKAGE / name
+    folder = PACKAGE if name == "psotrack" else PACKAGE.joinpath(*name.split("."))
     dotted = "psotrack" if name == "psotrack" else f"psotrack.{name}"
     stub, init = folder / "__init__.pyi", folder / "__init__.py"
     if not stub.exists():
-        modules = sorted(folder.glob("[a-z]*.py"), key=lambda path: path.name) if folder.is_dir() else []
-        public = [dotted, *(f"{dotted}.{path.stem}" for path in modules)]
+        public = [] if init.exists() else [dotted]
         if name == "psotrack":
             public = []
         blocks = [f"::: {one}\n    options:\n      show_root_full_path: true" for one in public]

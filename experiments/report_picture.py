@@ -14,8 +14,8 @@ from pathlib import Path
 import _results
 
 from psotrack import demo
-from psotrack.flights import read_flight
-from psotrack.reports import write_flight_report
+from psotrack.show.flights import read_flight
+from psotrack.show.reports import write_flight_report
 
 #: Windows: width and height in pixels, colour scheme, and the moment that the 3D view shows, seconds.
 WINDOWS = {"report.png": (1280, 860, "light", 2.2), "report_phone.png": (400, 860, "dark", 2.2)}

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from psotrack.recordings import probe, read_frames
-from psotrack.viewer import viewer_program
+from psotrack.show.viewer import viewer_program
 
 SCENARIO = "S02_D4_A"
 FRAMES = 125

@@ -34,7 +34,7 @@ import psotrack as pt
 from psotrack.geometry import project_boxes
 from psotrack.support import keep_compiled
 from psotrack.sweep import sweep
-from psotrack.tracking import camera_weights, foreground_and_area
+from psotrack.tracking.swarm import camera_weights, foreground_and_area
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs

@@ -32,15 +32,15 @@ import numpy as np
 from IPython.display import Image
 from matplotlib.animation import FuncAnimation, PillowWriter
 
-from psotrack.datasets.dpjait import read_sequence
-from psotrack.initiation import first_drones, room_bounds
-from psotrack.reports import PointCloud, Scene3D
+from psotrack.foreground.silhouettes import SilhouetteSettings, compute, summed_area_table
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute, summed_area_table
+from psotrack.show.reports import PointCloud, Scene3D
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
-from psotrack.tracking import SoftIoU, on_device, swarm
-from psotrack.tracking.fitness import drone_fitness, joint_fitness, score_inputs
+from psotrack.tracking.births import first_drones, room_bounds
+from psotrack.tracking.swarm import SoftIoU, on_device, optimiser
+from psotrack.tracking.swarm.fitness import drone_fitness, joint_fitness, score_inputs
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
@@ -98,7 +98,7 @@ seen = score_inputs(
 # Particles have the axes (particles, drones, 3): each drone has its own swarm, and all swarms move at once.
 spread = jax.random.normal(jax.random.key(1), (PARTICLES, *predicted_m.shape))
 first_m = predicted_m + SPREAD_M * spread
-params = swarm.SwarmParams(
+params = optimiser.SwarmParams(
     inertia=jnp.float32(settings.swarm.inertia),
     cognitive=jnp.float32(settings.swarm.cognitive),
     social=jnp.float32(settings.swarm.social),
@@ -107,9 +107,9 @@ params = swarm.SwarmParams(
     high=predicted_m + HALF_M,
 )
 fitness = jax.jit(lambda position_m: drone_fitness(seen, position_m))
-step = jax.jit(swarm.step, static_argnums=1)
+step = jax.jit(optimiser.step, static_argnums=1)
 
-states = [swarm.init(first_m, params)]
+states = [optimiser.init(first_m, params)]
 for iteration in range(SHOWN_ITERATIONS):
     states.append(step(jax.random.key(iteration), fitness, states[-1], params))
 
@@ -205,7 +205,7 @@ Scene3D(
 
 # %%
 joint = jax.jit(lambda position_m: joint_fitness(seen, position_m.reshape(PARTICLES, -1, 3))[:, None])
-all_at_once = swarm.SwarmParams(
+all_at_once = optimiser.SwarmParams(
     inertia=params.inertia,
     cognitive=params.cognitive,
     social=params.social,
@@ -214,13 +214,16 @@ all_at_once = swarm.SwarmParams(
     high=params.high.reshape(1, -1),
 )
 # The top of each hill, from a swarm with many particles and iterations.
-top_m = swarm.run(jax.random.key(0), fitness, jnp.tile(first_m, (10, 1, 1)), params, 300).gbest_position
+top_m = optimiser.run(jax.random.key(0), fitness, jnp.tile(first_m, (10, 1, 1)), params, 300).gbest_position
 
 distance_mm = {"a swarm per drone": [], "one swarm for all": []}
 for seed in range(SEEDS):
     key_spread, key_swarm = jax.random.split(jax.random.key(100 + seed))
     begin_m = predicted_m + SPREAD_M * jax.random.normal(key_spread, first_m.shape)
-    own, together = swarm.init(begin_m, params), swarm.init(begin_m.reshape(PARTICLES, 1, -1), all_at_once)
+    own, together = (
+        optimiser.init(begin_m, params),
+        optimiser.init(begin_m.reshape(PARTICLES, 1, -1), all_at_once),
+    )
     for iteration in range(ITERATIONS):
         key = jax.random.fold_in(key_swarm, iteration)
         own, together = step(key, fitness, own, params), step(key, joint, together, all_at_once)

@@ -24,14 +24,14 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.demo import save_picture
 from psotrack.evaluation import evaluate, plots, tables
+from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
-from psotrack.reports import view_3d
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.show.reports import view_3d
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.trajectories import write_trajectories

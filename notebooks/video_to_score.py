@@ -30,12 +30,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from psotrack.datasets.dpjait import read_sequence
-from psotrack.geometry import make_extents, project_boxes
-from psotrack.initiation import first_drones, room_bounds
-from psotrack.recordings import read_frames
-from psotrack.settings import DroneSettings
-from psotrack.silhouettes import (
+from psotrack.foreground.silhouettes import (
     Living,
     SilhouetteSettings,
     compute,
@@ -44,10 +39,15 @@ from psotrack.silhouettes import (
     scaled_settings,
     summed_area_table,
 )
+from psotrack.geometry import make_extents, project_boxes
+from psotrack.recordings import read_frames
+from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.settings import DroneSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
-from psotrack.tracking import SoftIoU, on_device
-from psotrack.tracking.fitness import PAPER_SCORE, camera_scores, drone_fitness, score_inputs
+from psotrack.tracking.births import first_drones, room_bounds
+from psotrack.tracking.swarm import SoftIoU, on_device
+from psotrack.tracking.swarm.fitness import PAPER_SCORE, camera_scores, drone_fitness, score_inputs
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
@@ -79,7 +79,7 @@ names = recording.rig.names
 # The cameras stand still, so a pixel shows the background most of the time. A background model learns what each pixel
 # usually shows from a first look at the whole video, and goes on learning from frame to frame; what differs from the model and
 # ends in sharp edges is foreground. The tracker reads a coarser picture: each value of a *silhouette* is the share of a
-# small square of pixels that is foreground, 0 to 255. `psotrack.silhouettes.compute` does the same for all cameras and
+# small square of pixels that is foreground, 0 to 255. `psotrack.foreground.silhouettes.compute` does the same for all cameras and
 # frames, and keeps the result.
 
 # %%
@@ -199,7 +199,7 @@ plt.show()
 # *What to see: nearly every camera prefers the true position. A camera that looks along x hardly notices a step along
 # x. `cam1`, in which two drones are one silhouette, prefers the wrong position. No single camera determines the
 # position; the mean over all cameras does. (The tracker also leaves out the part of an image that another drone is
-# expected to cover; see `psotrack.tracking.occlusion`.)*
+# expected to cover; see `psotrack.tracking.swarm.occlusion`.)*
 #
 # ## The landscape around a drone
 #
@@ -299,6 +299,6 @@ plt.show()
 # a few cameras agrees by chance: rays from cameras to the other drones, which are higher or lower, cross there. In
 # most of the room the score has no slope towards the hill. A swarm finds the hill because it starts at the position
 # that the motion model predicts. New drones are found in another way, from blobs that agree between cameras for several
-# frames (`psotrack.initiation.births`).*
+# frames (`psotrack.tracking.births.births`).*
 #
 # Next: [how the swarm moves](how_the_swarm_moves.ipynb) in this landscape.

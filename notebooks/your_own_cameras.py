@@ -38,7 +38,7 @@ import psotrack as pt
 from psotrack.evaluation import plots
 from psotrack.geometry import make_extents, project_boxes
 from psotrack.recordings import read_frames
-from psotrack.tracking import on_device
+from psotrack.tracking.swarm import on_device
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs

@@ -1,14 +1,15 @@
 from .api import background_model, detect_markers, read_recording, track
-from .clocks import find_offset
-from .detection import Detector
+from .calibration.clocks import find_offset
 from .evaluation import Evaluation, evaluate
-from .exchange import export_tracks, read_tracks
+from .foreground.detection import Detector
+from .foreground.silhouettes import BackgroundModel
 from .geometry import Rig, make_camera, make_rig, project, triangulate
+from .geometry.rig_files import read_rig, write_rig
 from .inside_out import MarkerMap, localise_video, read_marker_map
 from .pipeline import Method, MethodInputs, TrackedRecording, track_runs
-from .recordings import Recording, read_c3d
-from .reports import view_3d
-from .rig_files import read_rig, write_rig
+from .recordings import Recording
+from .recordings.exchange import export_tracks, read_tracks
+from .recordings.mocap import read_c3d
 from .settings import (
     DroneSettings,
     IdentitySettings,
@@ -18,10 +19,10 @@ from .settings import (
     SwarmSettings,
     TrackSettings,
 )
-from .silhouettes import BackgroundModel
+from .show.reports import view_3d
 from .simulation import SimulationSettings, simulate
 from .support import register_plugin
-from .tracking import Score, ScoreInputs, Search, SearchRegion
+from .tracking.swarm import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
 
 __version__: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 
-from psotrack.interrupts import Terminated, end, orderly_interrupts
+from psotrack.support.interrupts import Terminated, end, orderly_interrupts
 
 
 def main() -> None:

@@ -9,12 +9,12 @@ from typing import Any, Unpack
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.datasets import open_recording
+from psotrack.foreground.silhouettes import ForegroundSettings, Living
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.pipeline import Parts, TrackedRecording, check_detections, track_recording
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import ForegroundSettings, Living
 from psotrack.support import no_progress, progress_bar, user_cache
 
 

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate, plots, tables
+from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.geometry import make_extents, project_boxes
 from psotrack.pipeline import TrackedRecording, track_recording
 from psotrack.recordings import Recording, read_frames
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import Report, atomic_write, atomic_write_all, no_progress, refuse_to_overwrite
-from psotrack.tracking import on_device
+from psotrack.tracking.swarm import on_device
 from psotrack.trajectories import write_trajectories
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import Meta
 
 from psotrack.errors import SettingsError
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.support import NotNegative, Positive, Share, check_types, nearest, plain
 
 SwarmKind = Literal["joint", "per-drone"]
@@ -108,7 +108,7 @@ class ScoreSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class MotionSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The motion model of the drones, and how measured positions err (see `psotrack.motion`).
+    """The motion model of the drones, and how measured positions err (see `psotrack.tracking.motion`).
 
     Attributes:
         max_speed_m_s: largest speed of a drone, m/s; None: 6 m/s, or more where the data show more.

@@ -10,8 +10,8 @@ import numpy as np
 from helpers import ring_rig
 
 from psotrack.geometry import project
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter
-from psotrack.rig_files import write_rig
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
 RATE_HZ, NUM_FRAMES, IMAGE_SIZE_WH = 25.0, 14, (320, 240)

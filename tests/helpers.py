@@ -13,9 +13,9 @@ import pytest
 from filelock import FileLock
 
 from psotrack.cli.options import setting_name
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Silhouettes
 
 #: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
 LENSES = {

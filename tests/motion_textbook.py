@@ -1,7 +1,7 @@
 """Simulated flights with white jerk, and a textbook filter and smoother in float64 NumPy, as oracles for `motion`.
 
 The textbook's state is position, velocity and acceleration, (9,), or with a lasting error of the measurements, (12,).
-A measurement observes position plus lasting error. The state of `psotrack.motion` contains this sum instead.
+A measurement observes position plus lasting error. The state of `psotrack.tracking.motion` contains this sum instead.
 """
 
 from dataclasses import dataclass, replace
@@ -10,11 +10,11 @@ from functools import cache
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from psotrack.motion import Measurements, MotionParams
+from psotrack.tracking.motion import Measurements, MotionParams
 
 DT_S = 1 / 25
 
-#: (12, 12), maps the state of `psotrack.motion` to the textbook's state.
+#: (12, 12), maps the state of `psotrack.tracking.motion` to the textbook's state.
 TO_TEXTBOOK = np.eye(12) - np.eye(12, k=9)
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from helpers import make_once
 
-from psotrack.datasets import open_recording
-from psotrack.rig_files import write_rig
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import SimulationSettings, simulate
 
 #: Few, small cameras: a machine that is busy with other tests must keep up with the replay.

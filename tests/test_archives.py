@@ -21,12 +21,12 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.archives import compare_with_archive, pack_tracks, read_manifest, unpack
 from psotrack.cli import cli
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.foreground.silhouettes import SilhouetteSettings, compute
+from psotrack.pipeline.archives import compare_with_archive, pack_tracks, read_manifest, unpack
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.trajectories import read_trajectories, write_trajectories
 
 #: An archive of format version 1; tests/data/README.md says how it was made.

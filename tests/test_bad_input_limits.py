@@ -18,13 +18,18 @@ import test_archives
 import test_dpjait
 from helpers import make_once
 
-from psotrack import archives
-from psotrack.datasets import open_recording
-from psotrack.datasets.dpjait import read_marker_corners, read_masks, read_mocap_markers, read_poses
-from psotrack.detection import DetectorSettings, OnnxDetector
 from psotrack.errors import InputError, SettingsError
-from psotrack.exchange import read_tracks
+from psotrack.foreground.detection import DetectorSettings, OnnxDetector
+from psotrack.pipeline import archives
 from psotrack.recordings import read_image
+from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.datasets.dpjait import (
+    read_marker_corners,
+    read_masks,
+    read_mocap_markers,
+    read_poses,
+)
+from psotrack.recordings.exchange import read_tracks
 from psotrack.settings import DroneSettings, SwarmSettings, TrackSettings
 from psotrack.sweep import Store
 from psotrack.trajectories import read_trajectories
@@ -313,7 +318,7 @@ def test_an_archive_that_unpacks_to_far_more_than_it_is(tmp_path, monkeypatch):
             zipped.writestr(name, stored.read(name))
     path.write_bytes(test_archives.sealed(compressed.getvalue()))
     archives.unpack(path, tmp_path / "usual")
-    monkeypatch.setattr("psotrack.archives.sealed_zip._SMALL", 1 << 20)
+    monkeypatch.setattr("psotrack.pipeline.archives.sealed_zip._SMALL", 1 << 20)
     with pytest.raises(
         InputError, match=r"a\.psotrack: expected files of at most \d+ bytes in an archive of \d+"
     ):

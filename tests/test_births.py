@@ -9,9 +9,17 @@ from helpers import ROOM_M, draw_coverage, float32, make_unnamed_rig, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.correspondence import NOISE_PX, Sightings
+from psotrack.foreground.silhouettes import (
+    Exposures,
+    ForegroundSettings,
+    Mog2,
+    Silhouettes,
+    border_cells,
+    learning_step,
+)
 from psotrack.geometry import Rig, make_extents, project, project_boxes
-from psotrack.initiation import (
+from psotrack.settings import DroneSettings
+from psotrack.tracking.births import (
     NEW,
     BirthRules,
     Births,
@@ -24,15 +32,7 @@ from psotrack.initiation import (
     reidentify,
     unexplained,
 )
-from psotrack.settings import DroneSettings
-from psotrack.silhouettes import (
-    Exposures,
-    ForegroundSettings,
-    Mog2,
-    Silhouettes,
-    border_cells,
-    learning_step,
-)
+from psotrack.tracking.matching import NOISE_PX, Sightings
 from psotrack.trajectories import Trajectories
 
 FPS = 25.0

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import border_cells, find_blobs
+from psotrack.foreground.silhouettes import border_cells, find_blobs
 
 
 def test_blobs_by_hand():

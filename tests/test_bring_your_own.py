@@ -19,12 +19,12 @@ from sweeps import COMPILER
 import psotrack as pt
 from psotrack.cli import cli
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import ForegroundSettings, find_background
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
-from psotrack.silhouettes import ForegroundSettings, find_background
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import identify
-from psotrack.tracking import camera_weights, find_score, find_search, foreground_and_area
+from psotrack.tracking.swarm import camera_weights, find_score, find_search, foreground_and_area
 from psotrack.trajectories import Status, Tracks
 
 pytestmark = pytest.mark.slow
@@ -331,7 +331,7 @@ REGISTERED_PARTS = """
 import psotrack as pt
 from own_parts import Dice, RandomSearch
 from psotrack.errors import SettingsError
-from psotrack.tracking import tracker_settings
+from psotrack.tracking.swarm import tracker_settings
 
 settings = [pt.TrackSettings().changed({name: "own"}) for name in ("swarm.search", "score.kind")]
 for each in settings:
@@ -424,7 +424,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from psotrack.geometry import project_boxes
-from psotrack.tracking import camera_weights, foreground_and_area
+from psotrack.tracking.swarm import camera_weights, foreground_and_area
 from psotrack.trajectories import Status, Tracks
 
 @jax.tree_util.register_static

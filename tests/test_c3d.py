@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from psotrack.errors import InputError
-from psotrack.recordings import read_c3d
+from psotrack.recordings.mocap import read_c3d
 
 INTEL, DEC, SGI = 84, 85, 86
 LABELS = ("LASI", "RASI", "SACR")

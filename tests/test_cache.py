@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from helpers import Output
 
+from psotrack.foreground.silhouettes import Silhouettes, SilhouetteSettings, compute
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import Recording, VideoWriter, probe
-from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute
 from psotrack.support import atomic_write
 
 Run = Callable[..., Output]
 SIZE_WH = (64, 48)
 DAY_S = 24 * 3600
-NAME_OF_PROGRAM = f"psotrack.tracking.batch._track_batch-{'a' * 40}.program"
+NAME_OF_PROGRAM = f"psotrack.tracking.swarm.batch._track_batch-{'a' * 40}.program"
 NAME_IN_CACHE_OF_JAX = f"jit__scores-{'a' * 64}-cache"
 
 

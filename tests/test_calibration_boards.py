@@ -30,11 +30,11 @@ from psotrack.calibration.board_recognition import (
     recognise_board,
 )
 from psotrack.cli.calibrate import calibrate
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.geometry import make_camera, make_rig
+from psotrack.geometry.rig_files import read_rig, write_rig
 from psotrack.recordings import VideoWriter
-from psotrack.rig_files import read_rig, write_rig
+from psotrack.recordings.datasets import open_recording
 
 SIZE_WH = (640, 480)
 K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])

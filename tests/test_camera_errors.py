@@ -11,7 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack import cli
-from psotrack.camera_errors import (
+from psotrack.errors import SettingsError
+from psotrack.evaluation import evaluate
+from psotrack.geometry import project, reconstruct
+from psotrack.settings import ErrorSettings, TrackSettings
+from psotrack.tracking.camera_errors import (
     CameraErrors,
     Fading,
     FittedPlaces,
@@ -27,12 +31,8 @@ from psotrack.camera_errors import (
     views_of_places,
     views_of_sightings,
 )
-from psotrack.correspondence import Sightings
-from psotrack.errors import SettingsError
-from psotrack.evaluation import evaluate
-from psotrack.geometry import project, reconstruct
-from psotrack.motion import Measurements, MotionParams, filter_measurements
-from psotrack.settings import ErrorSettings, TrackSettings
+from psotrack.tracking.matching import Sightings
+from psotrack.tracking.motion import Measurements, MotionParams, filter_measurements
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 
 FPS = 25.0

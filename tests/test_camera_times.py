@@ -10,15 +10,15 @@ from helpers import ROOM_M, ring_rig, track_settings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.clocks import clocks_of_tracks, fit_clocks, places_of_tracks
-from psotrack.correspondence import NOISE_PX, NOISE_SHARE, Sightings, moved_to_instant
+from psotrack.calibration.clocks import clocks_of_tracks, fit_clocks, places_of_tracks
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import Exposures, Silhouettes
 from psotrack.geometry import make_extents, project, project_boxes
-from psotrack.initiation import Births, KnownDrones
-from psotrack.projection_lines import track_detections
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Exposures, Silhouettes
+from psotrack.tracking.births import Births, KnownDrones
+from psotrack.tracking.lines import track_detections
+from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings, moved_to_instant
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0

@@ -11,12 +11,19 @@ import pytest
 from helpers import ROOM_M, draw_coverage, ring_rig, silhouettes_in_memory, track_settings
 
 from psotrack.errors import SettingsError
-from psotrack.initiation import InitialState
+from psotrack.foreground.silhouettes import Exposures
 from psotrack.pipeline import causal_settings
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Exposures
-from psotrack.tracking import RunInputs, StepwiseTracker, block, stepwise, track_silhouettes, tracker_settings
-from psotrack.tracking.run import SwarmRun
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import (
+    RunInputs,
+    StepwiseTracker,
+    block,
+    stepwise,
+    track_silhouettes,
+    tracker_settings,
+)
+from psotrack.tracking.swarm.run import SwarmRun
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0

@@ -624,7 +624,7 @@ import gc, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def press(phase, info):
-    if "psotrack.datasets.dpjait" in sys.modules:
+    if "psotrack.recordings.datasets.dpjait" in sys.modules:
         gc.callbacks.remove(press)
         signal.raise_signal(signal.SIGINT)
 

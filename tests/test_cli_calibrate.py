@@ -11,13 +11,18 @@ from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import Board
+from psotrack.calibration.doctor import improve_with_check
 from psotrack.cli.calibrate import calibrate
-from psotrack.datasets.dpjait import read_sequence, write_calibration, write_detections, write_marker_corners
-from psotrack.doctor import improve_with_check
 from psotrack.errors import PsotrackError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
 from psotrack.recordings import Detections, VideoWriter
-from psotrack.rig_files import read_lenses, read_rig, write_rig
+from psotrack.recordings.datasets.dpjait import (
+    read_sequence,
+    write_calibration,
+    write_detections,
+    write_marker_corners,
+)
 from psotrack.trajectories import Trajectories, write_trajectories
 
 WORLD = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))
@@ -383,7 +388,7 @@ def test_why_a_rig_in_which_all_cameras_may_be_off_is_written_unchanged(tmp_path
     rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
     tracks = write_flight(tmp_path / "SEQ", rig, rig)
     monkeypatch.setattr(
-        "psotrack.doctor.improve_with_check",
+        "psotrack.calibration.doctor.improve_with_check",
         lambda *args, **more: replace(improve_with_check(*args, **more), all_off=True),
     )
     shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--out", tmp_path / "same.toml").stdout

@@ -10,8 +10,8 @@ from click.testing import CliRunner
 from psotrack.cli.calibrate import calibrate
 from psotrack.errors import PsotrackError
 from psotrack.geometry import project
+from psotrack.geometry.rig_files import read_rig, write_rig
 from psotrack.recordings import Detections, write_detections
-from psotrack.rig_files import read_rig, write_rig
 
 RIG = row_of_cameras(3)
 CENTRES = np.asarray(RIG.cameras.centre_world)

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from psotrack import cli
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.simulation import build, preview
 
 SMALL = ("--frames", "2", "--scale", "0.1", "--jobs", "1", "--no-onboard", "--quiet")

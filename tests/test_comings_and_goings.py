@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
+from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.geometry import project
 from psotrack.pipeline import track_recording
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import Scenario, SimulationSettings, simulate, write_recorded_flight
 from psotrack.trajectories import Status, Trajectories
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig, silhouettes_in_memory, track_settings
 
-from psotrack.initiation import InitialState
-from psotrack.silhouettes import Exposures
-from psotrack.tracking import RunInputs, StepwiseTracker, block, track_silhouettes, tracker_settings
+from psotrack.foreground.silhouettes import Exposures
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import RunInputs, StepwiseTracker, block, track_silhouettes, tracker_settings
 
 pytestmark = pytest.mark.slow
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from psotrack.correspondence import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST, epipolar_distance, match
 from psotrack.geometry import project
+from psotrack.tracking.matching import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST, epipolar_distance, match
 
 BOUNDS_M = np.array([[-4.0, -4.0, -1.0], [4.0, 4.0, 4.0]])
 LARGE_WH = (1280, 960)

@@ -9,13 +9,19 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings.marker_cross_poses import (
+from psotrack.recordings.mocap.marker_cross_poses import (
     complete_markers,
     correct_labels,
     estimate_poses,
     interpolate_poses,
 )
-from psotrack.recordings.marker_crosses import Cross, fit_rigid, identify_cross, identify_markers, learn_cross
+from psotrack.recordings.mocap.marker_crosses import (
+    Cross,
+    fit_rigid,
+    identify_cross,
+    identify_markers,
+    learn_cross,
+)
 
 #: Positions of the markers A (front), B (left), C (back), D (right), metres; `FIVE_M` has a fifth marker on a mast.
 FOUR_M = np.array([[0.055, 0, 0.1], [0, 0.085, 0.1], [-0.115, 0, 0.1], [0, -0.105, 0.1]])

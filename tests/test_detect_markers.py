@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from marker_pictures import Sheet, picture, rows_of_sheets
 
 from psotrack.cli.detect_markers import detect_markers
-from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.foreground.detection import marker_dictionary
 from psotrack.inside_out.detection import MarkerDetector
 from psotrack.recordings import VideoWriter, read_grey
 

@@ -10,11 +10,11 @@ from onnx_models import SIDE, STRIDE, bright_squares
 
 from psotrack.cli.detect import detect as command
 from psotrack.cli.track import track
-from psotrack.datasets import dpjait
-from psotrack.detection import DetectorSettings, OnnxDetector, detect_drones
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.foreground.detection import DetectorSettings, OnnxDetector, detect_drones
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.recordings import VideoWriter, probe, read_detections
+from psotrack.recordings.datasets import dpjait
 from psotrack.trajectories import read_trajectories
 
 #: Layout of the output -> side of the network's input, pixels. "v10" needs at least 300 boxes, so 18 x 18 boxes.

@@ -12,12 +12,12 @@ from click.testing import CliRunner
 from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
+from psotrack.calibration.doctor import Agreement, examine, sampled_frames
 from psotrack.cli.doctor import doctor
-from psotrack.correspondence import from_detections
-from psotrack.datasets.dpjait import write_calibration, write_detections, write_poses
-from psotrack.doctor import Agreement, examine, sampled_frames
 from psotrack.geometry import Rig, project
 from psotrack.recordings import Detections
+from psotrack.recordings.datasets.dpjait import write_calibration, write_detections, write_poses
+from psotrack.tracking.matching import from_detections
 from psotrack.trajectories import Trajectories
 
 #: Each test takes some seconds.

@@ -10,12 +10,18 @@ from helpers import ring_rig
 from scipy.stats import multivariate_normal
 
 from psotrack.calibration import find_drones_in_boxes
-from psotrack.correspondence import from_detections
-from psotrack.doctor import evidence, examine, improve_with_check
-from psotrack.doctor.common_points import CommonPoints
-from psotrack.doctor.fault_search import consistent_share
-from psotrack.doctor.hypotheses import PER_CAMERA, Corrected, Hypothesis, linearise, list_hypotheses
+from psotrack.calibration.doctor import evidence, examine, improve_with_check
+from psotrack.calibration.doctor.common_points import CommonPoints
+from psotrack.calibration.doctor.fault_search import consistent_share
+from psotrack.calibration.doctor.hypotheses import (
+    PER_CAMERA,
+    Corrected,
+    Hypothesis,
+    linearise,
+    list_hypotheses,
+)
 from psotrack.geometry import Rig, project
+from psotrack.tracking.matching import from_detections
 from psotrack.trajectories import Trajectories
 
 pytestmark = pytest.mark.slow
@@ -281,7 +287,7 @@ def test_an_adjustment_that_does_not_fit_other_parts_is_refused(monkeypatch):
     turns = np.array([[25, 0], [-25, 0], [0, 25], [0, -25]])
     points_px = views.points_px.copy()
     points_px[:, 1] += turns[quarter]
-    from psotrack.doctor import checked_adjustment
+    from psotrack.calibration.doctor import checked_adjustment
 
     monkeypatch.setattr(
         checked_adjustment,
@@ -305,7 +311,7 @@ def test_sightings_that_agree_by_chance_do_not_go_on_from_frame_to_frame(monkeyp
     # The scale of the noise is the median's, so that the far tenth of these jumps are outliers.
     assert consistent_share(rig, spots) < 0.85
     case = make_case(4, "late 0.5")
-    monkeypatch.setattr("psotrack.doctor.examination.consistent_share", lambda rig, points: 0.6)
+    monkeypatch.setattr("psotrack.calibration.doctor.examination.consistent_share", lambda rig, points: 0.6)
     (finding,) = examine(case.rig, from_detections(case.seen, case.rig, case.frames), fps=_boxes.FPS).findings
     assert finding.kind == "too little seen"
     assert "agree by chance" in finding.message

@@ -9,10 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from psotrack.cli import cli
-from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
-from psotrack.recordings import Markers, VideoWriter, write_c3d
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets import dpjait
+from psotrack.recordings.mocap import Markers, write_c3d
 
 WIDTH, HEIGHT, FPS = 64, 48, 25.0
 SIMULATED_HEADER = (

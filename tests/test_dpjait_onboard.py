@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from psotrack.datasets import dpjait
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import VideoWriter, describe_recording, inventory_table
+from psotrack.recordings.datasets import dpjait
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
 K = np.array([[30.5, 0.0, 31.5], [0.0, 30.25, 23.5], [0.0, 0.0, 1.0]])

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import Rig, make_camera, make_rig, project
+from psotrack.recordings.datasets import dpjait
 
 finite = st.floats(-50, 50)
 triples = st.tuples(finite, finite, finite)

@@ -22,18 +22,9 @@ from psotrack.errors import (
     check_positive,
     errors_name,
 )
-from psotrack.recordings import (
-    Detections,
-    Markers,
-    VideoWriter,
-    join_videos,
-    probe,
-    read_c3d,
-    read_detections,
-    write_c3d,
-    write_detections,
-)
-from psotrack.rig_files import read_camera_names, read_lenses, read_rig, write_calibration, write_rig
+from psotrack.geometry.rig_files import read_camera_names, read_lenses, read_rig, write_calibration, write_rig
+from psotrack.recordings import Detections, VideoWriter, join_videos, probe, read_detections, write_detections
+from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
 from psotrack.support import (
     atomic_write,
     digest_file,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from psotrack.estimation import (
+from psotrack.geometry.estimation import (
     Damping,
     NormalEquations,
     Step,

@@ -31,14 +31,14 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from psotrack.cli.export import FORMAT_NAMES
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.evaluation import evaluate
-from psotrack.exchange import FORMATS, Footage, export_tracks, read_tracks
-from psotrack.exchange.ros_messages import DEFINITIONS, camera_message
 from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import FrameTimes, Recording, VideoWriter
-from psotrack.rig_files import write_rig
+from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.exchange import FORMATS, Footage, export_tracks, read_tracks
+from psotrack.recordings.exchange.ros_messages import DEFINITIONS, camera_message
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 from psotrack.trajectories.tum import write_tum
 
@@ -576,7 +576,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("psotrack.exchange.mcap_files._write_bag_file", full)
+    monkeypatch.setattr("psotrack.recordings.exchange.mcap_files._write_bag_file", full)
     with pytest.raises(OutputError, match="No space left"):
         export_tracks(small_tracks(), "mcap", tmp_path / "bag", footage=footage)
     assert not list(tmp_path.iterdir())

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psotrack.foreground.silhouettes import ForegroundSettings, first_look, look_first, reduce_frame
 from psotrack.recordings import VideoWriter, probe, read_frames
-from psotrack.silhouettes import ForegroundSettings, first_look, look_first, reduce_frame
 
 SIZE_WH = (64, 48)
 SETTINGS = ForegroundSettings(working_reduction=2, num_learning_frames=10)

@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from windows import best_place, cut_at
 
-from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import SoftIoU
-from psotrack.tracking.fitness import (
+from psotrack.foreground.silhouettes import summed_area_table
+from psotrack.tracking.swarm import SoftIoU
+from psotrack.tracking.swarm.fitness import (
     PAPER_SCORE,
     camera_scores,
     drone_fitness,

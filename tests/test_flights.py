@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.exchange import export_tracks
-from psotrack.flights import (
+from psotrack.recordings import FrameTimes, Recording
+from psotrack.recordings.exchange import export_tracks
+from psotrack.show.flights import (
     EventKind,
     boxes_in_images,
     camera_quality,
@@ -25,7 +26,6 @@ from psotrack.flights import (
     read_flight,
     shown_frames,
 )
-from psotrack.recordings import FrameTimes, Recording
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
 RATE_HZ = 10.0
@@ -206,7 +206,7 @@ class TestEvents:
         """Frames 4 and 5 of a camera of 5 Hz that begins 0.2 s late are exposed from 1.0 s on: instant 10 of 10 Hz."""
         path = write_flight(tmp_path, straight_tracks(), {"sequence": "lab", "left_out": {"c1": [[4, 6]]}})
         slow = recording_of(ring_rig(2), frame_times={"c1": FrameTimes(9, 5.0, time_offset_s=0.2)})
-        monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: slow)
+        monkeypatch.setattr("psotrack.show.flights.flight.open_recording", lambda _: slow)
         (event,) = find_events(read_flight([path], "lab"))
         assert (event.frame, event.kind) == (10, EventKind.LEFT_OUT)
 
@@ -276,13 +276,17 @@ class TestReading:
 
     def test_tracks_of_another_recording(self, tmp_path, monkeypatch):
         path = write_flight(tmp_path, straight_tracks(), {"sequence": "barn"})
-        monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: recording_of(ring_rig(2)))
+        monkeypatch.setattr(
+            "psotrack.show.flights.flight.open_recording", lambda _: recording_of(ring_rig(2))
+        )
         with pytest.raises(InputError, match="expected tracks of lab, found tracks of barn"):
             read_flight([path], "lab")
 
     def test_tracks_of_a_longer_recording_of_the_same_name(self, tmp_path, monkeypatch):
         path = write_flight(tmp_path, straight_tracks(num_frames=30), {"sequence": "lab"})
-        monkeypatch.setattr("psotrack.flights.flight.open_recording", lambda _: recording_of(ring_rig(2)))
+        monkeypatch.setattr(
+            "psotrack.show.flights.flight.open_recording", lambda _: recording_of(ring_rig(2))
+        )
         with pytest.raises(
             InputError, match=r"expected times from 0.00 to 1.90 s, as in lab, found 0.00 to 2.90 s"
         ):

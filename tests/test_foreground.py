@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from psotrack.errors import SettingsError
-from psotrack.silhouettes import ForegroundSettings, Mog2, coverage, learning_step
-from psotrack.silhouettes.foreground import remove_speckle
+from psotrack.foreground.silhouettes import ForegroundSettings, Mog2, coverage, learning_step
+from psotrack.foreground.silhouettes.foreground import remove_speckle
 
 HEIGHT, WIDTH = 120, 160
 RADIUS_PX = 9.0

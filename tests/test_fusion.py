@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from psotrack.camera_errors import CameraErrors, Fading, LastingCovariances, TrackErrors
-from psotrack.fusion import COMMON_CORRELATION, fuse_tracks
 from psotrack.settings import MotionSettings
+from psotrack.tracking.camera_errors import CameraErrors, Fading, LastingCovariances, TrackErrors
+from psotrack.tracking.fusion import COMMON_CORRELATION, fuse_tracks
 from psotrack.trajectories import Arrival, Status, Tracks
 
 FPS, FRAMES = 25.0, 200

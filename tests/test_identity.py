@@ -12,10 +12,10 @@ from scipy.special import logsumexp
 from scipy.stats import binom
 
 from psotrack.errors import InputError
-from psotrack.identity import LabelOutcome, relabelled, resolve
-from psotrack.motion import Measurements
 from psotrack.simulation import scenario
 from psotrack.simulation.flights import planning
+from psotrack.tracking.identity import LabelOutcome, relabelled, resolve
+from psotrack.tracking.motion import Measurements
 
 ENCOUNTER_M = 0.6
 #: Motion model with a low jerk density, like the flights of the simulator and of these tests.

@@ -20,108 +20,111 @@ import pytest
 from helpers import ring_rig
 
 import psotrack
+from psotrack.foreground.silhouettes import box_sum
 from psotrack.geometry import triangulate_linearly
-from psotrack.silhouettes import box_sum
 
 PACKAGE = Path(psotrack.__file__).parent
 
-#: The rooms of the package, lowest first: a module imports only from its own room and from lower rooms.
-ROOMS = [
-    "_typing",
+#: The order of rooms, lowest first: a module imports only from its own room and from rooms before it. A room inside of
+#: a room stands beside it; a module belongs to the longest name that begins its own.
+ORDER = [
     "errors",
-    "interrupts",
     "support",
-    "estimation",
+    "geometry.estimation",
     "geometry",
-    "rig_files",
+    "geometry.rig_files",
     "trajectories",
+    "evaluation",
     "recordings",
-    "datasets",
-    "exchange",
-    "silhouettes",
+    "recordings.mocap",
+    "recordings.datasets",
+    "recordings.exchange",
+    "foreground",
+    "foreground.silhouettes",
+    "foreground.detection",
     "settings",
-    "motion",
-    "detection",
-    "correspondence",
-    "clocks",
-    "initiation",
     "tracking",
-    "projection_lines",
-    "camera_errors",
-    "fusion",
-    "identity",
+    "tracking.matching",
+    "tracking.motion",
+    "tracking.births",
+    "tracking.swarm",
+    "tracking.lines",
+    "tracking.camera_errors",
+    "tracking.fusion",
+    "tracking.identity",
+    "calibration.clocks",
     "calibration",
-    "doctor",
+    "calibration.doctor",
+    "inside_out.frame_motion",
+    "inside_out.camera_path",
+    "inside_out.lens_files",
+    "inside_out.marker_map",
+    "inside_out.frames",
+    "inside_out.detection",
+    "inside_out.pose",
+    "inside_out.filtering",
+    "inside_out.line_time",
+    "inside_out.mapping",
+    "inside_out.localising",
+    "inside_out.comparison",
+    "inside_out.fusing",
     "inside_out",
     "pipeline",
-    "archives",
+    "pipeline.archives",
     "live",
     "api",
-    "evaluation",
-    "flights",
-    "viewer",
-    "overlay",
     "simulation",
     "demo",
     "sweep",
-    "reports",
+    "show",
+    "show.flights",
+    "show.overlay",
+    "show.viewer",
+    "show.reports",
     "cli",
     "__main__",
 ]
-
-#: The rooms inside of `inside_out`, lowest first, in the same way.
-INSIDE_OUT = [
-    "camera_path",
-    "lens_files",
-    "marker_map",
-    "frames",
-    "detection",
-    "pose",
-    "filtering",
-    "line_time",
-    "mapping",
-    "localising",
-    "comparison",
-    "fusing",
-]
+#: Largest number of folders in the package.
+MOST_ROOMS = 15
 
 #: Largest number of files at the package's root.
-MOST_ROOT_FILES = 10
+MOST_ROOT_FILES = 6
 
 #: Modules and rooms that may use JAX and NumPy only.
 CORE = {
-    "_typing",
-    "estimation",
+    "foreground.silhouettes.exposures",
+    "foreground.silhouettes.summed_area",
     "geometry.boxes",
     "geometry.camera_names",
     "geometry.cameras",
+    "geometry.estimation",
     "geometry.image_fit",
     "geometry.reprojection",
     "geometry.triangulation",
-    "identity.encounters",
-    "identity.labellings",
-    "identity.likeness",
-    "identity.records",
-    "identity.resolving",
-    "motion",
-    "silhouettes.exposures",
-    "silhouettes.summed_area",
-    "tracking.fitness",
-    "tracking.moments",
-    "tracking.occlusion",
-    "tracking.patches",
-    "tracking.swarm",
-    "tracking.tracker",
-    "tracking.vertex",
+    "support.array_types",
+    "tracking.identity.encounters",
+    "tracking.identity.labellings",
+    "tracking.identity.likeness",
+    "tracking.identity.records",
+    "tracking.identity.resolving",
+    "tracking.motion",
+    "tracking.swarm.fitness",
+    "tracking.swarm.moments",
+    "tracking.swarm.occlusion",
+    "tracking.swarm.optimiser",
+    "tracking.swarm.patches",
+    "tracking.swarm.tracker",
+    "tracking.swarm.vertex",
     "trajectories.trajectories",
 }
 CORE_MAY_USE = {"jax", "jaxtyping", "lazy_loader", "numpy"}
 
 #: Module or room -> modules and rooms that it must not import, although the order of rooms allows it.
 FORBIDDEN = {
-    "tracking.swarm": {"tracking.fitness", "geometry"},
-    "tracking.fitness": {"tracking.swarm"},
-    "simulation": {"geometry.boxes", "tracking", "silhouettes", "pipeline"},
+    "tracking.swarm.optimiser": {"tracking.swarm.fitness", "geometry"},
+    "tracking.swarm.fitness": {"tracking.swarm.optimiser"},
+    "tracking": {"evaluation"},
+    "simulation": {"geometry.boxes", "tracking", "foreground", "pipeline"},
     "evaluation": {"tracking", "geometry", "pipeline"},
 }
 
@@ -164,16 +167,16 @@ def is_within(name, parents):
 
 def resolve_export(name):
     """Module that defines a name which a room exports: `geometry.Camera` -> `geometry.cameras`."""
-    room, *rest = name.split(".")
-    return f"{room}.{EXPORTS[room][rest[0]]}" if rest and rest[0] in EXPORTS.get(room, {}) else name
+    room, _, exported = name.rpartition(".")
+    return f"{room}.{EXPORTS[room][exported]}" if exported in EXPORTS.get(room, {}) else name
 
 
 def read_exports():
     """Room -> exported name -> module of the room that defines the name, read from the rooms' `__init__.pyi`."""
     found = {}
-    for stub in PACKAGE.glob("*/__init__.pyi"):
+    for stub in PACKAGE.glob("*/**/__init__.pyi"):
         tree = ast.parse(stub.read_text(encoding="utf-8"))
-        found[stub.parent.name] = {
+        found[".".join(stub.relative_to(PACKAGE).parts[:-1])] = {
             alias.name: node.module
             for node in tree.body
             if isinstance(node, ast.ImportFrom)
@@ -185,13 +188,19 @@ def read_exports():
 EXPORTS = read_exports()
 
 
+def place_in_order(name):
+    """Index in ORDER of the room that a module, or a name of a room, belongs to; None for the package itself."""
+    rooms = [room for room in ORDER if is_within(name, {room})]
+    return ORDER.index(max(rooms, key=len)) if rooms else None
+
+
 def find_violations(path, source):
     """Messages for the imports of a module that break the rules above; the path is relative to the package."""
-    importer = module_name(path) or "__init__"
-    room = importer.split(".")[0]
-    if room == "__init__":
+    importer = module_name(path)
+    if not importer:
         return []
-    if room not in ROOMS:
+    place = place_in_order(importer)
+    if place is None:
         return [f"{path}: not in the list of rooms"]
     wrong = []
     for name in sorted(imports(source, ".".join(["psotrack", *path.parts[:-1]]))):
@@ -200,22 +209,18 @@ def find_violations(path, source):
             if is_within(importer, CORE) and top not in CORE_MAY_USE and top not in sys.stdlib_module_names:
                 wrong.append(f"{path}: the core imports {name}")
             continue
-        other = rest.split(".")[0]
-        if other not in ROOMS:
+        imported = place_in_order(rest)
+        if imported is None:
             continue
-        if ROOMS.index(other) > ROOMS.index(room):
-            wrong.append(f"{path}: {room} imports {other}, a higher room")
-        if room == other == "inside_out":
-            inner, imported = (part.split(".")[1] if "." in part else "" for part in (importer, rest))
-            if {inner, imported} <= set(INSIDE_OUT) and INSIDE_OUT.index(imported) > INSIDE_OUT.index(inner):
-                wrong.append(f"{path}: inside_out.{inner} imports inside_out.{imported}, a higher room")
+        if imported > place:
+            wrong.append(f"{path}: {ORDER[place]} imports {ORDER[imported]}, a higher room")
         origin = resolve_export(rest)
-        for place, forbidden in FORBIDDEN.items():
-            if is_within(importer, {place}) and is_within(origin, forbidden):
-                wrong.append(f"{path}: {place} must not import {origin}")
+        for part, forbidden in FORBIDDEN.items():
+            if is_within(importer, {part}) and is_within(origin, forbidden):
+                wrong.append(f"{path}: {part} must not import {origin}")
         private = [part for part in rest.split(".")[1:] if part.startswith("_") and part != "__init__"]
-        if private and other != room:
-            wrong.append(f"{path}: {rest} is private to {other}")
+        if private and ORDER[imported] != ORDER[place]:
+            wrong.append(f"{path}: {rest} is private to {ORDER[imported]}")
     return wrong
 
 
@@ -228,16 +233,23 @@ def test_every_module_obeys_the_rules_of_imports():
 
 def test_the_lists_contain_existing_modules_and_all_rooms():
     names = {module_name(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py")}
-    listed = {*ROOMS, *CORE, *FORBIDDEN, *(f"inside_out.{room}" for room in INSIDE_OUT)}
-    assert listed <= names
-    assert {name.split(".")[0] for name in names if name} <= set(ROOMS)
+    assert {*ORDER, *CORE, *FORBIDDEN} <= names
+    assert {name.split(".")[0] for name in names if name} <= {room.split(".")[0] for room in ORDER}
+
+
+def test_rooms_are_few_and_the_parts_of_one_stand_together():
+    rooms = [room.split(".")[0] for room in ORDER]
+    assert len({path.name for path in PACKAGE.iterdir() if (path / "__init__.py").exists()}) <= MOST_ROOMS
+    assert [room for room, before in zip(rooms, [None, *rooms], strict=False) if room != before] == list(
+        dict.fromkeys(rooms)
+    )
 
 
 def test_the_architecture_page_lists_the_rooms_in_this_order():
     page = (PACKAGE.parent / "docs" / "pages" / "explanation" / "architecture.md").read_text(encoding="utf-8")
     table = page.partition("\n## Rooms\n")[2].partition("\n## ")[0]
-    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == [
-        room for room in ROOMS if room not in {"_typing", "errors", "interrupts", "demo", "__main__"}
+    assert re.findall(r"^\| `(\w+)/` \|", table, re.MULTILINE) == [
+        room for room in dict.fromkeys(room.split(".")[0] for room in ORDER) if (PACKAGE / room).is_dir()
     ]
 
 
@@ -276,7 +288,7 @@ def test_a_room_exports_what_its_stub_says(room):
     [
         ("geometry/boxes.py", "import cv2", "the core imports cv2"),
         (
-            "tracking/tracker.py",
+            "tracking/swarm/tracker.py",
             "def f():\n    from scipy.optimize import minimize",
             "the core imports scipy",
         ),
@@ -288,30 +300,47 @@ def test_a_room_exports_what_its_stub_says(room):
         ),
         ("geometry/cameras.py", "from psotrack import recordings", "imports recordings, a higher room"),
         (
-            "tracking/swarm.py",
-            "from psotrack.tracking.fitness import camera_scores",
-            "must not import tracking.fitness",
+            "tracking/swarm/optimiser.py",
+            "from psotrack.tracking.swarm.fitness import camera_scores",
+            "must not import tracking.swarm.fitness",
         ),
-        ("tracking/swarm.py", "from psotrack.geometry import Camera", "must not import geometry.cameras"),
-        ("tracking/fitness.py", "import psotrack.tracking.swarm", "must not import tracking.swarm"),
         (
-            "tracking/block.py",
+            "tracking/swarm/optimiser.py",
+            "from psotrack.geometry import Camera",
+            "must not import geometry.cameras",
+        ),
+        (
+            "tracking/swarm/fitness.py",
+            "import psotrack.tracking.swarm.optimiser",
+            "must not import tracking.swarm.optimiser",
+        ),
+        (
+            "tracking/swarm/block.py",
             "from psotrack.evaluation import evaluate",
-            "imports evaluation, a higher room",
+            "must not import evaluation.metrics",
         ),
         (
             "evaluation/metrics.py",
-            "from ..tracking import tracker",
-            "evaluation must not import tracking.tracker",
+            "from ..tracking.swarm import tracker",
+            "evaluation must not import tracking.swarm.tracker",
         ),
         ("simulation/renderer.py", "from ..geometry import project_boxes", "must not import geometry.boxes"),
         (
             "simulation/renderer.py",
-            "if True:\n    from psotrack.tracking import fitness as f",
+            "if True:\n    from psotrack.tracking.swarm import fitness as f",
             "must not import tracking",
         ),
-        ("cli/track.py", "from psotrack.datasets._poses import read_poses", "private to datasets"),
+        (
+            "cli/track.py",
+            "from psotrack.recordings.datasets._poses import read_poses",
+            "private to recordings.datasets",
+        ),
         ("inside_out/pose/fit.py", "from psotrack.inside_out.filtering.bank import init", "a higher room"),
+        (
+            "tracking/motion/kalman.py",
+            "from psotrack.tracking import lines",
+            "tracking.motion imports tracking.lines, a higher",
+        ),
         ("novelty.py", "", "not in the list of rooms"),
     ],
 )
@@ -324,13 +353,13 @@ def test_allowed_imports_give_no_message():
 from typing import TYPE_CHECKING
 import numpy as np
 from psotrack import __version__
-from psotrack.tracking import swarm
-from psotrack.tracking.fitness import camera_scores
+from psotrack.tracking.swarm import optimiser
+from psotrack.tracking.swarm.fitness import camera_scores
 if TYPE_CHECKING:
     import cv2
     from psotrack.pipeline import TrackSettings
 """
-    assert find_violations(Path("tracking/tracker.py"), source) == []
+    assert find_violations(Path("tracking/swarm/tracker.py"), source) == []
     assert (
         find_violations(Path("evaluation/tables.py"), "from psotrack.evaluation.metrics import Evaluation")
         == []

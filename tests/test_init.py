@@ -14,19 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.cli import cli
-from psotrack.datasets import DraftOptions, draft_recording, open_recording
 from psotrack.errors import InputError, PsotrackError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera, chosen_cameras
 from psotrack.recordings import (
     CameraTable,
-    Markers,
     RecordingFile,
     VideoWriter,
     WorldTable,
     read_recording_file,
-    write_c3d,
     write_recording_file,
 )
+from psotrack.recordings.datasets import DraftOptions, draft_recording, open_recording
+from psotrack.recordings.mocap import Markers, write_c3d
 
 CAMERA = """size = [64, 48]
 K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]

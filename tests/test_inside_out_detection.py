@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
+from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import distort, make_camera, undistort
 from psotrack.inside_out.detection import MarkerDetector, refine_corners
 from psotrack.inside_out.detection.gamma import estimate_gamma

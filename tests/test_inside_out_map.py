@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import (
@@ -26,7 +25,8 @@ from psotrack.inside_out import (
 from psotrack.inside_out.mapping.scene import outward
 from psotrack.inside_out.mapping.sightings import SQUARE, FrameMarkers, collect_sightings
 from psotrack.inside_out.mapping.square_fitting import fit_square
-from psotrack.recordings import Markers, write_c3d
+from psotrack.recordings.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.recordings.mocap import Markers, write_c3d
 
 SIDE_M = 0.4
 

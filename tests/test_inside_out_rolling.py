@@ -17,7 +17,6 @@ from scipy.stats import chi2
 
 from psotrack.cli.localise import localise as localise_command
 from psotrack.cli.map_markers import map_markers as map_command
-from psotrack.datasets.dpjait import write_marker_corners
 from psotrack.errors import SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import (
@@ -41,6 +40,7 @@ from psotrack.inside_out.pose import ExpectedMotion, estimate_pose
 from psotrack.inside_out.pose.equations import equations, seen_markers
 from psotrack.inside_out.pose.row_motion import RowMotion, row_times_s
 from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets.dpjait import write_marker_corners
 
 WIDTH, HEIGHT, FPS = 1280, 720, 30.0
 LENS = make_camera(

@@ -11,9 +11,9 @@ from windows import cut_at
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_extents
-from psotrack.initiation import InitialState
 from psotrack.settings import SwarmSettings
-from psotrack.tracking import (
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import (
     DroneFitness,
     RunInputs,
     ScoreInputs,

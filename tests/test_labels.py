@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.cli.labels import labels
-from psotrack.datasets import open_recording
-from psotrack.datasets.dpjait import read_masks, read_sequence
-from psotrack.detection import LabelSettings, box_corners, label_boxes, write_data_set
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
 from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter, read_frames
-from psotrack.rig_files import write_rig
+from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.datasets.dpjait import read_masks, read_sequence
 from psotrack.simulation import SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Mesh
 from psotrack.trajectories import Trajectories

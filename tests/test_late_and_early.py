@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from test_camera_times import FPS, RIG, alike, make_timeline, positions, sightings_of, tracked
 
+from psotrack.calibration.clocks import camera_offsets, clocks_of_tracks, find_offset
+from psotrack.calibration.doctor import examine
 from psotrack.cli.synchronise import offset_in_words
-from psotrack.clocks import camera_offsets, clocks_of_tracks, find_offset
-from psotrack.doctor import examine
 from psotrack.geometry import project
 from psotrack.recordings import FrameTimes
 from psotrack.trajectories import Trajectories

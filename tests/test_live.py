@@ -40,10 +40,10 @@ from network_cameras import (
     wait_for_server,
 )
 
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError
 from psotrack.live import CameraStream, LiveSession, ReplayedVideo, UdpLines, live_cameras
 from psotrack.recordings import read_frames
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
 from psotrack.trajectories import Trajectories, read_trajectories
 
@@ -510,7 +510,7 @@ def test_a_signal_that_comes_while_another_one_stops_the_session(sequence: Path)
     """A signal handler that interrupted itself waited for ever."""
     script = """
         import os, signal, sys, threading, time
-        from psotrack.datasets import open_recording
+        from psotrack.recordings.datasets import open_recording
         from psotrack.live import LiveSession, live_cameras
         from psotrack.settings import TrackSettings
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from helpers import ring_rig
 
-from psotrack.datasets import open_recording
 from psotrack.errors import OutputError, SettingsError
 from psotrack.live import CameraRecorder, recording_folder
 from psotrack.recordings import Recording, read_frames
+from psotrack.recordings.datasets import open_recording
 
 SIZE_WH = (320, 240)
 RIG = ring_rig(3, image_size_wh=SIZE_WH)

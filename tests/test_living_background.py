@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import ForegroundSettings, Living, LivingBackground
-from psotrack.silhouettes.lighting import light_of, remove_light
-from psotrack.silhouettes.object_blobs import find_objects, largest
+from psotrack.foreground.silhouettes import ForegroundSettings, Living, LivingBackground
+from psotrack.foreground.silhouettes.lighting import light_of, remove_light
+from psotrack.foreground.silhouettes.object_blobs import find_objects, largest
 
 HEIGHT, WIDTH = 120, 160
 SETTINGS = ForegroundSettings(working_reduction=1, min_blob_px=9)

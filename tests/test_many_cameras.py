@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psotrack.datasets import open_recording
 from psotrack.evaluation import evaluate
 from psotrack.pipeline import track_recording
+from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 
 NUM_CAMERAS = 32

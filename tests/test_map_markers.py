@@ -11,14 +11,15 @@ from click.testing import CliRunner
 from test_inside_out_map import ROOM, on_wall, recorded_corners, with_bent_corner
 
 from psotrack.cli.map_markers import FOUND, map_markers
-from psotrack.datasets.dpjait import read_marker_corners, write_marker_corners
-from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.lens_files import scale_lens
-from psotrack.recordings import VideoWriter, write_c3d
-from psotrack.rig_files import write_rig
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.recordings.mocap import write_c3d
 
 SIZE_WH = (960, 720)
 LENS = make_camera(

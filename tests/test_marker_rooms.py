@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from test_inside_out_localise import LENS, draw_markers, wall_markers
 
 from psotrack.cli import cli
-from psotrack.datasets.dpjait import write_marker_corners
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import (
     LocaliseSettings,
     MarkerCentres,
@@ -30,7 +30,7 @@ from psotrack.inside_out.localising.map_evidence import are_few, least_markers, 
 from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.recordings import VideoWriter
-from psotrack.rig_files import write_rig
+from psotrack.recordings.datasets.dpjait import write_marker_corners
 
 SIDE_M, FPS = 0.3, 25.0
 CAMERA = make_camera(

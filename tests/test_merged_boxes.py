@@ -3,13 +3,13 @@
 import numpy as np
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project
-from psotrack.projection_lines import track_detections
-from psotrack.projection_lines.merged_boxes import PART_SHARE, split_merged_boxes
 from psotrack.recordings import Detections
 from psotrack.settings import TrackSettings
+from psotrack.tracking.lines import track_detections
+from psotrack.tracking.lines.merged_boxes import PART_SHARE, split_merged_boxes
+from psotrack.tracking.matching import Sightings, from_detections
 from psotrack.trajectories import Trajectories
 
 RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))

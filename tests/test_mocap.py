@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings import Markers, NoDronesError, body_trajectories, read_c3d, write_c3d
+from psotrack.recordings.mocap import Markers, NoDronesError, body_trajectories, read_c3d, write_c3d
 from psotrack.trajectories import Status
 
 #: Positions of the markers of an asymmetric cross in the body's frame, metres.
@@ -411,7 +411,7 @@ def test_a_full_disk_is_an_error(tmp_path):
         from pathlib import Path
         import numpy as np
         from psotrack.errors import OutputError
-        from psotrack.recordings.c3d import Markers, write_c3d
+        from psotrack.recordings.mocap.c3d import Markers, write_c3d
         sys.dont_write_bytecode = True  # the limit would truncate the bytecode of other processes too
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
         try:

@@ -7,10 +7,10 @@ import pytest
 from helpers import assert_same, draw_coverage, float32, ring_rig, silhouettes_in_memory, track_settings
 
 from psotrack.geometry import look_at, make_camera, make_extents, make_rig, project_boxes
-from psotrack.initiation import InitialState
-from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
-from psotrack.tracking.moments import HALF_PER_STD, measure
-from psotrack.tracking.patches import ExpectedDrones, cut, make_pyramid
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.swarm.moments import HALF_PER_STD, measure
+from psotrack.tracking.swarm.patches import ExpectedDrones, cut, make_pyramid
 
 REDUCTION, RING = 2, 1.5
 #: Measured length of a filled ellipsoid divided by its true length.

@@ -27,7 +27,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, multivariate_normal
 
-from psotrack.motion import GATE_999, kalman, white_jerk_noise
+from psotrack.tracking.motion import GATE_999, kalman, white_jerk_noise
 
 
 def as_arrays(tree, dtype):

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from helpers import make_unnamed_rig
 
-from psotrack.correspondence import Sightings, from_detections, match
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, project
-from psotrack.initiation import (
+from psotrack.geometry.rig_files import write_rig
+from psotrack.pipeline import track_recording
+from psotrack.recordings import Detections, write_detections
+from psotrack.recordings.datasets import open_recording
+from psotrack.settings import MotionSettings, StatusSettings, TrackSettings
+from psotrack.tracking.births import (
     FlightVolume,
     find_cut_off,
     find_outside,
@@ -20,11 +23,8 @@ from psotrack.initiation import (
     moving_detections,
     room_bounds,
 )
-from psotrack.pipeline import track_recording
-from psotrack.projection_lines import track_detections
-from psotrack.recordings import Detections, write_detections
-from psotrack.rig_files import write_rig
-from psotrack.settings import MotionSettings, StatusSettings, TrackSettings
+from psotrack.tracking.lines import track_detections
+from psotrack.tracking.matching import Sightings, from_detections, match
 from psotrack.trajectories import Status
 
 FORMULA = runpy.run_path(str(Path(__file__).parents[1] / "experiments" / "accuracy" / "formula_flights.py"))

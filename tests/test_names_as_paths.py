@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_bad_input_limits import check_line
 
-from psotrack.archives import Manifest
-from psotrack.archives.sealed_zip import write_sealed
-from psotrack.detection import LabelSettings, write_data_set
 from psotrack.errors import InputError, PsotrackError
-from psotrack.exchange import Footage, export_tracks
-from psotrack.flights import TrackedFlight
+from psotrack.foreground.detection import LabelSettings, write_data_set
+from psotrack.foreground.silhouettes import masks_out
 from psotrack.live import recording_folder
-from psotrack.overlay import OverlayOptions, write_overlays
+from psotrack.pipeline.archives import Manifest
+from psotrack.pipeline.archives.sealed_zip import write_sealed
 from psotrack.recordings import Recording
-from psotrack.silhouettes import masks_out
+from psotrack.recordings.exchange import Footage, export_tracks
+from psotrack.show.flights import TrackedFlight
+from psotrack.show.overlay import OverlayOptions, write_overlays
 from psotrack.support import check_file_name, no_progress
 from psotrack.trajectories import read_trajectories, write_trajectories
 
@@ -89,7 +89,7 @@ def test_a_file_of_tracks_with_evil_names(tmp_path, run_psotrack):
 @pytest.fixture
 def evil_recording(tmp_path):
     """A recording whose first camera is called ../evil, as Python may build it; files have names that are checked."""
-    from psotrack.datasets import open_recording
+    from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(flight_files.make_sequence(tmp_path / "flight"))
     return _renamed(recording, "../evil")

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import psotrack
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError
-from psotrack.exchange import read_tracks
-from psotrack.rig_files import read_rig
+from psotrack.geometry.rig_files import read_rig
+from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.exchange import read_tracks
 from psotrack.simulation import load
 from psotrack.sweep import read_grid
 from psotrack.trajectories import read_trajectories

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from helpers import draw_coverage, float32, ring_rig
 
-from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import SoftIoU
-from psotrack.tracking.fitness import joint_fitness, score_inputs
+from psotrack.foreground.silhouettes import summed_area_table
+from psotrack.tracking.swarm import SoftIoU
+from psotrack.tracking.swarm.fitness import joint_fitness, score_inputs
 
 BENCHMARKS = Path(__file__).parent.parent / "experiments" / "benchmarks"
 REDUCTION = 4

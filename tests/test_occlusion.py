@@ -21,9 +21,9 @@ from windows import (
 )
 
 from psotrack.geometry import make_extents, project_boxes
-from psotrack.tracking.fitness import camera_scores, drone_fitness
-from psotrack.tracking.occlusion import CORE_SCALE, NUM_NEIGHBOURS, OCCLUDER_SCALE
-from psotrack.tracking.patches import SIDE
+from psotrack.tracking.swarm.fitness import camera_scores, drone_fitness
+from psotrack.tracking.swarm.occlusion import CORE_SCALE, NUM_NEIGHBOURS, OCCLUDER_SCALE
+from psotrack.tracking.swarm.patches import SIDE
 
 SIZES_M = np.array([[1.0, 1.0, 0.5]]).repeat(5, axis=0)
 #: (cameras, 2), half lengths of the ellipse of a drone of 1 m x 0.5 m, silhouette pixels.

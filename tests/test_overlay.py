@@ -26,9 +26,9 @@ from flight_files import (
 
 from psotrack import cli
 from psotrack.errors import OutputError
-from psotrack.flights import boxes_in_images, colour_rgb, read_flight, status_rgb
-from psotrack.overlay import Codec, find_codec, write_overlays
 from psotrack.recordings import probe, read_frames
+from psotrack.show.flights import boxes_in_images, colour_rgb, read_flight, status_rgb
+from psotrack.show.overlay import Codec, find_codec, write_overlays
 from psotrack.support import COLOURS
 from psotrack.trajectories import Status, write_trajectories
 

@@ -13,11 +13,11 @@ from helpers import ring_rig
 import psotrack as pt
 from psotrack.calibration import find_drones_in_boxes
 from psotrack.cli import cli
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
+from psotrack.geometry.rig_files import read_rig, write_rig
 from psotrack.recordings import Detections, read_detections, write_detections
-from psotrack.rig_files import read_rig, write_rig
+from psotrack.recordings.datasets import open_recording
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 from psotrack.trajectories.tum import write_tum
 

@@ -24,11 +24,11 @@ from windows import (
     pixels,
 )
 
+from psotrack.foreground.silhouettes import box_sum
 from psotrack.geometry import make_extents
-from psotrack.silhouettes import box_sum
-from psotrack.tracking import SoftIoU
-from psotrack.tracking.fitness import ScoreInputs, camera_scores, drone_fitness, filled_share
-from psotrack.tracking.patches import NUM_LEVELS, SIDE
+from psotrack.tracking.swarm import SoftIoU
+from psotrack.tracking.swarm.fitness import ScoreInputs, camera_scores, drone_fitness, filled_share
+from psotrack.tracking.swarm.patches import NUM_LEVELS, SIDE
 
 #: In the middle; beside it; over the upper left and lower right borders in most cameras; outside all images.
 PLACES_M = np.array([[0.01, 0, 0.02], [0.53, 0, 0.21], [-1.213, 0, 0.83], [1.24, 0, -0.87], [40.0, 0, 3.0]])

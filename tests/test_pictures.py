@@ -8,8 +8,8 @@ import pytest
 from click.testing import CliRunner
 
 from psotrack.cli import cli
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
+from psotrack.foreground.silhouettes import SilhouetteSettings, compute, find_blobs
 from psotrack.recordings import (
     VideoWriter,
     check_end,
@@ -19,7 +19,7 @@ from psotrack.recordings import (
     read_frames,
     recording_of_video,
 )
-from psotrack.silhouettes import SilhouetteSettings, compute, find_blobs
+from psotrack.recordings.datasets import open_recording
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 12
 #: Side of the moving square, pixels.

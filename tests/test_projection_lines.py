@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, ring_rig
 
-from psotrack.correspondence import Expected, Sightings, from_detections
 from psotrack.evaluation import evaluate
 from psotrack.geometry import make_rig, project
-from psotrack.initiation import state_at_first_frame
-from psotrack.projection_lines import track_detections
-from psotrack.projection_lines.single_views import find_single_views
 from psotrack.recordings import Detections
 from psotrack.settings import DroneSettings, StatusSettings, TrackSettings
+from psotrack.tracking.births import state_at_first_frame
+from psotrack.tracking.lines import track_detections
+from psotrack.tracking.lines.single_views import find_single_views
+from psotrack.tracking.matching import Expected, Sightings, from_detections
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0

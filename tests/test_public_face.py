@@ -13,10 +13,10 @@ import pytest
 
 import psotrack as pt
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import ForegroundSettings
 from psotrack.geometry import project_boxes
-from psotrack.silhouettes import ForegroundSettings
 from psotrack.support import short_repr
-from psotrack.tracking import SoftIoU, camera_weights, foreground_and_area, tracker_settings
+from psotrack.tracking.swarm import SoftIoU, camera_weights, foreground_and_area, tracker_settings
 
 
 def test_every_name_is_there_and_documented():

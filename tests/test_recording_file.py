@@ -11,17 +11,17 @@ import pytest
 from click.testing import CliRunner
 
 from psotrack.cli import cli
-from psotrack.datasets import find_marker_corners, open_recording
-from psotrack.datasets._poses import write_poses
 from psotrack.errors import InputError
 from psotrack.geometry import project
+from psotrack.geometry.rig_files import read_calibration, write_calibration, write_rig
 from psotrack.recordings import (
     Detections,
     VideoWriter,
     read_frames,
     write_detections,
 )
-from psotrack.rig_files import read_calibration, write_calibration, write_rig
+from psotrack.recordings.datasets import find_marker_corners, open_recording
+from psotrack.recordings.datasets._poses import write_poses
 from psotrack.trajectories import Trajectories, write_trajectories
 from psotrack.trajectories.tum import write_tum
 

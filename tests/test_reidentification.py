@@ -8,7 +8,7 @@ from helpers import ROOM_M
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal, norm
 
-from psotrack.initiation import (
+from psotrack.tracking.births import (
     NEW,
     LostTracks,
     TrackCandidate,
@@ -16,7 +16,7 @@ from psotrack.initiation import (
     find_lost_tracks,
     reidentify,
 )
-from psotrack.initiation.reidentification import NO_DRONE
+from psotrack.tracking.births.reidentification import NO_DRONE
 
 FPS = 25.0
 #: The instant from which the times of the tests count.

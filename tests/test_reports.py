@@ -17,13 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.cli import cli
-from psotrack.datasets import open_recording
 from psotrack.errors import OutputError, SettingsError
-from psotrack.reports import PointCloud, Scene3D, scene_of_tracks
-from psotrack.reports.charts import thinned
-from psotrack.reports.page import MOST_BYTES, write_page
-from psotrack.reports.scene import MOST_ROWS
-from psotrack.rig_files import write_rig
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings.datasets import open_recording
+from psotrack.show.reports import PointCloud, Scene3D, scene_of_tracks
+from psotrack.show.reports.charts import thinned
+from psotrack.show.reports.page import MOST_BYTES, write_page
+from psotrack.show.reports.scene import MOST_ROWS
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.sweep import Store
 from psotrack.trajectories import Status, write_trajectories

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import Evaluation, evaluate
+from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import SwarmSettings, TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.trajectories import Trajectories, write_trajectories
 

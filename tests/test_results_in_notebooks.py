@@ -15,11 +15,11 @@ from helpers import ring_rig
 from test_evaluation_shown import flights
 
 from psotrack.evaluation import evaluate, tables
-from psotrack.identity import Identities
 from psotrack.pipeline import TrackedRecording
 from psotrack.recordings import FrameTimes, Recording
 from psotrack.settings import TrackSettings
 from psotrack.support import html_paths
+from psotrack.tracking.identity import Identities
 from psotrack.trajectories import Status, Trajectories, summarise, summary_columns
 
 

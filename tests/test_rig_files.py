@@ -7,7 +7,7 @@ from helpers import LENSES, assert_same, ring_rig
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import Rig, make_rig, project
-from psotrack.rig_files import read_lenses, read_rig, write_lenses, write_rig
+from psotrack.geometry.rig_files import read_lenses, read_rig, write_lenses, write_rig
 
 #: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]

@@ -14,7 +14,7 @@ import pytest
 
 from psotrack.errors import InputError
 from psotrack.geometry import project, triangulate_linearly, undistort
-from psotrack.rig_files import read_lenses, read_rig, write_rig
+from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
 
 
 def published(owner_and_name):

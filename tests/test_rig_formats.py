@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, make_rig, project, undistort
-from psotrack.rig_files import RIG_FORMATS, read_lenses, read_rig, write_rig
+from psotrack.geometry.rig_files import RIG_FORMATS, read_lenses, read_rig, write_rig
 
 #: Points in front of all cameras of this file, metres.
 POINTS_M = np.array([[0.3, -0.2, 0.9], [-0.4, 0.5, 1.4], [0.0, 0.1, 0.2], [1.1, 0.8, 1.9]])
@@ -322,7 +322,7 @@ def test_a_correction_that_folds_the_image_is_refused(tmp_path):
 @given(k1=st.floats(-0.1, 0.25), k2=st.floats(-0.03, 0.03), shift=st.floats(-2, 2))
 def test_the_fit_reaches_the_error_that_it_states(k1, k2, shift):
     """OpenCV's own undistortion of the corners and edges agrees with the formula within the stated error."""
-    from psotrack.rig_files.radial_fit import fit_distortion
+    from psotrack.geometry.rig_files.radial_fit import fit_distortion
 
     centre = K[:2, 2] + shift
     fit = fit_distortion(K, SIZE_WH, centre, np.array([k1, k2]))

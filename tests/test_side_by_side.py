@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, drawn_silhouettes, ring_rig, track_settings
 
-from psotrack.identity import postprocess
-from psotrack.initiation import InitialState
 from psotrack.pipeline import track_runs
 from psotrack.recordings import FrameTimes, Recording
-from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.identity import postprocess
+from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import ARRAYS, Status, Trajectories
 
 pytestmark = pytest.mark.slow

@@ -3,10 +3,10 @@
 import numpy as np
 from helpers import draw_coverage, ring_rig
 
-from psotrack.correspondence import from_detections, from_silhouettes
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import project
 from psotrack.recordings import Detections
-from psotrack.silhouettes import Silhouettes
+from psotrack.tracking.matching import from_detections, from_silhouettes
 
 RIG = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))
 

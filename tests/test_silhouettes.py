@@ -26,17 +26,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import (
-    FrameTimes,
-    Recording,
-    TruncatedVideoError,
-    VideoWriter,
-    probe,
-    probe_silhouettes,
-    read_frames,
-)
-from psotrack.silhouettes import (
+from psotrack.foreground.silhouettes import (
     ForegroundSettings,
     Living,
     Mog2,
@@ -52,7 +42,17 @@ from psotrack.silhouettes import (
     stored_silhouettes,
     usual_drone_px,
 )
-from psotrack.silhouettes import store as silhouette_store
+from psotrack.foreground.silhouettes import store as silhouette_store
+from psotrack.geometry import look_at, make_camera, make_rig
+from psotrack.recordings import (
+    FrameTimes,
+    Recording,
+    TruncatedVideoError,
+    VideoWriter,
+    probe,
+    probe_silhouettes,
+    read_frames,
+)
 from psotrack.support import Advance, map_in_processes
 
 NUM_FRAMES = 30
@@ -661,7 +661,8 @@ def test_full_disk(folder: Path, tmp_path: Path) -> None:
 
 def test_workers_do_not_import_jax() -> None:
     program = (
-        "import sys, psotrack.silhouettes.store, psotrack.support.processes; sys.exit('jax' in sys.modules)"
+        "import sys, psotrack.foreground.silhouettes.store, psotrack.support.processes;"
+        "sys.exit('jax' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0
 

@@ -19,7 +19,10 @@ import pytest
 from placed_drones import drone_masks
 
 from psotrack import __version__
-from psotrack.datasets.dpjait import (
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.geometry import project
+from psotrack.recordings import VideoWriter, probe, read_detections, read_frames
+from psotrack.recordings.datasets.dpjait import (
     DETECTIONS,
     MARKER_CORNERS,
     read_marker_corners,
@@ -27,9 +30,6 @@ from psotrack.datasets.dpjait import (
     read_mocap_markers,
     read_sequence,
 )
-from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.geometry import project
-from psotrack.recordings import VideoWriter, probe, read_detections, read_frames
 from psotrack.simulation import (
     CameraRenderer,
     SimulationSettings,

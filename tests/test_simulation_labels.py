@@ -21,14 +21,14 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from psotrack.datasets.dpjait import (
+from psotrack.errors import InputError
+from psotrack.recordings.datasets.dpjait import (
     MaskWriter,
     join_archives,
     read_masks,
     read_mocap_markers,
     write_mocap_markers,
 )
-from psotrack.errors import InputError
 from psotrack.simulation import CameraRenderer, build, change_scenario, scenario
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from placed_drones import cube, straight_flight, with_drones
 
-from psotrack.datasets import open_recording
 from psotrack.errors import SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig, project, undistort
+from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import (
     CameraRenderer,
     SimulationSettings,

@@ -10,8 +10,8 @@ from click.testing import CliRunner
 from psotrack.cli.simulate import simulate
 from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry.rig_files import read_rig
 from psotrack.recordings import probe
-from psotrack.rig_files import read_rig
 from psotrack.simulation import OWN_CAMERAS, SimulationSettings, simulate_own_cameras
 from psotrack.simulation.imaging.lens_image import lens_image
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board

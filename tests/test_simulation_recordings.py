@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from psotrack.datasets.dpjait import pose_file, write_poses
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.recordings.datasets.dpjait import pose_file, write_poses
 from psotrack.simulation import Scenario, write_recorded_flight
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading

@@ -22,7 +22,7 @@ from test_fuse_command import make_files
 from test_map_markers import make_walk
 from test_synchronisation import make_recording
 
-from psotrack.rig_files import write_rig
+from psotrack.geometry.rig_files import write_rig
 
 #: Content of the files that a command is to replace.
 OLDER = b"older"

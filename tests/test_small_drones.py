@@ -8,9 +8,9 @@ from helpers import ROOM_M, draw_coverage, ring_rig, silhouettes_in_memory, trac
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from psotrack.foreground.silhouettes import find_blobs
 from psotrack.geometry import Rig
-from psotrack.silhouettes import find_blobs
-from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
 
 pytestmark = pytest.mark.slow
 

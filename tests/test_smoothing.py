@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import InputError
-from psotrack.motion import estimate_jerk_density, smooth
+from psotrack.tracking.motion import estimate_jerk_density, smooth
 
 
 def smooth_flight(flown: SimulatedFlight):

@@ -17,7 +17,7 @@ SMOOTHING = """
 import hashlib, logging, os, sys, threading
 import jax
 import numpy as np
-from psotrack.motion import Measurements, motion_params, smooth
+from psotrack.tracking.motion import Measurements, motion_params, smooth
 from psotrack.settings import MotionSettings
 from psotrack.support import keep_compiled, load_ahead
 logging.basicConfig(level=logging.INFO, format="%(message)s (%(threadName)s)")
@@ -117,7 +117,7 @@ def test_a_second_process_loads_the_program_and_does_not_trace(filled: tuple[Pat
     again, log = run(SMOOTHING, folder)
     assert again == printed
     assert not traces(log, "_smoothed")
-    assert "loaded the compiled program psotrack.motion.smoothing._smoothed" in log
+    assert "loaded the compiled program psotrack.tracking.motion.smoothing._smoothed" in log
 
 
 def test_a_thread_loads_the_programs_of_the_last_run_ahead(filled: tuple[Path, str]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.silhouettes import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
+from psotrack.foreground.silhouettes import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
 
 table_of = jax.jit(summed_area_table)
 sum_of = jax.jit(box_sum)

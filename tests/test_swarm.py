@@ -11,14 +11,14 @@ from helpers import assert_same
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.tracking import swarm
+from psotrack.tracking.swarm import optimiser
 
 #: Coefficients of a swarm where a test sets no others.
 COEFFICIENTS = {"inertia": 0.6, "cognitive": 1.5, "social": 1.5}
 
 
 def params(groups=1, dims=2, *, max_step=10.0, low=-100.0, high=100.0, **coefficients):
-    return swarm.SwarmParams(
+    return optimiser.SwarmParams(
         **{name: jnp.float32(value) for name, value in (COEFFICIENTS | coefficients).items()},
         max_step=jnp.full(dims, max_step, jnp.float32),
         low=jnp.full((groups, dims), low, jnp.float32),
@@ -46,15 +46,15 @@ def random_positions(particles, groups, dims, seed=0, scale=5.0):
 
 def evaluated_start(objective, position, knobs):
     """The initial swarm after its evaluation."""
-    return swarm.evaluate(objective, swarm.init(position, knobs))
+    return optimiser.evaluate(objective, optimiser.init(position, knobs))
 
 
 def advance(key, objective, state, knobs):
     """The swarm after one move and its evaluation, as at the end of an iteration."""
-    return swarm.evaluate(objective, swarm.move(key, state, knobs))
+    return optimiser.evaluate(objective, optimiser.move(key, state, knobs))
 
 
-run = jax.jit(swarm.run, static_argnums=1)
+run = jax.jit(optimiser.run, static_argnums=1)
 init = jax.jit(evaluated_start, static_argnums=0)
 step = jax.jit(advance, static_argnums=1)
 
@@ -297,7 +297,7 @@ def test_groups_do_not_interact():
     @jax.jit
     def search(weight):
         start = random_positions(9, 3, 2)
-        return swarm.run(
+        return optimiser.run(
             jax.random.key(0), lambda position: objective(position, weight), start, params(3), 30
         )
 
@@ -327,29 +327,33 @@ def test_run_is_init_steps_and_a_last_evaluation():
     """With 0 iterations, the result is the evaluated start; more iterations continue the same path."""
     position, knobs, key = random_positions(6, 2, 2), params(2), jax.random.key(0)
     assert_same(run(key, sphere, position, knobs, 0), init(sphere, position, knobs))
-    state = swarm.init(position, knobs)
+    state = optimiser.init(position, knobs)
     for i in range(3):
-        state = jax.jit(swarm.step, static_argnums=1)(jax.random.fold_in(key, i), sphere, state, knobs)
+        state = jax.jit(optimiser.step, static_argnums=1)(jax.random.fold_in(key, i), sphere, state, knobs)
     # Fused multiply-adds differ in the last bits inside and outside the loop.
-    assert_same(run(key, sphere, position, knobs, 3), swarm.evaluate(sphere, state), atol=1e-5)
+    assert_same(run(key, sphere, position, knobs, 3), optimiser.evaluate(sphere, state), atol=1e-5)
     fitness = [float(run(key, sphere, position, knobs, n).gbest_fitness.sum()) for n in range(6)]
     assert (np.diff(fitness) >= 0).all()
 
 
 def test_random_factors_are_uniform_and_independent():
     """The two factors come from the halves of one word. Moments of 70,000 factors, within five standard errors."""
-    state = swarm.init(jnp.zeros((10_000, 1, 7)), params(1, 7))
+    state = optimiser.init(jnp.zeros((10_000, 1, 7)), params(1, 7))
     pulled = replace(state, pbest_position=state.position + 1.0, gbest_position=jnp.zeros((1, 7)))
     led = replace(state, gbest_position=jnp.ones((1, 7)))
     knobs = params(1, 7, inertia=0.0, cognitive=1.0, social=1.0)
-    r1, r2 = (np.asarray(swarm.move(jax.random.key(0), one, knobs).position).ravel() for one in (pulled, led))
+    r1, r2 = (
+        np.asarray(optimiser.move(jax.random.key(0), one, knobs).position).ravel() for one in (pulled, led)
+    )
     for factor in (r1, r2):
         assert factor.min() >= 0
         assert factor.max() < 1
         assert factor.mean() == pytest.approx(1 / 2, abs=5 * np.sqrt(1 / 12 / 70_000))
         assert factor.var() == pytest.approx(1 / 12, abs=5 * np.sqrt(1 / 180 / 70_000))
     # Factors are not correlated from one element, particle or iteration to the next either.
-    later = np.asarray(swarm.move(jax.random.fold_in(jax.random.key(0), 1), pulled, knobs).position).ravel()
+    later = np.asarray(
+        optimiser.move(jax.random.fold_in(jax.random.key(0), 1), pulled, knobs).position
+    ).ravel()
     for one, other in ((r1, r2), (r1[1:], r1[:-1]), (r1[7:], r1[:-7]), (r1[1:], r2[:-1]), (r1, later)):
         assert abs(np.corrcoef(one, other)[0, 1]) < 5 / np.sqrt(69_000)
     # Counts in 256 bins: chi-squared with 255 degrees of freedom, limit at its mean plus five standard deviations.
@@ -366,7 +370,7 @@ def test_other_settings_and_numbers_of_iterations_need_no_compilation():
         traces += 1
         return sphere(position)
 
-    compiled = jax.jit(lambda key, position, knobs, n: swarm.run(key, counted, position, knobs, n))
+    compiled = jax.jit(lambda key, position, knobs, n: optimiser.run(key, counted, position, knobs, n))
     compiled(jax.random.key(0), random_positions(6, 2, 2), params(2), jnp.int32(3))
     once = traces
     compiled(

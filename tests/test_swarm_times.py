@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, draw_coverage, ring_rig, track_settings
 
-from psotrack.initiation import InitialState
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.recordings import FrameTimes, make_timeline
-from psotrack.silhouettes import Silhouettes
-from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status
 
 FPS = 25.0

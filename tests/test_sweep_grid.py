@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
-from psotrack.silhouettes import SilhouetteSettings
 from psotrack.sweep import Perturbation, cell_key, grid, read_grid
 from psotrack.sweep.names import SETTINGS
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.recordings import Recording, VideoInfo
-from psotrack.silhouettes import Silhouettes
 from psotrack.sweep import Perturbation, perturb
 from psotrack.sweep.perturbations import choose_cameras
 

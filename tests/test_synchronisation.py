@@ -12,13 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from psotrack.calibration.clocks import find_offset
+from psotrack.calibration.clocks.synchronisation import camera_offsets
 from psotrack.cli.synchronise import synchronise
-from psotrack.clocks import find_offset
-from psotrack.clocks.synchronisation import camera_offsets
-from psotrack.datasets import dpjait
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera
-from psotrack.recordings import Markers, VideoWriter, write_c3d
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets import dpjait
+from psotrack.recordings.mocap import Markers, write_c3d
 from psotrack.simulation import scenario
 from psotrack.simulation.flights.planning import plan
 from psotrack.trajectories import UNASSIGNED, Trajectories, write_trajectories

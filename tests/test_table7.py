@@ -13,7 +13,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from psotrack.datasets.dpjait import (
+from psotrack.foreground.detection import marker_dictionary
+from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets.dpjait import (
     CALIBRATION,
     MARKER_CORNERS,
     ONBOARD_CALIBRATION,
@@ -25,9 +28,7 @@ from psotrack.datasets.dpjait import (
     write_onboard_calibration,
     write_poses,
 )
-from psotrack.detection import marker_dictionary
-from psotrack.geometry import look_at, make_camera, make_rig, project
-from psotrack.recordings import Markers, VideoWriter, write_c3d
+from psotrack.recordings.mocap import Markers, write_c3d
 
 EXPERIMENT = Path(__file__).parents[1] / "experiments" / "table7"
 METHODS = ("paper", "single frames", "filter", "smoother")

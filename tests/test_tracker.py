@@ -12,8 +12,8 @@ from helpers import (
     track_settings,
 )
 
-from psotrack.initiation import InitialState
-from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status
 
 FPS = 25.0

@@ -5,9 +5,9 @@ import pytest
 from helpers import drawn_silhouettes, track_settings
 
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.identity import postprocess
-from psotrack.initiation import InitialState
-from psotrack.tracking import RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.identity import postprocess
+from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
 
 FPS, REDUCTION, NUM_FRAMES = 25.0, 2, 25
 SIZE_WH = (480, 360)

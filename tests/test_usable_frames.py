@@ -11,10 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from psotrack.foreground.silhouettes import Silhouettes, SilhouetteSettings, blob_detections, compute
+from psotrack.foreground.silhouettes.usable_frames import (
+    LEAST_FRAMES,
+    foreground_is_everywhere,
+    in_words,
+    intervals_of,
+)
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import Recording, VideoWriter, probe
-from psotrack.silhouettes import Silhouettes, SilhouetteSettings, blob_detections, compute
-from psotrack.silhouettes.usable_frames import LEAST_FRAMES, foreground_is_everywhere, in_words, intervals_of
 
 SIZE_WH = (160, 120)
 NUM_FRAMES = 80

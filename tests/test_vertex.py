@@ -8,11 +8,11 @@ from helpers import draw_coverage, float32, make_unnamed_rig, ring_rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from psotrack.foreground.silhouettes import summed_area_table
 from psotrack.geometry import look_at, make_camera
-from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import SoftIoU
-from psotrack.tracking.fitness import camera_scores, score_inputs
-from psotrack.tracking.vertex import SPAN, find_vertex
+from psotrack.tracking.swarm import SoftIoU
+from psotrack.tracking.swarm.fitness import camera_scores, score_inputs
+from psotrack.tracking.swarm.vertex import SPAN, find_vertex
 
 REDUCTION = 4
 SIZE_M = np.array([[0.5, 0.5, 0.2]])

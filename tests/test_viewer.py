@@ -31,12 +31,12 @@ from helpers import listening_at
 from rerun.chunk import RrdReader
 
 from psotrack import cli
-from psotrack.datasets import open_recording
-from psotrack.flights import boxes_in_images, read_flight
 from psotrack.geometry import project
 from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames
+from psotrack.recordings.datasets import open_recording
+from psotrack.show.flights import boxes_in_images, read_flight
+from psotrack.show.viewer import LiveView, ViewContent, write_flight
 from psotrack.trajectories import read_trajectories, write_trajectories
-from psotrack.viewer import LiveView, ViewContent, write_flight
 
 
 @pytest.fixture(scope="module")

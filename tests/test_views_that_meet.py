@@ -8,8 +8,8 @@ from helpers import make_unnamed_rig
 from psotrack.cli import cli
 from psotrack.errors import InputError
 from psotrack.geometry import look_at, make_camera, project, views_meet
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import Detections, write_detections
-from psotrack.rig_files import write_rig
 
 K = np.array([[1000.0, 0, 960], [0, 1000.0, 540], [0, 0, 1]])
 TELEPHOTO = np.array([[60_000.0, 0, 960], [0, 60_000.0, 540], [0, 0, 1]])

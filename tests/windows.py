@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import far_camera, float32, make_unnamed_rig
 
+from psotrack.foreground.silhouettes import LOW_BITS, summed_area_table
 from psotrack.geometry import make_extents
-from psotrack.silhouettes import LOW_BITS, summed_area_table
-from psotrack.tracking import SoftIoU
-from psotrack.tracking.fitness import ScoreInputs, drone_fitness, score_inputs
-from psotrack.tracking.patches import SIDE, ExpectedDrones, cut, make_pyramid
+from psotrack.tracking.swarm import SoftIoU
+from psotrack.tracking.swarm.fitness import ScoreInputs, drone_fitness, score_inputs
+from psotrack.tracking.swarm.patches import SIDE, ExpectedDrones, cut, make_pyramid
 
 RING = SoftIoU().ring
 

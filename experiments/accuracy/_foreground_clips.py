@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from psotrack.datasets import dpjait, open_recording
 from psotrack.recordings import read_frames
+from psotrack.recordings.datasets import dpjait, open_recording
 from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
 
 Image = UInt8[np.ndarray, "height width 3"]

@@ -11,13 +11,13 @@ from typing import Any
 
 import pandas as pd
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import evaluate
+from psotrack.foreground.silhouettes import Silhouettes, compute
 from psotrack.pipeline import track_runs
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import keep_compiled
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))

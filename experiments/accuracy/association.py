@@ -29,8 +29,8 @@ from bat_flights import RealFlight, read_flight, write_recording
 from formula_flights import FPS, SCENES, make_flight
 from jaxtyping import Float
 
-from psotrack.correspondence import Sightings, from_detections
-from psotrack.initiation import FlightVolume, flight_volume, moving_detections
+from psotrack.tracking.births import FlightVolume, flight_volume, moving_detections
+from psotrack.tracking.matching import Sightings, from_detections
 from psotrack.trajectories import read_trajectories
 from psotrack.trajectories.association import GATE_M, identity_switches, partners_per_frame
 

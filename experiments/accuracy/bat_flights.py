@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import Rig, make_camera, make_rig
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import Detections, write_detections
-from psotrack.rig_files import write_rig
 from psotrack.trajectories import Trajectories
 
 REPOSITORY = Path("christofhapp/batflight3D_publication")

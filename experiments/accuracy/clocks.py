@@ -19,10 +19,10 @@ import _runs
 import numpy as np
 
 from psotrack.evaluation import evaluate
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.pipeline import TrackedRecording, track_runs
 from psotrack.recordings import Recording
 from psotrack.settings import Clocks, TrackSettings
-from psotrack.silhouettes import Silhouettes
 from psotrack.sweep import Perturbation, delays_frames, perturb
 from psotrack.trajectories import resample
 

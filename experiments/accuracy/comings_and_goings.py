@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
+from psotrack.foreground.silhouettes import SilhouetteSettings, compute
 from psotrack.geometry import project, viewpoints
 from psotrack.pipeline import track_runs
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.simulation import SimulationSettings, scenarios, simulate
 from psotrack.support import atomic_write
 from psotrack.trajectories import Status, Trajectories

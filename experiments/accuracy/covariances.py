@@ -29,18 +29,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.camera_errors import views_of_sightings, with_camera_errors
-from psotrack.correspondence import NOISE_PX, NOISE_SHARE, Sightings
 from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, project
 from psotrack.pipeline import track_runs
-from psotrack.projection_lines import track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Silhouettes
 from psotrack.simulation import build, scenario
 from psotrack.sweep import Perturbation, perturb
+from psotrack.tracking.camera_errors import views_of_sightings, with_camera_errors
+from psotrack.tracking.lines import track_detections
+from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings
 from psotrack.trajectories import Status, Trajectories
 
 SEQUENCES = ("S01_D2_A", "S02_D4_A")

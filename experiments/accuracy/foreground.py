@@ -26,7 +26,7 @@ import numpy as np
 from _foreground_clips import Clip, Image, Mask, clips
 from _runs import parser, save_rows, start
 
-from psotrack.silhouettes import ForegroundSettings, Living, Mog2, learning_step
+from psotrack.foreground.silhouettes import ForegroundSettings, Living, Mog2, learning_step
 
 Model = Callable[[list[Image]], Iterable[Mask]]
 #: MOG2's and KNN's label of shadows.

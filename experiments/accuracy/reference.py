@@ -30,8 +30,8 @@ from bat_flights import read_flight, write_recording
 from comings_and_goings import open_sequence
 from restless import false_tracks, made
 
-from psotrack.datasets import open_recording
 from psotrack.evaluation import evaluate
+from psotrack.recordings.datasets import open_recording
 from psotrack.trajectories import Status, Trajectories, read_trajectories
 
 METHODS: dict[str, tuple[str, ...]] = {

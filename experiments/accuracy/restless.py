@@ -24,8 +24,8 @@ import numpy as np
 import pandas as pd
 from _runs import parser, save_rows, start
 
-from psotrack.datasets import open_recording
 from psotrack.evaluation import evaluate
+from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
 from psotrack.support import progress_bar
 from psotrack.trajectories import Status, Trajectories, read_trajectories

@@ -24,17 +24,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.optimize import linear_sum_assignment
 
-from psotrack.datasets.dpjait import read_sequence
+from psotrack.foreground.silhouettes import SilhouetteSettings, compute
 from psotrack.geometry import Camera, make_extents
-from psotrack.initiation import first_drones, room_bounds
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import DroneSettings
-from psotrack.silhouettes import SilhouetteSettings, compute
 from psotrack.simulation import Scenario, SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation
 from psotrack.simulation.world.drones import MODELS
-from psotrack.tracking import Score, SoftIoU, on_device
-from psotrack.tracking.fitness import PAPER_SCORE, ScoreInputs, drone_fitness
-from psotrack.tracking.patches import ExpectedDrones, Pyramid, cut, make_pyramid
+from psotrack.tracking.births import first_drones, room_bounds
+from psotrack.tracking.swarm import Score, SoftIoU, on_device
+from psotrack.tracking.swarm.fitness import PAPER_SCORE, ScoreInputs, drone_fitness
+from psotrack.tracking.swarm.patches import ExpectedDrones, Pyramid, cut, make_pyramid
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

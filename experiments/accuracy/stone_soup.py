@@ -1,7 +1,7 @@
 """Stone Soup's trackers on points in space: global nearest neighbour (GNN) and joint probabilistic data association.
 
-The points of each frame are those of `psotrack.correspondence.match`, without any prediction: Stone Soup does not match
-detections of several cameras whose correspondence is unknown.
+The points of each frame are those of `psotrack.tracking.matching.match`, without any prediction: Stone Soup does not
+match detections of several cameras whose correspondence is unknown.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence import Sightings, match
 from psotrack.geometry import Rig, reconstruct
+from psotrack.tracking.matching import Sightings, match
 
 START = datetime.datetime(2000, 1, 1)
 

@@ -14,9 +14,9 @@ import numpy as np
 from _peers import Problem
 
 from psotrack.geometry import make_extents, project_boxes
-from psotrack.tracking import SoftIoU, on_device
-from psotrack.tracking.patches import ExpectedDrones, cut, make_pyramid
-from psotrack.tracking.tracker import REACH_SIGMAS
+from psotrack.tracking.swarm import SoftIoU, on_device
+from psotrack.tracking.swarm.patches import ExpectedDrones, cut, make_pyramid
+from psotrack.tracking.swarm.tracker import REACH_SIGMAS
 
 
 class LookUps:

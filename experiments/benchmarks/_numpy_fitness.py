@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from psotrack.geometry import NEAR_M, Camera
-from psotrack.tracking import SoftIoU
-from psotrack.tracking.fitness import MIN_WEIGHT
-from psotrack.tracking.patches import FULL
+from psotrack.tracking.swarm import SoftIoU
+from psotrack.tracking.swarm.fitness import MIN_WEIGHT
+from psotrack.tracking.swarm.patches import FULL
 
 
 class NumpyFitness:
-    """Mean fitness over the drones of each particle, as in `psotrack.tracking.fitness.joint_fitness`.
+    """Mean fitness over the drones of each particle, as in `psotrack.tracking.swarm.fitness.joint_fitness`.
 
     Arrays are float32, with contiguous cameras as the last axis. There is one small matrix product per coordinate, no
     table is read twice at one place, and tables are read by `take` with flat indices.

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from _numpy_fitness import NumpyFitness
 
+from psotrack.foreground.silhouettes import summed_area_table
 from psotrack.geometry import Rig
-from psotrack.initiation import InitialState
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import summed_area_table
-from psotrack.tracking import fitness, on_device
-from psotrack.tracking.parameters import find_score
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import fitness, on_device
+from psotrack.tracking.swarm.parameters import find_score
 
 #: Gains of the alpha-beta filter, the motion model of the other libraries; its time is negligible beside the swarm.
 POSITION_GAIN, VELOCITY_GAIN = 0.8, 0.3

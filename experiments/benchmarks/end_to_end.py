@@ -33,10 +33,10 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from psotrack.datasets import open_recording
+from psotrack.foreground.silhouettes import reduce_frame, scaled_settings
 from psotrack.recordings import Recording, VideoInfo, read_frames
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import reduce_frame, scaled_settings
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 from psotrack.support import Advance, map_in_processes, progress_bar
 

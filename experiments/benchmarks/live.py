@@ -29,10 +29,10 @@ import numpy as np
 import pandas as pd
 import psutil
 
-from psotrack.datasets import open_recording
 from psotrack.geometry import project
 from psotrack.live import LiveSession, ReplayedVideo, SourceFrame, live_cameras
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 from psotrack.support import progress_bar

@@ -35,18 +35,18 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from psotrack.datasets import open_recording
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import Silhouettes, compute
 from psotrack.pipeline import results, running, track_runs
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Silhouettes, compute
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled, progress_bar, use_device
 from psotrack.sweep import Grid, read_grid, sweep
-from psotrack.tracking import track_silhouettes
-from psotrack.tracking.block import Block, Engine, Job
-from psotrack.tracking.run import SwarmRun
+from psotrack.tracking.swarm import track_silhouettes
+from psotrack.tracking.swarm.block import Block, Engine, Job
+from psotrack.tracking.swarm.run import SwarmRun
 from psotrack.trajectories import Status, Trajectories
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))

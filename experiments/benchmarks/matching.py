@@ -13,8 +13,8 @@ import click
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence import Matches, match
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
+from psotrack.tracking.matching import Matches, match
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

@@ -22,9 +22,9 @@ from pathlib import Path
 import pandas as pd
 import psutil
 
-from psotrack.datasets import open_recording
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoInfo, VideoWriter, read_frames
-from psotrack.rig_files import write_rig
+from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 from psotrack.support import processors, progress_bar
 

@@ -52,11 +52,11 @@ import numpy as np
 import pandas as pd
 
 from psotrack.evaluation import evaluate
+from psotrack.foreground.silhouettes import Silhouettes, compute
 from psotrack.live import Meeting
 from psotrack.pipeline import TrackedRecording, prepare, track_runs
 from psotrack.recordings import Recording, VideoWriter, probe
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Silhouettes, compute
 from psotrack.support import COLOURS, processors, save_figure
 from psotrack.trajectories import Trajectories
 

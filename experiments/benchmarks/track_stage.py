@@ -28,12 +28,12 @@ from _look_ups import LookUps
 from _numpy_fitness import NumpyFitness
 from _peers import Evosax, Problem, PySwarms
 
-from psotrack.initiation import InitialState
+from psotrack.foreground.silhouettes import border_cells, summed_area_table
 from psotrack.settings import SwarmSettings, TrackSettings
-from psotrack.silhouettes import border_cells, summed_area_table
-from psotrack.tracking import RunInputs, fitness, on_device, tracker_settings
-from psotrack.tracking.block import Engine, Setting, make_block
-from psotrack.tracking.run import SwarmRun
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import RunInputs, fitness, on_device, tracker_settings
+from psotrack.tracking.swarm.block import Engine, Setting, make_block
+from psotrack.tracking.swarm.run import SwarmRun
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

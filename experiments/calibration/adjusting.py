@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack.calibration import find_drones_in_boxes
+from psotrack.calibration.doctor import improve_with_check
 from psotrack.calibration.gauge import common_motions, pose_change_metric, pose_changes
-from psotrack.doctor import improve_with_check
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, project, triangulate_linearly
 from psotrack.trajectories import Trajectories

@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from psotrack.correspondence import from_detections
-from psotrack.doctor import Diagnosis, Finding, examine
+from psotrack.calibration.doctor import Diagnosis, Finding, examine
 from psotrack.geometry import Rig
 from psotrack.recordings import Detections
+from psotrack.tracking.matching import from_detections
 
 sys.path += [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 import _boxes

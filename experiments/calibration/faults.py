@@ -19,14 +19,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from psotrack.correspondence import from_detections
-from psotrack.datasets.dpjait import read_detections, read_sequence
-from psotrack.doctor import Diagnosis, examine
+from psotrack.calibration.doctor import Diagnosis, examine
 from psotrack.geometry import Rig
 from psotrack.pipeline import detection_files_of
 from psotrack.recordings import Detections
+from psotrack.recordings.datasets.dpjait import read_detections, read_sequence
 from psotrack.settings import YOLO
 from psotrack.support import save_figure
+from psotrack.tracking.matching import from_detections
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

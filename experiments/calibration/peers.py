@@ -35,7 +35,7 @@ from psotrack.calibration import (
     open_images,
 )
 from psotrack.geometry import Rig, make_camera, make_rig, triangulate_linearly
-from psotrack.rig_files import read_rig
+from psotrack.geometry.rig_files import read_rig
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

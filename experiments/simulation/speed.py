@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from psotrack.datasets.dpjait import MaskWriter
 from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets.dpjait import MaskWriter
 from psotrack.simulation import CameraRenderer, Scene, build, preset_names, scenario
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.labels.detector import detect

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from psotrack.datasets.dpjait import CALIBRATION
 from psotrack.errors import PsotrackError
+from psotrack.recordings.datasets.dpjait import CALIBRATION
 from psotrack.support import progress_bar
 from psotrack.sweep import grid, pivot, render_table, sweep
 

@@ -13,12 +13,12 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.calibration import lens_of_view
-from psotrack.clocks import own_reference
-from psotrack.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
+from psotrack.calibration.clocks import own_reference
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, make_camera
 from psotrack.inside_out import MarkerMap, read_marker_map
 from psotrack.recordings import OnboardVideo, VideoInfo
+from psotrack.recordings.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.support import progress_bar
 from psotrack.trajectories import Trajectories
 

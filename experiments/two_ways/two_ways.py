@@ -20,9 +20,9 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from psotrack.datasets.dpjait import read_sequence
 from psotrack.errors import InputError, PsotrackError
 from psotrack.inside_out import CameraPath, FusedTracks, fuse, read_camera_path
+from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import Trajectories, read_trajectories
 

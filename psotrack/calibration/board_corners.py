@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.calibration.boards import Board
-from psotrack.detection import marker_dictionary
+from psotrack.foreground.detection import marker_dictionary
 
 #: Largest standard deviation of corners from one line that is still a line, pixels.
 _LINE_PX = 1.5

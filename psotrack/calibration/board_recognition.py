@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from psotrack.calibration.board_corners import BoardFinder
 from psotrack.calibration.boards import Board
-from psotrack.detection import marker_dictionary
+from psotrack.foreground.detection import marker_dictionary
 
 #: Number of views after which one way of printing is certain, if it has three times as many views as any other way.
 _CERTAIN = 6

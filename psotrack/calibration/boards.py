@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError, check_positive
+from psotrack.foreground.detection import marker_dictionary
 
 BoardKind = Literal["charuco", "chessboard", "grid"]
 #: Smallest number of corners of a view that counts, or all that the board has.

@@ -1,7 +1,8 @@
 """Bundle adjustment: move cameras and points together until the points project to their measured pixels, in float64.
 
 Triggs, McLauchlan, Hartley & Fitzgibbon (2000), "Bundle adjustment, a modern synthesis": Levenberg-Marquardt with the
-points eliminated (`psotrack.estimation`), first with a robust loss, then with squared residuals of the inliers.
+points eliminated (`psotrack.geometry.estimation`), first with a robust loss, then with squared residuals of the
+inliers.
 
 Pixels do not determine the world's origin, the directions of its axes, or its scale: see `gauge`.
 """

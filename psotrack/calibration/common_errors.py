@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration.bundles.points import PointBundle, camera_columns
-from psotrack.estimation import ReducedEquations
+from psotrack.geometry.estimation import ReducedEquations
 
 #: Smallest information about a common error, in units of its stated precision, with which the residuals can check its
 #: size.

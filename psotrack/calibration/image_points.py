@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.common_errors import CommonErrors
-from psotrack.correspondence import BORDER_PX, NOISE_PX, NOISE_SHARE
-from psotrack.detection import marker_dictionary
 from psotrack.errors import InputError
+from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import Rig, project_visible
 from psotrack.recordings import Detections, FrameTimes, VideoInfo, nearest_frames, read_frames
 from psotrack.support import Column, Table, TextRow, read_rows
+from psotrack.tracking.matching import BORDER_PX, NOISE_PX, NOISE_SHARE
 from psotrack.trajectories import Trajectories, resample
 
 _SEPARATOR = ","

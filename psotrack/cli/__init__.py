@@ -5,7 +5,7 @@ no numerics. A command's module is imported when the command runs, and the modul
 when they are called, so that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2
 for every error; it is 2 also if `doctor` or `map-markers --check` finds a fault. No other room uses this room;
 `psotrack.__main__`, which the installed script and `python -m psotrack` run, calls `main` and answers Ctrl-C and
-SIGTERM (`psotrack.interrupts`).
+SIGTERM (`psotrack.support.interrupts`).
 """
 
 from __future__ import annotations

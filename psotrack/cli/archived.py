@@ -17,7 +17,7 @@ from psotrack.errors import InputError
 from psotrack.settings import TrackSettings
 
 if TYPE_CHECKING:
-    from psotrack.archives import Manifest
+    from psotrack.pipeline.archives import Manifest
 
 #: Key of the archive in the context of a command.
 _ARCHIVE = "psotrack.archive"
@@ -66,7 +66,7 @@ def opened_archive(context: click.Context, path: Path) -> Path:
     Raises:
         InputError: the archive does not exist, was cut short or changed, or is of a newer version.
     """
-    from psotrack.archives import read_manifest, unpack
+    from psotrack.pipeline.archives import read_manifest, unpack
 
     temporary = Path(context.with_resource(tempfile.TemporaryDirectory(prefix="psotrack-")))
     manifest = unpack(path, temporary / "archive")
@@ -131,7 +131,7 @@ def with_comparison(
     archive = archive_of(click.get_current_context())
     if archive is None:
         return record, ""
-    from psotrack.archives import compare_with_archive
+    from psotrack.pipeline.archives import compare_with_archive
 
     asked = archive.without_place(settings)
     comparison = compare_with_archive(archive.folder, archive.manifest, tracks, record, asked)

@@ -14,7 +14,7 @@ from psotrack.cli.output import output_json, print_line, print_table
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.silhouettes import CacheEntry
+    from psotrack.foreground.silhouettes import CacheEntry
 
 
 @click.group()
@@ -45,7 +45,7 @@ def list_command(cache: Path | None, quiet: bool, force: bool, json_path: Path |
       psotrack cache list
       psotrack cache list --cache /shared/cache --json -
     """
-    from psotrack.silhouettes import list_entries
+    from psotrack.foreground.silhouettes import list_entries
 
     folder, now_s = cache_folder(cache), time.time()
     entries = list_entries(folder)
@@ -76,7 +76,7 @@ def check(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) 
       psotrack cache check
       psotrack cache check --cache /shared/cache --json damaged.json
     """
-    from psotrack.silhouettes import is_damaged, list_entries
+    from psotrack.foreground.silhouettes import is_damaged, list_entries
 
     folder = cache_folder(cache)
     entries = list_entries(folder)
@@ -125,7 +125,7 @@ def prune(
       psotrack cache prune --older-than 30 --dry-run
       psotrack cache prune --max-gb 20
     """
-    from psotrack.silhouettes import choose_to_prune, list_entries
+    from psotrack.foreground.silhouettes import choose_to_prune, list_entries
 
     if older_than_days is None and max_gb is None:
         raise SettingsError("cache prune", expected="--older-than DAYS or --max-gb GB", found="neither")
@@ -148,7 +148,7 @@ def empty(force: bool, cache: Path | None, quiet: bool, json_path: Path | None) 
       psotrack cache empty
       psotrack cache empty --force --cache /shared/cache
     """
-    from psotrack.silhouettes import list_entries
+    from psotrack.foreground.silhouettes import list_entries
 
     folder = cache_folder(cache)
     entries = list_entries(folder)
@@ -169,7 +169,7 @@ def _remove(
     folder: Path, chosen: list[CacheEntry], dry_run: bool, quiet: bool, force: bool, json_path: Path | None
 ) -> None:
     """Remove entries, and say which."""
-    from psotrack.silhouettes import remove_entry
+    from psotrack.foreground.silhouettes import remove_entry
 
     if not dry_run:
         for each in chosen:

@@ -25,7 +25,7 @@ from psotrack.cli.options import (
 )
 from psotrack.cli.output import output_json, print_line, report_to
 from psotrack.errors import SettingsError
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.foreground.silhouettes import SilhouetteSettings
 
 if TYPE_CHECKING:
     from psotrack.recordings import Detections, Recording
@@ -141,7 +141,7 @@ def _by_network(
     recording: Recording, chosen: str, confidence: float, nms: float, size: int, quiet: bool
 ) -> Any:
     """Detections of each camera by a network, one camera after the other."""
-    from psotrack.detection import DetectorSettings, detect_drones, find_detector
+    from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
 
     detector = find_detector(chosen, DetectorSettings(confidence, nms, size))
     for name, video in recording.videos.items():
@@ -156,7 +156,7 @@ def _by_blobs(
     quiet: bool,
 ) -> list[tuple[str, Detections]]:
     """Detections of each camera by the blobs of its silhouettes."""
-    from psotrack.silhouettes import blob_detections, compute
+    from psotrack.foreground.silhouettes import blob_detections, compute
 
     sizes_wh = [video.image_size_wh for video in recording.videos.values()]
     if settings.reduction is None:

@@ -56,7 +56,7 @@ def detect_markers(
       psotrack detect-markers a.jpg b.png c.tif --dictionary 6x6_250 --out markers.csv --json -
       psotrack detect-markers flight.mp4 --dictionary 4x4_1000 --out markers.csv --frames 100
     """
-    from psotrack.detection import marker_dictionary
+    from psotrack.foreground.detection import marker_dictionary
     from psotrack.inside_out import markers_of_images, markers_of_video, open_source, write_marker_table
 
     check_outputs(out, json_path, force)

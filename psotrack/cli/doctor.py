@@ -22,7 +22,7 @@ from psotrack.cli.options import (
 from psotrack.cli.output import finite_or_none, output_json, print_line, report_to
 
 if TYPE_CHECKING:
-    from psotrack.doctor import Diagnosis
+    from psotrack.calibration.doctor import Diagnosis
     from psotrack.geometry import Rig
 
 #: Exit code if something was found.
@@ -78,14 +78,14 @@ def doctor(
       psotrack doctor data/Real_Data/R12_D4
       psotrack doctor data/Real_Data/R12_D4 --detections blobs --json -
     """
-    from psotrack.correspondence import from_detections, from_silhouettes
-    from psotrack.datasets import open_recording
-    from psotrack.doctor import examine
-    from psotrack.initiation import room_bounds
+    from psotrack.calibration.doctor import examine
+    from psotrack.foreground.silhouettes import SilhouetteSettings, compute
     from psotrack.pipeline import detection_files_of
     from psotrack.recordings import read_detections
+    from psotrack.recordings.datasets import open_recording
     from psotrack.settings import BLOBS
-    from psotrack.silhouettes import SilhouetteSettings, compute
+    from psotrack.tracking.births import room_bounds
+    from psotrack.tracking.matching import from_detections, from_silhouettes
 
     recording = open_recording(sequence)
     report = report_to(quiet)

@@ -60,10 +60,10 @@ def evaluate(
     """
     from rich.console import Console
 
-    from psotrack.datasets import open_recording
     from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
-    from psotrack.exchange import read_tracks
+    from psotrack.recordings.datasets import open_recording
+    from psotrack.recordings.exchange import read_tracks
 
     recording = open_recording(sequence, bodies=bodies)
     if recording.truth is None:
@@ -104,7 +104,7 @@ def _shifted_reference(
     recording: Recording, estimate: Trajectories, offset: str, *, where: str
 ) -> tuple[Trajectories, float]:
     """The reference at the frames of the videos, and the time by which the reference's clock is ahead, seconds."""
-    from psotrack.clocks import find_offset, own_reference, shifted
+    from psotrack.calibration.clocks import find_offset, own_reference, shifted
 
     reference = own_reference(recording)
     if offset == "auto":

@@ -62,8 +62,8 @@ def export(
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mot --out mot
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mcap --out flight.mcap --images
     """
-    from psotrack.datasets import open_recording
-    from psotrack.exchange import Footage, export_tracks, read_tracks
+    from psotrack.recordings.datasets import open_recording
+    from psotrack.recordings.exchange import Footage, export_tracks, read_tracks
 
     _check_options(tracks, sequence, to, out, images)
     recording = None if sequence is None else open_recording(sequence)

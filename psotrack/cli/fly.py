@@ -8,8 +8,8 @@ import click
 
 from psotrack.cli.options import FORCE, QUIET, Numbers
 from psotrack.errors import errors_name
-from psotrack.interrupts import unhurried_end
 from psotrack.support import refuse_to_overwrite
+from psotrack.support.interrupts import unhurried_end
 
 
 @click.command()

@@ -26,8 +26,8 @@ def info(sequence: Path, bodies: dict[str, tuple[str, ...]], force: bool, json_p
       psotrack info flight/recording.toml
       psotrack info flight --body cf1=M1,M2,M3,M4
     """
-    from psotrack.datasets import open_recording
     from psotrack.recordings import check_end, describe_recording, inventory_table
+    from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(sequence, bodies=bodies)
     for video in recording.videos.values():

@@ -12,7 +12,7 @@ from psotrack.cli.output import output_json, print_inventory, print_line
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.datasets import Draft
+    from psotrack.recordings.datasets import Draft
 
 
 @click.command("init")
@@ -85,7 +85,6 @@ def init(
       psotrack init flight --calibration rig.toml --match left=GX010123.MP4 --leave-out test.mp4
       psotrack init flight --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
     """
-    from psotrack.datasets import DraftOptions, draft_recording
     from psotrack.errors import check_positive
     from psotrack.recordings import (
         RECORDING_FILE,
@@ -94,6 +93,7 @@ def init(
         recording_file_text,
         write_recording_file,
     )
+    from psotrack.recordings.datasets import DraftOptions, draft_recording
     from psotrack.support import refuse_to_overwrite
 
     path = out or folder / RECORDING_FILE

@@ -92,8 +92,8 @@ def labels(
       psotrack labels data/Simulated_Data/S0* --out yolo --drone-size 0.43,0.43,0.23 --every 5
       psotrack labels R01_D2 R12_D4 --out yolo --drone-size 0.4,0.4,0.2 --offset 0,0,-0.117 --validation R12_D4
     """
-    from psotrack.datasets import open_recording
-    from psotrack.detection import DATA_SET, LabelSettings, write_data_set
+    from psotrack.foreground.detection import DATA_SET, LabelSettings, write_data_set
+    from psotrack.recordings.datasets import open_recording
 
     counts = write_data_set(
         [open_recording(sequence) for sequence in sequences],

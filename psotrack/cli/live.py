@@ -34,14 +34,14 @@ from psotrack.cli.options import (
 from psotrack.cli.output import output_json, print_line, write_json
 from psotrack.cli.run_files import run_file_options
 from psotrack.errors import SettingsError
-from psotrack.interrupts import unhurried_end
 from psotrack.settings import TrackSettings
 from psotrack.support import refuse_to_overwrite
+from psotrack.support.interrupts import unhurried_end
 
 if TYPE_CHECKING:
     from psotrack.live import LiveResult, LiveSession, RowsOutput
     from psotrack.recordings import Recording
-    from psotrack.viewer import LiveView
+    from psotrack.show.viewer import LiveView
 
 #: Time between two changes of the table on the terminal, seconds.
 _SHOWN_S = 0.5
@@ -142,7 +142,6 @@ def live(
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
     started = click.get_current_context().obj or time.perf_counter()
-    from psotrack.datasets import open_recording
     from psotrack.live import (
         WAIT_S,
         CameraRecorder,
@@ -154,6 +153,7 @@ def live(
         write_lines,
     )
     from psotrack.pipeline import warn_of_missing_drones, with_real_time
+    from psotrack.recordings.datasets import open_recording
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
@@ -233,7 +233,7 @@ def live(
 
 
 def _check_viewer(viewer: str) -> None:
-    from psotrack.viewer import check_display, check_installed
+    from psotrack.show.viewer import check_display, check_installed
 
     check_installed()
     if viewer == "window":
@@ -242,7 +242,7 @@ def _check_viewer(viewer: str) -> None:
 
 @contextlib.contextmanager
 def _open_view(viewer: str, recording: Recording, quiet: bool) -> Iterator[LiveView]:
-    from psotrack.viewer import LiveView
+    from psotrack.show.viewer import LiveView
 
     with LiveView(recording, web=viewer == "web") as view:
         if view.page:

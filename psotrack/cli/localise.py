@@ -22,7 +22,7 @@ from psotrack.cli.options import (
 from psotrack.cli.output import check_outputs, output_json, print_line, report_to
 from psotrack.cli.shutter import given_shutter, shutter_content, shutter_options, shutter_sentence
 from psotrack.errors import InputError, SettingsError
-from psotrack.interrupts import unhurried_end
+from psotrack.support.interrupts import unhurried_end
 
 if TYPE_CHECKING:
     from psotrack.geometry import Camera
@@ -252,10 +252,10 @@ def localise(
 
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
     """The input that VIDEO names: a video, a folder of images, a stream, or one drone's video in a sequence."""
-    from psotrack.datasets import find_marker_corners
-    from psotrack.datasets.dpjait import read_onboard
     from psotrack.inside_out import open_source
     from psotrack.recordings import is_picture_folder
+    from psotrack.recordings.datasets import find_marker_corners
+    from psotrack.recordings.datasets.dpjait import read_onboard
 
     stream, folder = live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()

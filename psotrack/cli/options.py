@@ -14,8 +14,8 @@ import platformdirs
 from psotrack.cli.log_file import LogFile
 from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
 from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.silhouettes import Shadows, SilhouetteSettings
 from psotrack.settings import TrackSettings, setting_names
-from psotrack.silhouettes import Shadows, SilhouetteSettings
 from psotrack.support import ARCHIVE_SUFFIX, refuse_files, whole_number
 
 if TYPE_CHECKING:
@@ -355,15 +355,15 @@ def setting_name(option: str) -> str:
 
 def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:
     """Recording with the cameras and frames that the options `CAMERAS` and `--frames` select."""
-    from psotrack.datasets import open_recording
+    from psotrack.recordings.datasets import open_recording
 
     return open_recording(folder).usable(camera_names(cameras), num_frames)
 
 
 def filmed_recording(source: Path, cameras: str | None, num_frames: int | None) -> Recording:
     """The videos of a recording, calibrated or not, or a single video, or a folder of pictures as a recording."""
-    from psotrack.datasets import is_recording, open_recording
     from psotrack.recordings import is_picture_folder, open_video, recording_of_video, with_all_videos
+    from psotrack.recordings.datasets import is_recording, open_recording
 
     if not source.exists():
         raise InputError(

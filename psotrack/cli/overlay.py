@@ -64,8 +64,8 @@ def overlay(
       psotrack overlay tracks.csv data/Simulated_Data/S02_D4_A --out videos --mosaic
       psotrack overlay tracks.csv flight --out videos --cameras cam1,cam2 --scale 0.5
     """
-    from psotrack.flights import first_instants, read_flight
-    from psotrack.overlay import OverlayOptions, write_overlays
+    from psotrack.show.flights import first_instants, read_flight
+    from psotrack.show.overlay import OverlayOptions, write_overlays
 
     flight = read_flight([tracks], sequence, cameras=camera_names(cameras))
     if num_frames is not None:

@@ -36,8 +36,8 @@ def pack(
       psotrack pack tracks.csv flight --out flight.psotrack --videos
       psotrack track flight.psotrack --out again.csv
     """
-    from psotrack.archives import pack_tracks
-    from psotrack.datasets import open_recording
+    from psotrack.pipeline.archives import pack_tracks
+    from psotrack.recordings.datasets import open_recording
 
     if out.suffix != ARCHIVE_SUFFIX:
         raise SettingsError("--out", expected=f"a file that ends in {ARCHIVE_SUFFIX}", found=out.name)
@@ -71,7 +71,7 @@ def unpack(archive: Path, out: Path, force: bool, quiet: bool) -> None:
       psotrack unpack flight.psotrack --out flight
       psotrack evaluate flight/tracks.csv flight
     """
-    from psotrack.archives import unpack as unpack_archive
+    from psotrack.pipeline.archives import unpack as unpack_archive
 
     manifest = unpack_archive(archive, out, force=force, report=report_to(quiet))
     print_line(quiet, None, f"{out}: {manifest.sequence}, {len(manifest.files)} files, {manifest.tracks}")

@@ -53,8 +53,8 @@ def report(
       psotrack report results --out sweep.html
       psotrack report calibration.json --out calibration.html
     """
-    from psotrack.flights import read_flight
-    from psotrack.reports import (
+    from psotrack.show.flights import read_flight
+    from psotrack.show.reports import (
         is_calibration_record,
         write_calibration_report,
         write_flight_report,

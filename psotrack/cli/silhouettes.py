@@ -21,7 +21,7 @@ from psotrack.cli.options import (
     silhouette_options,
 )
 from psotrack.cli.output import output_json, print_line, report_to
-from psotrack.silhouettes import SilhouetteSettings
+from psotrack.foreground.silhouettes import SilhouetteSettings
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -85,7 +85,7 @@ def silhouettes(
       psotrack silhouettes flight.mp4 --masks flight_mask.mp4
       psotrack silhouettes pictures/ --masks masks --background mog2 --min-blob 16
     """
-    from psotrack.silhouettes import compute
+    from psotrack.foreground.silhouettes import compute
 
     recording = filmed_recording(sequence, cameras, num_frames)
     if masks_path is not None:
@@ -134,7 +134,7 @@ def _write_masks(
     force: bool,
 ) -> dict[str, Any]:
     """Write the masks of all cameras; returns what was written, as JSON."""
-    from psotrack.silhouettes import write_masks
+    from psotrack.foreground.silhouettes import write_masks
 
     places = write_masks(recording, settings, out, jobs=jobs, force=force, report=report_to(quiet))
     return {

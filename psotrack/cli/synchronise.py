@@ -12,7 +12,7 @@ from psotrack.cli.output import output_json, print_line
 from psotrack.errors import errors_name
 
 if TYPE_CHECKING:
-    from psotrack.clocks import Offset
+    from psotrack.calibration.clocks import Offset
     from psotrack.trajectories import Trajectories
 
 
@@ -52,8 +52,8 @@ def synchronise(
       psotrack synchronise tracks.csv data/Real_Data/R12_D4
       psotrack synchronise tracks.csv data/Real_Data/R12_D4 --max-offset 10 --plot offset.png --json -
     """
-    from psotrack.clocks import find_offset, own_reference, save_curve
-    from psotrack.datasets import open_recording
+    from psotrack.calibration.clocks import find_offset, own_reference, save_curve
+    from psotrack.recordings.datasets import open_recording
     from psotrack.trajectories import read_trajectories
 
     recording = open_recording(sequence, bodies=bodies)

@@ -246,9 +246,9 @@ def track(
       psotrack track data/Simulated_Data/S02_D4_A --out paper.parquet --swarm joint --particles 100 --iterations 70
     """
     started = click.get_current_context().obj or time.perf_counter()
-    from psotrack.datasets import open_recording
-    from psotrack.detection import DetectorSettings, find_detector
+    from psotrack.foreground.detection import DetectorSettings, find_detector
     from psotrack.pipeline import Parts, check_detections, track_recording, usable_for, with_real_time
+    from psotrack.recordings.datasets import open_recording
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 

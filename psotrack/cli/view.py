@@ -27,8 +27,8 @@ from psotrack.errors import SettingsError
 from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
-    from psotrack.flights import TrackedFlight
-    from psotrack.viewer import WrittenFlight
+    from psotrack.show.flights import TrackedFlight
+    from psotrack.show.viewer import WrittenFlight
 
 
 @click.command()
@@ -95,8 +95,8 @@ def view(
       psotrack view swarm.csv lines.csv --sequence flight --web
       psotrack view --sequence flight --frames 250
     """
-    from psotrack.flights import first_instants, read_flight
-    from psotrack.viewer import (
+    from psotrack.show.flights import first_instants, read_flight
+    from psotrack.show.viewer import (
         check_display,
         check_installed,
         find_silhouettes,
@@ -110,7 +110,7 @@ def view(
         raise SettingsError("--save", expected="a file that ends in .rrd", found=save.name)
     check_installed()
     # These names need Rerun.
-    from psotrack.viewer import ViewContent, write_flight
+    from psotrack.show.viewer import ViewContent, write_flight
 
     if save is not None:
         refuse_to_overwrite(save, force)

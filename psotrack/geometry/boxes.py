@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from psotrack._typing import Array
 from psotrack.geometry.cameras import NEAR_M, Camera, distort
 from psotrack.geometry.lenses import is_one_to_one, lens_derivative, second_sheet
+from psotrack.support.array_types import Array
 
 #: Middle and half width of the interval between the tangents of an ellipsoid along one direction across the optical
 #: axis, in undistorted coordinates, from the middle's coordinate along the direction and two elements of the shape:

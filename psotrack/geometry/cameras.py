@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack._typing import Array
 from psotrack.errors import SettingsError
 from psotrack.geometry.camera_names import chosen_cameras
 from psotrack.geometry.lenses import (
@@ -34,6 +33,7 @@ from psotrack.geometry.lenses import (
     undistort_normalised,
 )
 from psotrack.support import short_repr
+from psotrack.support.array_types import Array
 
 #: Smallest depth of a point that has a projection, metres.
 NEAR_M = 1e-3

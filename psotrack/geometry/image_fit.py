@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.estimation import Damping, NormalEquations, Step, levenberg_marquardt
 from psotrack.geometry.cameras import NEAR_M, Camera, distort, has_image, to_camera
+from psotrack.geometry.estimation import Damping, NormalEquations, Step, levenberg_marquardt
 from psotrack.geometry.lenses import lens_derivative
 
 #: A step shorter than this is not taken, standard deviations of the point.

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack._typing import Array
+from psotrack.support.array_types import Array
 
 #: Numbers of coefficients that OpenCV's pinhole model has, and its fisheye model.
 PINHOLE_COEFFICIENTS = (0, 4, 5, 8, 12, 14)

@@ -18,12 +18,18 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from psotrack.foreground.silhouettes import (
+    ForegroundSettings,
+    LivingBackground,
+    coverage,
+    ignored_pixels,
+    reduce_frame,
+)
 from psotrack.live.addresses import ANSWER_S
 from psotrack.live.cameras import LiveCamera
 from psotrack.live.meeting import Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
 from psotrack.live.sources import SourceFrame
-from psotrack.silhouettes import ForegroundSettings, LivingBackground, coverage, ignored_pixels, reduce_frame
 
 logger = logging.getLogger(__name__)
 

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import (
     RECORDING_FILE,
     CameraTable,
@@ -33,7 +34,6 @@ from psotrack.recordings import (
     probe,
     write_recording_file,
 )
-from psotrack.rig_files import write_rig
 from psotrack.support import check_file_name
 
 logger = logging.getLogger(__name__)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from psotrack.errors import InputError, OutputError, PsotrackError
+from psotrack.foreground.silhouettes import Exposures, usual_drone_px
 from psotrack.live.cameras import LiveCamera
 from psotrack.live.front_end import FrontEnd
 from psotrack.live.meeting import Instant, Meeting, MeetingCamera
@@ -19,7 +20,6 @@ from psotrack.live.recorder import RecordedCounts
 from psotrack.pipeline import causal_settings, causal_tracker
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import Exposures, usual_drone_px
 from psotrack.trajectories import Trajectories
 
 logger = logging.getLogger(__name__)

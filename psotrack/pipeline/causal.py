@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import compute, exposures_of
 from psotrack.geometry import Rig
-from psotrack.initiation import flight_volume
 from psotrack.pipeline.results import environment, warn_of_missing_drones
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import compute, exposures_of
 from psotrack.support import Report, no_progress
-from psotrack.tracking import StepwiseTracker, tracker_settings
+from psotrack.tracking.births import flight_volume
+from psotrack.tracking.swarm import StepwiseTracker, tracker_settings
 from psotrack.trajectories import Status, Trajectories
 
 #: Number of frames whose silhouettes are read together.

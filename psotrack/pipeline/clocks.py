@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from psotrack.clocks import CameraClocks, clocks_of_tracks
-from psotrack.correspondence import from_silhouettes
+from psotrack.calibration.clocks import CameraClocks, clocks_of_tracks
 from psotrack.pipeline.inputs import Run
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS
+from psotrack.tracking.matching import from_silhouettes
 from psotrack.trajectories import Tracks
 
 logger = logging.getLogger(__name__)

@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from psotrack.clocks import CameraClocks
-from psotrack.correspondence import Sightings, from_detections, from_silhouettes
-from psotrack.datasets.dpjait import detection_files, read_detections
+from psotrack.calibration.clocks import CameraClocks
 from psotrack.errors import InputError
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import views_meet
-from psotrack.initiation import (
+from psotrack.pipeline.parts import Method, Parts, find_method
+from psotrack.recordings import Recording
+from psotrack.recordings.datasets.dpjait import detection_files, read_detections
+from psotrack.settings import BLOBS, YOLO, TrackSettings
+from psotrack.support import Report, digest_file, no_progress
+from psotrack.tracking.births import (
     FlightVolume,
     MovingPoints,
     StartSource,
@@ -22,11 +26,7 @@ from psotrack.initiation import (
     moving_detections,
     start_source,
 )
-from psotrack.pipeline.parts import Method, Parts, find_method
-from psotrack.recordings import Recording
-from psotrack.settings import BLOBS, YOLO, TrackSettings
-from psotrack.silhouettes import Silhouettes
-from psotrack.support import Report, digest_file, no_progress
+from psotrack.tracking.matching import Sightings, from_detections, from_silhouettes
 
 
 def usable_for(

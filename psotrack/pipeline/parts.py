@@ -11,15 +11,15 @@ from typing import Protocol, TypedDict, get_type_hints, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.correspondence import Sightings
-from psotrack.detection import Detector
 from psotrack.errors import SettingsError
+from psotrack.foreground.detection import Detector
+from psotrack.foreground.silhouettes import BackgroundModel, Silhouettes
 from psotrack.geometry import Rig
-from psotrack.initiation import InitialState
 from psotrack.settings import YOLO, TrackSettings
-from psotrack.silhouettes import BackgroundModel, Silhouettes
 from psotrack.support import Report, check_interface, make_plugin, no_progress
-from psotrack.tracking import Score, Search
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.matching import Sightings
+from psotrack.tracking.swarm import Score, Search
 from psotrack.trajectories import Tracks
 
 #: The methods of this package.

@@ -16,13 +16,19 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.camera_errors import TrackErrors
 from psotrack.errors import InputError
-from psotrack.identity import Identities, postprocess
-from psotrack.initiation import BirthRules, count_common, find_cut_off, find_outside, state_at_first_frame
 from psotrack.pipeline.inputs import Run
 from psotrack.settings import TrackSettings, flatten
 from psotrack.support import html_block, html_lines, identify
+from psotrack.tracking.births import (
+    BirthRules,
+    count_common,
+    find_cut_off,
+    find_outside,
+    state_at_first_frame,
+)
+from psotrack.tracking.camera_errors import TrackErrors
+from psotrack.tracking.identity import Identities, postprocess
 from psotrack.trajectories import Tracks, Trajectories, drones_html
 
 logger = logging.getLogger(__name__)

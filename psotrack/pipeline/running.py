@@ -20,11 +20,9 @@ from typing import Any, Literal, Unpack
 import msgspec
 import numpy as np
 
-from psotrack.camera_errors import CameraViews, views_of_middles, views_of_sightings, with_camera_errors
-from psotrack.detection import stored_detections
 from psotrack.errors import InputError, SettingsError
-from psotrack.fusion import fuse_tracks
-from psotrack.initiation import MovingPoints, first_drones, given_state, known_motion, start_source
+from psotrack.foreground.detection import stored_detections
+from psotrack.foreground.silhouettes import Living, Silhouettes, compute, find_background, scaled_settings
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
 from psotrack.pipeline.inputs import Run, prepare, usable_for
 from psotrack.pipeline.parts import (
@@ -40,12 +38,19 @@ from psotrack.pipeline.results import (
     finish,
     with_real_time,
 )
-from psotrack.projection_lines import track_detections
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
-from psotrack.silhouettes import Living, Silhouettes, compute, find_background, scaled_settings
 from psotrack.support import Report, load_ahead, no_progress, processors
-from psotrack.tracking import Places, RunInputs, track_silhouettes, tracker_settings
+from psotrack.tracking.births import MovingPoints, first_drones, given_state, known_motion, start_source
+from psotrack.tracking.camera_errors import (
+    CameraViews,
+    views_of_middles,
+    views_of_sightings,
+    with_camera_errors,
+)
+from psotrack.tracking.fusion import fuse_tracks
+from psotrack.tracking.lines import track_detections
+from psotrack.tracking.swarm import Places, RunInputs, track_silhouettes, tracker_settings
 from psotrack.trajectories import Status, Tracks
 
 

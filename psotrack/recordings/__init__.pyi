@@ -1,4 +1,3 @@
-from .c3d import Markers, read_c3d, write_c3d
 from .detections import Detections, read_detections, write_detections
 from .filmed import recording_of_video, with_all_videos
 from .image_files import (
@@ -13,8 +12,6 @@ from .image_files import (
     read_mask,
 )
 from .inventory import describe_recording, inventory_table
-from .marker_bodies import body_trajectories
-from .marker_groups import NoDronesError
 from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
 from .recording import OnboardVideo, Recording
@@ -55,9 +52,7 @@ __all__ = [
     "CameraTable",
     "Detections",
     "FrameTimes",
-    "Markers",
     "MarkersTable",
-    "NoDronesError",
     "OnboardVideo",
     "Recording",
     "RecordingFile",
@@ -69,7 +64,6 @@ __all__ = [
     "VideoInfo",
     "VideoWriter",
     "WorldTable",
-    "body_trajectories",
     "check_end",
     "check_rate",
     "describe_recording",
@@ -90,7 +84,6 @@ __all__ = [
     "probe",
     "probe_images",
     "probe_silhouettes",
-    "read_c3d",
     "read_detections",
     "read_frames",
     "read_frames_at",
@@ -105,7 +98,6 @@ __all__ = [
     "silence_opencv",
     "warn_of_missing_numbers",
     "with_all_videos",
-    "write_c3d",
     "write_detections",
     "write_recording_file",
 ]

@@ -1,6 +1,7 @@
 """`recording.toml`: the file of a recording, which names the videos, the calibration and the reference of any rig.
 
-Only the file itself is read and checked here. `psotrack.datasets.open_recording` opens the files that it names.
+Only the file itself is read and checked here. `psotrack.recordings.datasets.open_recording` opens the files that it
+names.
 """
 
 from __future__ import annotations

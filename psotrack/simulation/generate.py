@@ -16,7 +16,11 @@ import msgspec
 import numpy as np
 
 from psotrack import __version__
-from psotrack.datasets.dpjait import (
+from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import make_rig
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import RECORDING_FILE
+from psotrack.recordings.datasets.dpjait import (
     CALIBRATION,
     DETECTIONS,
     MARKER_CORNERS,
@@ -30,10 +34,6 @@ from psotrack.datasets.dpjait import (
     write_onboard_calibration,
     write_poses,
 )
-from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import make_rig
-from psotrack.recordings import RECORDING_FILE
-from psotrack.rig_files import write_rig
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
 from psotrack.simulation.labels.mocap import mocap_markers_m

@@ -21,8 +21,8 @@ from jaxtyping import Float, UInt8
 from psotrack import __version__
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter
-from psotrack.rig_files import write_rig
 from psotrack.simulation import scenarios
 from psotrack.simulation.generate import SimulationSettings
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board

@@ -18,7 +18,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
-from psotrack.datasets.dpjait import (
+from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.geometry import Camera, Rig, to_pixels, undistort
+from psotrack.recordings import Recording, VideoInfo, VideoWriter, read_frames
+from psotrack.recordings.datasets.dpjait import (
     CALIBRATION,
     DETECTIONS,
     Detections,
@@ -29,9 +32,7 @@ from psotrack.datasets.dpjait import (
     write_calibration,
     write_detections,
 )
-from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.geometry import Camera, Rig, to_pixels, undistort
-from psotrack.recordings import Markers, Recording, VideoInfo, VideoWriter, read_frames, write_c3d
+from psotrack.recordings.mocap import Markers, write_c3d
 from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite
 
 #: Serial numbers of the dataset's cameras, without the fifth camera, which was a spare.

@@ -30,7 +30,7 @@ from psotrack.errors import InputError, OutputError
 #: Longest name that becomes the name of a file, bytes.
 _LONGEST_NAME = 180
 
-#: Ending of the names of archives (`psotrack.archives`).
+#: Ending of the names of archives (`psotrack.pipeline.archives`).
 ARCHIVE_SUFFIX = ".psotrack"
 
 #: Hash functions of `digest_file`: BLAKE2b with 512 and with 160 bits, and SHA-256.

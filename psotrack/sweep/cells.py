@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings
-from psotrack.silhouettes import check_whole
 
 #: Part of every key. Raise it when the same cell would give other rows.
 SCHEMA = 1

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psotrack.errors import InputError, PsotrackError, SettingsError
-from psotrack.silhouettes import compute
+from psotrack.foreground.silhouettes import compute
 from psotrack.support import (
     Device,
     Report,

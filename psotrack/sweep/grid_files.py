@@ -16,8 +16,8 @@ from typing import Annotated, Any
 import msgspec
 
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings, flatten
-from psotrack.silhouettes import check_whole
 from psotrack.support import convert, read_toml
 from psotrack.sweep.cells import Cell, Perturbation, cell_key
 from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, nest, place_of, table

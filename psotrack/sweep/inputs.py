@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from psotrack.datasets import open_recording
 from psotrack.errors import InputError, PsotrackError
+from psotrack.foreground.silhouettes import Silhouettes, SilhouetteSettings, compute, stored_silhouettes
 from psotrack.geometry import Camera
 from psotrack.pipeline import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
+from psotrack.recordings.datasets import open_recording
 from psotrack.settings import YOLO
-from psotrack.silhouettes import Silhouettes, SilhouetteSettings, compute, stored_silhouettes
 from psotrack.support import digest_file
 from psotrack.sweep.cells import Cell
 from psotrack.sweep.locks import Locks

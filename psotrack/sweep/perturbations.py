@@ -16,9 +16,9 @@ from jaxtyping import UInt8
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig
 from psotrack.recordings import Recording
-from psotrack.silhouettes import Silhouettes
 from psotrack.sweep.cells import Perturbation
 
 #: Random stream of each kind of perturbation; these numbers decide the results.

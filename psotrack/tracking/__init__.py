@@ -1,10 +1,14 @@
-"""The tracker: a particle swarm that maximises the soft IoU of boxes and silhouettes, frame after frame.
+"""Tracking: from silhouettes or detections, and a rig, to the positions of drones in every frame.
 
-In: coverage of the silhouettes, the rig, initial states and settings. Out: positions with covariances, velocities,
-status and learned sizes, per frame and drone. The swarm and the score do not know each other; `tracker` combines
-them. Other rooms may use every name in `__init__.pyi`.
+In: the silhouettes or boxes of all cameras, the rig, and settings. Out: rows of positions with covariances, status and
+identity. The rooms inside, lowest first:
+
+- `motion`: the motion model, its Kalman filter and smoother.
+- `matching`: which detections of several cameras are of the same drone.
+- `births`: drones that have no track yet, and lost drones that come back.
+- `swarm`: the particle swarm that maximises the overlap of boxes and silhouettes.
+- `lines`: the projection lines, which triangulate detections.
+- `camera_errors`: what the tracks show of the cameras' errors.
+- `fusion`: the tracks of two methods as one set.
+- `identity`: which track is which drone after drones met.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -21,19 +21,22 @@ import test_rig_formats as rigs
 from helpers import ring_rig
 
 from fuzz.mutations import Change, columns, members
-from psotrack import archives, calibration, datasets, exchange, flights, inside_out, recordings, simulation
-from psotrack.datasets.dpjait import (
+from psotrack import calibration, inside_out, recordings, simulation
+from psotrack.errors import errors_name
+from psotrack.foreground.detection import DetectorSettings, OnnxDetector
+from psotrack.foreground.silhouettes import compute
+from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
+from psotrack.pipeline import archives
+from psotrack.recordings import datasets, exchange, mocap
+from psotrack.recordings.datasets.dpjait import (
     pose_file,
     read_marker_centres,
     read_masks,
     write_marker_corners,
     write_poses,
 )
-from psotrack.detection import DetectorSettings, OnnxDetector
-from psotrack.errors import errors_name
-from psotrack.reports import write_calibration_report
-from psotrack.rig_files import read_lenses, read_rig, write_rig
-from psotrack.silhouettes import compute
+from psotrack.show import flights
+from psotrack.show.reports import write_calibration_report
 from psotrack.simulation.flights.piloting import read_sticks
 from psotrack.simulation.flights.recordings import read_recorded_flight
 from psotrack.sweep import Store, read_grid
@@ -235,7 +238,7 @@ def _recording(folder: Path) -> None:
     cross_m = np.array([[0.1, 0, 0], [0, 0.12, 0], [-0.15, 0, 0], [0, -0.1, 0.05]])
     position_m = np.concatenate([cross_m + np.array([x, 0, 1.2]) for x in (-0.6, 0.6)])
     moved_m = position_m + 0.01 * np.arange(20)[:, None, None]
-    recordings.write_c3d(folder / "mocap.c3d", recordings.Markers(labels, moved_m, 50.0))
+    mocap.write_c3d(folder / "mocap.c3d", mocap.Markers(labels, moved_m, 50.0))
     write_marker_corners(folder / "corners.csv", _corners())
     text = (folder / "recording.toml").read_text()
     text = text.replace('video = "c1.avi"', 'video = "c1.avi"\ntimestamps = "times.csv"')
@@ -314,7 +317,7 @@ _RECORDINGS = {
     "recording-rig": _part("rig.toml"),
     "recording-boxes": _part("boxes.csv", recordings.read_detections),
     "recording-times": _part("times.csv", recordings.read_timestamps),
-    "recording-c3d": _part("mocap.c3d", recordings.read_c3d),
+    "recording-c3d": _part("mocap.c3d", mocap.read_c3d),
     "recording-video": _part("c0.avi"),
     "recording-reference": Format(_csv_recording, "dron1.csv", (_open,), _INFO, is_slow=True),
     "dpjait-calibration": _published("cameras_calibration.csv"),
@@ -434,16 +437,16 @@ _TABLES = {
         "map-markers {file} --out {out}/corners.csv",
     ),
     "measured-c3d": Format(
-        lambda folder: recordings.write_c3d(
+        lambda folder: mocap.write_c3d(
             folder / "room.c3d",
-            recordings.Markers(
+            mocap.Markers(
                 tuple(f"Marker{marker}:{corner + 1}" for marker in _corners() for corner in range(4)),
                 np.tile(np.concatenate(list(_corners().values())), (3, 1, 1)),
                 100.0,
             ),
         ),
         "room.c3d",
-        (inside_out.read_measured_corners, recordings.read_c3d),
+        (inside_out.read_measured_corners, mocap.read_c3d),
         "map-markers {file} --out {out}/corners.csv",
     ),
     "image-points": _table(

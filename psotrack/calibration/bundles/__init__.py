@@ -1,4 +1,4 @@
-"""Bundle adjustments as `psotrack.estimation` solves them: residuals, derivatives and normal equations.
+"""Bundle adjustments as `psotrack.geometry.estimation` solves them: residuals, derivatives and normal equations.
 
 In: what cameras see, and a state near the solution. Out: the state with the smallest cost, and its equations. There are
 two adjustments, with the same parts: a problem (the data), a state (the unknowns), and a bundle (a state with its

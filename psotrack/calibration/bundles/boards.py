@@ -1,7 +1,7 @@
 """Bundle adjustment of lenses, cameras and boards: residuals, derivatives and normal equations (see `calibration.rig`).
 
 A corner X of the board is seen at K(R_c (R_b X + t_b) + t_c). The unknowns of the lenses and the cameras are shared by
-all instants; the board's pose at an instant is a block, which `psotrack.estimation` eliminates.
+all instants; the board's pose at an instant is a block, which `psotrack.geometry.estimation` eliminates.
 """
 
 from __future__ import annotations
@@ -14,8 +14,14 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.bundles.poses import move_poses
 from psotrack.calibration.lens_models import LensModel
-from psotrack.estimation import NormalEquations, Step, cauchy_loss, cauchy_weight, levenberg_marquardt
 from psotrack.geometry import cross_matrices
+from psotrack.geometry.estimation import (
+    NormalEquations,
+    Step,
+    cauchy_loss,
+    cauchy_weight,
+    levenberg_marquardt,
+)
 
 _MAX_STEPS = 100
 #: Relative change of the cost that ends the search; the robust search only has to find the outliers.

@@ -1,7 +1,7 @@
 """Bundle adjustment of cameras and points: residuals, derivatives and normal equations (see `calibration.bundle`).
 
 A point X is seen at K(R_c X + t_c). The unknowns of the cameras, and a common factor of the focal lengths, are shared
-by all points; each point is a block, which `psotrack.estimation` eliminates.
+by all points; each point is a block, which `psotrack.geometry.estimation` eliminates.
 """
 
 from __future__ import annotations
@@ -15,8 +15,14 @@ from jaxtyping import Bool, Float, Int
 from psotrack.calibration.bundles.poses import move_poses
 from psotrack.calibration.derivatives import reproject
 from psotrack.calibration.gauge import pose_changes
-from psotrack.estimation import NormalEquations, Step, cauchy_loss, cauchy_weight, levenberg_marquardt
 from psotrack.geometry import Camera
+from psotrack.geometry.estimation import (
+    NormalEquations,
+    Step,
+    cauchy_loss,
+    cauchy_weight,
+    levenberg_marquardt,
+)
 
 #: Weight of the constraint on common motions of the rig: large enough to suppress them, and small enough that sums with
 #: the other equations keep their digits.

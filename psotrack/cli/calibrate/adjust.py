@@ -18,7 +18,7 @@ from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import DroneViews, Improved
-    from psotrack.doctor import CheckedAdjustment
+    from psotrack.calibration.doctor import CheckedAdjustment
     from psotrack.geometry import Rig
     from psotrack.recordings import Recording
 
@@ -79,10 +79,10 @@ def adjust(
       psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
     """
     from psotrack.calibration import find_drones_in_boxes
-    from psotrack.datasets import open_recording
-    from psotrack.doctor import improve_with_check
+    from psotrack.calibration.doctor import improve_with_check
+    from psotrack.geometry.rig_files import write_rig
     from psotrack.recordings import read_detections
-    from psotrack.rig_files import write_rig
+    from psotrack.recordings.datasets import open_recording
     from psotrack.trajectories import read_trajectories
 
     refuse_to_overwrite(out, force)

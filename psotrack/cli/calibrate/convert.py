@@ -67,7 +67,7 @@ def convert(
       psotrack calibrate convert cameras_calibration.csv rig.yml --size 1920,1080
     """
     from psotrack.geometry import Rig
-    from psotrack.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
+    from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
 
     if units is not None and units not in UNITS_M:
         raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=units)

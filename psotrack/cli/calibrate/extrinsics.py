@@ -83,7 +83,7 @@ def extrinsics(
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
     from psotrack.calibration import read_image_points
-    from psotrack.rig_files import write_rig
+    from psotrack.geometry.rig_files import write_rig
 
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
@@ -108,7 +108,7 @@ def _lenses(
 ) -> Mapping[str, Any]:
     """Lens of each camera, by name, from intrinsics, fields of view, or focal length and sensor."""
     from psotrack.calibration import lens_of_sensor, lens_of_view
-    from psotrack.rig_files import read_lenses
+    from psotrack.geometry.rig_files import read_lenses
 
     given = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
     if sum(given) != 1 or (focal_length_mm is None) != (sensor_mm is None):
@@ -139,8 +139,8 @@ def _lenses(
 def _find_markers(folder: Path, dictionary: str) -> dict[str, ImagePoints]:
     """Corners of the markers in the videos of a sequence, by camera."""
     from psotrack.calibration import find_markers
-    from psotrack.datasets import find_marker_corners, open_recording
     from psotrack.inside_out import read_marker_map
+    from psotrack.recordings.datasets import find_marker_corners, open_recording
 
     corners_m = read_marker_map(find_marker_corners(folder)).corners_m
     videos = open_recording(folder).videos

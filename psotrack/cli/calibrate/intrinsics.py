@@ -61,7 +61,7 @@ def intrinsics(
         say_searched,
     )
     from psotrack.geometry import make_rig
-    from psotrack.rig_files import write_lenses, write_rig
+    from psotrack.geometry.rig_files import write_lenses, write_rig
 
     refuse_to_overwrite(out, force)
     if squares_wh is None:

@@ -187,7 +187,7 @@ def rig(
 
 
 def _write(out: Path, rig: Any, force: bool) -> None:
-    from psotrack.rig_files import write_rig
+    from psotrack.geometry.rig_files import write_rig
 
     write_rig(out, rig, force=force)
 
@@ -211,7 +211,7 @@ def _by_board(
         say_print,
         say_searched,
     )
-    from psotrack.datasets import open_recording
+    from psotrack.recordings.datasets import open_recording
 
     if len(sources) == 1 and is_recording(sources[0]):
         cameras, instants = open_recorded(open_recording(sources[0]), floor)
@@ -270,7 +270,7 @@ def _report(
 def _lenses(lens: str, is_shared: bool, path: Path | None) -> LensChoice:
     """The lenses of the options."""
     from psotrack.calibration import LensChoice, known_lenses, parse_lens_model
-    from psotrack.rig_files import read_lenses
+    from psotrack.geometry.rig_files import read_lenses
 
     known = None if path is None else known_lenses(read_lenses(path))
     return LensChoice(parse_lens_model(lens), known, is_shared)

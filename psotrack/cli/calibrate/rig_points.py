@@ -201,7 +201,7 @@ def calibrate_pairs(
 def known_lenses_of(names: tuple[str, ...], path: Path | None) -> Rig:
     """Lenses of the cameras from a calibration; a file with one camera has the lens of all."""
     from psotrack.geometry import Rig, chosen_camera
-    from psotrack.rig_files import read_lenses
+    from psotrack.geometry.rig_files import read_lenses
 
     if path is None:
         raise SettingsError(
@@ -242,8 +242,8 @@ def in_words(path: Path, left_m: dict[str, float]) -> str:
 def _read_views(sources: tuple[Path, ...]) -> PointViews:
     """Sightings from a CSV file, or from the detections of a recording."""
     from psotrack.calibration import read_point_views, views_of_detections
-    from psotrack.datasets import open_recording
     from psotrack.recordings import read_detections
+    from psotrack.recordings.datasets import open_recording
 
     if len(sources) != 1:
         raise SettingsError(

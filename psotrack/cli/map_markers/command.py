@@ -140,7 +140,6 @@ def map_markers(
       psotrack map-markers data/Simulated_Data/S01_D2_A --drone dron1 --known 7 --out corners.csv --json -
       psotrack map-markers data/Simulated_Data/S01_D2_A --check corners.csv
     """
-    from psotrack.datasets.dpjait import write_marker_corners
     from psotrack.inside_out import (
         build_map,
         check_map,
@@ -149,6 +148,7 @@ def map_markers(
         read_marker_map,
         read_measured_corners,
     )
+    from psotrack.recordings.datasets.dpjait import write_marker_corners
 
     given = [name for name, value in {"--out": out, "--check": checked}.items() if value is not None]
     if len(given) != 1:

@@ -22,8 +22,8 @@ def known_corners(
     known: str | None, table: Path | None, side_m: float | None, sources: tuple[Path, ...]
 ) -> dict[int, np.ndarray]:
     """Corners of the known markers, (4, 3) in metres, by id."""
-    from psotrack.datasets import find_marker_corners, is_recording
     from psotrack.inside_out import corners_in_own_frame, read_marker_map
+    from psotrack.recordings.datasets import find_marker_corners, is_recording
     from psotrack.support import whole_number
 
     words = [word.strip() for word in (known or "").split(",") if word.strip()]
@@ -76,8 +76,8 @@ def videos_of(
     sources: tuple[Path, ...], drones: str | None, lenses: Lenses, fps: float | None = None
 ) -> dict[str, tuple[VideoInfo, Camera]]:
     """Videos with their lenses, by name; a folder of pictures is a video of `fps` frames per second."""
-    from psotrack.datasets import is_recording
     from psotrack.recordings import is_picture_folder, open_video
+    from psotrack.recordings.datasets import is_recording
 
     if is_recording(sources[0]):
         if len(sources) > 1:
@@ -93,8 +93,8 @@ def videos_of(
 
 
 def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
-    from psotrack.datasets import open_recording
     from psotrack.inside_out import lens_from_matrix
+    from psotrack.recordings.datasets import open_recording
 
     onboard = open_recording(folder).onboard or {}
     if not onboard:

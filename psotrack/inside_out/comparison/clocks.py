@@ -1,6 +1,6 @@
 """Clock offsets between a camera's path and a reference: of its positions, and separately of its orientations.
 
-Both use `psotrack.clocks.find_offset`, first over a wide range and then near the result with all samples.
+Both use `psotrack.calibration.clocks.find_offset`, first over a wide range and then near the result with all samples.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation, Slerp
 
-from psotrack.clocks import Offset, find_offset, time_shift
+from psotrack.calibration.clocks import Offset, find_offset, time_shift
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.trajectories import GATE_M, Status, Trajectories, resampling
@@ -53,7 +53,7 @@ def find_position_offset(
         max_offset_s: see `comparing.compare_paths`.
 
     Raises:
-        SettingsError, InputError: see `psotrack.clocks.find_offset`.
+        SettingsError, InputError: see `psotrack.calibration.clocks.find_offset`.
     """
     path = _without_jumps(path)
     estimate, points_m = path.trajectories("camera"), position_m[:, None]
@@ -103,7 +103,7 @@ def find_orientation_offset(
         max_offset_s: see `comparing.compare_paths`.
 
     Raises:
-        SettingsError, InputError: see `psotrack.clocks.find_offset`.
+        SettingsError, InputError: see `psotrack.calibration.clocks.find_offset`.
     """
     path, middles_m = _without_jumps(path), _APART_M * np.eye(3)
     status = np.repeat(path.status[:, None], 3, axis=1)

@@ -2,8 +2,8 @@
 
 The paper (technical validation, "ArUco markers") shifts the path along the reference, takes the offset with the
 smallest mean distance, and states distances and differences of angles at corresponding frames. The paper's shifts are
-whole samples of the reference; here the offset is found to a fraction of a sample (`psotrack.clocks`). Orientations may
-have their own clock, such as an IMU's: their offset is found from the rotation of the camera.
+whole samples of the reference; here the offset is found to a fraction of a sample (`psotrack.calibration.clocks`).
+Orientations may have their own clock, such as an IMU's: their offset is found from the rotation of the camera.
 
 Two constant differences are no errors: the lever arm, from the reference's point on the drone to the camera, and the
 turn from the camera's axes to the axes of the reference's body. Each can be estimated and removed, and is returned.
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack.clocks import time_shift
+from psotrack.calibration.clocks import time_shift
 from psotrack.inside_out.camera_path import CameraPath, roll_pitch_yaw_deg
 from psotrack.inside_out.comparison import clocks as clocks
 

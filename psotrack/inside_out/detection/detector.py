@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.detection import marker_dictionary
 from psotrack.errors import SettingsError
+from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import Camera
 from psotrack.inside_out.detection.codes import MarkerCodes, pattern_agreement
 from psotrack.inside_out.detection.corners import refine_corners

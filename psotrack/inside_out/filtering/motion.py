@@ -6,9 +6,9 @@ Systems 6(4), 1970) along the world's axes, and orientation and turn rate about 
 for several levels of jerk and angular acceleration at once.
 
 Poses of neighbouring frames have similar errors, because they come from the same corners at nearly the same places in
-the image. Therefore a share of a measurement's covariance belongs to a lasting error, as in `psotrack.motion`. The
-lasting error is L u: L is the symmetric root of that share, and u are six slowly changing numbers of variance 1 that
-are part of the state. A filter that treated these errors as white noise would become overconfident.
+the image. Therefore a share of a measurement's covariance belongs to a lasting error, as in `psotrack.tracking.motion`.
+The lasting error is L u: L is the symmetric root of that share, and u are six slowly changing numbers of variance 1
+that are part of the state. A filter that treated these errors as white noise would become overconfident.
 
 Errors of the map, of the focal length and of the line time are constant. No motion reveals them, and no number of
 frames averages them out, so the filter considers them without estimating them (S. F. Schmidt, Application of
@@ -35,7 +35,7 @@ from psotrack.inside_out.filtering.manifold import (
     turned,
 )
 from psotrack.inside_out.frame_motion import FrameMotion
-from psotrack.motion import white_jerk_noise
+from psotrack.tracking.motion import white_jerk_noise
 
 #: Size of the error state: position, velocity, acceleration, turn, turn rate (3 each), and the lasting error u (6).
 SIZE = 21

@@ -2,7 +2,7 @@
 
 The causal filter runs once forwards and once backwards in time. A pose is used if it fits in both directions. Both runs
 estimate how violently the camera moves, and how good the poses are, at any time. With these estimates a
-Rauch-Tung-Striebel smoother on the manifold of poses (`psotrack.estimation`) gives the path.
+Rauch-Tung-Striebel smoother on the manifold of poses (`psotrack.geometry.estimation`) gives the path.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.estimation import backward_step
+from psotrack.geometry.estimation import backward_step
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering.manifold import right_jacobian_inverse

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.clocks import Offset, find_offset
+from psotrack.calibration.clocks import Offset, find_offset
 from psotrack.errors import InputError
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, unfused_path

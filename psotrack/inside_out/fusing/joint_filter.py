@@ -1,11 +1,12 @@
 """Kalman filter and smoother of one drone from two sources: its motion, the errors of both sources, and an arm.
 
-The motion has white jerk (`psotrack.motion`); the backward pass is Rauch-Tung-Striebel's (`psotrack.estimation`). The
-two sources have independent errors. Part of each source's error is white noise, and part lasts: a first-order
-Gauss-Markov process (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
-2001, chapter 8), because the output of a filter, or a body seen from one side, has similar errors in neighbouring
-frames. The lasting errors are part of the state. Where one source ends, the estimate of the other source's error stays,
-and the path does not jump. The arm is the vector between the points that the two sources measure.
+The motion has white jerk (`psotrack.tracking.motion`); the backward pass is Rauch-Tung-Striebel's
+(`psotrack.geometry.estimation`). The two sources have independent errors. Part of each source's error is white noise,
+and part lasts: a first-order Gauss-Markov process (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 2001, chapter 8), because the output of a filter, or a body seen from one side,
+has similar errors in neighbouring frames. The lasting errors are part of the state. Where one source ends, the estimate
+of the other source's error stays, and the path does not jump. The arm is the vector between the points that the two
+sources measure.
 
 All computations are in float64, and for several error models at once.
 """
@@ -18,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.estimation import backward_step
-from psotrack.motion import white_jerk_noise
+from psotrack.geometry.estimation import backward_step
+from psotrack.tracking.motion import white_jerk_noise
 
 INSIDE, OUTSIDE = 0, 1
 

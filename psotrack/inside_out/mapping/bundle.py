@@ -1,9 +1,9 @@
 """Bundle adjustment of markers: move cameras and markers together until the squares project to where they are seen.
 
 Triggs, McLauchlan, Hartley & Fitzgibbon (2000), "Bundle adjustment, a modern synthesis": Levenberg-Marquardt with the
-cameras eliminated (`psotrack.estimation`), first with a robust loss, then with squared residuals of the inliers. A
-marker is a rigid square with six unknowns, and a seventh, the logarithm of its side, where the side is estimated. Fixed
-markers define the world's axes; at least one marker must be fixed.
+cameras eliminated (`psotrack.geometry.estimation`), first with a robust loss, then with squared residuals of the
+inliers. A marker is a rigid square with six unknowns, and a seventh, the logarithm of its side, where the side is
+estimated. Fixed markers define the world's axes; at least one marker must be fixed.
 
 Ink, exposure and blur move the sides of a square in its image, inwards or outwards, by a fraction of a pixel that does
 not depend on the distance. The square then seems smaller and farther away, and the effect grows with the distance. The
@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import GATE, spread_px
-from psotrack.estimation import (
+from psotrack.geometry.estimation import (
     NormalEquations,
     ReducedEquations,
     Step,

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.datasets.dpjait import MarkerRow, read_marker_rows, split_label
 from psotrack.errors import InputError
 from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.inside_out.marker_map import SQUARE_TOLERANCE, MarkerMap, normals, sides_m
-from psotrack.recordings import read_c3d
+from psotrack.recordings.datasets.dpjait import MarkerRow, read_marker_rows, split_label
+from psotrack.recordings.mocap import read_c3d
 
 #: Distance of a viewer from a marker's plane, in sides, below which the viewer is on neither side of the marker.
 _ON_A_SIDE = 0.5

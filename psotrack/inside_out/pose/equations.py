@@ -10,10 +10,10 @@ pose, the inset and the focal length, and derivatives S by a marker's place, the
     Σ |r - J x - S d|² / own² + Σ |d|² / place² + (inset / its deviation)² + (focal length / its deviation)².
 
 Where the shutter rolls, the velocity and the turn rate of the camera are six more unknowns (see `row_motion`), with the
-prior that the motion gives. The places d are eliminated (`psotrack.estimation`). Both variances, own² and place², are
-estimated from the residuals and from the number of unknowns that the data determine (MacKay, Bayesian interpolation,
-Neural Computation 4(3), 1992), with a scaled inverse χ² prior. The principal point is not an unknown, because a turn of
-the camera has almost the same effect, except at the edge of a wide image.
+prior that the motion gives. The places d are eliminated (`psotrack.geometry.estimation`). Both variances, own² and
+place², are estimated from the residuals and from the number of unknowns that the data determine (MacKay, Bayesian
+interpolation, Neural Computation 4(3), 1992), with a scaled inverse χ² prior. The principal point is not an unknown,
+because a turn of the camera has almost the same effect, except at the edge of a wide image.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.calibration import reproject
-from psotrack.estimation import NormalEquations, covariance_from_information
 from psotrack.geometry import NEAR_M, Camera
+from psotrack.geometry.estimation import NormalEquations, covariance_from_information
 from psotrack.inside_out.pose.records import CornerResiduals
 from psotrack.inside_out.pose.row_motion import RowMotion, UnsureRows, at_rows, slopes_by_motion
 

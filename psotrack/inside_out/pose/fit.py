@@ -1,6 +1,6 @@
 """The most likely pose near an initial pose, and the corners that fit the most likely pose.
 
-Robust steps come first, then steps with all corners that fit (`psotrack.estimation.gauss_newton`). Studentised
+Robust steps come first, then steps with all corners that fit (`psotrack.geometry.estimation.gauss_newton`). Studentised
 residuals, which are residuals in units of their own standard deviations, decide which corners and markers fit (Cook &
 Weisberg, Residuals and influence in regression, 1982, section 2.2). The covariance is the inverse of the information
 after the elimination of the inset, the focal length and the markers' places (see `equations`).
@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from psotrack.calibration import spread_px
-from psotrack.estimation import NormalEquations, cauchy_weight, gauss_newton
 from psotrack.geometry import NEAR_M
+from psotrack.geometry.estimation import NormalEquations, cauchy_weight, gauss_newton
 from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.inside_out.pose.equations import (
     PRIOR_RESIDUALS,

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from psotrack.datasets.dpjait import read_poses
 from psotrack.errors import InputError, SettingsError
+from psotrack.recordings.datasets.dpjait import read_poses
 from psotrack.simulation.flights.motion import Flight, Heading
 from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
 from psotrack.simulation.scenarios import FlightFromFile

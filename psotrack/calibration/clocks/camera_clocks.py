@@ -1,0 +1,357 @@
+"""Offsets between the clocks of cameras, from the motion of drones that several cameras see.
+
+A video that shows the scene late shows a drone where the drone was when the other cameras exposed the same frame: its
+detection is off the epipolar lines by the drone's motion in the image times the delay. The offsets of all cameras and
+the points in space are estimated together by Gauss-Newton steps in which the points are eliminated
+(`psotrack.geometry.estimation`), until the offsets settle. Each detection is weighted by how well it fits (S. Geman and
+D. E. McClure, Statistical Methods for Tomographic Image Reconstruction, 1987).
+
+Errors of neighbouring frames are not independent: the middle of a drone's box is off in nearly the same way for as long
+as the drone flies in the same attitude. The standard deviations therefore use the autocovariance of the residuals
+(W. K. Newey and K. D. West, Econometrica 55 (3), 1987), pooled over all drones and both image axes of a camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack.calibration.clocks.correlated_errors import autocorrelation, widening
+from psotrack.errors import SettingsError, check_positive
+from psotrack.geometry import (
+    MAX_CONDITION,
+    Camera,
+    Rig,
+    has_image,
+    project_with_jacobian,
+    to_camera,
+    triangulate_linearly,
+)
+from psotrack.geometry.estimation import NormalEquations, cauchy_weight, gauss_newton
+
+#: Number of rounds without a step until the weights have settled, and largest number of steps.
+_WEIGHT_ROUNDS, _MAX_STEPS = 5, 35
+#: The iteration ends when no offset changes by more than this, frames.
+_SETTLED = 1e-4
+#: A detection at this multiple of the median distance has a weight of 1/4.
+_MEDIANS = 3.0
+#: Smallest median distance that is used for the weights, pixels: exact detections would have a median of 0.
+_MIN_MEDIAN_PX = 0.1
+#: A velocity is the slope of a straight line through the points at most this far away in time, seconds.
+_REACH_S = 0.25
+#: A velocity counts only beyond this multiple of its standard deviation: the noise of a hovering drone is not motion.
+_CLEARLY = 3.0
+#: Smallest curvature of the robust cost, as a share of the curvature of weighted least squares.
+_MIN_CURVATURE = 0.3
+#: Largest leverage: a larger share of a detection's error that the triangulated point absorbs is not corrected.
+_MAX_LEVERAGE = 0.9
+
+
+@dataclass(frozen=True)
+class CameraOffsets:
+    """Offsets between the clocks of cameras.
+
+    Attributes:
+        offset_frames: (cameras,), frames: a camera exposed its frame k at time k + offset of the common clock, as a
+            `time_offset_s` says it. The mean of the offsets is 0.
+        std_frames: (cameras,), standard deviations of the offsets, frames; near `max_offset_frames` for a camera whose
+            detections do not show its offset.
+        rms_before_px: weighted root mean square distance of the detections from the projections if all offsets are 0,
+            pixels; NaN if no point is seen by two cameras.
+        rms_after_px: the same distance with the estimated offsets, pixels.
+    """
+
+    offset_frames: Float[np.ndarray, "cameras"]
+    std_frames: Float[np.ndarray, "cameras"]
+    rms_before_px: float
+    rms_after_px: float
+
+    @property
+    def late_frames(self) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), by how many frames each video shows the scene late; negative for a video that is early."""
+        return -self.offset_frames
+
+
+def camera_offsets(
+    rig: Rig,
+    points_px: Float[np.ndarray, "frames drones cameras 2"],
+    fps: float,
+    *,
+    max_offset_frames: float = 5.0,
+) -> CameraOffsets:
+    """Estimate the offset of each camera's clock, in fractions of a frame, from matched detections.
+
+    If all drones hover, or a camera has no detections, the offset stays near 0 and its standard deviation near
+    `max_offset_frames`, which are the values of the prior distribution.
+
+    The standard deviations include errors that are correlated in time, as far as the residuals show them. They do not
+    include an error that always points along the motion, because such an error looks like an offset of the clock.
+
+    Args:
+        rig: the calibrated cameras.
+        points_px: (frames, drones, cameras, 2), detections, pixels; NaN where a camera does not see a drone.
+            Detections are interpolated between neighbouring frames only.
+        fps: frames per second of the videos.
+        max_offset_frames: standard deviation of the offsets' prior distribution, and largest offset, frames.
+
+    Raises:
+        SettingsError: `fps` or `max_offset_frames` is not above 0, or `points_px` has another number of cameras than
+            the rig.
+    """
+    check_positive("fps", fps)
+    check_positive("max_offset_frames", max_offset_frames)
+    if points_px.shape[2] != len(rig):
+        raise SettingsError("points_px", expected=f"{len(rig)} cameras", found=f"{points_px.shape[2]}")
+    problem = _Problem(rig.cameras, points_px, max(1, round(_REACH_S * fps)), max_offset_frames)
+    weights = np.ones(points_px.shape[:-1])
+    # Offsets are not changed before the weights have excluded the outliers.
+    for _ in range(_WEIGHT_ROUNDS):
+        before = _linearise(problem, np.zeros(len(rig)), weights)
+        weights = before.weights
+    after = gauss_newton(_linearise(problem, np.zeros(len(rig)), weights), max_steps=_MAX_STEPS)
+    std_frames = _standard_deviations(after, max_offset_frames)
+    return CameraOffsets(after.offset_frames, std_frames, before.rms_px, after.rms_px)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Data of the estimate.
+
+    Attributes:
+        cameras: the calibrated cameras.
+        points_px: (frames, drones, cameras, 2), detections, pixels.
+        reach: number of frames before and after a frame through which a velocity is fitted.
+        max_offset_frames: standard deviation of the offsets' prior distribution, and largest offset, frames.
+    """
+
+    cameras: Camera
+    points_px: Float[np.ndarray, "frames drones cameras 2"]
+    reach: int
+    max_offset_frames: float
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations at given offsets with the points eliminated, `estimation.least_squares.Reweighted`.
+
+    Attributes:
+        problem: data of the estimate.
+        offset_frames: (cameras,), offsets at which the problem was linearised, frames.
+        normal: (cameras, cameras), left side, squared pixels per squared frame.
+        gradient: (frames, cameras), right side of each frame, squared pixels per frame.
+        weights: (frames, drones, cameras), weights of the detections; 0 where there is no detection.
+        residual_px: (frames, drones, cameras, 2), detections minus projections; 0 where there is no detection.
+        influence: (cameras, frames, drones, cameras, 2), derivatives of the right side by the weighted residuals,
+            pixels per frame.
+        leverage: (frames, drones, cameras), share of a detection's error that the triangulated point absorbs.
+        variance_px2: variance of one coordinate of a detection, squared pixels.
+        rms_px: weighted root mean square distance of the detections from the projections, pixels.
+    """
+
+    problem: _Problem
+    offset_frames: Float[np.ndarray, "cameras"]
+    normal: Float[np.ndarray, "cameras cameras"]
+    gradient: Float[np.ndarray, "frames cameras"]
+    weights: Float[np.ndarray, "frames drones cameras"]
+    residual_px: Float[np.ndarray, "frames drones cameras 2"]
+    influence: Float[np.ndarray, "solved frames drones cameras 2"]
+    leverage: Float[np.ndarray, "frames drones cameras"]
+    variance_px2: float
+    rms_px: float
+
+    def moved(self) -> _System:
+        """Take a step with the prior, keep the offsets within their limit, and keep their mean at 0."""
+        limit = self.problem.max_offset_frames
+        stiffness = self.variance_px2 / limit**2
+        normal = self.normal + stiffness * np.eye(len(self.offset_frames))
+        right = self.gradient.sum(axis=0) - stiffness * self.offset_frames
+        offset_frames = self.offset_frames + NormalEquations(normal, right).solved().shared
+        offset_frames = np.clip(offset_frames, -limit, limit)
+        return _linearise(self.problem, offset_frames - offset_frames.mean(), self.weights)
+
+    def is_settled(self, before: _System) -> bool:
+        return bool(np.abs(self.offset_frames - before.offset_frames).max() < _SETTLED)
+
+
+def _linearise(
+    problem: _Problem,
+    offset_frames: Float[np.ndarray, "cameras"],
+    weights: Float[np.ndarray, "frames drones cameras"],
+) -> _System:
+    """Linearise |e - u δ - J ΔX|², where δ are changes of the offsets, ΔX changes of the points, and u = J V.
+
+    V are the velocities of the points, and e the detections minus the projections. `weights` are those of the previous
+    round, for the triangulation.
+    """
+    cameras, seen_px = problem.cameras, _interpolate_at_common_times(problem.points_px, offset_frames)
+    point_m = triangulate_linearly(cameras, seen_px, np.maximum(weights, 1e-9))
+    places_m = np.nan_to_num(point_m)[:, :, None]
+    pixels, _, J = project_with_jacobian(cameras, places_m)
+    e = seen_px - pixels
+    there = (
+        np.isfinite(e).all(axis=-1)
+        & has_image(cameras, to_camera(cameras, places_m))
+        & np.isfinite(point_m).all(axis=-1)[..., None]
+    )
+    there &= there.sum(axis=-1, keepdims=True) >= 2
+    e = np.where(there[..., None], e, 0.0)
+    weights = _robust_weights(e, there)
+    point_normal = np.einsum("fdc,fdcik,fdcil->fdkl", weights, J, J)
+    known = np.linalg.cond(point_normal) < MAX_CONDITION
+    point_normal = np.where(known[..., None, None], point_normal, np.eye(3))
+    squares, total = float((weights * (e**2).sum(axis=-1)).sum()), float(weights.sum())
+    # Each triangulated point uses up three degrees of freedom.
+    freedom = 2 * total - 3 * float((weights.max(axis=-1) * known).sum())
+    variance_px2 = squares / max(freedom, 1.0) + 1e-12
+
+    trace_m2 = np.trace(np.linalg.inv(point_normal), axis1=-2, axis2=-1)
+    spread_m2 = np.where(known, variance_px2 * trace_m2, np.inf)
+    velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, problem.reach)
+    moving = known & ((velocity_m**2).sum(axis=-1) > _CLEARLY**2 * noise_m2)
+    u = np.einsum("fdcij,fdj->fdci", J, np.where(moving[..., None], velocity_m, 0.0))
+    coupling = np.einsum("fdc,fdcik,fdci->fdkc", weights, J, u)
+    point_right = np.einsum("fdc,fdcik,fdci->fdk", weights, J, e)
+    gradient = np.einsum("fdc,fdci,fdci->fc", weights, u, e)
+    num_cameras = len(offset_frames)
+    reduced = NormalEquations(
+        np.diag(np.einsum("fdc,fdci,fdci->c", weights, u, u)),
+        gradient.sum(axis=0),
+        point_normal.reshape(-1, 3, 3),
+        point_right.reshape(-1, 3),
+        coupling.reshape(-1, 3, num_cameras),
+    ).reduced()
+    inverse, gain = reduced.block_covariance.reshape(point_normal.shape), reduced.gain.reshape(coupling.shape)
+    gradient -= np.einsum("fdlc,fdl->fc", gain, point_right)
+    # The derivative of camera b's equation by camera c's weighted residual: u_b if b = c, less J_c M⁻¹ J_bᵀ w u_b.
+    influence = -np.einsum("fdcik,fdkb->bfdci", J, gain)
+    index = np.arange(num_cameras)
+    influence[index, :, :, index] += np.moveaxis(u, 2, 0)
+    influence *= there[..., None]
+    leverage = np.einsum("fdcik,fdkl,fdcil,fdc->fdc", J, inverse, J, weights) / 2
+    rms_px = np.sqrt(squares / total) if total else np.nan
+    return _System(
+        problem,
+        offset_frames,
+        reduced.information,
+        gradient,
+        weights,
+        e,
+        influence,
+        leverage,
+        variance_px2,
+        rms_px,
+    )
+
+
+def _robust_weights(
+    e: Float[np.ndarray, "frames drones cameras 2"], there: np.ndarray
+) -> Float[np.ndarray, "frames drones cameras"]:
+    """Geman-McClure weights of the detections, (1 + (distance / scale)²)⁻²; 0 where there is no detection."""
+    distance_px = np.linalg.norm(e, axis=-1)
+    # Two rays nearly always meet, so the distances of points that only two cameras see do not show the noise.
+    checked = there & (there.sum(axis=-1, keepdims=True) >= 3)
+    checked = checked if checked.any() else there
+    median_px = float(np.median(distance_px[checked])) if checked.any() else 0.0
+    scale_px = _MEDIANS * max(median_px, _MIN_MEDIAN_PX)
+    return there * cauchy_weight((distance_px / scale_px) ** 2) ** 2
+
+
+def _interpolate_at_common_times(
+    points_px: Float[np.ndarray, "frames drones cameras 2"], offset: Float[np.ndarray, "cameras"]
+) -> Float[np.ndarray, "frames drones cameras 2"]:
+    """Interpolate each camera's detections at whole frames k of the common clock: at k - offset of its own clock."""
+    own_time = np.arange(len(points_px))[:, None] - offset
+    before = np.floor(own_time).astype(int)
+    share = (own_time - before)[:, None, :, None]
+    rows, columns = np.clip(before, 0, len(points_px) - 1), np.arange(len(offset))
+    next_rows = np.clip(before + (share[:, 0, :, 0] > 0), 0, len(points_px) - 1)
+    # Index arrays that a slice separates put their axes first: (frames, cameras, drones, 2).
+    first_px, second_px = (points_px[row, :, columns].swapaxes(1, 2) for row in (rows, next_rows))
+    inside = (own_time >= 0) & (own_time <= len(points_px) - 1)
+    return np.where(inside[:, None, :, None], (1 - share) * first_px + share * second_px, np.nan)
+
+
+def _fit_velocities(
+    point_m: Float[np.ndarray, "frames drones 3"], spread_m2: Float[np.ndarray, "frames drones"], reach: int
+) -> tuple[Float[np.ndarray, "frames drones 3"], Float[np.ndarray, "frames drones"]]:
+    """Fit a straight line through the points near each frame: velocities, metres per frame, and their variances.
+
+    Args:
+        point_m: (frames, drones, 3), points, metres.
+        spread_m2: (frames, drones), variances of the points, square metres; infinite where there is no point.
+        reach: number of frames before and after a frame through which the line is fitted.
+    """
+    num_frames = len(point_m)
+    around = ((reach, reach), (0, 0))
+    padded_m = np.pad(np.nan_to_num(point_m), (*around, (0, 0)))
+    weight = np.pad(1 / spread_m2, around)
+    steps = np.arange(-reach, reach + 1.0)
+    rows = np.arange(num_frames)[:, None] + np.arange(len(steps))
+    total, first, second = (np.einsum("fwd,w->fd", weight[rows], steps**power) for power in (0, 1, 2))
+    # The weighted mean time of each window, and the weighted sum of squares about this mean.
+    middle = first / np.maximum(total, 1e-300)
+    squares = second - first * middle
+    pull = np.einsum("fwd,w,fwdi->fdi", weight[rows], steps, padded_m[rows])
+    pull -= middle[..., None] * np.einsum("fwd,fwdi->fdi", weight[rows], padded_m[rows])
+    known = squares > 1e-9 * np.maximum(second, 1e-300)
+    squares = np.where(known, squares, 1.0)
+    return np.where(known[..., None], pull / squares[..., None], 0.0), np.where(known, 1 / squares, np.inf)
+
+
+def _standard_deviations(system: _System, max_offset_frames: float) -> Float[np.ndarray, "cameras"]:
+    """Standard deviations of the offsets: a sandwich covariance with the residuals' autocovariance (P. J. Huber 1967).
+
+    The residual of a detection is divided by 1 - leverage, which makes it the distance from the point that the other
+    cameras see (the HC3 estimator of J. G. MacKinnon and H. White, J. Econometrics 29, 1985).
+    """
+    num_cameras = len(system.normal)
+    prior = np.eye(num_cameras) / max_offset_frames**2
+    w = system.weights
+    # The Geman-McClure cost has less curvature than least squares with the fixed weights w: its second derivatives are
+    # w (4 √w - 3) along the residual and w across it.
+    curvature = max(float((w * (2 * np.sqrt(w) - 1)).sum() / max(w.sum(), 1e-12)), _MIN_CURVATURE)
+    inverse = np.linalg.inv(curvature * system.normal / system.variance_px2 + prior)
+    # The mean of the offsets is 0.
+    inverse -= inverse.mean(axis=0)
+    inverse -= inverse.mean(axis=1, keepdims=True)
+    influence = np.einsum("kb,bfdci->kfdci", inverse / system.variance_px2, system.influence)
+    error_px = (w / (1 - np.minimum(system.leverage, _MAX_LEVERAGE)))[..., None] * system.residual_px
+    variance = np.einsum("kb,bc,kc->k", inverse, prior, inverse)
+    for camera in range(num_cameras):
+        variance += _propagate_errors(influence[..., camera, :], error_px[:, :, camera], w[:, :, camera] > 0)
+    return np.sqrt(variance)
+
+
+def _propagate_errors(
+    influence: Float[np.ndarray, "cameras frames drones 2"],
+    error_px: Float[np.ndarray, "frames drones 2"],
+    there: Bool[np.ndarray, "frames drones"],
+) -> Float[np.ndarray, "cameras"]:
+    """Variances of all offsets that the errors of one camera's detections cause.
+
+    The errors are stationary, with the same autocovariance for all drones and for both axes. Different drones have a
+    constant covariance, which is that of an error of the camera's pose or lens.
+    """
+    if not there.any():
+        return np.zeros(len(influence))
+    pairs = np.round(autocorrelation(there.astype(float)).sum(axis=1))
+    covariance = autocorrelation(error_px).sum(axis=(1, 2)) / np.maximum(2 * pairs, 1)
+    # Estimates at long lags are noise: the sum ends where two neighbouring lags are negative together (C. J. Geyer,
+    # Statistical Science 7 (4), 1992). Only lags count at which pairs of frames exist.
+    lags = np.flatnonzero(pairs)
+    padded = np.append(covariance[lags], 0.0)[: len(lags) + len(lags) % 2]
+    positive = np.logical_and.accumulate(padded[0::2] + padded[1::2] > 0)
+    kept = lags[np.repeat(positive, 2)[: len(lags)]]
+    products = autocorrelation(np.moveaxis(influence, 1, 0)).sum(axis=(2, 3))
+    twice = np.where(kept > 0, 2.0, 1.0)
+    # Never less than the variance of independent errors.
+    variance = np.maximum(products[0] * covariance[0], (twice * covariance[kept]) @ products[kept])
+    error_sum, influence_sum, count = error_px.sum(axis=0), influence.sum(axis=1), there.sum(axis=0)
+    pairs_of_drones = count.sum() ** 2 - (count**2).sum()
+    shared = (error_sum.sum(axis=0) ** 2).sum() - (error_sum**2).sum()
+    product = (influence_sum.sum(axis=1) ** 2).sum(axis=-1) - (influence_sum**2).sum(axis=(1, 2))
+    variance += max(shared / max(2 * pairs_of_drones, 1), 0.0) * np.maximum(product, 0.0)
+    share = variance / np.maximum(products[0] * (error_px**2).sum(), 1e-300)
+    return variance * widening(share) ** 2

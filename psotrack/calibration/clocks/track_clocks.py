@@ -1,0 +1,229 @@
+"""Offsets and drifts of cameras' clocks, from tracks and the places where the cameras show the tracked drones.
+
+The tracks say which sightings are of which drone. The clocks themselves come from the sightings: `camera_clocks`
+estimates constant offsets in each of several stretches of the recording, and a straight line through the offsets of
+the stretches gives offset and drift. Only differences between cameras show: the median of all offsets, and of all
+drifts, is 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from psotrack.calibration.clocks.camera_clocks import camera_offsets
+from psotrack.calibration.clocks.track_places import MAX_OFFSET_FRAMES, places_of_tracks
+from psotrack.foreground.silhouettes import Silhouettes
+from psotrack.geometry import Rig
+from psotrack.recordings import FrameTimes, Timeline
+from psotrack.tracking.matching import Sightings
+from psotrack.trajectories import Status, Tracks, Trajectories
+
+#: Least number of instants of a stretch, and largest number of stretches.
+_LEAST_INSTANTS, _MOST_STRETCHES = 60, 12
+#: A drift counts only beyond this multiple of its standard deviation: over seconds all clocks run alike.
+_CLEARLY = 5.0
+#: Least number of places that a camera must show in a stretch.
+_LEAST_PLACES = 10
+#: An offset counts only if its standard deviation is below this share of an interval between instants.
+_KNOWN = 0.25
+
+
+@dataclass(frozen=True)
+class CameraClocks:
+    """Estimated corrections of the times of the cameras' frames.
+
+    A frame that was given the time t was exposed at t + offset + drift * (t - middle).
+
+    Attributes:
+        offset_s: (cameras,), offset in the middle of the recording, seconds; the median is 0. A video that shows the
+            scene late has a negative offset. 0 for a camera whose sightings do not show the offset.
+        offset_std_s: (cameras,), standard deviations of the offsets, seconds; infinite for a camera that shows nothing.
+        drift: (cameras,), seconds per second; 0 where none is certain.
+        drift_std: (cameras,), standard deviations of the drifts; infinite where the recording is too short.
+        middle_s: time of the middle of the recording, seconds.
+    """
+
+    offset_s: Float[np.ndarray, "cameras"]
+    offset_std_s: Float[np.ndarray, "cameras"]
+    drift: Float[np.ndarray, "cameras"]
+    drift_std: Float[np.ndarray, "cameras"]
+    middle_s: float
+
+    @property
+    def late_s(self) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), by how much each video shows the scene late, seconds; negative for a video that is early."""
+        return -self.offset_s
+
+    def corrected(
+        self, frame_times: Mapping[str, FrameTimes], cameras: Sequence[str]
+    ) -> dict[str, FrameTimes]:
+        """Frame times with the corrections of these cameras, in the order of the estimate."""
+        changes = dict(
+            zip(cameras, zip(self.offset_s.tolist(), self.drift.tolist(), strict=True), strict=True)
+        )
+        return {
+            name: times.corrected(changes[name][0] - changes[name][1] * self.middle_s, changes[name][1])
+            if name in changes
+            else times
+            for name, times in frame_times.items()
+        }
+
+    def record(self, cameras: Sequence[str]) -> dict[str, dict[str, float | None]]:
+        """Corrections by camera name, fit for JSON; None for a standard deviation that is not known."""
+
+        def rows() -> Any:
+            values = (self.offset_s, self.late_s, self.offset_std_s, self.drift, self.drift_std)
+            return zip(cameras, *values, strict=True)
+
+        return {
+            name: {
+                "offset_s": float(offset_s),
+                "late_s": float(late_s),
+                "offset_std_s": float(offset_std_s) if np.isfinite(offset_std_s) else None,
+                "drift": float(drift),
+                "drift_std": float(drift_std) if np.isfinite(drift_std) else None,
+            }
+            for name, offset_s, late_s, offset_std_s, drift, drift_std in rows()
+        }
+
+    def is_certain(self, least_s: float, multiple: float = 5.0) -> Bool[np.ndarray, "cameras"]:
+        """(cameras,), whether an offset is at least `least_s`, and this multiple of its standard deviation."""
+        size_s = np.abs(self.offset_s)
+        return (size_s >= least_s) & (size_s > multiple * self.offset_std_s)
+
+
+def clocks_of_tracks(
+    rig: Rig,
+    sightings: Sightings,
+    timeline: Timeline,
+    tracks: Tracks | Trajectories,
+    silhouettes: Silhouettes | None = None,
+) -> CameraClocks:
+    """Estimate the clocks of the cameras that a recording was tracked with.
+
+    Args:
+        rig: the calibrated cameras.
+        sightings: sightings at the instants.
+        timeline: the instants.
+        tracks: tracks with velocities and status at the instants; only positions that were found count.
+        silhouettes: silhouettes at the instants, from which the sightings were made; None where a detector made the
+            sightings.
+    """
+    assert tracks.status is not None
+    assert tracks.velocity_m_s is not None
+    found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
+    position_m, velocity_m_s = (
+        np.where(found, values, np.nan).astype(np.float64)
+        for values in (tracks.position_m, tracks.velocity_m_s)
+    )
+    places = places_of_tracks(rig.cameras, sightings, timeline, position_m, velocity_m_s, silhouettes)
+    return estimate_clocks(rig, places, timeline)
+
+
+def estimate_clocks(
+    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], timeline: Timeline
+) -> CameraClocks:
+    """Estimate offset and drift of each camera's clock from matched sightings.
+
+    Args:
+        rig: the calibrated cameras.
+        points_px: (instants, drones, cameras, 2), matched sightings at the instants (see `places_of_tracks`).
+        timeline: the instants.
+    """
+    num_stretches = int(np.clip(len(points_px) // _LEAST_INSTANTS, 1, _MOST_STRETCHES))
+    parts = np.array_split(np.arange(len(points_px)), num_stretches)
+    estimates = [_offsets_of_stretch(rig, points_px[part], timeline.rate_hz) for part in parts]
+    time_s = np.array([timeline.time_s[part].mean() for part in parts])
+    offset_s, std_s = (np.array(values) / timeline.rate_hz for values in zip(*estimates, strict=True))
+    return fit_clocks(time_s, offset_s, std_s, known_s=_KNOWN / timeline.rate_hz)
+
+
+def _offsets_of_stretch(
+    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], rate_hz: float
+) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]]:
+    """Offsets and standard deviations, intervals between instants; 0 and infinite for cameras that show nothing.
+
+    Offsets are relative to the mean of all cameras, so a camera that shows nothing must not be one of them.
+    """
+    offset, std = np.zeros(len(rig)), np.full(len(rig), np.inf)
+    left = np.flatnonzero(np.isfinite(points_px).all(axis=-1).sum(axis=(0, 1)) >= _LEAST_PLACES)
+    while len(left) >= 2:
+        part = rig.select([rig.names[camera] for camera in left])
+        found = camera_offsets(part, points_px[:, :, left], rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
+        if found.std_frames.max() < MAX_OFFSET_FRAMES / 10:
+            offset[left], std[left] = found.offset_frames, found.std_frames
+            break
+        left = np.delete(left, found.std_frames.argmax())
+    return offset, std
+
+
+def fit_clocks(
+    time_s: Float[np.ndarray, "stretches"],
+    offset_s: Float[np.ndarray, "stretches cameras"],
+    std_s: Float[np.ndarray, "stretches cameras"],
+    known_s: float,
+) -> CameraClocks:
+    """Straight lines through the offsets of stretches of a recording, by weighted least squares.
+
+    The zero of the offsets may differ from stretch to stretch, because a stretch shows differences only.
+
+    Args:
+        time_s: (stretches,), middle of each stretch, seconds.
+        offset_s, std_s: (stretches, cameras), estimated offsets and their standard deviations, seconds.
+        known_s: an offset with a larger standard deviation is not used, seconds.
+    """
+    num_stretches, num_cameras = offset_s.shape
+    middle_s = float(time_s.mean())
+    fitted_s, covariance_s2 = _fit(np.ones((num_stretches, 1)), offset_s, std_s)
+    drift, drift_std = np.zeros(num_cameras), np.full(num_cameras, np.inf)
+    if num_stretches >= 3:
+        both, covariance = _fit(
+            np.stack([np.ones(num_stretches), time_s - middle_s], axis=-1), offset_s, std_s
+        )
+        found = both[:, 1] - np.median(both[:, 1])
+        drift_std = np.sqrt(np.diag(covariance)[1::2])
+        if (np.abs(found) > _CLEARLY * drift_std).any():
+            drift, fitted_s, covariance_s2 = found, both[:, :1], covariance[::2, ::2]
+    seen = np.isfinite(std_s).any(axis=0)
+    offset_std_s = np.where(seen, np.sqrt(np.diag(covariance_s2)), np.inf)
+    known = offset_std_s < known_s
+    zero_s = float(np.median(fitted_s[known])) if known.any() else 0.0
+    offset_s = np.where(known, fitted_s[:, 0] - zero_s, 0.0)
+    return CameraClocks(offset_s, offset_std_s, np.where(known, drift, 0.0), drift_std, middle_s)
+
+
+def _fit(
+    basis: Float[np.ndarray, "stretches terms"],
+    offset_s: Float[np.ndarray, "stretches cameras"],
+    std_s: Float[np.ndarray, "stretches cameras"],
+) -> tuple[Float[np.ndarray, "cameras terms"], Float[np.ndarray, "unknowns unknowns"]]:
+    """Coefficients of each camera, relative to the mean of all cameras, and their covariance.
+
+    Where the offsets scatter more than their standard deviations say, the covariance is larger accordingly.
+    """
+    (num_stretches, terms), num_cameras = basis.shape, offset_s.shape[1]
+    unknowns = num_cameras * terms
+    weight = 1 / np.maximum(std_s, 1e-9).ravel()
+    design = np.zeros((num_stretches, num_cameras, unknowns + num_stretches))
+    for camera in range(num_cameras):
+        design[:, camera, camera * terms : (camera + 1) * terms] = basis
+    design[np.arange(num_stretches), :, unknowns + np.arange(num_stretches)] = 1.0
+    design = weight[:, None] * design.reshape(-1, unknowns + num_stretches)
+    # A common change of all cameras and all zeros changes nothing: the pseudo-inverse takes the smallest solution.
+    inverse = np.linalg.pinv(design)
+    solution = inverse @ (weight * offset_s.ravel())
+    residual = weight * offset_s.ravel() - design @ solution
+    freedom = len(residual) - np.linalg.matrix_rank(design)
+    scatter = float(np.sqrt((residual**2).sum() / freedom)) if freedom else 1.0
+    covariance = (inverse @ inverse.T)[:unknowns, :unknowns] * max(1.0, scatter) ** 2
+    # The coefficients are relative to the cameras' mean, weighted by what is known of them; this mean has no error.
+    known = np.square(weight.reshape(offset_s.shape)).sum(axis=0)
+    share = known / known.sum() if known.any() else np.full(num_cameras, 1 / num_cameras)
+    centred = np.kron(np.eye(num_cameras) - share, np.eye(terms))
+    coefficients = solution[:unknowns].reshape(num_cameras, terms)
+    return coefficients - share @ coefficients, centred @ covariance @ centred.T

@@ -1,0 +1,151 @@
+"""Other interpretations of a whole rig: conventions of calibration files that are often confused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.calibration.doctor.agreement import measure_agreement
+from psotrack.geometry import Camera, Rig
+from psotrack.tracking.matching import Sightings
+
+#: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
+_SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
+_FINER = np.exp(np.arange(-0.1, 0.1001, 0.01))
+#: All interpretations are compared in every third frame, and this number of the best in all frames.
+_FEW, _KEPT = 3, 8
+
+
+@dataclass(frozen=True)
+class RigInterpretation:
+    """A rig that results from another interpretation of the calibration.
+
+    Attributes:
+        kind: kind of fault that the calibration has if this interpretation is right.
+        words: what was confused.
+        remedy: what to do.
+        cameras: names of the concerned cameras.
+        rig: the rig according to this interpretation.
+    """
+
+    kind: str
+    words: str
+    remedy: str
+    cameras: tuple[str, ...]
+    rig: Rig
+
+
+def find_better_interpretation(
+    rig: Rig,
+    sightings: Sightings,
+    frames: Int[np.ndarray, "chosen"],
+    bounds_m: Float[np.ndarray, "2 3"],
+) -> RigInterpretation | None:
+    """Find the interpretation that explains clearly more sightings (`required_share`); None if no interpretation does.
+
+    Args:
+        rig: the rig as it was read.
+        sightings: sightings of the rig's cameras.
+        frames: (chosen,), numbers of the frames to examine.
+        bounds_m: (2, 3), corners of the region where bodies can be, metres.
+    """
+    share = measure_agreement(rig, sightings, frames, bounds_m).share
+
+    def explained(interpretation: RigInterpretation) -> float:
+        return measure_agreement(interpretation.rig, sightings, frames, bounds_m).share
+
+    def explained_in_few(interpretation: RigInterpretation) -> float:
+        return measure_agreement(interpretation.rig, sightings, frames[::_FEW], bounds_m).share
+
+    every = [*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)]
+    best = max(sorted(every, key=explained_in_few)[-_KEPT:], key=explained)
+    if best.kind == "focal lengths":
+        scale = best.rig.cameras.K[0, 0, 0] / rig.cameras.K[0, 0, 0]
+        best = max(_lenses(rig, scale * _FINER), key=explained)
+    return best if explained(best) > required_share(share) else None
+
+
+def required_share(share: float) -> float:
+    """Share of sightings that an interpretation must explain: the present share and half of the missing share."""
+    return (1 + share) / 2
+
+
+def _conventions(rig: Rig) -> Iterator[RigInterpretation]:
+    """Interpretations with translation or centre, world to camera or the reverse, mirrored or normal camera axes."""
+    T = rig.cameras.T_cam_world
+    for centred, turned, signs in product((False, True), (False, True), product((1.0, -1.0), repeat=3)):
+        flip = np.array(signs)
+        if not (centred or turned or (flip < 0).any()):
+            continue
+        R = T[:, :3, :3].swapaxes(-1, -2) if turned else T[:, :3, :3]
+        t_m = -np.matvec(R, T[:, :3, 3]) if centred else T[:, :3, 3]
+        # With an odd number of mirrored camera axes, an axis of the world is mirrored too, so that R stays a rotation:
+        # z if this brings the cameras above the floor, else x.
+        world = np.ones(3)
+        world[2 if np.matvec(R.swapaxes(-1, -2), t_m)[:, 2].mean() > 0 else 0] = np.prod(flip)
+        cameras = _posed(rig.cameras, flip[:, None] * R * world, flip * t_m)
+        yield _convention(rig, cameras, centred, turned, flip)
+
+
+def _convention(
+    rig: Rig, cameras: Camera, centred: bool, turned: bool, flip: Float[np.ndarray, "3"]
+) -> RigInterpretation:
+    words, remedies = [], []
+    if centred:
+        words.append("its translation is the camera's centre C, which was read as t of x_cam = R X + t")
+        remedies.append("write t = -R C for each camera")
+    if turned:
+        words.append("its rotation is from camera to world, which was read as world to camera")
+        remedies.append("write the transposed rotation")
+    if (flip < 0).any():
+        axes = ", ".join(axis for axis, sign in zip("xyz", flip, strict=True) if sign < 0)
+        hand = "" if np.prod(flip) > 0 else " in a left-handed world"
+        opengl = " as in OpenGL" if flip.tolist() == [1.0, -1.0, -1.0] else ""
+        words.append(f"camera axes {axes} are mirrored{opengl}{hand}")
+        also = ", and mirror an axis of the world" if hand else ""
+        remedies.append(
+            f"change the sign of rows {axes} of R and t: cameras have x right, y down, z ahead{also}"
+        )
+    kind = (
+        "mirrored axes" if (flip < 0).any() else "translation or centre" if centred else "rotation inverted"
+    )
+    return RigInterpretation(kind, "; ".join(words), "; ".join(remedies), (), Rig(rig.names, cameras))
+
+
+def _exchanges(rig: Rig) -> Iterator[RigInterpretation]:
+    """Interpretations in which the calibrations of two cameras are exchanged."""
+    for first, second in combinations(range(len(rig)), 2):
+        order = np.arange(len(rig))
+        order[[first, second]] = second, first
+        names = rig.names[first], rig.names[second]
+        yield RigInterpretation(
+            "exchanged",
+            "what one of them sees fits the calibration of the other",
+            "exchange their lines in the calibration, or the names of their videos and detections",
+            names,
+            Rig(rig.names, rig.cameras[order]),
+        )
+
+
+def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterpretation]:
+    """Interpretations in which all focal lengths are multiplied with a factor."""
+    for scale in scales.tolist():
+        K = rig.cameras.K.copy()
+        K[:, :2, :2] *= scale
+        yield RigInterpretation(
+            "focal lengths",
+            f"all focal lengths are {abs(100 * (1 / scale - 1)):.0f} % too {'short' if scale > 1 else 'long'}",
+            f"multiply them by {scale:.3f}, or calibrate the lenses anew",
+            (),
+            Rig(rig.names, replace(rig.cameras, K=K)),
+        )
+
+
+def _posed(cameras: Camera, R: Float[np.ndarray, "n 3 3"], t_m: Float[np.ndarray, "n 3"]) -> Camera:
+    T = cameras.T_cam_world.copy()
+    T[:, :3, :3], T[:, :3, 3] = R, t_m
+    return replace(cameras, T_cam_world=T)

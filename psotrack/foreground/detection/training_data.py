@@ -1,0 +1,170 @@
+"""YOLO data sets for training: images, a text file of labels per image, and `data.yaml` with the parts.
+
+YOLOv5 and its successors use this layout. The labels of images/PART/NAME.jpg are in labels/PART/NAME.txt, one
+line per drone: its class, and the middle and size of its box as fractions of the image's width and height.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.foreground.detection.labels import LabelSettings, box_corners, label_boxes
+from psotrack.recordings import Recording, VideoInfo, read_frames_at
+from psotrack.support import (
+    Advance,
+    Report,
+    atomic_write,
+    check_file_name,
+    map_in_processes,
+    no_progress,
+    refuse_to_overwrite,
+)
+from psotrack.trajectories import resample
+
+#: Name of the file that describes a data set; every folder with a data set has one.
+DATA_SET = "data.yaml"
+
+
+def write_data_set(
+    recordings: Sequence[Recording],
+    out: Path | str,
+    settings: LabelSettings,
+    *,
+    validation: Sequence[str] = (),
+    force: bool = False,
+    jobs: int | None = None,
+    report: Report = no_progress,
+) -> dict[str, dict[str, int]]:
+    """Write images and labels of sequences as a YOLO data set in a new folder.
+
+    Poses at the times of the frames are interpolated, but not over gaps of the reference (see `resample`). Frames in
+    which the pose of a drone is unknown are left out, because the drone may be in the image without a label.
+    Images without drones have an empty label file, which trainers use as background.
+
+    Args:
+        recordings: at least two recordings, each with a reference.
+        out: folder of the data set.
+        settings: settings of the labels.
+        validation: names of the sequences for validation; the others are for training. If there are no names, the last
+            sequence is for validation.
+        force: replace an existing data set.
+        jobs: largest number of processes; None: one per processor.
+        report: shows the progress in frames of all cameras.
+
+    Returns:
+        Numbers of `images` and `labels` in the parts `train` and `val`.
+
+    Raises:
+        SettingsError: two sequences have the same name, a validation name is unknown, or no sequence is left for
+            training or validation.
+        InputError: a sequence has no reference, no frame with all poses known, or inconsistent videos.
+        OutputError: the folder exists and `force` is not set, or it cannot be written.
+    """
+    out = Path(out)
+    parts = _parts([recording.name for recording in recordings], validation)
+    refuse_to_overwrite(out, force)
+    if out.exists() and not (out / DATA_SET).is_file():
+        expected, remedy = "a new folder, or a data set", f"only a folder with a {DATA_SET} can be replaced"
+        raise OutputError(out, expected=expected, found="something else", remedy=remedy)
+    with atomic_write(out) as temporary:
+        for name in ("images/train", "images/val", "labels/train", "labels/val"):
+            (temporary / name).mkdir(parents=True)
+        tasks: list[_Task] = []
+        for recording in recordings:
+            tasks += _tasks(recording, parts[recording.name], settings, temporary)
+        with report("label", sum(len(task.frame) for task in tasks)) as advance:
+            map_in_processes(_write_camera, tasks, jobs=jobs or os.cpu_count() or 1, advance=advance)
+        folders = {"train": "images/train", "val": "images/val"}
+        content = {"path": str(out.resolve()), **folders, "nc": 1, "names": ["drone"]}
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        (temporary / DATA_SET).write_text(text, encoding="utf-8")
+    counts = {}
+    for part in ("train", "val"):
+        written = [lines for task in tasks if task.part == part for lines in task.labels]
+        counts[part] = {"images": len(written), "labels": "".join(written).count("\n")}
+    return counts
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The images and labels of one camera.
+
+    Attributes:
+        out: folder of the data set.
+        part: `train` or `val`.
+        stem: beginning of the files' names.
+        video: video of the camera.
+        frame: numbers of the used frames of the camera.
+        labels: content of each frame's label file.
+    """
+
+    out: Path
+    part: str
+    stem: str
+    video: VideoInfo
+    frame: list[int]
+    labels: list[str]
+
+
+def _parts(names: Sequence[str], validation: Sequence[str]) -> dict[str, str]:
+    """The part of each sequence, `train` or `val`, by the sequence's name."""
+    chosen = set(validation or names[-1:])
+    if len(set(names)) < len(names) or not chosen < set(names):
+        raise SettingsError(
+            "sequences",
+            expected="different names, some for training and others for validation",
+            found=f"{', '.join(names)}, of which {', '.join(sorted(chosen))} for validation",
+            remedy="validation on frames of the training flights would prove nothing",
+        )
+    return {name: "val" if name in chosen else "train" for name in names}
+
+
+def _tasks(recording: Recording, part: str, settings: LabelSettings, out: Path) -> list[_Task]:
+    truth = recording.truth
+    if truth is None:
+        raise InputError(recording.folder, expected="a reference with the drones' positions", found="none")
+    filmed = [name for name in recording.rig.names if name in recording.videos]
+    recording = recording.usable(filmed, recording.num_frames)
+    tasks = []
+    for index, name in enumerate(recording.rig.names):
+        times = recording.frame_times[name]
+        frame = np.arange(0, times.num_frames, settings.every)
+        corners_m = box_corners(resample(truth, frame, times.time_s[frame]), settings)
+        known = np.isfinite(corners_m).all(axis=(1, 2, 3))
+        if known.any():
+            xyxy = label_boxes(recording.rig.cameras[index], corners_m[known], settings)
+            labels = [_lines(boxes, recording.videos[name].image_size_wh) for boxes in xyxy]
+            stem = check_file_name(f"{recording.name}_{name}", recording.folder)
+            tasks.append(_Task(out, part, stem, recording.videos[name], frame[known].tolist(), labels))
+    if not tasks:
+        expected = f"a frame in which the poses of all drones are known, with a step of {settings.every}"
+        raise InputError(recording.folder, expected=expected, found="none")
+    return tasks
+
+
+def _lines(xyxy: Float[np.ndarray, "drones 4"], image_size_wh: tuple[int, int]) -> str:
+    """Lines `class cx cy w h` as fractions of the image's width and height; six decimals are a hundredth of a pixel."""
+    corner, far_corner = xyxy[:, :2] / image_size_wh, xyxy[:, 2:] / image_size_wh
+    values = np.hstack([(corner + far_corner) / 2, far_corner - corner])
+    labelled = values[np.isfinite(values).all(axis=1)].tolist()
+    return "".join("0 {:.6f} {:.6f} {:.6f} {:.6f}\n".format(*row) for row in labelled)
+
+
+def _write_camera(task: _Task, advance: Advance) -> None:
+    """Write one camera's images and labels."""
+    frames = read_frames_at(task.video, task.frame)
+    for (number, image), lines in zip(frames, task.labels, strict=True):
+        name = f"{task.part}/{task.stem}_{number:06d}"
+        encoded = cv2.imencode(".jpg", image)[1]
+        (task.out / "images" / f"{name}.jpg").write_bytes(encoded.tobytes())
+        (task.out / "labels" / f"{name}.txt").write_text(lines, encoding="ascii")
+        advance(1)

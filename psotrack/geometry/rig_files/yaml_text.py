@@ -1,0 +1,98 @@
+"""YAML files of OpenCV, ROS and Kalibr as plain data.
+
+OpenCV's own reader is not used, because damaged files can end the process. Scalars are read by the rules of YAML 1.2,
+except that 07 and other digits after a zero stay text, as they are names. References between parts of a file are
+refused: a few lines of them can stand for any amount of data.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+import yaml
+
+from psotrack.errors import InputError
+from psotrack.geometry.rig_files.entries import Source
+
+_INTEGER = re.compile(r"[-+]?(0|[1-9]\d*)")
+_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}
+_NOT_FINITE = {".nan": np.nan, ".inf": np.inf, "+.inf": np.inf, "-.inf": -np.inf}
+
+
+class _Loader(yaml.SafeLoader):
+    """Loader for plain data and OpenCV's matrices."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose a node that is no reference."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.MarkedYAMLError(problem="a reference", problem_mark=event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_object(self, node: Any, deep: bool = False) -> Any:
+        """Plain data of a node, whatever its tag."""
+        if isinstance(node, yaml.ScalarNode):
+            return node.value if node.style else _scalar(node.value)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.construct_object(item) for item in node.value]
+        pairs = [(str(key.value), self.construct_object(value)) for key, value in node.value]
+        return as_matrix(dict(pairs))
+
+
+def parse_yaml(source: Source) -> dict[str, Any]:
+    """The top level of a YAML or JSON file; maps with rows, cols and data become arrays.
+
+    Raises:
+        InputError: the file is not valid; the message names the line.
+    """
+    text = source.text.lstrip("\ufeff \n\r\t")
+    # OpenCV's header is not one of YAML's.
+    header, _, rest = text.partition("\n")
+    text = f"\n{rest}" if header.startswith("%YAML") else text
+    try:
+        content = _from_json(json.loads(text)) if text.startswith("{") else yaml.load(text, _Loader)
+    except json.JSONDecodeError as error:
+        place, reason = f"line {error.lineno}", error.msg
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
+    except (RecursionError, ValueError) as error:
+        place, reason = "", "nested too deeply" if isinstance(error, RecursionError) else str(error)
+    else:
+        return content if isinstance(content, dict) else {}
+    where = f"{source.path}, {place}" if place else source.path
+    raise InputError(where, expected="valid YAML or JSON", found=f"an error ({reason})") from None
+
+
+def _scalar(text: str) -> Any:
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    if _INTEGER.fullmatch(text) and len(text) < 20:
+        return int(text)
+    if _FLOAT.fullmatch(text) and (text[:1] != "0" or "." in text or "e" in text.lower()):
+        return float(text)
+    return _NOT_FINITE.get(text.lower(), text)
+
+
+def _from_json(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_from_json(item) for item in value]
+    if isinstance(value, dict):
+        return as_matrix({key: _from_json(item) for key, item in value.items()})
+    return value
+
+
+def as_matrix(values: dict[str, Any]) -> Any:
+    """An array for a map with rows, cols and data; its plain numbers if they do not fill it; else the map itself."""
+    if not {"rows", "cols", "data"} <= values.keys():
+        return values
+    data = values["data"]
+    try:
+        return np.array(data, np.float64).reshape(int(values["rows"]), int(values["cols"]))
+    except (TypeError, ValueError, OverflowError):
+        return data

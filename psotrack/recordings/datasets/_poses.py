@@ -1,0 +1,117 @@
+"""`dronN_pos_25.csv` of the DPJAIT dataset: the poses of one simulated drone, one line per video frame.
+
+Row i belongs to video frame i. Row 0 is a placeholder, (0, 0, -0), so that frame 0 has no pose. The names of the
+orientation columns in the published files are unknown. The reader uses four columns that end in `w`, `x`, `y`, `z`
+after a word with a `q` (`q_w`, `qw`, `quat_w`, ...) as the quaternion, which turns body into world coordinates. Euler
+angles are not read: beside a quaternion they are redundant, and without a quaternion their order would be a guess. The
+written columns are `rot_x[rad]`, `rot_y[rad]`, `rot_z[rad]`, with R = Rz Ry Rx, and `q_w`, `q_x`, `q_y`, `q_z`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import SettingsError
+from psotrack.geometry.rig_files import METRES_PER_UNIT
+from psotrack.recordings.datasets._frames import rows_by_frame
+from psotrack.support import Column, Table, TextRow, read_table, write_rows
+
+Positions = Float[np.ndarray, "frames 3"]
+Orientations = Float[np.ndarray, "frames 4"]
+
+_QUATERNION = re.compile(r"(?P<stem>[a-z_ .]*q[a-z_ .]*?)[_ .]?(?P<axis>[wxyz])")
+#: Largest deviation of a quaternion's norm from 1: the effect of rounding to two decimals.
+_NORM_TOLERANCE = 0.02
+
+
+def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
+    """Read positions (metres) and orientations (w, x, y, z) at frames 0, 1, ...; NaN for frames without a row.
+
+    The orientations are None if the file has no quaternions.
+
+    Raises:
+        InputError: the file cannot be read, a column is missing, a frame occurs twice, or a value is not a finite
+            number. The message names line and column.
+    """
+    table = read_table(path)
+    id_column = table.column("id")
+    position = [table.column(f"pos_{axis}") for axis in "xyz"]
+    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in position])
+    quaternion = _quaternion_columns(table)
+    rows = rows_by_frame(table, id_column)
+    position_m = np.full((max(rows) + 1, 3), np.nan)
+    orientation_wxyz = np.full((max(rows) + 1, 4), np.nan)
+    for frame, row in rows.items():
+        here_m = np.array([row.number(column) for column in position]) * metres
+        if frame == 0 and not here_m.any():
+            continue
+        position_m[frame] = here_m
+        if quaternion:
+            orientation_wxyz[frame] = _unit_quaternion(row, quaternion)
+    return position_m, orientation_wxyz if quaternion else None
+
+
+def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orientations) -> None:
+    """Write the poses of one drone at all video frames; the pose of frame 0 is replaced by the layout's placeholder.
+
+    Args:
+        path: path of the file, with a name from `pose_file`.
+        position_m: (frames, 3), positions in the world, metres.
+        orientation_wxyz: (frames, 4), unit quaternions that turn body into world coordinates.
+
+    Raises:
+        SettingsError: the numbers of frames differ, there is no frame, or a number is not finite.
+        OutputError: the file cannot be written.
+    """
+    if len(position_m) != len(orientation_wxyz) or len(position_m) == 0:
+        raise SettingsError(
+            "poses",
+            expected="equal numbers of positions and orientations, at least one",
+            found=f"{len(position_m)} positions and {len(orientation_wxyz)} orientations",
+        )
+    poses = np.hstack([position_m, _euler_rad(orientation_wxyz), orientation_wxyz])
+    if not np.isfinite(poses[1:]).all():
+        frame = int(np.argmin(np.isfinite(poses[1:]).all(axis=1))) + 1
+        raise SettingsError("poses", expected="finite numbers", found=f"NaN or infinity at frame {frame}")
+    header = [
+        "id",
+        *(f"pos_{axis}[m]" for axis in "xyz"),
+        *(f"rot_{axis}[rad]" for axis in "xyz"),
+        *(f"q_{axis}" for axis in "wxyz"),
+    ]
+    placeholder = [0, *(0.0, 0.0, -0.0), *(0.0, 0.0, 0.0), *(1.0, 0.0, 0.0, 0.0)]
+    write_rows(path, [header, placeholder, *([frame, *poses[frame]] for frame in range(1, len(poses)))])
+
+
+def pose_file(number: int, fps: float = 25.0) -> str:
+    """Name of the pose file of drone `number`, 1-based."""
+    return f"dron{number}_pos_{fps:g}.csv"
+
+
+def _euler_rad(orientation_wxyz: Orientations) -> Positions:
+    """Angles about x, y, z in radians, with R = Rz Ry Rx."""
+    return Rotation.from_quat(orientation_wxyz, scalar_first=True).as_euler("xyz")
+
+
+def _quaternion_columns(table: Table) -> list[Column]:
+    """The columns of w, x, y, z, or an empty list."""
+    stems: dict[str, dict[str, Column]] = {}
+    for column in table.columns:
+        match = _QUATERNION.fullmatch(column.name)
+        if match:
+            stems.setdefault(match["stem"], {})[match["axis"]] = column
+    complete = [axes for axes in stems.values() if len(axes) == 4]
+    return [complete[0][axis] for axis in "wxyz"] if complete else []
+
+
+def _unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, " 4"]:
+    quaternion = np.array([row.number(column) for column in columns])
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > _NORM_TOLERANCE:
+        raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
+    return quaternion / norm

@@ -1,0 +1,327 @@
+"""The DPJAIT dataset (Zenodo, record 14748573): real and simulated recordings of drones in halls.
+
+A sequence is a folder with `cameras_calibration.csv`, one video per camera, and a reference: files `dronN_pos_25.csv`
+in the simulated half, one `.c3d` file in the real half. The reader relies on the files, not on the name of the folder:
+S05_D8 has ten drones.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from psotrack.errors import InputError
+from psotrack.geometry import Rig, files_by_camera
+from psotrack.geometry.rig_files import read_calibration, read_camera_names, write_calibration
+from psotrack.recordings import (
+    Detections,
+    FrameTimes,
+    OnboardVideo,
+    Recording,
+    VideoInfo,
+    probe,
+    read_detections,
+    write_detections,
+)
+from psotrack.recordings.datasets._archives import join_archives
+from psotrack.recordings.datasets._marker_corners import (
+    MarkerRow,
+    read_marker_centres,
+    read_marker_corners,
+    read_marker_rows,
+    split_label,
+    write_marker_corners,
+)
+from psotrack.recordings.datasets._masks import MASKS, Masks, MaskWriter, read_masks
+from psotrack.recordings.datasets._mocap_markers import (
+    mocap_markers_file,
+    read_mocap_markers,
+    write_mocap_markers,
+)
+from psotrack.recordings.datasets._onboard import (
+    ONBOARD_CALIBRATION,
+    check_rate,
+    is_onboard_video,
+    numbered_files,
+    onboard_pose_file,
+    onboard_video_file,
+    read_onboard,
+    read_onboard_calibration,
+    write_onboard_calibration,
+)
+from psotrack.recordings.datasets._poses import pose_file, read_poses, write_poses
+from psotrack.recordings.mocap import NoDronesError, body_trajectories, read_c3d
+from psotrack.trajectories import Trajectories
+
+__all__ = [
+    "CALIBRATION",
+    "DETECTIONS",
+    "MARKER_CORNERS",
+    "MASKS",
+    "ONBOARD_CALIBRATION",
+    "Detections",
+    "MarkerRow",
+    "MaskWriter",
+    "Masks",
+    "detection_files",
+    "join_archives",
+    "mocap_markers_file",
+    "onboard_pose_file",
+    "onboard_video_file",
+    "pose_file",
+    "read_calibration",
+    "read_detections",
+    "read_marker_centres",
+    "read_marker_corners",
+    "read_marker_rows",
+    "read_masks",
+    "read_mocap_markers",
+    "read_onboard",
+    "read_onboard_calibration",
+    "read_poses",
+    "read_sequence",
+    "reference_files_in",
+    "split_label",
+    "write_calibration",
+    "write_detections",
+    "write_marker_corners",
+    "write_mocap_markers",
+    "write_onboard_calibration",
+    "write_poses",
+]
+
+CALIBRATION = "cameras_calibration.csv"
+#: The folder of the detections, one file per camera.
+DETECTIONS = "dl_data"
+MARKER_CORNERS = "aruco_corners.csv"
+
+_logger = logging.getLogger(__name__)
+_VIDEO_SUFFIXES = {".avi", ".mp4"}
+#: Largest distance of a principal point from the middle of the image, in shares of its width and height.
+_OFF_CENTRE = 0.1
+_POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
+
+
+def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
+    """Read a sequence from a folder of the dataset, simulated or real.
+
+    A camera without video gets the image size of most videos. Videos may differ in length; the reference is as long as
+    the longest video. `Recording.usable` is stricter. Videos of cameras on drones that cannot be used are left out with
+    a warning, because their published layout is unknown and tracking does not need them. So is a .c3d file without
+    drones.
+
+    Args:
+        folder: the folder.
+        bodies: labels of the markers of each drone in the .c3d file, as the user says; None: by the labels.
+
+    Raises:
+        InputError: the folder does not belong to the dataset, or one of its files cannot be used.
+    """
+    folder = Path(folder)
+    _check_folder(folder)
+    calibration = folder / CALIBRATION
+    names = read_camera_names(calibration)
+    files = sorted(folder.iterdir())
+    videos = _videos(folder, files, names)
+    rig = read_calibration(calibration, _image_sizes(names, videos))
+    _check_principal_points(rig, videos)
+    detections = files_by_camera(_detection_files(folder / DETECTIONS), names)
+    corners = folder / MARKER_CORNERS
+    return Recording(
+        name=folder.resolve().name,
+        folder=folder,
+        rig=rig,
+        videos=videos,
+        truth=_truth(files, videos, bodies),
+        detections=detections or None,
+        onboard=_onboard(folder),
+        frame_times=_frame_times(videos, detections),
+        marker_corners=corners if corners.exists() else None,
+        bodies=bodies or {},
+    )
+
+
+def detection_files(folder: Path | str, cameras: Sequence[str]) -> dict[str, Path]:
+    """Find the detection files of cameras in a folder, by the file names of `dl_data`.
+
+    A camera without a file is absent; it has no detections.
+
+    Args:
+        folder: folder with the files.
+        cameras: names of the cameras.
+
+    Raises:
+        InputError: no camera has a file, or a camera has two files.
+    """
+    folder = Path(folder)
+    found = files_by_camera(folder.glob("*.csv"), cameras)
+    if not found:
+        raise InputError(
+            folder,
+            expected=f"a folder with files named like the cameras, {cameras[0]}.csv ...",
+            found="no such file" if folder.is_dir() else "no such folder",
+        )
+    return found
+
+
+def _detection_files(folder: Path) -> list[Path]:
+    """The files of a sequence's detections; none without such a folder.
+
+    Raises:
+        InputError: there is a file of the folder's name, or the folder cannot be read.
+    """
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix == ".csv")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        found = (error.strerror or str(error)).lower()
+        raise InputError(folder, expected="a folder of detections, or none", found=found) from error
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        remedy = "unpack it first" if folder.suffix.lower() == ".zip" and folder.exists() else ""
+        raise InputError(folder, expected="the folder of a sequence", found=found, remedy=remedy)
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(
+            folder, expected="the folder of a sequence", found="a folder without read permission"
+        )
+    if not (folder / CALIBRATION).exists():
+        below = sorted(path.parent for path in folder.glob(f"*/{CALIBRATION}"))
+        remedy = f"did you mean {below[0]}?" if below else "is it a folder of the DPJAIT dataset?"
+        raise InputError(folder, expected=f"the file {CALIBRATION} in it", found="none", remedy=remedy)
+
+
+def _onboard(folder: Path) -> Mapping[str, OnboardVideo] | None:
+    try:
+        return read_onboard(folder) or None
+    except InputError as error:
+        _logger.warning("cameras on drones are left out: %s", error)
+        return None
+
+
+def _videos(folder: Path, files: Sequence[Path], names: Sequence[str]) -> dict[str, VideoInfo]:
+    videos = [path for path in files if path.suffix.lower() in _VIDEO_SUFFIXES]
+    candidates = [path for path in videos if not is_onboard_video(path)]
+    found = files_by_camera(candidates, names)
+    if not found:
+        raise InputError(
+            folder,
+            expected=f"videos named like the cameras, {names[0]}.avi ...",
+            found=", ".join(path.name for path in candidates) or "no .avi or .mp4 at all",
+        )
+    for path in candidates:
+        if path not in found.values():
+            _logger.info("%s: not used, because no camera in %s has this name", path, CALIBRATION)
+    return {name: probe(path) for name, path in found.items()}
+
+
+def _frame_times(videos: Mapping[str, VideoInfo], detections: Mapping[str, Path]) -> dict[str, FrameTimes]:
+    """Frame i of every camera was exposed at one time; a camera with detections only lasts as long as the others."""
+    first = next(iter(videos.values()))
+    most = max(video.num_frames for video in videos.values())
+    alone = {name: FrameTimes(most, first.fps) for name in detections if name not in videos}
+    # Rates are rounded in headers: rates that differ by less than a thousandth of a hertz are one rate.
+    return alone | {
+        name: FrameTimes(video.num_frames, first.fps if abs(video.fps - first.fps) < 1e-3 else video.fps)
+        for name, video in videos.items()
+    }
+
+
+def _image_sizes(names: Sequence[str], videos: Mapping[str, VideoInfo]) -> dict[str, tuple[int, int]]:
+    most_wh = Counter(video.image_size_wh for video in videos.values()).most_common(1)[0][0]
+    for name in names:
+        if name not in videos:
+            _logger.info("camera %s has no video: assuming %d x %d pixels like most cameras", name, *most_wh)
+    return {name: videos[name].image_size_wh if name in videos else most_wh for name in names}
+
+
+def _check_principal_points(rig: Rig, videos: Mapping[str, VideoInfo]) -> None:
+    """Raise `InputError` where sizes differ, and a principal point says that a video is of another camera.
+
+    The calibration states no image sizes, so that nothing else shows it.
+    """
+    if len({video.image_size_wh for video in videos.values()}) == 1:
+        return
+    for name, video in videos.items():
+        x, y = rig.cameras.K[rig.names.index(name), :2, 2]
+        width, height = video.image_size_wh
+        if max(abs(x / width - 0.5), abs(y / height - 0.5)) > _OFF_CENTRE:
+            raise InputError(
+                video.path,
+                expected=f"images with their middle near the principal point ({x:g}, {y:g})",
+                found=f"{width} x {height} pixels",
+                remedy="is it the video of another camera?",
+            )
+
+
+def _truth(
+    files: Sequence[Path], videos: Mapping[str, VideoInfo], bodies: Mapping[str, Sequence[str]] | None
+) -> Trajectories | None:
+    """The reference at the frames of the longest video, or None."""
+    first = next(iter(videos.values()))
+    num_frames = max(video.num_frames for video in videos.values())
+    poses = _pose_files(files, first)
+    recordings = [path for path in files if path.suffix.lower() == ".c3d"]
+    if bodies and (poses or not recordings):
+        raise InputError(
+            f"bodies {', '.join(bodies)}",
+            expected="a .c3d file that holds their markers",
+            found="pose files" if poses else "none",
+        )
+    if poses:
+        return _simulated_truth(poses, first.fps, num_frames)
+    if len(recordings) > 1:
+        names = ", ".join(path.name for path in recordings)
+        raise InputError(recordings[0].parent, expected="one .c3d file", found=names)
+    if recordings:
+        markers = read_c3d(recordings[0])
+        try:
+            return body_trajectories(
+                markers, fps=first.fps, num_frames=num_frames, where=recordings[0], named=bodies
+            )
+        except NoDronesError as error:
+            _logger.warning("no reference: %s", error)
+    return None
+
+
+def reference_files_in(folder: Path) -> tuple[Path, ...]:
+    """The pose files of a sequence's reference by the number of the drone, or else its .c3d file."""
+    files = sorted(folder.iterdir())
+    poses = tuple(numbered_files(files, _POSE_FILE).values())
+    return poses or tuple(path for path in files if path.suffix.lower() == ".c3d")
+
+
+def _pose_files(files: Sequence[Path], video: VideoInfo) -> dict[int, Path]:
+    """Pose files by the number of the drone."""
+    found = numbered_files(files, _POSE_FILE)
+    for path in found.values():
+        check_rate(path, _POSE_FILE, video.fps)
+    return found
+
+
+def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:
+    position_m = np.full((num_frames, len(poses), 3), np.nan)
+    orientation_wxyz = np.full((num_frames, len(poses), 4), np.nan)
+    for index, path in enumerate(poses.values()):
+        position, orientation = read_poses(path)
+        shared = min(num_frames, len(position))
+        position_m[:shared, index] = position[:shared]
+        if orientation is not None:
+            orientation_wxyz[:shared, index] = orientation[:shared]
+    frame = np.arange(num_frames)
+    return Trajectories(
+        frame,
+        frame / fps,
+        tuple(f"dron{number}" for number in poses),
+        position_m,
+        orientation_wxyz=None if np.isnan(orientation_wxyz).all() else orientation_wxyz,
+    )

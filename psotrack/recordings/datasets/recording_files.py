@@ -1,0 +1,445 @@
+"""Recordings that a `recording.toml` describes: the files that it names are opened and checked against each other."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.geometry import Camera, Rig, chosen_camera, make_rig
+from psotrack.geometry.rig_files import UNITS_M, Entry, camera_of_table, read_entries
+from psotrack.recordings import (
+    MOST_INSTANTS,
+    RECORDING_FILE,
+    CameraTable,
+    FrameTimes,
+    Recording,
+    RecordingFile,
+    StoredSilhouettes,
+    VideoInfo,
+    check_rate,
+    find_images,
+    open_pictures,
+    probe,
+    probe_images,
+    probe_silhouettes,
+    read_detections,
+    read_mask,
+    read_recording_file,
+    read_timestamps,
+    warn_of_missing_numbers,
+)
+from psotrack.recordings.datasets._reference import read_reference, reference_at
+
+_logger = logging.getLogger(__name__)
+#: Size of the images of a rig file that does not state it; no camera has this size.
+_UNKNOWN_WH = (1, 1)
+#: Rate of pictures until their timestamps are read.
+_UNKNOWN_HZ = 1.0
+#: Largest deviation of a rate from a thousandth of another one at which the unit of time was mistaken, not the rate.
+_SLIP_SHARE = 0.05
+#: How addresses of streams begin that OpenCV reads, with FFmpeg or with GStreamer.
+_SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtp", "udp", "tcp", "srt", "gstreamer")
+_LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "R", "tvec")
+
+
+def read_recording_toml(path: Path | str, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
+    """Read a recording from its `recording.toml`.
+
+    Args:
+        path: path of the file.
+        bodies: labels of the markers of each drone in the C3D file of the reference, instead of those of the file.
+
+    Raises:
+        InputError: the file is wrong, or one of the files that it names cannot be used; the message names it.
+    """
+    path, content = Path(path), read_recording_file(path)
+    if bodies:
+        if content.reference is None:
+            raise _error(path, "reference", "a C3D file, because markers of drones are named", "none")
+        named = {name: tuple(labels) for name, labels in bodies.items()}
+        reference = msgspec.structs.replace(content.reference, bodies=named)
+        content = msgspec.structs.replace(content, reference=reference)
+    return recording_of(path, content)
+
+
+def recording_of(path: Path, content: RecordingFile) -> Recording:
+    """The recording that the content of a `recording.toml` describes.
+
+    Args:
+        path: path of the file, which need not exist; other paths are relative to its folder.
+        content: content of the file.
+
+    Raises:
+        InputError: one of the files that the content names cannot be used; the message names it.
+    """
+    folder = path.parent
+    opened = {name: _open_camera(path, name, table) for name, table in content.cameras.items()}
+    _check_videos(path, opened)
+    for name, table in content.cameras.items():
+        _check_shutter(path, name, table, opened[name])
+    calibrated = _calibrated(path, content)
+    cameras = {
+        name: _camera(path, name, content.cameras[name], opened[name], calibrated.get(name))
+        for name in opened
+    }
+    placed = {name: camera for name, camera in cameras.items() if camera is not None}
+    frame_times = {name: each.times for name, each in opened.items() if each.times is not None}
+    recording = Recording(
+        name=path.resolve().parent.name if path.name == RECORDING_FILE else path.stem,
+        folder=folder,
+        rig=make_rig(placed) if placed else _no_rig(),
+        videos={name: each.video for name, each in opened.items() if each.video is not None},
+        silhouettes={name: each.silhouettes for name, each in opened.items() if each.silhouettes is not None},
+        detections={name: each.detections for name, each in opened.items() if each.detections is not None}
+        or None,
+        frame_times=frame_times,
+        unplaced=tuple(name for name in cameras if name not in placed),
+        streams={name: each.stream for name, each in opened.items() if each.stream},
+        ignore={name: each.ignore for name, each in opened.items() if each.ignore is not None},
+        line_time_s={name: table.line_time_s for name, table in content.cameras.items() if table.line_time_s},
+        bounds_m=_bounds(content),
+        marker_corners=None
+        if content.markers is None
+        else _existing(folder, content.markers.corners, path, "markers.corners"),
+        reference_files=_reference_files(path, content),
+        bodies={} if content.reference is None else content.reference.bodies,
+        reference_offset_s=0.0 if content.reference is None else content.reference.time_offset_s,
+    )
+    return _with_reference(recording)
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """The opened files of one camera.
+
+    Attributes:
+        size_wh: width and height of the images, pixels; None where only the calibration may know it.
+        video: its video, or None.
+        silhouettes: its stored silhouettes, or None.
+        stream: address of its stream, or "device" and number or path of its device; empty where it has none.
+        times: times of its frames; None for a stream.
+        ignore: image of what is ignored, or None.
+        detections: file of its detections, or None.
+    """
+
+    size_wh: tuple[int, int] | None
+    video: VideoInfo | None
+    silhouettes: StoredSilhouettes | None
+    stream: str
+    times: FrameTimes | None
+    ignore: Path | None
+    detections: Path | None
+
+
+def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
+    folder, place = path.parent, f"cameras.{name}"
+    stream = _stream(path, f"{place}.video", table.video)
+    video = None if stream else _open_video(path, name, table)
+    if video is not None and table.size is not None and table.size != video.image_size_wh:
+        raise _error(
+            path,
+            f"{place}.size",
+            _size_text(video.image_size_wh) + " as in the video",
+            _size_text(table.size),
+        )
+    size_wh = table.size if video is None else video.image_size_wh
+    detections = None
+    if table.detections is not None:
+        detections = _existing(folder, table.detections, path, f"{place}.detections")
+    silhouettes = None
+    if table.silhouettes is not None:
+        silhouettes = probe_silhouettes(_existing(folder, table.silhouettes, path, f"{place}.silhouettes"))
+    times = None if stream else _times(path, name, table, video, silhouettes, detections)
+    if video is not None and times is not None and not video.is_finished:
+        # The program that wrote video and times was stopped: the one that is longer is cut.
+        video = replace(video, num_frames=min(video.num_frames, times.num_frames))
+        times = times.cut(video.num_frames)
+        _logger.warning(
+            "%s: the video was not finished; its first %d frames are used", video.path, video.num_frames
+        )
+    ignore = None
+    if table.ignore is not None:
+        ignore = _existing(folder, table.ignore, path, f"{place}.ignore")
+        height, width = read_mask(ignore).shape
+        if size_wh is not None and (width, height) != size_wh:
+            raise InputError(
+                ignore, expected=f"{_size_text(size_wh)} as camera {name}", found=_size_text((width, height))
+            )
+    return _Opened(size_wh, video, silhouettes, stream, times, ignore, detections)
+
+
+def _check_videos(path: Path, opened: Mapping[str, _Opened]) -> None:
+    """Raise `InputError` for a video of two cameras, and warn of a camera that films alone."""
+    owners: dict[Path, str] = {}
+    for name, each in opened.items():
+        if each.video is None:
+            continue
+        file = (each.video.images[0] if each.video.images else each.video.path).resolve()
+        if file in owners:
+            raise _error(
+                path, f"cameras.{name}", "a video of its own", f"that of {owners[file]}, {file.name}"
+            )
+        owners[file] = name
+    spans = {
+        name: each.times.time_s[[0, -1]]
+        for name, each in opened.items()
+        if each.times and each.times.num_frames
+    }
+    for name, (begin_s, end_s) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(begin_s <= last_s and first_s <= end_s for first_s, last_s in others):
+            _logger.warning(
+                "%s, cameras.%s: no other camera films while it does, from %.3f to %.3f s; see time_offset_s and "
+                "timestamps",
+                path, name, begin_s, end_s,
+            )  # fmt: skip
+
+
+def _check_shutter(path: Path, name: str, table: CameraTable, opened: _Opened) -> None:
+    """Raise `InputError` where the rows of an image would take longer than the time from frame to frame."""
+    if opened.size_wh is None or opened.times is None:
+        return
+    longest_s = 1 / (opened.times.fps * opened.size_wh[1])
+    if abs(table.line_time_s) > longest_s:
+        expected = f"at most {longest_s:.2g} s, a frame's time for {opened.size_wh[1]} rows"
+        raise _error(path, f"cameras.{name}.line_time_s", expected, f"{table.line_time_s:g}")
+
+
+def _stream(path: Path, place: str, video: str | int | None) -> str:
+    """Address of a stream, or "device" and number or path of a device; empty for a file."""
+    if isinstance(video, int):
+        if video < 0:
+            raise _error(path, place, "the number of a device, from 0", f"{video}")
+        return f"device {video}"
+    if video is None:
+        return ""
+    if video.startswith("/dev/"):
+        return f"device {video}"
+    scheme, separator, rest = video.partition("://")
+    if not separator:
+        return ""
+    if scheme not in _SCHEMES:
+        expected = (
+            f"a file, the number of a device, or an address that begins with {'://, '.join(_SCHEMES)}://"
+        )
+        raise _error(path, place, expected, f"{scheme}://")
+    try:
+        parts = urlsplit(video)
+        is_whole = bool(parts.hostname or rest.startswith("@")) and parts.port != 0
+    except ValueError:
+        is_whole = False
+    if not (bool(rest) if scheme == "gstreamer" else is_whole):
+        raise _error(path, place, "an address with a host, and a port below 65536 if any", video)
+    return video
+
+
+def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:
+    folder, place = path.parent, f"cameras.{name}"
+    if table.images is not None:
+        fps = table.fps
+        images = find_images(folder, table.images, f"{path}, {place}.images")
+        if table.timestamps is not None:
+            fps = read_timestamps(folder / table.timestamps, len(images)).fps
+        else:
+            warn_of_missing_numbers(images[0].parent, images)
+        assert fps is not None, "the schema asks for fps or timestamps of images"
+        return probe_images(images, fps)
+    if table.video is None:
+        return None
+    file = _existing(folder, str(table.video), path, f"{place}.video")
+    if file.suffix.lower() == ".zip":
+        raise _error(path, f"{place}.video", "a video", f"an archive, {table.video}", "unpack it first")
+    if file.is_dir():
+        if table.fps is None and table.timestamps is None:
+            raise _error(path, f"{place}.fps", "frames per second of the pictures, or timestamps", "none")
+        video = open_pictures(file, table.fps or _UNKNOWN_HZ)
+        if table.fps is None:
+            times = read_timestamps(folder / str(table.timestamps), video.num_frames)
+            video = replace(video, fps=times.fps)
+        return video
+    video = probe(file)
+    if table.fps is not None:
+        return replace(video, fps=table.fps)
+    if table.timestamps is None:
+        check_rate(file, video.fps, f"write the rate as fps below [{place}]")
+    return video
+
+
+def _times(
+    path: Path,
+    name: str,
+    table: CameraTable,
+    video: VideoInfo | None,
+    silhouettes: StoredSilhouettes | None,
+    detections: Path | None,
+) -> FrameTimes:
+    """Times of the frames of a camera; without video it lasts as long as its silhouettes, or as `frames` says, or until
+    its last detection.
+    """
+    if table.timestamps is not None:
+        file = _existing(path.parent, table.timestamps, path, f"cameras.{name}.timestamps")
+        times = read_timestamps(file, video.num_frames if video is not None and video.is_finished else None)
+        if video is not None and not video.images:
+            _check_seconds(file, times, video)
+        if video is None and silhouettes is not None:
+            if times.num_frames < silhouettes.num_frames:
+                expected = f"times of the {silhouettes.num_frames} frames of the silhouettes"
+                raise InputError(file, expected=expected, found=f"{times.num_frames}")
+            return times.cut(silhouettes.num_frames)
+        return times
+    offset_s = table.time_offset_s or 0.0
+    if video is not None:
+        return FrameTimes(video.num_frames, video.fps, offset_s)
+    if silhouettes is not None:
+        num_frames = silhouettes.num_frames
+    elif table.frames is not None:
+        num_frames = table.frames
+    else:
+        num_frames = 0 if detections is None else int(read_detections(detections).frame.max(initial=-1)) + 1
+    assert table.fps is not None, "the schema asks for fps of a camera without video"
+    if num_frames > MOST_INSTANTS:
+        where = (
+            detections if table.frames is None and silhouettes is None else f"{path}, cameras.{name}.frames"
+        )
+        raise InputError(where, expected=f"at most {MOST_INSTANTS} frames", found=f"{num_frames}")
+    return FrameTimes(num_frames, table.fps, offset_s)
+
+
+def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
+    """Raise `InputError` for times in milliseconds: a thousandth of the video's own rate is no coincidence."""
+    if abs(video.fps / times.fps / 1000 - 1) < _SLIP_SHARE:
+        raise InputError(
+            file,
+            expected=f"times in seconds, of about {video.fps:g} frames per second as in {video.path.name}",
+            found=f"{times.fps:g} frames per second",
+            remedy="divide the times by 1000 if they are milliseconds",
+        )
+
+
+def _calibrated(path: Path, content: RecordingFile) -> dict[str, Entry]:
+    """The cameras of the rig file, by their names in the recording."""
+    if content.calibration is None:
+        return {}
+    unit = content.calibration_unit
+    entries = read_entries(
+        _existing(path.parent, content.calibration, path, "calibration"),
+        _UNKNOWN_WH,
+        metres_per_unit=None if unit is None else UNITS_M[unit],
+    )
+    known = {name: chosen_camera(name, tuple(entries)) for name in content.cameras}
+    _check_one_each(path, known)
+    return {name: entries[entry] for name, entry in known.items() if entry is not None}
+
+
+def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
+    """Raise `InputError` where two cameras of the recording are one camera of the rig file."""
+    taken: dict[str, str] = {}
+    for name, entry in known.items():
+        if entry is not None and entry in taken:
+            expected = "cameras with names as in the calibration"
+            raise _error(path, f"cameras.{name}", expected, f"{entry} for {taken[entry]} as well")
+        if entry is not None:
+            taken[entry] = name
+
+
+def _camera(
+    path: Path, name: str, table: CameraTable, opened: _Opened, calibrated: Entry | None
+) -> Camera | None:
+    """A camera from its own keys and, where it has none, from the rig file; None where its place is not known."""
+    known = {} if calibrated is None else _keys(calibrated)
+    # A size of the rig file that differs from the video's is an error of `Recording.usable`.
+    size_wh = known.get("size") or opened.size_wh
+    if size_wh is None and not opened.stream:
+        expected = "width and height of the images, because the camera has no video"
+        raise _error(path, f"cameras.{name}.size", expected, "none")
+    own = msgspec.json.decode(msgspec.json.encode(table))
+    keys = known | {key: own[key] for key in (*known, *_LENS_AND_PLACE) if own.get(key) is not None}
+    if "R" in own and own["R"] is not None:
+        keys.pop("rvec", None)
+    if size_wh is None or not keys.keys() - {"size"}:
+        return None
+    entry = camera_of_table(path, name, {**keys, "size": list(size_wh)})
+    return entry.camera if entry.placed else None
+
+
+def _keys(entry: Entry) -> dict[str, Any]:
+    """The keys of a `recording.toml` that say what a rig file says of a camera."""
+    camera = entry.camera
+    if camera is None:
+        return {}
+    fisheye = camera.fisheye is not None and bool(camera.fisheye)
+    keys: dict[str, Any] = {
+        "K": camera.K.tolist(),
+        "distortion": camera.dist.tolist(),
+        "model": "fisheye" if fisheye else "opencv",
+    }
+    size_wh = tuple(int(side) for side in camera.image_size_wh)
+    if size_wh != _UNKNOWN_WH:
+        keys["size"] = size_wh
+    if entry.placed:
+        T = np.asarray(camera.T_cam_world)
+        keys |= {"rvec": Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist(), "tvec": T[:3, 3].tolist()}
+    return keys
+
+
+def _no_rig() -> Rig:
+    return Rig((), Camera(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), np.zeros((0, 0)), np.zeros((0, 2))))
+
+
+def _bounds(content: RecordingFile) -> tuple[float, float, float, float, float, float] | None:
+    if content.world.bounds_m is None:
+        return None
+    (x0, y0, z0), (x1, y1, z1) = content.world.bounds_m
+    return x0, x1, y0, y1, z0, z1
+
+
+def _reference_files(path: Path, content: RecordingFile) -> tuple[Path, ...]:
+    if content.reference is None:
+        return ()
+    return tuple(_existing(path.parent, file, path, "reference.files") for file in content.reference.files)
+
+
+def _existing(folder: Path, written: str, path: Path, place: str) -> Path:
+    """Path of a file that a key names, relative to the folder of the recording."""
+    file = folder / written
+    if not file.exists():
+        raise _error(path, place, "a file that exists", f"none at {file}")
+    return file
+
+
+def _size_text(size_wh: tuple[int, int]) -> str:
+    return f"{size_wh[0]} x {size_wh[1]} pixels"
+
+
+def _error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
+    return InputError(f"{path}, {place}", expected=expected, found=found, remedy=remedy)
+
+
+def _with_reference(recording: Recording) -> Recording:
+    """The recording with its reference at its instants."""
+    if not recording.reference_files:
+        return recording
+    references = read_reference(recording.reference_files, recording.fps, recording.bodies)
+    time_s = recording.timeline().time_s
+    later_s = -recording.reference_offset_s
+    truth = reference_at(references, np.arange(len(time_s)), time_s, later_s=later_s)
+    if not truth.seen.any():
+        begin_s, end_s = (
+            edge(reference.time_s[index] for reference in references) - later_s
+            for edge, index in ((min, 0), (max, -1))
+        )
+        _logger.warning(
+            "the reference says nothing about the recording, which lasts from %.3f to %.3f s: it lasts from %.3f to "
+            "%.3f s on the recording's clock; see [reference] time_offset_s",
+            time_s[0], time_s[-1], begin_s, end_s,
+        )  # fmt: skip
+    return replace(recording, truth=truth)

@@ -1,0 +1,129 @@
+"""KITTI odometry: poses/NAME.txt with the 12 numbers of a pose per line, and sequences/NAME/times.txt with its times.
+
+A line is the first three rows of the 4 x 4 matrix [R | t] that turns body coordinates into world coordinates, row by
+row (Geiger et al., CVPR 2012). The format has no gaps and no unknown rotation. Frames in which a drone is not seen have
+no line, and the times say which frames the lines are; an unknown orientation is the identity in every line.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import InputError
+from psotrack.recordings.exchange.number_lines import read_numbers
+from psotrack.recordings.exchange.timed_paths import TimedPath, known_orientations
+from psotrack.support import check_file_name, first_repeat
+from psotrack.trajectories import Trajectories
+
+POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
+#: Largest difference of R R' from the identity: KITTI's own files have 7 digits.
+_ROTATION = 1e-4
+
+
+def write_kitti(folder: Path, trajectories: Trajectories) -> int:
+    """Write the poses and times of each drone into a new folder; return the number of files.
+
+    Raises:
+        InputError: a drone's name cannot be the name of a file.
+    """
+    for drone, name in enumerate(trajectories.drones):
+        check_file_name(name, "drones")
+        seen = trajectories.seen[:, drone]
+        poses = np.zeros((int(seen.sum()), 3, 4))
+        poses[:, :, :3] = _rotations(trajectories, drone)[seen]
+        poses[:, :, 3] = trajectories.position_m[seen, drone]
+        _write(folder / POSES / f"{name}.txt", poses.reshape(-1, 12))
+        _write(folder / SEQUENCES / name / TIMES, trajectories.time_s[seen].astype(float)[:, None])
+    return 2 * trajectories.num_drones
+
+
+def find_times(file: Path) -> Path | None:
+    """The file with the times of a file of poses: KITTI's own place, NAME_times.txt beside the file, or times.txt."""
+    candidates = (
+        file.parent.parent / SEQUENCES / file.stem / TIMES,
+        file.with_name(f"{file.stem}_{TIMES}"),
+        file.with_name(TIMES),
+    )
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def read_kitti(file: Path, instant_s: Float[np.ndarray, "instants"] | None) -> TimedPath:
+    """The path in a file of poses. Without a file of times, line k is instant k of the recording.
+
+    Args:
+        file: file of poses; the drone has its name.
+        instant_s: (instants,), times of the recording's instants, seconds; None if no recording is known.
+
+    Raises:
+        InputError: a file cannot be read, a line is no pose, or poses and times differ in number; there are no times
+            and no recording, or a recording of another length.
+    """
+    table = read_numbers(file, 12, "12 finite numbers: the rows of [R | t]")
+    poses = table.reshape(-1, 3, 4)
+    off = np.abs(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    mirrored = np.linalg.det(poses[:, :, :3]) < 0
+    if (off > _ROTATION).any() or mirrored.any():
+        line = int(np.argmax((off > _ROTATION) | mirrored)) + 1
+        raise InputError(f"{file}, pose {line}", expected="a rotation matrix", found="another matrix")
+    orientation = Rotation.from_matrix(poses[:, :, :3]).as_quat(scalar_first=True, canonical=True)
+    return TimedPath(
+        file.stem, _times(file, len(poses), instant_s), poses[:, :, 3], known_orientations(orientation)
+    )
+
+
+def _times(
+    file: Path, count: int, instant_s: Float[np.ndarray, "instants"] | None
+) -> Float[np.ndarray, "rows"]:
+    beside = find_times(file)
+    if beside is not None:
+        time_s = read_numbers(beside, 1, "one time in seconds per line")[:, 0]
+        if len(time_s) != count:
+            raise InputError(
+                beside, expected=f"{count} times, as many as {file.name} has poses", found=f"{len(time_s)}"
+            )
+        again = first_repeat(time_s)
+        if again is not None:
+            raise InputError(
+                f"{beside}, line {again + 1}",
+                expected="times that increase from line to line",
+                found=f"{time_s[again]:g} s",
+            )
+        return time_s
+    if instant_s is None:
+        raise InputError(
+            file,
+            expected=f"a file of times, {SEQUENCES}/{file.stem}/{TIMES}",
+            found="none",
+            remedy="name SEQ, too",
+        )
+    if len(instant_s) != count:
+        raise InputError(
+            file,
+            expected=f"{len(instant_s)} poses, one for each instant of the recording, or a file of times",
+            found=f"{count} poses",
+        )
+    return instant_s.astype(np.float64)
+
+
+def _rotations(trajectories: Trajectories, drone: int) -> Float[np.ndarray, "frames 3 3"]:
+    """Rotations of a drone; the identity in every frame if one of its seen frames has no orientation."""
+    identity = np.broadcast_to(np.eye(3), (trajectories.num_frames, 3, 3))
+    if trajectories.orientation_wxyz is None:
+        return identity
+    orientation = trajectories.orientation_wxyz[:, drone].astype(float)
+    known = np.isfinite(orientation).all(axis=-1)
+    if not known[trajectories.seen[:, drone]].all():
+        return identity
+    rotations = identity.copy()
+    rotations[known] = Rotation.from_quat(orientation[known], scalar_first=True).as_matrix()
+    return rotations
+
+
+def _write(path: Path, rows: Float[np.ndarray, "rows columns"]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [" ".join(map(repr, row)) + "\n" for row in rows.tolist()]
+    path.write_text("".join(lines), encoding="ascii")

@@ -1,0 +1,362 @@
+"""MCAP files with ROS 2 messages: a topic of poses per drone, TF, and with a recording the cameras and their images.
+
+    /NAME/pose                      geometry_msgs/PoseWithCovarianceStamped, in the frame `world`
+    /tf                             the drones at each time; the cameras, whose z looks ahead, at each whole second and
+                                    at the end, so that no player has to know that they stand still
+    /CAMERA/camera_info             sensor_msgs/CameraInfo
+    /CAMERA/image/compressed        sensor_msgs/CompressedImage, JPEG
+
+Stamps are times on the recording's clock, from 0 on. A drone whose name is no ROS name, such as `0`, has the topic
+/drone_0/pose; the metadata record `psotrack` has the names. A folder is a rosbag2 bag with one MCAP file. The libraries
+mcap and mcap-ros2-support are an extra: `pip install 'psotrack[ros]'`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import io
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import read_frames
+from psotrack.recordings.exchange import ros_messages as ros
+from psotrack.recordings.exchange.camera_boxes import CameraFrames, camera_frames
+from psotrack.recordings.exchange.formats import Footage
+from psotrack.recordings.exchange.timed_paths import TimedPath
+from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat, short_repr
+from psotrack.trajectories import Trajectories
+
+WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
+_JPEG_QUALITY = 90
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+#: Time in nanoseconds, topic, type and content of a message.
+_Message = tuple[int, str, str, dict[str, Any]]
+
+
+def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, report: Report) -> list[str]:
+    """Write poses of the drones, and with a recording its cameras; return what is missing in it, as noun phrases.
+
+    Args:
+        path: the file, or a new folder if the name does not end in .mcap.
+        trajectories: the tracks.
+        footage: the recording, and whether its images are written; None: poses alone.
+        report: shows the progress in frames of the tracks and images.
+
+    Raises:
+        SettingsError: the libraries are not installed.
+        InputError: a time is below 0, two drones have one topic, or a video cannot be read.
+    """
+    writer_class = _library("mcap_ros2.writer").Writer
+    if (trajectories.time_s < 0).any():
+        raise InputError(
+            "tracks",
+            expected="times from 0 s on, for stamps of ROS",
+            found=f"{trajectories.time_s.min():g} s",
+        )
+    names = _ros_names(trajectories.drones, "drone")
+    cameras = [] if footage is None else camera_frames(footage.recording, trajectories)
+    shown = [camera.name for camera in cameras]
+    camera_names = dict(zip(shown, _ros_names(shown, "cam"), strict=True))
+    _check_different([WORLD, *names, *camera_names.values()])
+    filmed = []
+    if footage is not None and footage.images:
+        filmed = [camera for camera in cameras if camera.name in footage.recording.videos]
+    missing: list[str] = []
+    counts: Counter[tuple[str, str]] = Counter()
+    first_ns, last_ns = 2**63 - 1, 0
+    file = path if path.suffix == ".mcap" else path / f"{path.name.lstrip('.').partition('.')[0]}_0.mcap"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    total = trajectories.num_frames + sum(len(camera.time_s) for camera in filmed)
+    with report("messages", total) as advance, file.open("wb") as stream:
+        streams: list[Iterator[_Message]] = [_drone_messages(trajectories, names, advance)]
+        if footage is not None:
+            infos, missing = _camera_infos(footage, cameras, camera_names)
+            places = _camera_places(footage, cameras, camera_names, float(trajectories.time_s[-1]))
+            images = [_image_messages(footage, each, camera_names[each.name], advance) for each in filmed]
+            streams = [iter(infos), places, *streams, *images]
+        writer = writer_class(stream)
+        schemas = {name: writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
+        drones = dict(zip((f"/{name}/pose" for name in names), trajectories.drones, strict=True))
+        writer.add_metadata(METADATA, {"version": "1", "drones": json.dumps(drones, ensure_ascii=False)})
+        for time_ns, topic, kind, content in heapq.merge(*streams, key=lambda message: message[0]):
+            writer.write_message(topic, schemas[kind], content, time_ns, time_ns)
+            counts[topic, kind] += 1
+            first_ns, last_ns = min(first_ns, time_ns), max(last_ns, time_ns)
+        writer.finish()
+    if file != path:
+        _write_bag_file(path, file.name, counts, first_ns, last_ns)
+    return missing
+
+
+def read_mcap(path: Path) -> list[TimedPath]:
+    """The paths in the poses of an MCAP file: a drone for each topic of poses, with or without covariance, or odometry.
+
+    Args:
+        path: the file, or the folder of a bag with one MCAP file.
+
+    Raises:
+        SettingsError: the libraries are not installed.
+        InputError: the file cannot be read, is cut short, has no poses, or a topic has two poses of one time.
+    """
+    if path.is_dir():
+        files = sorted(path.glob("*.mcap"))
+        if len(files) != 1:
+            raise InputError(path, expected="a bag with one MCAP file", found=f"{len(files)} MCAP files")
+        path = files[0]
+    make_reader = _library("mcap.reader").make_reader
+    decoder = _library("mcap_ros2.decoder").DecoderFactory()
+    rows: dict[str, _Rows] = {}
+    names: dict[str, str] = {}
+    try:
+        # The library also prints what it finds in a damaged file.
+        with path.open("rb") as stream, contextlib.redirect_stderr(io.StringIO()):
+            reader = make_reader(stream, decoder_factories=[decoder])
+            summary = reader.get_summary()
+            if summary is None:
+                raise EOFError("no summary at its end")
+            for record in reader.iter_metadata():
+                if record.name == METADATA:
+                    names = json.loads(record.metadata["drones"])
+            topics = [
+                channel.topic
+                for channel in summary.channels.values()
+                if _reader_of(summary.schemas[channel.schema_id].name) is not None
+            ]
+            for schema, channel, _, message in reader.iter_decoded_messages(topics=topics) if topics else ():
+                position = _reader_of(schema.name)
+                assert position is not None
+                rows.setdefault(channel.topic, _Rows()).add(message.header.stamp, *position(message))
+    except OSError as error:
+        raise InputError(
+            path, expected="a file to read", found=(error.strerror or f"{error}").lower()
+        ) from error
+    except InputError:
+        raise
+    except Exception as error:  # The library raises whatever a damaged byte leads to.
+        found = f"a damaged or shortened file ({type(error).__name__}: {error})".partition("\n")[0]
+        raise InputError(path, expected="an MCAP file", found=found, remedy="copy it again") from error
+    if not rows:
+        found = ", ".join(sorted({channel.topic for channel in summary.channels.values()})) or "no topic"
+        raise InputError(path, expected="a topic with poses or odometry of ROS 2", found=found)
+    return [
+        each.path(path, topic, names.get(topic) or _drone_of(topic, rows)) for topic, each in rows.items()
+    ]
+
+
+@dataclass(repr=False)
+class _Rows:
+    """The poses of a topic, as they are read."""
+
+    time_s: list[float] = field(default_factory=list)
+    position: list[list[float]] = field(default_factory=list)
+    wxyz: list[list[float]] = field(default_factory=list)
+    covariance: list[Any] = field(default_factory=list)
+
+    __repr__ = short_repr
+
+    def add(self, stamp: Any, pose: Any, covariance: Any) -> None:
+        self.time_s.append(stamp.sec + stamp.nanosec * 1e-9)
+        self.position.append([pose.position.x, pose.position.y, pose.position.z])
+        turn = pose.orientation
+        self.wxyz.append([turn.w, turn.x, turn.y, turn.z])
+        self.covariance.append(np.zeros(36) if covariance is None else np.asarray(covariance, float))
+
+    def path(self, where: Path, topic: str, name: str) -> TimedPath:
+        order = np.argsort(self.time_s, kind="stable")
+        time_s = np.array(self.time_s)[order]
+        again = first_repeat(time_s)
+        if again is not None:
+            found = f"two at {time_s[again]:g} s"
+            raise InputError(f"{where}, topic {topic}", expected="one pose per time", found=found)
+        covariance = np.array(self.covariance)[order].reshape(-1, 6, 6)
+        orientation = np.array(self.wxyz)[order]
+        if (far := np.abs(orientation) > LARGEST).any():
+            found = f"{orientation[far][0]:g} in an orientation"
+            raise InputError(f"{where}, topic {topic}", expected=MODERATE, found=found)
+        length = np.linalg.norm(orientation, axis=1, keepdims=True)
+        unknown = (covariance[:, [3, 4, 5], [3, 4, 5]] >= ros.UNKNOWN_RAD2).any(axis=1) | (length[:, 0] == 0)
+        orientation = np.where(unknown[:, None], np.nan, orientation / np.where(length == 0, 1, length))
+        block = covariance[:, :3, :3]
+        stated = block.any(axis=(1, 2)) & (block[:, 0, 0] >= 0)
+        block = np.where(stated[:, None, None], (block + block.swapaxes(1, 2)) / 2, np.nan)
+        return TimedPath(
+            name,
+            time_s,
+            np.array(self.position)[order],
+            None if unknown.all() else orientation,
+            block if stated.any() else None,
+        )
+
+
+def _reader_of(kind: str) -> Callable[[Any], tuple[Any, Any]] | None:
+    """The function that takes pose and covariance from a message of a type; None for a type without a pose."""
+    readers: dict[str, Callable[[Any], tuple[Any, Any]]] = {
+        ros.POSE: lambda message: (message.pose.pose, message.pose.covariance),
+        "nav_msgs/msg/Odometry": lambda message: (message.pose.pose, message.pose.covariance),
+        "geometry_msgs/msg/PoseStamped": lambda message: (message.pose, None),
+    }
+    return readers.get(kind)
+
+
+def _drone_of(topic: str, topics: dict[str, Any]) -> str:
+    """Name of the drone of a topic: its first part that no other topic has there, else the topic."""
+    first = [each.strip("/").split("/")[0] for each in topics]
+    own = topic.strip("/").split("/")[0]
+    return own if first.count(own) == 1 else topic.strip("/")
+
+
+def _ros_names(names: Sequence[str], prefix: str) -> list[str]:
+    """Names that ROS allows in topics: letters, digits and _, not beginning with a digit."""
+    found = []
+    for name in names:
+        plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
+        found.append(plain if _NAME.match(plain) else f"{prefix}_{plain}")
+    return found
+
+
+def _check_different(names: Sequence[str]) -> None:
+    """Raise `InputError` for a drone and another drone, a camera or the world with one name."""
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(
+            "names", expected="drones and cameras that differ as names of ROS", found=f"{twice[0]} twice"
+        )
+
+
+def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advance) -> Iterator[_Message]:
+    """A pose for each drone that is seen at a time, and one message of transforms for all."""
+    seen, orientation, covariance = (
+        trajectories.seen,
+        trajectories.orientation_wxyz,
+        trajectories.covariance_m2,
+    )
+    for row, time_ns in enumerate(
+        np.round(trajectories.time_s.astype(float) * 1e9).astype(np.int64).tolist()
+    ):
+        head = ros.header(time_ns, WORLD)
+        transforms = []
+        advance(1)
+        for drone in np.flatnonzero(seen[row]).tolist():
+            position_m = trajectories.position_m[row, drone]
+            turned = None if orientation is None else orientation[row, drone]
+            message = ros.pose_message(
+                head, position_m, turned, None if covariance is None else covariance[row, drone]
+            )
+            yield time_ns, f"/{names[drone]}/pose", ros.POSE, message
+            transforms.append(ros.transform(head, names[drone], position_m, turned))
+        if transforms:
+            yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": transforms}
+
+
+def _camera_infos(
+    footage: Footage, cameras: list[CameraFrames], names: dict[str, str]
+) -> tuple[list[_Message], list[str]]:
+    """Lenses of the cameras at time 0, and what ROS cannot hold of them."""
+    infos: list[_Message] = []
+    missing = []
+    for camera in cameras:
+        name = names[camera.name]
+        info = ros.camera_message(ros.header(0, name), footage.recording.rig.cameras[camera.index])
+        if info is None:
+            missing.append(f"the lens of {camera.name}, for which ROS has no model")
+        else:
+            infos.append((0, f"/{name}/camera_info", ros.CAMERA_INFO, info))
+    return infos, missing
+
+
+def _camera_places(
+    footage: Footage, cameras: list[CameraFrames], names: dict[str, str], last_s: float
+) -> Iterator[_Message]:
+    """Places of the cameras at each whole second, and at the end."""
+    poses = [
+        (names[each.name], *ros.camera_pose(footage.recording.rig.cameras[each.index])) for each in cameras
+    ]
+    times_ns = [*range(0, round(last_s * 1e9), 10**9), round(last_s * 1e9)]
+    for time_ns in times_ns:
+        head = ros.header(time_ns, WORLD)
+        yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": [ros.transform(head, *pose) for pose in poses]}
+
+
+def _image_messages(
+    footage: Footage, camera: CameraFrames, name: str, advance: Advance
+) -> Iterator[_Message]:
+    """The images of a camera, each with the camera's lens; an image whose time is below 0 is left out."""
+    video = footage.recording.videos[camera.name]
+    times_ns = np.round(camera.time_s * 1e9).astype(np.int64).tolist()
+    one = footage.recording.rig.cameras[camera.index]
+    wanted = replace(video, num_frames=min(video.num_frames, len(times_ns)))
+    for time_ns, image in zip(times_ns, read_frames(wanted), strict=False):
+        advance(1)
+        if time_ns < 0:
+            continue
+        encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        head = ros.header(time_ns, name)
+        info = ros.camera_message(head, one)
+        if info is not None and time_ns > 0:
+            yield time_ns, f"/{name}/camera_info", ros.CAMERA_INFO, info
+        yield (
+            time_ns,
+            f"/{name}/image/compressed",
+            ros.IMAGE,
+            {"header": head, "format": "jpeg", "data": encoded},
+        )
+
+
+def _write_bag_file(
+    folder: Path, file: str, counts: Counter[tuple[str, str]], first_ns: int, last_ns: int
+) -> None:
+    """Write the description of a bag, as rosbag2 does (its version 5)."""
+    import yaml
+
+    total = sum(counts.values())
+    span = {"duration": {"nanoseconds": last_ns - first_ns}, "message_count": total}
+    start = {"starting_time": {"nanoseconds_since_epoch": first_ns}}
+    topics = [
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": kind,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": "",
+            },
+            "message_count": count,
+        }
+        for (topic, kind), count in sorted(counts.items())
+    ]
+    content = {
+        "version": 5,
+        "storage_identifier": "mcap",
+        **span,
+        **start,
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file],
+        "files": [{"path": file, **span, **start}],
+    }
+    text = yaml.safe_dump({"rosbag2_bagfile_information": content}, sort_keys=False)
+    (folder / BAG).write_text(text, encoding="utf-8")
+
+
+def _library(name: str) -> ModuleType:
+    """A module of the extra `ros`."""
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise SettingsError(
+            "mcap", expected="the packages mcap and mcap-ros2-support", found=f"{error}".lower(),
+            remedy="pip install 'psotrack[ros]'",
+        ) from error  # fmt: skip

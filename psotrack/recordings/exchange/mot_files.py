@@ -1,0 +1,220 @@
+"""MOTChallenge: boxes per camera in the folders that TrackEval reads, and positions in MOT15's 3D columns.
+
+A line is `frame, id, left, top, width, height, confidence, x, y, z` with frames, identities and pixels counted from 1,
+and -1 where there is nothing (Leal-Taixe et al. 2015). A reference has `frame, id, left, top, width, height, 1, class,
+visibility` (Milan et al. 2016), which serves every benchmark of TrackEval.
+
+    3d/tracks.txt, 3d/reference.txt, 3d/seqinfo.ini       positions in metres; frames are the recording's instants
+    gt/MOT15-train/SEQ-CAMERA/gt/gt.txt, seqinfo.ini      boxes of the reference
+    gt/seqmaps/MOT15-train.txt                            names of the sequences
+    trackers/MOT15-train/psotrack/data/SEQ-CAMERA.txt     boxes of the tracks
+"""
+
+from __future__ import annotations
+
+import configparser
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.recordings import Recording
+from psotrack.recordings.exchange.camera_boxes import boxes_in_camera, camera_frames
+from psotrack.recordings.exchange.formats import Footage, interval_s
+from psotrack.recordings.exchange.number_lines import read_numbers
+from psotrack.support import Report, check_file_name
+from psotrack.trajectories import UNASSIGNED, Trajectories, check_cells
+from psotrack.trajectories.association import align, fixed_identity
+
+#: The folder of TrackEval: with the benchmark MOT15, TrackEval leaves nothing out.
+BENCHMARK, SPLIT, TRACKER = "MOT15", "train", "psotrack"
+WORLD, TRACKS, REFERENCE, INFO = "3d", "tracks.txt", "reference.txt", "seqinfo.ini"
+#: Largest number of a frame or an identity.
+_LARGEST = 2**31
+#: A lower rate is none; times would overflow.
+_SLOWEST_HZ = 1e-6
+_COLUMNS = "frame, id, left, top, width, height, confidence, x, y, z"
+
+
+def write_mot_positions(path: Path, trajectories: Trajectories) -> None:
+    """Write positions in MOT15's 3D columns; drones have the numbers 1, 2, ... in their order."""
+    lines = []
+    for row, drone in np.argwhere(trajectories.seen):
+        x, y, z = (str(value) for value in trajectories.position_m[row, drone])
+        lines.append(f"{trajectories.frame[row] + 1},{drone + 1},-1,-1,-1,-1,1,{x},{y},{z}\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(lines), encoding="ascii")
+
+
+def write_mot_folder(folder: Path, trajectories: Trajectories, footage: Footage, report: Report) -> list[str]:
+    """Write positions, and boxes per camera, into a new folder; return what is missing in it, as noun phrases.
+
+    Boxes are those of the drones' ellipsoids, as in `geometry.boxes`, at the time at which the camera exposed the
+    frame. Boxes of the reference have the sizes of the tracks that belong to its drones.
+
+    Raises:
+        SettingsError: the sizes of the drones are not known.
+    """
+    recording, size_m = footage.recording, footage.size_m
+    if size_m is None:
+        raise SettingsError(
+            "--drone-size",
+            expected="the drones' size, for boxes in the cameras",
+            found="none, and no record beside the tracks that has it",
+            remedy="name it, or leave out SEQ to write positions alone",
+        )
+    truth = _reference(recording, trajectories)
+    write_mot_positions(folder / WORLD / TRACKS, trajectories)
+    if truth is not None:
+        write_mot_positions(folder / WORLD / REFERENCE, truth)
+    fps = 1 / interval_s(trajectories)
+    _write_info(folder / WORLD, recording.name, fps, int(trajectories.frame[-1]) + 1, None)
+    cameras = camera_frames(recording, trajectories)
+    split = f"{BENCHMARK}-{SPLIT}"
+    names = []
+    with report("boxes", len(cameras)) as advance:
+        for camera in cameras:
+            name = check_file_name(f"{recording.name}-{camera.name}", recording.folder)
+            names.append(name)
+            sequence = folder / "gt" / split / name
+            _write_info(sequence, name, camera.fps, len(camera.time_s), camera.image_size_wh)
+            boxes = boxes_in_camera(recording, camera, trajectories, size_m)
+            _write_boxes(folder / "trackers" / split / TRACKER / "data" / f"{name}.txt", boxes, ",-1,-1,-1")
+            if truth is not None:
+                boxes = boxes_in_camera(
+                    recording, camera, truth, _reference_sizes(trajectories, truth, size_m)
+                )
+                _write_boxes(sequence / "gt" / "gt.txt", boxes, ",1,1")
+            advance(1)
+    maps = folder / "gt" / "seqmaps" / f"{split}.txt"
+    maps.parent.mkdir(parents=True, exist_ok=True)
+    maps.write_text("".join(f"{name}\n" for name in ("name", *names)), encoding="utf-8")
+    return [] if truth is not None else ["boxes of a reference, because SEQ has none"]
+
+
+def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
+    """Positions from MOT15's 3D columns; drones have their numbers as names.
+
+    Args:
+        path: the file; its frame 1 is the recording's first instant. `seqinfo.ini` beside the file says its rate.
+        recording: the recording, or None.
+
+    Raises:
+        InputError: the file cannot be read, has boxes only, has a drone twice in a frame, or there is no rate.
+    """
+    table = read_numbers(path, 7, f"at least 7 numbers: {_COLUMNS}", more=True)
+    numbers = table[:, :2]
+    wrong = (table[:, 0] < 1) | ((numbers != np.floor(numbers)) | (np.abs(numbers) > _LARGEST)).any(axis=1)
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise InputError(
+            f"{path}, row {first + 1}", expected="whole frame numbers from 1", found=f"{table[first, 0]:g}"
+        )
+    position_m = _positions(path)
+    frame, row = np.unique(table[:, 0].astype(np.int64) - 1, return_inverse=True)
+    identities, drone = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
+    check_cells(path, len(frame), len(identities), len(row))
+    cell = row * len(identities) + drone
+    if len(np.unique(cell)) < len(cell):
+        again = int(np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0])
+        raise InputError(
+            f"{path}, row {again + 1}",
+            expected="one row per frame and identity",
+            found=f"a second row for frame {frame[row[again]] + 1} and identity {identities[drone[again]]}",
+        )
+    values = np.full((len(frame) * len(identities), 3), np.nan)
+    values[cell] = position_m
+    return Trajectories(
+        frame, _times(path, frame, recording), tuple(map(str, identities)), values.reshape(len(frame), -1, 3)
+    )
+
+
+def _positions(path: Path) -> Float[np.ndarray, "rows 3"]:
+    remedy = "name a file with 3D columns, or the folder that `psotrack export --to mot` wrote"
+    try:
+        position_m = read_numbers(path, 10, f"10 numbers: {_COLUMNS}", more=True)[:, 7:]
+    except InputError as error:
+        found = f"boxes alone ({error})"
+        raise InputError(
+            path, expected="positions in MOT15's 3D columns", found=found, remedy=remedy
+        ) from None
+    if (position_m == -1).all():
+        raise InputError(
+            path,
+            expected="positions in MOT15's 3D columns",
+            found="boxes alone: x, y and z are -1 in every row",
+            remedy=remedy,
+        )
+    return position_m
+
+
+def _times(
+    path: Path, frame: Int[np.ndarray, "frames"], recording: Recording | None
+) -> Float[np.ndarray, "frames"]:
+    info = path.with_name(INFO)
+    fps = None
+    if info.is_file():
+        parser = configparser.ConfigParser()
+        try:
+            parser.read(info, encoding="utf-8")
+            fps = float(parser["Sequence"]["frameRate"])
+        except (configparser.Error, KeyError, ValueError) as error:
+            raise InputError(info, expected="a frameRate", found=f"{error}".partition("\n")[0]) from error
+        if not _SLOWEST_HZ < fps < np.inf:
+            raise InputError(info, expected=f"a frameRate above {_SLOWEST_HZ:g}", found=f"{fps:g}")
+    if recording is not None and (fps is None or abs(fps / recording.fps - 1) < 1e-3):
+        time_s = recording.timeline().time_s
+        return np.where(
+            frame < len(time_s), time_s[np.minimum(frame, len(time_s) - 1)], frame / recording.fps
+        )
+    if fps is None:
+        raise InputError(
+            path, expected=f"a rate, in {INFO} beside the file", found="none", remedy="name SEQ, too"
+        )
+    return frame / fps
+
+
+def _reference(recording: Recording, trajectories: Trajectories) -> Trajectories | None:
+    """The reference until the end of the tracks; None without a known position."""
+    truth = recording.truth
+    if truth is None or not truth.seen.any():
+        return None
+    return truth.at_frames(truth.frame[truth.time_s <= trajectories.time_s[-1] + 1e-9])
+
+
+def _reference_sizes(
+    trajectories: Trajectories, truth: Trajectories, size_m: Float[np.ndarray, "drones 3"]
+) -> Float[np.ndarray, "references 3"]:
+    """(references, 3), sizes of the tracks that belong to the reference's drones, and else the tracks' median size."""
+    sizes = np.repeat(np.median(size_m, axis=0)[None], truth.num_drones, axis=0)
+    try:
+        pair = align(trajectories, truth)
+    except InputError:  # no frame in common, because the tracks have a rate of their own
+        return sizes
+    for name, partner in zip(pair.drones, fixed_identity(pair), strict=True):
+        if partner != UNASSIGNED:
+            sizes[truth.drones.index(name)] = size_m[partner]
+    return sizes
+
+
+def _write_boxes(path: Path, xyxy: Float[np.ndarray, "frames drones 4"], end: str) -> None:
+    """Write boxes with a thousandth of a pixel; the left column of the image is 1."""
+    lines = []
+    for frame, drone in np.argwhere(np.isfinite(xyxy).all(axis=-1)):
+        x0, y0, x1, y1 = xyxy[frame, drone]
+        numbers: Iterable[float] = (x0 + 1, y0 + 1, x1 - x0, y1 - y0)
+        box = ",".join(f"{number:.3f}" for number in numbers)
+        lines.append(f"{frame + 1},{drone + 1},{box},1{end}\n")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("".join(lines), encoding="ascii")
+
+
+def _write_info(folder: Path, name: str, fps: float, frames: int, size_wh: tuple[int, int] | None) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    values = {"name": name, "imDir": "img1", "frameRate": repr(float(fps)), "seqLength": frames}
+    if size_wh is not None:
+        values |= {"imWidth": size_wh[0], "imHeight": size_wh[1], "imExt": ".jpg"}
+    lines = ["[Sequence]", *(f"{key}={value}" for key, value in values.items())]
+    (folder / INFO).write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,223 @@
+"""Reading of a flight: files of tracks, their records, and the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.silhouettes import check_whole
+from psotrack.recordings import Recording, VideoInfo
+from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.exchange import read_tracks
+from psotrack.show.flights.run_record import RunRecord, read_run_record
+from psotrack.support import COLOURS, short_repr
+from psotrack.trajectories import Trajectories
+
+#: Full lengths of a drone of whose size the record says nothing, metres: an assumption, for drawing only.
+USUAL_SIZE_M = (0.3, 0.3, 0.3)
+
+
+@dataclass(frozen=True, repr=False)
+class FlightTracks:
+    """The tracks of one file.
+
+    Attributes:
+        label: name of the tracks, which no other tracks of the flight have.
+        path: the file, or a folder of another format; see `exchange.read_tracks`.
+        trajectories: the tracks.
+        record: the record of the run; None where there is none beside the file.
+        size_m: (drones, 3), full lengths of the drones along the world's axes, metres: as the run learned them, else
+            `USUAL_SIZE_M`.
+    """
+
+    label: str
+    path: Path
+    trajectories: Trajectories
+    record: RunRecord | None
+    size_m: Float[np.ndarray, "drones 3"]
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, repr=False)
+class TrackedFlight:
+    """Tracks, and the recording that they belong to.
+
+    Attributes:
+        name: name of the recording, or of the first tracks.
+        tracks: the tracks of each file; empty where only the recording is known.
+        recording: the recording; None where only the tracks are known.
+    """
+
+    name: str
+    tracks: tuple[FlightTracks, ...]
+    recording: Recording | None
+
+    __repr__ = short_repr
+
+    @property
+    def truth(self) -> Trajectories | None:
+        """The reference of the recording; None where there is none."""
+        return None if self.recording is None else self.recording.truth
+
+    def colours(self, number: int) -> list[str]:
+        """Colours of the drones of the tracks with a number, as #rrggbb.
+
+        One colour per drone; where several files of tracks are compared, one colour per file.
+        """
+        count = self.tracks[number].trajectories.num_drones
+        if len(self.tracks) > 1:
+            return [COLOURS[number % len(COLOURS)]] * count
+        return [COLOURS[drone % len(COLOURS)] for drone in range(count)]
+
+
+def read_flight(
+    tracks: Sequence[Path | str] = (),
+    sequence: Path | str | None = None,
+    *,
+    cameras: Sequence[str] | None = None,
+) -> TrackedFlight:
+    """Read tracks, their records and their recording.
+
+    Args:
+        tracks: files of tracks.
+        sequence: the recording, as for `open_recording`; None: no recording.
+        cameras: names of the cameras to keep; None: all.
+
+    Raises:
+        InputError: a file cannot be used, there is neither a file of tracks nor a recording, or tracks have no instant
+            of the recording.
+        SettingsError: a camera is unknown.
+    """
+    recording = None if sequence is None else open_recording(sequence)
+    if recording is not None and cameras is not None:
+        recording = recording.usable(cameras, videos=False)
+    if recording is None and cameras is not None:
+        raise SettingsError("cameras", expected="a recording, which has the cameras", found="none")
+    if recording is None and not tracks:
+        raise InputError("flight", expected="files of tracks, or a recording", found="neither")
+    paths = [Path(path) for path in tracks]
+    read = tuple(
+        read_tracks_file(path, label, recording) for path, label in zip(paths, _labels(paths), strict=True)
+    )
+    for each in read:
+        if recording is not None:
+            _check_fits(each, recording)
+    return TrackedFlight(recording.name if recording is not None else _name_of(read[0]), read, recording)
+
+
+def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
+    """The first instants of a flight: of its recording, of the cameras on drones, of the reference and of all tracks.
+
+    Args:
+        flight: the flight.
+        num_frames: number of instants of the recording; without a recording, of each file of tracks.
+
+    Raises:
+        SettingsError: the recording has fewer instants.
+        InputError: tracks begin later.
+    """
+    if flight.recording is None:
+        check_whole("frames", num_frames, lowest=1)
+        tracks = (_until(each, each.trajectories.time_s[:num_frames][-1]) for each in flight.tracks)
+        return replace(flight, tracks=tuple(tracks))
+    recording = flight.recording.usable(num_frames=num_frames, videos=False)
+    end_s = float(recording.timeline().time_s[-1]) + 0.5 / recording.fps
+    onboard = {
+        name: replace(camera, video=replace(camera.video, num_frames=_count_until(camera.video, end_s)))
+        for name, camera in (recording.onboard or {}).items()
+    }
+    recording = replace(
+        recording,
+        onboard=onboard or None,
+        truth=None if recording.truth is None else _cut(recording.truth, end_s),
+    )
+    return replace(flight, recording=recording, tracks=tuple(_until(each, end_s) for each in flight.tracks))
+
+
+def _until(tracks: FlightTracks, end_s: float) -> FlightTracks:
+    if tracks.trajectories.time_s[0] > end_s:
+        raise InputError(
+            tracks.path,
+            expected=f"times before {end_s:.2f} s",
+            found=f"{tracks.trajectories.time_s[0]:.2f} s",
+        )
+    return replace(tracks, trajectories=_cut(tracks.trajectories, end_s))
+
+
+def _cut(trajectories: Trajectories, end_s: float) -> Trajectories:
+    return trajectories.at_frames(trajectories.frame[trajectories.time_s <= end_s])
+
+
+def _count_until(video: VideoInfo, end_s: float) -> int:
+    return max(1, min(video.num_frames, int(end_s * video.fps) + 1))
+
+
+def read_tracks_file(path: Path | str, label: str, recording: Recording | None = None) -> FlightTracks:
+    """Read one file of tracks and the record beside it.
+
+    Args:
+        path: the file, or a folder of another format; see `exchange.read_tracks`.
+        label: name of the tracks.
+        recording: the recording, whose rate is that of tracks without times.
+
+    Raises:
+        InputError: the file or its record cannot be read.
+    """
+    path = Path(path)
+    trajectories = read_tracks(path, recording=recording)
+    record_path = path.with_suffix(".json")
+    record = read_run_record(record_path) if record_path.is_file() and record_path != path else None
+    return FlightTracks(label, path, trajectories, record, _sizes_m(trajectories, record))
+
+
+def _sizes_m(trajectories: Trajectories, record: RunRecord | None) -> Float[np.ndarray, "drones 3"]:
+    """Sizes of the drones as the record has them, by the drones' names; the usual size for all others."""
+    learned = {} if record is None or isinstance(record.drones, int) else record.drones
+    size_m = {f"{drone.drone}": drone.size_m for drone in learned}
+    return np.array([size_m.get(name, USUAL_SIZE_M) for name in trajectories.drones], np.float64).reshape(
+        -1, 3
+    )
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """Names of files: their own names without suffix, or with as many folders as they need to differ."""
+    for count in range(1, max((len(path.parts) for path in paths), default=1) + 1):
+        labels = ["/".join(path.with_suffix("").parts[-count:]) for path in paths]
+        if len(set(labels)) == len(labels):
+            return labels
+    twice = next(path for number, path in enumerate(paths) if path in paths[:number])
+    raise InputError(twice, expected="different files of tracks", found="one file twice")
+
+
+def _name_of(tracks: FlightTracks) -> str:
+    return tracks.record.sequence if tracks.record is not None and tracks.record.sequence else tracks.label
+
+
+def _check_fits(tracks: FlightTracks, recording: Recording) -> None:
+    """Raise `InputError` for tracks of another recording, as far as their record or their times say so."""
+    if tracks.record is not None and tracks.record.sequence not in ("", recording.name):
+        raise InputError(
+            tracks.path,
+            expected=f"tracks of {recording.name}",
+            found=f"tracks of {tracks.record.sequence}",
+            remedy=f"name the recording {tracks.record.sequence}, or remove {tracks.path.with_suffix('.json').name} "
+            "if the recording was renamed",
+        )
+    first_s, last_s = tracks.trajectories.time_s[[0, -1]]
+    begin_s, end_s = recording.timeline().time_s[[0, -1]]
+    # Tracks of this package have instants of their recording only; other programs may have tracked for longer.
+    apart = first_s > end_s or last_s < begin_s
+    longer = tracks.record is not None and last_s > end_s + 1 / recording.fps
+    if apart or longer:
+        raise InputError(
+            tracks.path,
+            expected=f"times from {begin_s:.2f} to {end_s:.2f} s, as in {recording.name}",
+            found=f"{first_s:.2f} to {last_s:.2f} s",
+            remedy="name the recording that was tracked",
+        )

@@ -1,0 +1,200 @@
+"""A flight as a file of Rerun, .rrd."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import rerun as rr
+
+from psotrack.errors import OutputError
+from psotrack.foreground.silhouettes import Silhouettes
+from psotrack.recordings import VideoInfo
+from psotrack.show.flights import TrackedFlight
+from psotrack.show.viewer.camera_images import (
+    CameraKey,
+    EncodingTask,
+    ImagePlan,
+    encode_images,
+    plan_images,
+)
+from psotrack.show.viewer.entity_log import EntityLog
+from psotrack.show.viewer.image_marks import log_images, log_marks
+from psotrack.show.viewer.layout import blueprint_of
+from psotrack.show.viewer.plots import log_plots
+from psotrack.show.viewer.space import log_drones, log_world
+from psotrack.support import Report, atomic_write, map_in_processes, no_progress
+
+#: Largest size by default: this number of bytes per second of the recording, up to the second number.
+_BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
+#: Share of the rest of the size that images take, and bytes of the list of contents at the end of the file.
+_IMAGES_SHARE, _CONTENTS_BYTES = 0.96, 250e3
+#: End of a complete file.
+_END = b"RRF2FOOT\x01\x00\x00\x00"
+#: Name of the program in Rerun; arrangements that a user changes are kept under it.
+APPLICATION = "psotrack"
+
+
+@dataclass(frozen=True)
+class WrittenFlight:
+    """What was written.
+
+    Attributes:
+        num_bytes: size of the file.
+        plan: how the images were reduced.
+    """
+
+    num_bytes: int
+    plan: ImagePlan
+
+
+@dataclass(frozen=True)
+class ViewContent:
+    """What is shown of a flight.
+
+    Attributes:
+        silhouettes: the silhouettes of the recording by frames; None: they are not shown.
+        onboard: whether the cameras on drones are shown, with the markers that they see.
+        dictionary: dictionary of the markers.
+        max_bytes: largest size of the file; None: 5.8 MB per second of the recording, at most 1.95 GB.
+    """
+
+    silhouettes: Silhouettes | None = None
+    onboard: bool = False
+    dictionary: str = "4x4_1000"
+    max_bytes: float | None = None
+
+
+def write_flight(
+    path: Path,
+    flight: TrackedFlight,
+    content: ViewContent = ViewContent(),
+    *,
+    jobs: int | None = None,
+    report: Report = no_progress,
+) -> WrittenFlight:
+    """Write a flight as a file of Rerun, which appears under its name when it is complete.
+
+    Images are made as small, and as many frames are left out, as `max_bytes` demands.
+
+    Args:
+        path: the file; an existing file is replaced.
+        flight: the flight.
+        content: what is shown.
+        jobs: largest number of processes; None is one per processor.
+        report: progress of the images.
+
+    Raises:
+        InputError: a video cannot be read.
+        OutputError: the file cannot be written completely.
+    """
+    with atomic_write(path) as temporary:
+        try:
+            plan = _write(temporary, flight, content, jobs or os.cpu_count() or 1, report)
+            _check_end(temporary)
+        except _FileError as error:
+            expected, found = "to write the whole file", "that Rerun could not"
+            raise OutputError(path, expected=expected, found=found, remedy="is the disk full?") from error
+        num_bytes = temporary.stat().st_size
+    return WrittenFlight(num_bytes, plan)
+
+
+class _FileError(Exception):
+    """Rerun could not write the file."""
+
+
+def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, report: Report) -> ImagePlan:
+    stream = rr.RecordingStream(APPLICATION, recording_id=flight.name, send_properties=False)
+    stream.save(path)
+    try:
+        stream.send_recording_name(flight.name)
+        videos = _videos(flight, content.onboard)
+        log = EntityLog(stream)
+        stream.send_blueprint(blueprint_of(flight, has_images=bool(videos), has_onboard=content.onboard))
+        log_world(log, flight)
+        log_drones(log, flight)
+        log_plots(log, flight)
+        _flush(stream)
+        most = _max_bytes(flight, content)
+        plan = plan_images(videos, _left_bytes(path, most))
+        log_marks(log, flight, plan.step)
+        _flush(stream)
+        with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
+            tasks = _tasks(content, videos, plan, Path(folder), _left_bytes(path, most))
+            with report("images", plan.num_images) as advance:
+                encoded = map_in_processes(encode_images, list(tasks.values()), jobs=jobs, advance=advance)
+            for camera, images in zip(tasks, encoded, strict=True):
+                task = tasks[camera]
+                log_images(log, flight, camera, images, (task.reduction, task.cell_px))
+    finally:
+        stream.disconnect()
+    return plan
+
+
+def _check_end(path: Path) -> None:
+    """Raise `_FileError` for a file without its end."""
+    with path.open("rb") as file:
+        file.seek(-min(len(_END), path.stat().st_size), os.SEEK_END)
+        if file.read() != _END:
+            raise _FileError
+
+
+def _flush(stream: rr.RecordingStream) -> None:
+    """Wait until the file has everything that was logged."""
+    try:
+        stream.flush()
+    except RuntimeError as error:
+        raise _FileError from error
+
+
+def _left_bytes(path: Path, max_bytes: float) -> float:
+    """Bytes that are left for images."""
+    return max(0.0, _IMAGES_SHARE * (max_bytes - path.stat().st_size - _CONTENTS_BYTES))
+
+
+def _max_bytes(flight: TrackedFlight, content: ViewContent) -> float:
+    if content.max_bytes is not None:
+        return content.max_bytes
+    assert flight.recording is not None or not content.onboard
+    if flight.recording is None or not flight.recording.num_frames:
+        return _MOST_BYTES
+    return min(_MOST_BYTES, _BYTES_PER_S * max(1.0, flight.recording.num_frames / flight.recording.fps))
+
+
+def _videos(flight: TrackedFlight, with_onboard: bool) -> dict[CameraKey, VideoInfo]:
+    """The videos that are shown."""
+    recording = flight.recording
+    if recording is None:
+        return {}
+    names = [name for name in recording.rig.names if name in recording.videos]
+    videos = {CameraKey(name): recording.videos[name] for name in names}
+    for name, camera in (recording.onboard or {}).items() if with_onboard else ():
+        videos[CameraKey(name, on_drone=True)] = camera.video
+    return videos
+
+
+def _tasks(
+    content: ViewContent,
+    videos: Mapping[CameraKey, VideoInfo],
+    plan: ImagePlan,
+    folder: Path,
+    max_bytes: float,
+) -> dict[CameraKey, EncodingTask]:
+    silhouettes = content.silhouettes
+    arrays = {} if silhouettes is None else dict(zip(silhouettes.cameras, silhouettes.arrays, strict=True))
+    return {
+        camera: EncodingTask(
+            video=video,
+            path=folder / f"{number}.images",
+            step=plan.step,
+            reduction=plan.reduction[camera],
+            bytes_per_image=max_bytes / max(plan.num_images, 1),
+            silhouettes=None if camera.on_drone else arrays.get(camera.name),
+            cell_px=1 if silhouettes is None else silhouettes.reduction,
+            dictionary=content.dictionary if camera.on_drone else None,
+        )
+        for number, (camera, video) in enumerate(videos.items())
+    }

@@ -1,0 +1,238 @@
+"""The volume in which drones fly and their largest speed, from the cameras and from what moves before them.
+
+Cameras alone do not say where drones fly: cameras on the ground look up at drones of any height. In some short windows
+of frames, drones are therefore looked for in a region so wide that no drone is outside, and of any speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.foreground.silhouettes import Silhouettes
+from psotrack.geometry import Rig, viewpoints
+from psotrack.settings import USUAL_SPEED_M_S
+from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, TrackCandidate
+from psotrack.tracking.births.initial_state import room_bounds
+from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
+
+#: Number of windows, and frames of a window: enough for a drone to be born before two cameras.
+WINDOWS, WINDOW_FRAMES = 12, 16
+#: Time between two frames of a window, seconds; at lower rates, one frame.
+STEP_S = 0.04
+#: Largest speed that is looked for, m/s.
+FASTEST_M_S = 60.0
+#: Largest number of sightings per image: of noisy silhouettes the largest blobs count.
+MOST_SIGHTINGS = 12
+#: A point counts if its standard deviation is below this share of its distance from the cameras.
+MOST_VAGUE = 0.1
+#: The volume reaches beyond the points by this share of their largest extent, metres at least. Only some windows are
+#: looked at, and drones that fly far fly high too.
+MARGIN, LEAST_MARGIN_M = 0.15, 1.0
+#: The room of the cameras is extended where points are outside of it, or nearer to its border than this, metres.
+NEAR_BOUND_M = 0.5
+#: The speed limit is this many times the largest speed that is seen.
+SPEED_MARGIN = 1.5
+#: Share of the points that may be outliers, on each side.
+OUTLIERS = 0.01
+#: A smaller share of the points outside of given bounds is not worth a warning.
+FEW_OUTSIDE = 0.2
+#: Cameras whose optical axes point down by this much, on average, look down on a floor (sine of the angle). Below a
+#: floor there are only shadows and reflections, unless most of what moves is there.
+LOOKS_DOWN, MOST_BELOW = 0.05, 0.75
+
+
+@dataclass(frozen=True)
+class MovingPoints:
+    """Points that move on through a window of frames.
+
+    Attributes:
+        position_m: (points, 3), positions where they were first found, metres.
+        speed_m_s: (points,), speeds.
+        speed_std_m_s: (points,), standard deviations of the speeds.
+    """
+
+    position_m: Float[np.ndarray, "points 3"]
+    speed_m_s: Float[np.ndarray, "points"]
+    speed_std_m_s: Float[np.ndarray, "points"]
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+    @property
+    def largest_speed_m_s(self) -> float:
+        """Largest speed, without the part that noise makes up, and without outliers."""
+        certain = np.sqrt(np.maximum(self.speed_m_s**2 - self.speed_std_m_s**2, 0.0))
+        return float(np.quantile(certain, 1 - OUTLIERS))
+
+
+@dataclass(frozen=True)
+class FlightVolume:
+    """Where drones are searched and how fast they may be, and where the numbers come from.
+
+    Attributes:
+        bounds_m: (2, 3), lowest and highest corner, metres.
+        bounds_from: "given", "cameras", or "cameras and moving points", which extend the room of the cameras.
+        max_speed_m_s: largest speed of a drone, m/s.
+        speed_from: "given", "default" or "moving points".
+        num_points: number of moving points; None where they were not looked for.
+        share_outside: share of the moving points outside of the bounds; 0 where few are.
+        seen_speed_m_s: largest speed of the moving points; 0 where there are none.
+    """
+
+    bounds_m: Float[np.ndarray, "2 3"]
+    bounds_from: str
+    max_speed_m_s: float
+    speed_from: str
+    num_points: int | None = None
+    share_outside: float = 0.0
+    seen_speed_m_s: float = 0.0
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The volume, fit for JSON."""
+        return {**vars(self), "bounds_m": self.bounds_m.tolist()}
+
+
+def flight_volume(
+    rig: Rig,
+    points: MovingPoints | None,
+    *,
+    bounds_m: tuple[float, ...] | None = None,
+    max_speed_m_s: float | None = None,
+) -> FlightVolume:
+    """The volume in which drones are searched, and their speed limit; given values win.
+
+    Args:
+        rig: the cameras.
+        points: moving points; None where they are not known.
+        bounds_m: given bounds (x0, x1, y0, y1, z0, z1), metres.
+        max_speed_m_s: given speed limit, m/s.
+    """
+    found = points if points is not None and len(points) else None
+    room_m, bounds_from = room_bounds(rig), "cameras"
+    if bounds_m is not None:
+        room_m, bounds_from = np.array(bounds_m, np.float64).reshape(3, 2).T, "given"
+    elif found is not None:
+        extended_m = _extended(rig, room_m, found)
+        if (extended_m != room_m).any():
+            room_m, bounds_from = extended_m, "cameras and moving points"
+    seen_m_s = 0.0 if found is None else found.largest_speed_m_s
+    speed_m_s, speed_from = USUAL_SPEED_M_S, "default"
+    if max_speed_m_s is not None:
+        speed_m_s, speed_from = max_speed_m_s, "given"
+    elif SPEED_MARGIN * seen_m_s > speed_m_s:
+        speed_m_s, speed_from = round(SPEED_MARGIN * seen_m_s, 1), "moving points"
+    outside = 0.0
+    if found is not None:
+        within = ((found.position_m >= room_m[0]) & (found.position_m <= room_m[1])).all(axis=-1)
+        outside = float((~within).mean())
+    return FlightVolume(
+        room_m,
+        bounds_from,
+        speed_m_s,
+        speed_from,
+        num_points=None if points is None else len(points),
+        share_outside=outside if outside > FEW_OUTSIDE else 0.0,
+        seen_speed_m_s=seen_m_s,
+    )
+
+
+def _extended(rig: Rig, room_m: Float[np.ndarray, "2 3"], points: MovingPoints) -> Float[np.ndarray, "2 3"]:
+    """The room, extended to the moving points outside of it with a margin."""
+    low, high = np.quantile(points.position_m, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    margin_m = max(LEAST_MARGIN_M, MARGIN * float((high - low).max()))
+    low_m = np.where(low < room_m[0] + NEAR_BOUND_M, np.minimum(low - margin_m, room_m[0]), room_m[0])
+    high_m = np.where(high > room_m[1] - NEAR_BOUND_M, np.maximum(high + margin_m, room_m[1]), room_m[1])
+    axis_z = rig.cameras.T_cam_world[:, 2, 2].mean()
+    below = points.position_m[:, 2] < room_m[0, 2]
+    if axis_z < -LOOKS_DOWN and below.mean() < MOST_BELOW:
+        low_m[2] = room_m[0, 2]
+    return np.stack([low_m, high_m])
+
+
+def moving_detections(
+    rig: Rig, sightings: Sightings, fps: float, size_m: tuple[float, ...] | None = None
+) -> MovingPoints:
+    """Points that move, from detections; windows begin where at least two viewpoints have detections.
+
+    Args:
+        rig: the cameras.
+        sightings: the detections of all frames.
+        fps: frames per second.
+        size_m: full lengths of the drones, metres, where they are given.
+    """
+    seen = np.isfinite(sightings.noise_px).any(axis=-1)
+    viewpoint = viewpoints(rig.cameras)
+    by_viewpoint = np.stack([seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)], axis=-1)
+    frames = np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2)
+    # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
+    return _find(rig, lambda some: sightings[some], frames, fps, BirthRules(2, size_m=size_m))
+
+
+def moving_blobs(
+    rig: Rig, silhouettes: Silhouettes, fps: float, size_m: tuple[float, ...] | None = None
+) -> MovingPoints:
+    """Points that move, from the blobs of silhouettes; arguments as for `moving_detections`."""
+
+    def read(frames: Int[np.ndarray, "chosen"]) -> Sightings:
+        first, last = int(frames[0]), int(frames[-1])
+        return from_silhouettes(silhouettes, first=first, stop=last + 1)[frames - first]
+
+    return _find(rig, read, np.arange(silhouettes.num_frames), fps, BirthRules(size_m=size_m))
+
+
+def _find(
+    rig: Rig,
+    read: Callable[[Int[np.ndarray, "chosen"]], Sightings],
+    frames: Int[np.ndarray, "frames"],
+    fps: float,
+    rules: BirthRules,
+) -> MovingPoints:
+    """Points that move, in windows that are spread over the frames: drones that are born there.
+
+    Args:
+        rig: the cameras.
+        read: gives the sightings of frames.
+        frames: (frames,), numbers of the frames from which windows may begin, ascending; the last window ends at the
+            last of them.
+        fps: frames per second.
+        rules: what is asked of a drone.
+    """
+    step = max(1, round(STEP_S * fps))
+    last = 0 if not len(frames) else int(frames[-1])
+    starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
+    chosen = np.linspace(0, len(starts) - 1, min(WINDOWS, len(starts))).round().astype(int)
+    points = []
+    for first in starts[np.unique(chosen)].tolist():
+        sightings = read(np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step))
+        births = Births(
+            rig.cameras,
+            rules,
+            fps=fps / step,
+            bounds_m=wide_bounds(rig),
+            max_speed_m_s=FASTEST_M_S,
+        )
+        for number in range(sightings.num_frames):
+            births.step(number, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
+        points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]
+    table = np.array([point for point in points if point is not None]).reshape(-1, 5)
+    return MovingPoints(table[:, :3], table[:, 3], table[:, 4])
+
+
+def _point(rig: Rig, candidate: TrackCandidate, step_s: float) -> tuple[float, ...] | None:
+    """Position, speed and its standard deviation; None where the position is too vague to say anything."""
+    place_m, variance_m2 = candidate.position_m, np.trace(candidate.path[candidate.instant].covariance_m2)
+    nearest_m = np.linalg.norm(place_m - rig.cameras.centre_world, axis=-1).min()
+    if np.sqrt(variance_m2) > MOST_VAGUE * nearest_m:
+        return None
+    time_s = step_s * np.array([*candidate.path])
+    places_m = np.array([one.position_m for one in candidate.path.values()])
+    (velocity, _), residual = np.polyfit(time_s, places_m, 1), time_s - time_s.mean()
+    std_m = np.sqrt(np.median([np.trace(one.covariance_m2) for one in candidate.path.values()]))
+    speed_std_m_s = std_m / np.sqrt((residual**2).sum())
+    return (*place_m.tolist(), float(np.linalg.norm(velocity)), float(speed_std_m_s))

@@ -1,0 +1,136 @@
+"""Tracks with covariances that hold for the errors of their cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from jaxtyping import Float, Int
+
+from psotrack.settings import ErrorSettings, MotionSettings
+from psotrack.tracking.camera_errors.covariances import (
+    LastingCovariances,
+    lasting_covariances,
+    noise_covariance,
+    noise_ratios,
+)
+from psotrack.tracking.camera_errors.fading import Fading
+from psotrack.tracking.camera_errors.filtered_variance import MeasurementErrors
+from psotrack.tracking.camera_errors.learning import CameraErrors, learn_camera_errors
+from psotrack.tracking.camera_errors.views import CameraViews
+from psotrack.trajectories import Status, Tracks, Trajectories
+
+#: Largest share of the noise that fades, for the motion model, which needs some white noise.
+_MOST_FADING = 0.95
+
+
+@dataclass(frozen=True)
+class TrackErrors:
+    """The errors of a method's tracks that come from the cameras.
+
+    Attributes:
+        cameras: errors of the cameras.
+        lasting: covariances of the positions by errors that last, which the tracks' covariances do not contain.
+    """
+
+    cameras: CameraErrors
+    lasting: LastingCovariances
+
+    def smoothing(self, motion: MotionSettings) -> MotionSettings:
+        """Settings of the motion model with noise that fades as it was found to."""
+        fading = self.cameras.fading
+        return msgspec.structs.replace(
+            motion,
+            error_share=min(fading.fading_share, _MOST_FADING),
+            error_time_s=fading.time_s,
+        )
+
+    def added_to(
+        self, trajectories: Trajectories, order: Int[np.ndarray, "frames drones"] | None
+    ) -> Trajectories:
+        """Trajectories with the errors that last in their covariances.
+
+        Args:
+            trajectories: trajectories from the tracks.
+            order: (frames, drones), index of each drone's track (see `Identities.order`); None where labels stay.
+        """
+        assert trajectories.covariance_m2 is not None
+        covariance_m2 = trajectories.covariance_m2
+
+        def added(
+            lasting_m2: Float[np.ndarray, "frames drones 3 3"],
+        ) -> Float[np.ndarray, "frames drones 3 3"]:
+            if order is not None:
+                lasting_m2 = np.take_along_axis(lasting_m2, order[..., None, None], axis=1)
+            total_m2 = covariance_m2 + lasting_m2
+            return (total_m2 + total_m2.swapaxes(-1, -2)) / 2
+
+        return replace(
+            trajectories,
+            covariance_m2=added(self.lasting.absolute_m2),
+            relative_covariance_m2=added(self.lasting.relative_m2),
+        )
+
+    def record(self, names: Sequence[str]) -> dict[str, Any]:
+        """The cameras' errors, fit for JSON; None for what is not known."""
+        errors = self.cameras
+        return {
+            "cameras": {
+                name: {
+                    "noise_px": None if np.isnan(noise_px).any() else noise_px.tolist(),
+                    "lasting_px": lasting_px.tolist(),
+                }
+                for name, noise_px, lasting_px in zip(names, errors.noise_px, errors.lasting_px, strict=True)
+            },
+            "turn_deg": float(np.degrees(errors.turn_rad) * np.sqrt(3)),
+            "clock_s": errors.clock_s,
+            "fading_share": errors.fading.fading_share,
+            "fading_time_s": errors.fading.time_s,
+        }
+
+
+def with_camera_errors(
+    tracks: Tracks, views: CameraViews, motion: MotionSettings, given: ErrorSettings, fps: float
+) -> tuple[Tracks, TrackErrors]:
+    """Tracks whose covariances are those of the noise that was found, and the errors that last.
+
+    Args:
+        tracks: tracks of the swarm or of the projection lines.
+        views: the views of the tracked drones.
+        motion: settings of the motion model that the tracker used.
+        given: what is known of the cameras' errors beforehand.
+        fps: frames per second.
+    """
+    usual = Fading(1 - motion.error_share, motion.error_share, 0.0, motion.error_time_s)
+    errors = learn_camera_errors(views, fps, usual)
+    measured_m2, filtered_m2 = (
+        np.asarray(value, np.float64) for value in (tracks.measured_covariance_m2, tracks.covariance_m2)
+    )
+    found = (tracks.status == Status.TRACKED)[..., None, None]
+    measured, filtered = noise_ratios(
+        np.where(found, measured_m2, np.nan),
+        noise_covariance(views, errors),
+        errors,
+        MeasurementErrors(1.0, motion.error_share, motion.error_time_s),
+        dt_s=1 / fps,
+        jerk_density_m2_s5=motion.jerk_density,
+    )
+    corrected = replace(
+        tracks,
+        measured_covariance_m2=measured_m2 * measured[..., None, None],
+        covariance_m2=filtered_m2 * filtered[..., None, None],
+    )
+    return corrected, TrackErrors(errors, lasting_of(views, errors, given))
+
+
+def lasting_of(views: CameraViews, errors: CameraErrors, given: ErrorSettings) -> LastingCovariances:
+    """Covariances of the positions by errors that last."""
+    return lasting_covariances(
+        views,
+        errors,
+        rig_error_deg=given.rig_deg,
+        pixel_error_px=given.pixel_px,
+    )

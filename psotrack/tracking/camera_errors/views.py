@@ -1,0 +1,272 @@
+"""Single cameras' views of tracked drones: where each camera alone sees a drone, relative to the drone's track."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.foreground.silhouettes import Exposures, moved_by
+from psotrack.geometry import (
+    NEAR_M,
+    Camera,
+    cross_matrices,
+    project_visible,
+    project_with_jacobian,
+    to_camera,
+)
+from psotrack.tracking.matching import Sightings
+from psotrack.tracking.swarm import Places
+
+#: A detection is of a drone if it is at most this many standard deviations from the drone's projection.
+_GATE = 5.0
+#: Number of frames that are computed at once: those of all frames would take gigabytes for a long recording.
+_FRAMES_AT_ONCE = 1000
+#: The standard deviation of a normal distribution over its median absolute deviation.
+_MAD_STD = 1.4826
+
+
+@dataclass(frozen=True)
+class CameraViews:
+    """Views of the drones of a recording in its cameras, linearised at the drones' tracks.
+
+    What follows from the attributes is computed when it is asked for. For all frames of a long recording it would take
+    gigabytes, so it is asked of `parts`.
+
+    Attributes:
+        cameras: cameras with one leading axis.
+        exposures: exposures of the cameras' frames; None where all were exposed at the instant.
+        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
+        residual_px: (frames, drones, cameras, 2), place of the drone in the camera's image minus the projection of its
+            track, pixels; NaN where the camera does not show the place clearly.
+        jacobian: (frames, drones, cameras, 2, 3), derivatives of the projection by the position, pixels per metre; 0
+            where the drone's position is not known or is not in front of the camera.
+        weight: (frames, drones, cameras, 2), weights of the views in the estimate of the position, along columns and
+            rows; 0 where the camera does not count. Only their ratios matter.
+    """
+
+    cameras: Camera
+    exposures: Exposures | None
+    position_m: Float[np.ndarray, "frames drones 3"]
+    velocity_m_s: Float[np.ndarray, "frames drones 3"]
+    residual_px: Float[np.ndarray, "frames drones cameras 2"]
+    jacobian: Float[np.ndarray, "frames drones cameras 2 3"]
+    weight: Float[np.ndarray, "frames drones cameras 2"]
+
+    def __getitem__(self, frames: slice) -> CameraViews:
+        """The views of some frames."""
+        return CameraViews(
+            self.cameras,
+            _at(self.exposures, frames),
+            self.position_m[frames],
+            self.velocity_m_s[frames],
+            self.residual_px[frames],
+            self.jacobian[frames],
+            self.weight[frames],
+        )
+
+    def parts(self) -> Iterator[tuple[slice, CameraViews]]:
+        """The views of some frames after the other, with the frames."""
+        return ((frames, self[frames]) for frames in _blocks(self.num_frames))
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return self.weight.shape[0]
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return self.weight.shape[2]
+
+    @cached_property
+    def shown(self) -> Bool[np.ndarray, "frames drones cameras"]:
+        """(frames, drones, cameras), whether the camera shows the place of the drone."""
+        return np.asarray(np.isfinite(self.residual_px).all(axis=-1) & (self.weight > 0).all(axis=-1))
+
+    @property
+    def flow_px_s(self) -> Float[np.ndarray, "frames drones cameras 2"]:
+        """(frames, drones, cameras, 2), velocities of the drones in the images, pixels per second."""
+        return np.einsum("...cij,...j->...ci", self.jacobian, np.nan_to_num(self.velocity_m_s))
+
+    @property
+    def turn_px(self) -> Float[np.ndarray, "frames drones cameras 2 3"]:
+        """(frames, drones, cameras, 2, 3), derivatives of the projection by small turns of the camera, px per radian.
+
+        The turns are about the camera's own x, y and z axes.
+        """
+        # A camera that turns by w moves a point by w x p in its own axes.
+        seen_m = _seen(self.position_m, self.velocity_m_s, self.exposures)
+        in_camera_m = np.asarray(to_camera(self.cameras, seen_m))
+        by_camera = self.jacobian @ self.cameras.T_cam_world[:, :3, :3].swapaxes(-1, -2)
+        return -by_camera @ cross_matrices(in_camera_m)
+
+    @property
+    def gain(self) -> Float[np.ndarray, "frames drones cameras 3 2"]:
+        """(frames, drones, cameras, 3, 2), derivatives of the estimated position by the cameras' places, m per pixel.
+
+        That of weighted least squares, (Σ Jᵀ W J)⁻¹ Jᵀ W; 0 where the cameras do not determine a position.
+        """
+        weighted = self.jacobian.swapaxes(-1, -2) * self.weight[..., None, :]
+        normal = (weighted @ self.jacobian).sum(axis=2)
+        scale = np.trace(normal, axis1=-2, axis2=-1)[..., None, None] / 3
+        least = np.linalg.eigvalsh(normal / np.where(scale > 0, scale, 1.0))[..., 0]
+        solvable = ((scale[..., 0, 0] > 0) & (least > 1e-9))[..., None, None]
+        inverse = np.linalg.inv(np.where(solvable, normal, np.eye(3)))
+        return np.where(solvable[..., None], inverse[:, :, None] @ weighted, 0.0)
+
+
+def views_of_places(
+    cameras: Camera,
+    place_px: Float[np.ndarray, "frames drones cameras 2"],
+    weight: Float[np.ndarray, "frames drones cameras 2"],
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+    exposures: Exposures | None = None,
+) -> CameraViews:
+    """The views, from the drones' places in the images.
+
+    Args:
+        cameras: cameras with one leading axis.
+        place_px: (frames, drones, cameras, 2), pixels; NaN where a camera does not show the place.
+        weight: (frames, drones, cameras, 2), weights of the views in the estimate; 0 where a camera does not count.
+        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
+        exposures: exposures of the cameras' frames; None where all were exposed at the instant.
+    """
+    residual_px = np.empty(place_px.shape)
+    jacobian = np.empty((*place_px.shape, 3))
+    counted = np.empty(place_px.shape)
+    for frames in _blocks(len(place_px)):
+        seen_m = _seen(position_m[frames], velocity_m_s[frames], _at(exposures, frames))
+        pixels = _visible(cameras, position_m[frames], seen_m)
+        ahead = np.isfinite(pixels).all(axis=-1)[..., None]
+        residual_px[frames] = place_px[frames] - pixels
+        jacobian[frames] = np.where(ahead[..., None], project_with_jacobian(cameras, seen_m)[2], 0.0)
+        counted[frames] = np.where(ahead, weight[frames], 0.0)
+    return CameraViews(cameras, exposures, position_m, velocity_m_s, residual_px, jacobian, counted)
+
+
+def views_of_sightings(
+    cameras: Camera,
+    sightings: Sightings,
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+) -> CameraViews:
+    """The views, from detections: the detection nearest to a drone's projection, if no other drone is nearer to it.
+
+    Args:
+        cameras: cameras with one leading axis.
+        sightings: detections of all cameras.
+        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
+    """
+    num_frames, num_cameras = sightings.centre_px.shape[:2]
+    place_px = np.empty((num_frames, position_m.shape[1], num_cameras, 2))
+    noise_px, distance = np.empty(place_px.shape[:3]), np.empty(place_px.shape[:3])
+    for frames in _blocks(num_frames):
+        seen_m = _seen(position_m[frames], velocity_m_s[frames], _at(sightings.exposures, frames))
+        pixels = _visible(cameras, position_m[frames], seen_m)
+        box, distance[frames] = _nearest(sightings.centre_px[frames], sightings.noise_px[frames], pixels)
+        frame, camera = np.ogrid[: len(box), :num_cameras]
+        at = (frame[:, None], camera[:, None], box)
+        place_px[frames], noise_px[frames] = sightings.centre_px[frames][at], sightings.noise_px[frames][at]
+    # Most detections are of the drones: their median distance shows the real noise, which may exceed the stated noise.
+    # Both axes together have a Rayleigh distribution, whose median is 1.18 standard deviations.
+    of_drone = np.isfinite(distance)
+    usual = np.median(distance[of_drone]) / 1.18 if of_drone.any() else 1.0
+    of_drone &= distance <= _GATE * max(1.0, float(usual))
+    place_px = np.where(of_drone[..., None], place_px, np.nan)
+    weight = np.where(of_drone, np.nan_to_num(noise_px, nan=np.inf) ** -2.0, 0.0)
+    views = views_of_places(
+        cameras,
+        place_px,
+        np.repeat(weight[..., None], 2, axis=-1),
+        position_m,
+        velocity_m_s,
+        sightings.exposures,
+    )
+    return _without_outliers(views)
+
+
+def _nearest(
+    centre_px: Float[np.ndarray, "frames cameras boxes 2"],
+    noise_px: Float[np.ndarray, "frames cameras boxes"],
+    pixels: Float[np.ndarray, "frames drones cameras 2"],
+) -> tuple[Int[np.ndarray, "frames drones cameras"], Float[np.ndarray, "frames drones cameras"]]:
+    """Number of the detection that is nearest to each drone, and its distance in standard deviations.
+
+    The distance is infinite where another drone is nearer to the detection, or where the camera has none.
+    """
+    off_px = centre_px[:, None] - pixels[..., None, :]
+    distance = np.linalg.norm(off_px, axis=-1) / noise_px[:, None]
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    box = distance.argmin(axis=-1)
+    nearest = np.take_along_axis(distance, box[..., None], axis=-1)[..., 0]
+    own_drone = np.take_along_axis(distance.argmin(axis=1), box.swapaxes(1, 2), axis=-1).swapaxes(1, 2)
+    return box, np.where(own_drone == np.arange(pixels.shape[1])[:, None], nearest, np.inf)
+
+
+def _blocks(num_frames: int) -> Iterator[slice]:
+    """Blocks of frames that are computed at once."""
+    return (slice(first, first + _FRAMES_AT_ONCE) for first in range(0, num_frames, _FRAMES_AT_ONCE))
+
+
+def _at(exposures: Exposures | None, frames: slice) -> Exposures | None:
+    return None if exposures is None else exposures[frames]
+
+
+def _seen(
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+    exposures: Exposures | None,
+) -> Float[np.ndarray, "frames drones #cameras 3"]:
+    """Where each camera sees each drone; the origin where a drone's position is not known."""
+    moved_m = 0.0 if exposures is None else moved_by(exposures, np.nan_to_num(velocity_m_s))
+    return np.nan_to_num(position_m[:, :, None] + moved_m)
+
+
+def _visible(
+    cameras: Camera,
+    position_m: Float[np.ndarray, "frames drones 3"],
+    seen_m: Float[np.ndarray, "frames drones #cameras 3"],
+) -> Float[np.ndarray, "frames drones cameras 2"]:
+    """Pixels of drones where each camera sees them; NaN where the position is not known or has no image."""
+    pixels, depth = project_visible(cameras, seen_m)
+    known = np.isfinite(position_m).all(axis=-1)[..., None]
+    ahead = known & (depth > NEAR_M) & np.isfinite(pixels).all(axis=-1)
+    return np.where(ahead[..., None], pixels, np.nan)
+
+
+def _without_outliers(views: CameraViews) -> CameraViews:
+    """The views without detections that are far from what is usual for their camera."""
+    off_px = views.residual_px - np.nanmedian(views.residual_px, axis=(0, 1)) if views.shown.any() else 0.0
+    spread_px = _MAD_STD * np.nanmedian(np.abs(off_px), axis=(0, 1)) if views.shown.any() else 1.0
+    far = (np.abs(off_px) > _GATE * np.maximum(spread_px, 1e-6)).any(axis=-1)
+    return replace(
+        views,
+        residual_px=np.where(far[..., None], np.nan, views.residual_px),
+        weight=np.where(far[..., None], 0.0, views.weight),
+    )
+
+
+def views_of_middles(
+    cameras: Camera,
+    exposures: Exposures | None,
+    middles: Places,
+    position_m: Float[np.ndarray, "frames drones 3"],
+    velocity_m_s: Float[np.ndarray, "frames drones 3"],
+) -> CameraViews:
+    """The views, from the middles of the foreground.
+
+    Args:
+        cameras: cameras with one leading axis.
+        exposures: exposures of the silhouettes; None where all cameras' frames were exposed at the instant.
+        middles: where the cameras show the drones.
+        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where a drone is not found.
+    """
+    # The score changes with a shift relative to the box, so a view counts by the square of this share.
+    weight = np.nan_to_num(np.square(1 / np.asarray(middles.half_px, np.float64)))
+    middle_px = np.asarray(middles.middle_px, np.float64)
+    return views_of_places(cameras, middle_px, weight, position_m, velocity_m_s, exposures)

@@ -1,0 +1,260 @@
+"""Smoothed tracks: every frame estimated from all measurements, before and after the frame.
+
+A Rauch-Tung-Striebel smoother (`psotrack.geometry.estimation`) over the motion model of `kalman` with its lasting
+errors, and an estimate of the jerk density from the measurements. All computations are in float64, unlike in the
+tracker, because the backward pass inverts covariances and its time is not critical.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from operator import itemgetter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from psotrack.errors import InputError
+from psotrack.geometry.estimation import backward_step
+from psotrack.support import stored_jit
+from psotrack.support.array_types import Array
+from psotrack.tracking.motion import kalman
+from psotrack.tracking.motion.kalman import MotionParams, MotionState
+
+#: Grid of log10 jerk densities, m²/s⁵: from a drone that hovers to one in violent manoeuvres.
+_JERK_DECADES = np.arange(-4.0, 7.0)
+
+#: Step of the second, finer grid, decades. Over this step the log likelihood is close to a parabola.
+_FINER_STEP = 0.2
+
+#: Standard deviation of the prior on log10 of the density, decades. The data of a few dozen frames outweigh the prior.
+_JERK_PRIOR_DECADES = 1.0
+
+#: The values of `Measurements` in a compiled program.
+_Measured = tuple[Array, Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Measured positions of drones. Each must come from its own frame alone.
+
+    The output of a filter already contains the earlier frames, which would then count twice.
+
+    Attributes:
+        time_s: (frames,), increasing, seconds.
+        position_m: (frames, drones, 3), measured positions, world, metres; any value, also NaN, where not measured.
+        covariance_m2: (frames, drones, 3, 3), symmetric and positive definite where measured, m².
+        was_measured: (frames, drones), True where a drone has a measurement.
+    """
+
+    time_s: Float[np.ndarray, "frames"]
+    position_m: Float[np.ndarray, "frames drones 3"]
+    covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+    was_measured: Bool[np.ndarray, "frames drones"]
+
+    def __getitem__(self, frames: slice | Int[np.ndarray, "rows"]) -> Measurements:
+        """The measurements in some frames."""
+        return Measurements(*(value[frames] for value in vars(self).values()))
+
+    def check(self) -> None:
+        """Check that a filter can use the measurements.
+
+        Raises:
+            InputError: a requirement is not met; the message names the first place and the value found there.
+        """
+        if not (np.diff(self.time_s) > 0).all() or not np.isfinite(self.time_s).all():
+            raise InputError("time_s", expected="increasing times", found="repeats, steps back or no numbers")
+        for name in ("position_m", "covariance_m2"):
+            value = getattr(self, name)
+            wrong = self.was_measured & ~np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
+            if wrong.any():
+                row, drone = np.argwhere(wrong)[0]
+                where = f"{name}, row {row}, drone {drone}"
+                raise InputError(
+                    where, expected="numbers where it was measured", found=f"{value[row, drone]}"
+                )
+        known_m2 = np.where(self.was_measured[..., None, None], self.covariance_m2, np.eye(3))
+        smallest_m2 = np.linalg.eigvalsh(known_m2)[..., 0]
+        if not (smallest_m2 > 0).all():
+            row, drone = np.unravel_index(smallest_m2.argmin(), smallest_m2.shape)
+            raise InputError(
+                f"covariance_m2, row {row}, drone {drone}",
+                expected="a positive definite covariance",
+                found=f"one whose least eigenvalue is {smallest_m2.min():.3g} m2",
+            )
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Filtered or smoothed tracks, float64; NaN before a drone's first measurement.
+
+    Attributes:
+        position_m, velocity_m_s, acceleration_m_s2: (frames, drones, 3), world.
+        covariance_m2: (frames, drones, 3, 3), covariances of the positions, m².
+    """
+
+    position_m: Float[np.ndarray, "frames drones 3"]
+    velocity_m_s: Float[np.ndarray, "frames drones 3"]
+    acceleration_m_s2: Float[np.ndarray, "frames drones 3"]
+    covariance_m2: Float[np.ndarray, "frames drones 3 3"]
+
+
+def smooth(measured: Measurements, params: MotionParams) -> Smoothed:
+    """Estimate every frame from all measurements, before and after the frame.
+
+    A track begins at its first measurement with velocity 0 and the standard deviation of `params`. Gaps are bridged
+    from both sides, and after the last measurement the drone is predicted. Outliers get less weight, as in
+    `kalman.update`, except for the first measurement, which has no prediction to compare with.
+
+    Raises:
+        InputError: as `Measurements.check` says.
+    """
+    return _estimated(_smoothed, measured, params)
+
+
+def filter_measurements(measured: Measurements, params: MotionParams) -> Smoothed:
+    """Estimate every frame from the measurements up to that frame: the Kalman filter without the backward pass.
+
+    Errors and NaN are as in `smooth`.
+    """
+    return _estimated(_filter, measured, params)
+
+
+def last_state(measured: Measurements, params: MotionParams) -> MotionState:
+    """The filter's state after the last frame. A drone that was never measured has a state without meaning."""
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, _last_state(*_in_float64(measured, params)))
+
+
+def _estimated(program: Callable, measured: Measurements, params: MotionParams) -> Smoothed:
+    """What a compiled program estimates from measurements, on the host."""
+    measured.check()
+    # The context manager limits float64 to this call.
+    with jax.enable_x64(True):
+        states = Smoothed(*map(np.array, program(*_in_float64(measured, params))))
+    not_begun = ~np.logical_or.accumulate(measured.was_measured, axis=0)
+    for value in vars(states).values():
+        value[not_begun] = np.nan
+    return states
+
+
+def estimate_jerk_density(measured: Measurements, params: MotionParams) -> Float[np.ndarray, "drones"]:
+    """(drones,), jerk density of the highest posterior probability given the measurements, m²/s⁵.
+
+    The likelihood is that of all innovations (Bar-Shalom et al. 2001, section 11.4). The search tries decades, then a
+    finer grid around the best decade, then the vertex of a parabola. The prior is centred on
+    `params.jerk_density_m2_s5`, so a drone with few measurements keeps that value. Outliers do not raise the density,
+    because `kalman.log_likelihood` has long tails. Measurement covariances that are too small do raise the density.
+
+    Raises:
+        InputError: as `Measurements.check` says.
+    """
+    measured.check()
+    expected = np.log10(np.asarray(params.jerk_density_m2_s5, np.float64))
+    drones = np.arange(len(expected))
+
+    def scores(decades: Float[np.ndarray, "tried drones"]) -> Float[np.ndarray, "tried drones"]:
+        with jax.enable_x64(True):
+            found = _log_likelihoods(*_in_float64(measured, params), 10.0**decades)
+        return np.asarray(found) - ((decades - expected) / _JERK_PRIOR_DECADES) ** 2 / 2
+
+    decades = np.tile(_JERK_DECADES[:, None], len(drones))
+    best = decades[scores(decades).argmax(axis=0), drones]
+    decades = best + _FINER_STEP * (_JERK_DECADES - _JERK_DECADES.mean())[:, None]
+    score = scores(decades)
+    best = np.clip(score.argmax(axis=0), 1, len(decades) - 2)
+    below, at, above = (score[best + shift, drones] for shift in (-1, 0, 1))
+    # The prior makes the score concave, so a vertex exists. The search stays within one grid step.
+    vertex = np.clip((above - below) / 2 / (2 * at - above - below), -1, 1)
+    return 10.0 ** (decades[best, drones] + vertex * _FINER_STEP)
+
+
+def _in_float64(measured: Measurements, params: MotionParams) -> tuple[_Measured, MotionParams]:
+    """Arguments of the compiled programs."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float64),
+        (tuple(vars(measured).values()), params),
+    )
+
+
+def _filtered(measured: _Measured, params: MotionParams) -> tuple[MotionState, MotionState, Array]:
+    """Run the filter: predicted states, corrected states, and log likelihoods (frames, drones).
+
+    Before a drone's first measurement its state has no meaning; the log likelihood is 0 up to that measurement.
+    """
+
+    def initial(position: Array, covariance: Array) -> MotionState:
+        return kalman.init(position, jnp.zeros_like(position), covariance, params)
+
+    def step(carry: tuple, frame: tuple) -> tuple[tuple, tuple]:
+        state, has_begun = carry
+        dt_s, position, covariance, is_measured = frame
+        predicted = kalman.predict(state, dt_s, params)
+        corrected, _ = kalman.update(predicted, position, covariance, is_measured, params)
+        log_density = kalman.log_likelihood(predicted, position, covariance, params)
+        state = kalman.select_drones(has_begun, corrected, initial(position, covariance))
+        log_density = jnp.where(has_begun & is_measured, log_density, 0.0)
+        return (state, has_begun | is_measured), (predicted, state, log_density)
+
+    # The scan carries these values along before a drone's first measurement, so they must be finite.
+    time_s, position_m, covariance_m2, was_measured = measured
+    position_m = jnp.where(was_measured[..., None], position_m, 0.0)
+    covariance_m2 = jnp.where(was_measured[..., None, None], covariance_m2, jnp.eye(3))
+    carry = (initial(position_m[0], covariance_m2[0]), jnp.zeros(was_measured.shape[1], bool))
+    dt_s = jnp.diff(time_s, prepend=time_s[:1])
+    return jax.lax.scan(step, carry, (dt_s, position_m, covariance_m2, was_measured))[1]
+
+
+def _without_error(states: MotionState) -> tuple[Array, ...]:
+    """The values of `Smoothed`: states without the lasting error."""
+    return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
+
+
+@stored_jit
+def _filter(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
+    """Filtered states of all frames."""
+    return _without_error(_filtered(measured, params)[1])
+
+
+@stored_jit
+def _last_state(measured: _Measured, params: MotionParams) -> MotionState:
+    return jax.tree.map(itemgetter(-1), _filtered(measured, params)[1])
+
+
+@stored_jit
+def _smoothed(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
+    """Smoothed states of all frames."""
+    predicted, filtered, _ = _filtered(measured, params)
+
+    def step(later: tuple[Array, Array], frame: tuple) -> tuple[tuple[Array, Array], MotionState]:
+        state, next_predicted, dt_s = frame
+        change, covariance = backward_step(
+            state.covariance,
+            kalman.apply_transition(jnp.broadcast_to(jnp.eye(12), state.covariance.shape), dt_s, params),
+            kalman.process_noise(state.noise_m2, dt_s, params),
+            next_predicted.covariance,
+            later[1],
+            (later[0] - next_predicted.mean)[..., None],
+        )
+        mean = state.mean + change[..., 0]
+        return (mean, covariance), kalman.state_from_mean(mean, covariance, state.noise_m2)
+
+    earlier, last = (jax.tree.map(itemgetter(rows), filtered) for rows in (slice(-1), -1))
+    next_predicted = jax.tree.map(itemgetter(slice(1, None)), predicted)
+    _, smoothed = jax.lax.scan(
+        step, (last.mean, last.covariance), (earlier, next_predicted, jnp.diff(measured[0])), reverse=True
+    )
+    return _without_error(jax.tree.map(lambda part, end: jnp.concatenate([part, end[None]]), smoothed, last))
+
+
+@stored_jit
+def _log_likelihoods(measured: _Measured, params: MotionParams, densities: Array) -> Array:
+    """(tried, drones), log likelihood of all measurements under each jerk density of `densities`, (tried, drones)."""
+
+    def total(density: Array) -> Array:
+        varied = replace(params, jerk_density_m2_s5=density)
+        return _filtered(measured, varied)[2].sum(axis=0)
+
+    return jax.vmap(total)(densities)

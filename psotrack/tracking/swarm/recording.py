@@ -1,0 +1,184 @@
+"""Tracking of a whole recording by the swarm: blocks of frames come from disk, and each block may be tracked again.
+
+A candidate is a drone some frames after it was first seen. Its track begins where it was first seen, in the present
+block or in the one before, and these blocks are tracked again with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from psotrack.foreground.silhouettes import Silhouettes
+from psotrack.geometry import Rig
+from psotrack.support import Report, no_progress
+from psotrack.tracking.births import TrackCandidate, state_at
+from psotrack.tracking.swarm.block import BLOCK_FRAMES, Block, Engine, Setting, make_block
+from psotrack.tracking.swarm.run import RunInputs, Start, SwarmRun
+from psotrack.tracking.swarm.tracker import Rows, Slots
+from psotrack.trajectories import ARRAYS, Arrival, Tracks, padded
+
+#: Largest number of searches for new drones in a block: each time with the drones that the search before has found.
+_MOST_SEARCHES = 3
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where each camera shows the drones of a run; NumPy arrays with axes (frames, drones, cameras).
+
+    Attributes:
+        middle_px: (frames, drones, cameras, 2), middles of the drones' foreground, pixels; pixel centres are at whole
+            numbers. NaN where the camera does not show the drone whole and clear of other drones.
+        half_px: (frames, drones, cameras, 2), half lengths of the drone's box; NaN where the drone is not in the image.
+    """
+
+    middle_px: np.ndarray
+    half_px: np.ndarray
+
+
+@dataclass
+class _Progress:
+    """A run of the recording: its rows so far, and the drones before the last two blocks."""
+
+    run: SwarmRun
+    starts: list[Start]
+    rows: list[Rows] = field(default_factory=list)
+    before: list[Slots] = field(default_factory=list)
+    arrivals: list[Arrival] = field(default_factory=list)
+
+
+def track_silhouettes(
+    rig: Rig,
+    silhouettes: Silhouettes,
+    runs: Sequence[RunInputs],
+    *,
+    fps: float,
+    side_by_side: bool | None = None,
+    report: Report = no_progress,
+) -> tuple[list[tuple[Tracks, Places]], float]:
+    """Track the drones of one or more runs through all frames.
+
+    Args:
+        rig: calibrated cameras.
+        silhouettes: silhouettes of all cameras of the rig.
+        runs: inputs of each run.
+        fps: instants per second.
+        side_by_side: whether runs are computed side by side, not one after the other; None: on accelerators only.
+        report: shows the progress in frames; all runs go through the frames together.
+
+    Returns:
+        For each run its tracks, and where the cameras show the drones; and the seconds of compiling.
+    """
+    setting = Setting(rig, silhouettes.reduction, silhouettes.borders, fps)
+    engine = Engine(setting, side_by_side=side_by_side)
+    on_cpu = not engine.side_by_side
+    progress = [_begin(setting, inputs, silhouettes.num_frames, on_cpu=on_cpu) for inputs in runs]
+    last: Block | None = None
+    with report("track", silhouettes.num_frames) as advance:
+        for block in _blocks(setting, silhouettes):
+            tracked = engine.track([each.run.job(block, each.starts) for each in progress], block)
+            begun = list(range(len(progress)))
+            for attempt in range(_MOST_SEARCHES):
+                starts = {
+                    number: _planned(progress[number], block, last, *tracked[number], again=attempt > 0)
+                    for number in begun
+                }
+                begun = [number for number in begun if starts[number]]
+                _track_again(
+                    engine,
+                    [
+                        progress[number]
+                        for number in begun
+                        if any(start.instant < block.instant[0] for start in starts[number])
+                    ],
+                    last,
+                )
+                jobs = [progress[number].run.job(block, progress[number].starts) for number in begun]
+                for number, result in zip(begun, engine.track(jobs, block), strict=True):
+                    tracked[number] = result
+            for each, (slots, rows) in zip(progress, tracked, strict=True):
+                each.before = [*each.before[-1:], each.run.slots]
+                each.rows.append(rows)
+                each.run.finish(block, slots, rows)
+                # The block may be tracked again with the next one: with these starts, and further ones.
+                each.starts = [start for start in each.starts if start.instant >= block.instant[0]]
+            last = block
+            advance(len(block))
+    return [_results(each) for each in progress], engine.compile_s
+
+
+def _begin(setting: Setting, inputs: RunInputs, num_frames: int, *, on_cpu: bool) -> _Progress:
+    run = SwarmRun(setting, inputs, on_cpu=on_cpu, num_frames=num_frames)
+    return _Progress(run, [] if inputs.given is None else run.given_starts(inputs.given, 0))
+
+
+def _planned(
+    each: _Progress, block: Block, last: Block | None, slots: Slots, rows: Rows, *, again: bool
+) -> list[Start]:
+    """Tracks that start in the block that was just tracked, or in the one before; they are added to the run's."""
+    run = each.run
+    oldest = int((block if last is None else last).instant[0])
+
+    def begin(candidate: TrackCandidate) -> tuple[int, np.ndarray, np.ndarray]:
+        instant = max(candidate.instant, oldest)
+        return instant, *state_at(candidate.path, instant, run.fps, run.max_speed_m_s)
+
+    starts = run.plan(run.search(block, rows, slots, again=again), block, rows, begin)
+    for start in starts:
+        if start.instant > 0 or start.again:
+            each.arrivals.append(Arrival(start.instant, int(run.drone[start.slot]), start.again))
+    each.starts = [*each.starts, *starts]
+    return starts
+
+
+def _track_again(engine: Engine, runs: Sequence[_Progress], block: Block | None) -> None:
+    """Track the block before the present one again, of runs in which a track starts there."""
+    if block is None or not runs:
+        return
+    jobs = [each.run.job(block, each.starts, each.before[-1]) for each in runs]
+    for each, (slots, rows) in zip(runs, engine.track(jobs, block), strict=True):
+        each.rows[-1] = rows
+        each.run.take_back()
+        each.run.finish(block, slots, rows)
+
+
+def _blocks(setting: Setting, silhouettes: Silhouettes) -> Iterator[Block]:
+    """The blocks of a recording; while a block is used, a thread reads the next one."""
+    length, exposures = min(BLOCK_FRAMES, silhouettes.num_frames), silhouettes.exposures
+    firsts = range(0, silhouettes.num_frames, BLOCK_FRAMES)
+
+    def read(first: int) -> Block:
+        stop = min(first + BLOCK_FRAMES, silhouettes.num_frames)
+        exposed = None if exposures is None else exposures[first:stop]
+        coverage = silhouettes.read(first, stop)
+        return make_block(setting, np.arange(first, stop), coverage, exposed, length=length)
+
+    with ThreadPoolExecutor(1) as thread:
+        reading = [thread.submit(read, first) for first in firsts[:1]]
+        for number in range(len(firsts)):
+            block = reading.pop().result()
+            reading += [thread.submit(read, first) for first in firsts[number + 1 : number + 2]]
+            yield block
+
+
+def _results(each: _Progress) -> tuple[Tracks, Places]:
+    """The rows of all blocks of a run, by drone."""
+    num_drones = int(each.run.drone.max(initial=-1)) + 1
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([padded(name, getattr(rows, name), num_drones) for rows in each.rows])
+
+    arrays = {one.name: joined(one.name) for one in fields(Rows)}
+    box_px = arrays.pop("box_px")
+    places = Places(arrays.pop("middle_px"), box_px[..., 2:])
+    slots = each.run.with_room(each.run.slots)
+    tracks = Tracks(
+        **{name: arrays[name] for name in ARRAYS},
+        size_m=np.asarray(slots.size_m)[:num_drones],
+        size_frames=np.asarray(slots.size_frames)[:num_drones],
+        arrivals=tuple(each.arrivals),
+    )
+    return tracks, places
