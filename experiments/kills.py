@@ -91,7 +91,7 @@ COMMANDS = {
         units="Simulated_Data/S01_D2_A/*.avi",
     ),
     "silhouettes": Command(
-        f"silhouettes {FLIGHT} --cache {{out}}/cache", ("cache",), units="cache/[0-9a-f]*/c/**/*"
+        f"detect {FLIGHT} --silhouettes --cache {{out}}/cache", ("cache",), units="cache/[0-9a-f]*/c/**/*"
     ),
     "track": Command(
         f"track {FLIGHT} --out {{out}}/tracks.csv {QUICK} --force --cache {{out}}/cache",
@@ -102,18 +102,18 @@ COMMANDS = {
     "two sweeps": replace(SWEEP, processes=2),
     "cluster": replace(SWEEP, words=f"{SWEEP.words} --cluster local --workers 2", has_workers=True),
     "labels": Command(
-        f"labels {FLIGHT} {{given}}/Simulated_Data/S01_D2_A --out {{out}}/labels --drone-size 0.3,0.3,0.15 --force",
+        f"simulate labels {FLIGHT} {{given}}/Simulated_Data/S01_D2_A --out {{out}}/labels --drone-size 0.3,0.3,0.15 --force",
         ("labels",),
     ),
     "localise": Command(
-        "localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force", ("poses.csv",)
+        "onboard localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force", ("poses.csv",)
     ),
     "export": Command(
         f"export {{given}}/tracks.csv {FLIGHT} --to mot --out {{out}}/mot --force",
         ("mot",),
     ),
     "pack": Command(
-        f"pack {{given}}/tracks.csv {FLIGHT} --out {{out}}/flight.psotrack --force --cache {{given}}/cache",
+        f"archive {{given}}/tracks.csv {FLIGHT} --out {{out}}/flight.psotrack --force --cache {{given}}/cache",
         ("flight.psotrack",),
     ),
     "overlay": Command(

@@ -175,7 +175,7 @@ plt.show()
 # | What you see | Look at | Likely cause |
 # |---|---|---|
 # | `calibrate rig`: the board is not the one that is stated | the line says what it sees | another dictionary; columns and rows exchanged |
-# | no drones found | `psotrack silhouettes`, camera by camera | the drones stand still for most of the video; dark drones before a dark wall: `--background mog2` with a lower `--var-threshold` |
+# | no drones found | `psotrack detect --silhouettes`, camera by camera | the drones stand still for most of the video; dark drones before a dark wall: `--background mog2` with a lower `--var-threshold` |
 # | false drones | silhouettes, as above | people, vehicles, small things that move: an `ignore` image, `bounds_m`, `--drone-px` |
 # | boxes beside the drones in one camera | `psotrack doctor` | the camera was moved after the calibration, or the video has another size or crop |
 # | boxes beside the drones that swing with their speed | `psotrack track --clocks auto` | the videos do not begin at the same moment |

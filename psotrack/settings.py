@@ -33,6 +33,13 @@ USUAL_SPEED_M_S = 6.0
 Particles = Annotated[int, Meta(ge=2, le=100_000)]
 Iterations = Annotated[int, Meta(ge=0, le=100_000)]
 DroneCount = Annotated[int, Meta(ge=1, le=1000)]
+
+
+def _metavar(values: str) -> Meta:
+    """What stands for a setting's values in the help of the command line."""
+    return Meta(extra={"metavar": values})
+
+
 #: The seeds of JAX and NumPy.
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
@@ -53,6 +60,9 @@ class _Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             choices = get_args(field.type) if get_origin(field.type) is Literal else ()
             if choices and value not in choices:
                 raise SettingsError(name, expected=f"one of {', '.join(choices)}", found=value)
+            if isinstance(value, list):
+                # What Python callers and files give as a list or an array.
+                msgspec.structs.force_setattr(self, field.name, tuple(value))
             numbers = value if isinstance(value, list | tuple) else (value,)
             if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 raise SettingsError(name, expected="finite numbers", found=f"{value}")
@@ -75,7 +85,7 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     prefix: ClassVar[str] = "swarm."
-    search: str = "pso"
+    search: Annotated[str, _metavar("pso|pso-kernel|NAME")] = "pso"
     kind: SwarmKind = "per-drone"
     particles: Particles = 30
     iterations: Iterations = 30
@@ -101,7 +111,7 @@ class ScoreSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     prefix: ClassVar[str] = "score."
-    kind: str = "soft"
+    kind: Annotated[str, _metavar("soft|hard|NAME")] = "soft"
     windows: Annotated[tuple[Positive, ...], Meta(min_length=1)] = (0.4, 0.7, 1.0)
     occlusion: bool = True
     vertex: bool = True
@@ -152,8 +162,8 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """What is known of the drones beforehand.
 
     Attributes:
-        count: number of drones; None takes all drones that are found.
-        size_m: full lengths of every drone along x, y and z, metres; None takes them from the first frames.
+        count: number of drones; None: all drones that are found.
+        size_m: full lengths of every drone along x, y and z, metres; None: estimated while tracking.
         learn_sizes: whether sizes are learned while tracking; `size_m` switches this off.
         body_offset_m: vector from the body's origin to the middle of the silhouette (with "projection-lines" of the
             box), along the world's axes, metres. No image shows where the origin is.
@@ -164,14 +174,9 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 
     prefix: ClassVar[str] = "drones."
     count: DroneCount | None = None
-    size_m: tuple[Positive, Positive, Positive] | None = None
+    size_m: Annotated[tuple[Positive, Positive, Positive], _metavar("X,Y,Z")] | None = None
     learn_sizes: bool = True
-    body_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def lengths_m(self) -> tuple[float, ...] | None:
-        """`size_m` as a tuple, which Python callers may give as a list or an array."""
-        return None if self.size_m is None else tuple(float(length) for length in self.size_m)
+    body_offset_m: Annotated[tuple[float, float, float], _metavar("X,Y,Z")] = (0.0, 0.0, 0.0)
 
 
 class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -180,9 +185,9 @@ class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
     Attributes:
         min_fitness: smallest fitness of a drone that counts as found.
         min_cameras: smallest number of cameras that see a drone that counts as found, by foreground or by detections.
-        min_cameras_to_begin: number of cameras, at different places, that must agree to begin a track; None: three
-            where at least three cameras have the place in view, else two. Two that agree for long are enough for the
-            projection lines also where a third should see the drone: something may hide the drone.
+        min_cameras_to_begin: number of cameras, at different places, that must agree to begin a track. Two that agree
+            for long are enough for the projection lines also where a third should see the drone: something may hide
+            the drone. None: three where at least three cameras have the place in view, else two.
         max_coasting_s: seconds for which a drone that is not found coasts on its prediction before it is lost.
         max_coasting_std_m: largest standard deviation, along the worst axis, of a position that the projection lines
             state for a drone that is not found, metres; a drone seen by one camera alone may coast for long.
@@ -243,10 +248,10 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         seed: seed of the swarm's random numbers.
         init: initial state: "auto" finds the drones in the first frames, "truth" takes them from the reference; or the
             name of a file of tracks, whose first frame is used.
-        bounds_m: lowest and highest x, y and z of the room, metres: (x0, x1, y0, y1, z0, z1); None derives them from
-            the cameras.
+        bounds_m: lowest and highest x, y and z of the room, metres: (x0, x1, y0, y1, z0, z1); None: derived from the
+            cameras and from what moves.
         smooth: whether later frames correct earlier ones.
-        rate_hz: instants per second at which drones are tracked; None is the rate of the fastest camera.
+        rate_hz: instants per second at which drones are tracked; None: the rate of the fastest camera.
         clocks: times of the cameras' frames: "given", those of the recording; or "auto", those corrected by each
             camera's offset and drift, which are estimated from the motion of the drones. This takes a second pass.
         swarm: the search in one frame.
@@ -262,11 +267,11 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         SettingsError: a value is not allowed.
     """
 
-    method: str = "swarm"
-    detections: str = YOLO
+    method: Annotated[str, _metavar("swarm|projection-lines|fused|NAME")] = "swarm"
+    detections: Annotated[str, _metavar("yolo|blobs|FOLDER")] = YOLO
     seed: Seed = 0
-    init: str = "auto"
-    bounds_m: tuple[float, float, float, float, float, float] | None = None
+    init: Annotated[str, _metavar("auto|truth|FILE")] = "auto"
+    bounds_m: Annotated[tuple[float, float, float, float, float, float], _metavar("X0,X1,Y0,Y1,Z0,Z1")] | None = None
     smooth: bool = False
     rate_hz: Positive | None = None
     clocks: Clocks = "given"

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from psotrack.cli.options import setting_name
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
-from psotrack.settings import TrackSettings
+from psotrack.settings import TrackSettings, setting_names
 
 #: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
 LENSES = {
@@ -210,6 +209,18 @@ def silhouettes_in_memory(rig: Rig, coverage, reduction) -> Silhouettes:
     return Silhouettes(rig.names, drawn, reduction, len(coverage), coverage.shape[2:], {}, arrays)
 
 
+#: Short names of settings whose last name is not theirs alone.
+SHORT_NAMES = {
+    "swarm": "swarm.kind",
+    "score": "score.kind",
+    "drones": "drones.count",
+    "drone_size_m": "drones.size_m",
+}
+
+
 def track_settings(**options):
-    """Tracking settings; options have the names of the command line, such as `particles`, or dotted names."""
-    return TrackSettings().changed({setting_name(name): value for name, value in options.items()})
+    """Tracking settings by their last names, such as `particles`, by `SHORT_NAMES`, or by dotted names."""
+    last = {name.rpartition(".")[2]: name for name in reversed(setting_names())}
+    return TrackSettings().changed(
+        {SHORT_NAMES.get(name) or last.get(name, name): value for name, value in options.items()}
+    )

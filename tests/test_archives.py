@@ -141,7 +141,7 @@ class TestOldArchives:
         assert errors["drones"] == 4
         # A pixel is 2 to 3 cm at the drones, as in tests/test_cli.py.
         assert errors["mean_error_m"] < 0.15
-        described = json.loads(run("info", OLD, "--json", "-"))
+        described = json.loads(run("init", "--show", OLD, "--json", "-"))
         assert described["name"] == "S02_D4_A"
         assert described["cameras"]["cam1"]["video"] is None
         assert described["cameras"]["cam1"]["silhouettes"].endswith("cam1")
@@ -202,7 +202,7 @@ class TestDamage:
     def test_the_command_says_it_in_one_line(self, tmp_path: Path) -> None:
         archive = tmp_path / "flight.psotrack"
         archive.write_bytes(CONTENT[:-100])
-        for words in (["unpack", archive, "--out", tmp_path / "out"], ["info", archive]):
+        for words in (["archive", archive, "--out", tmp_path / "out"], ["init", "--show", archive]):
             result = psotrack(*words)
             assert (result.returncode, result.stdout) == (2, "")
             assert result.stderr.count("\n") == 1
@@ -345,11 +345,11 @@ class TestPacking:
         self, flight: Path, own_flight: Path, tmp_path: Path
     ) -> None:
         for name, folder in (("a", flight), ("b", own_flight)):
-            run("pack", folder / "tracks.csv", folder, "--out", tmp_path / f"{name}.psotrack")
+            run("archive", folder / "tracks.csv", folder, "--out", tmp_path / f"{name}.psotrack")
         assert (tmp_path / "a.psotrack").read_bytes() == (tmp_path / "b.psotrack").read_bytes()
 
     def test_what_was_unpacked_is_packed_again(self, flight: Path, tmp_path: Path) -> None:
-        run("pack", flight / "tracks.csv", OLD, "--out", tmp_path / "again.psotrack")
+        run("archive", flight / "tracks.csv", OLD, "--out", tmp_path / "again.psotrack")
         with zipfile.ZipFile(OLD) as old, zipfile.ZipFile(tmp_path / "again.psotrack") as new:
             assert new.testzip() is None
             assert new.namelist() == old.namelist()
@@ -416,7 +416,7 @@ class TestPacking:
     ) -> None:
         change(own_flight)
         with pytest.raises(InputError) as error:
-            run("pack", own_flight / "tracks.csv", own_flight, "--out", tmp_path / "out" / "a.psotrack")
+            run("archive", own_flight / "tracks.csv", own_flight, "--out", tmp_path / "out" / "a.psotrack")
         assert "\n" not in str(error.value)
         assert words in str(error.value)
         assert not (tmp_path / "out").exists()
@@ -428,7 +428,7 @@ class TestPacking:
         record = json.loads((own_flight / "tracks.json").read_text())
         (own_flight / "tracks.json").write_text(json.dumps({**record, "causal": True, "most_drones": 6}))
         archive = tmp_path / "a.psotrack"
-        run("pack", own_flight / "tracks.csv", own_flight, "--out", archive)
+        run("archive", own_flight / "tracks.csv", own_flight, "--out", archive)
         with pytest.raises(SettingsError, match="first_look: expected True"):
             run("track", archive, "--out", tmp_path / "t.csv", "--cache", tmp_path)
         unpack(archive, tmp_path / "out")
@@ -439,16 +439,16 @@ class TestPacking:
         archive = tmp_path / "a.psotrack"
         archive.write_text("mine")
         with pytest.raises(OutputError, match="--force"):
-            run("pack", flight / "tracks.csv", flight, "--out", archive)
+            run("archive", flight / "tracks.csv", flight, "--out", archive)
         assert archive.read_text() == "mine"
-        run("pack", flight / "tracks.csv", flight, "--out", archive, "--force")
+        run("archive", flight / "tracks.csv", flight, "--out", archive, "--force")
         unpack(archive, tmp_path / "out")
         with pytest.raises(SettingsError, match=r"ends in \.psotrack, found a\.zip"):
-            run("pack", flight / "tracks.csv", flight, "--out", tmp_path / "a.zip")
+            run("archive", flight / "tracks.csv", flight, "--out", tmp_path / "a.zip")
 
     def test_other_functions_say_that_it_is_an_archive(self) -> None:
         with pytest.raises(
-            InputError, match=r"found an archive; `psotrack unpack .*version_1.psotrack --out FOLDER`"
+            InputError, match=r"found an archive; `psotrack archive .*version_1.psotrack --out FOLDER`"
         ):
             open_recording(OLD)
 
@@ -644,7 +644,7 @@ def test_tracks_are_computed_again_bit_by_bit(simulated: Path, tmp_path: Path, n
         options = [*options, "--detections", str(tmp_path / "boxes"), "--init", str(tmp_path / "start.csv")]
     run("track", sequence, "--out", tracks, "--cache", tmp_path / "cache", *USUAL, *options)
     errors = json.loads(run("evaluate", tracks, sequence, "--json", "-"))
-    run("pack", tracks, sequence, "--out", archive, "--cache", tmp_path / "cache", *pack_options)
+    run("archive", tracks, sequence, "--out", archive, "--cache", tmp_path / "cache", *pack_options)
     for path in (sequence, tmp_path / "boxes", tmp_path / "start.csv", tmp_path / "cache"):
         if path.exists():
             path.rename(tmp_path / f"moved {path.name}")

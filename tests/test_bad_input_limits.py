@@ -106,7 +106,7 @@ def test_options_of_track(flight, run_psotrack, tmp_path, options, name):
 @pytest.mark.parametrize("command", ["silhouettes", "detect"])
 def test_no_camera_is_no_camera(command, flight, run_psotrack, tmp_path):
     words = {
-        "silhouettes": ("silhouettes", flight, "--masks", tmp_path / "o"),
+        "silhouettes": ("detect", flight, "--masks", tmp_path / "o"),
         "detect": ("detect", flight, "--blobs", "--out", tmp_path / "o"),
     }[command]
     check_line(run_psotrack(*words, "--cameras", ""), "--cameras")
@@ -151,11 +151,11 @@ def test_a_huge_frame_in_detections_of_a_camera_without_video(flight, run_psotra
         "size = [320, 240]\n"
     )
     recording = write(tmp_path / "recording.toml", content)
-    check_line(run_psotrack("info", tmp_path), boxes)
+    check_line(run_psotrack("init", "--show", tmp_path), boxes)
     recording.write_text(
         content.replace('detections = "c0.csv"', 'detections = "c0.csv"\nframes = 2000000000')
     )
-    check_line(run_psotrack("info", tmp_path), recording, "cameras.c0.frames")
+    check_line(run_psotrack("init", "--show", tmp_path), recording, "cameras.c0.frames")
 
 
 def test_tracks_of_huge_frames_are_sparse(tmp_path, little_memory):
@@ -212,10 +212,10 @@ def test_a_parquet_file_of_one_repeated_row(tmp_path, little_memory):
 def test_a_marker_of_thousands_of_digits(header, flight, run_psotrack, tmp_path):
     values = ";".join(["0"] * header.count(";"))
     path = write(tmp_path / "m.csv", f"{header}\n{HUGE[:900]};{values}\n")
-    output = run_psotrack("localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv")
+    output = run_psotrack("onboard", "localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv")
     check_line(output, path)
     path.write_text(f"{header}\n{HUGE};{values}\n")
-    output = run_psotrack("localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv")
+    output = run_psotrack("onboard", "localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv")
     check_line(output, path)
 
 
@@ -229,7 +229,7 @@ def test_a_label_of_thousands_of_digits(tmp_path):
     "words",
     [
         ("calibrate", "convert", "rig.toml", "out.toml", "--size", f"{HUGE},720"),
-        ("map-markers", "c0.avi", "--known", HUGE, "--side", "0.2", "--out", "m.csv"),
+        ("onboard", "map", "c0.avi", "--known", HUGE, "--side", "0.2", "--out", "m.csv"),
         ("live", ".", "--out", "o.csv", "--udp", f"127.0.0.1:{HUGE}"),
     ],
 )
@@ -262,7 +262,7 @@ def test_detections_that_are_no_folder(simulated_folder, run_psotrack):
     if (simulated_folder / "dl_data").is_dir():
         (simulated_folder / "dl_data").rmdir()
     write(simulated_folder / "dl_data", "no folder")
-    check_line(run_psotrack("info", simulated_folder), simulated_folder / "dl_data")
+    check_line(run_psotrack("init", "--show", simulated_folder), simulated_folder / "dl_data")
 
 
 # Files that unpack or decode to far more than they are
@@ -351,12 +351,12 @@ JUNK = [b"", b"junk", b"PAR1" + bytes(40) + b"PAR1", b"[1, 2]", b'{"runs": 3}', 
 
 
 @pytest.mark.parametrize("junk", JUNK)
-@pytest.mark.parametrize("command", ["table", "report"])
+@pytest.mark.parametrize("command", ["--table", "report"])
 def test_junk_in_a_cell_of_a_sweep(command, junk, sweep_folder, run_psotrack, tmp_path):
     path = sweep_folder / "cells" / f"{'a' * 40}.parquet"
     path.write_bytes(junk)
-    out = ("--out", tmp_path / "page.html") if command == "report" else ()
-    check_line(run_psotrack(command, sweep_folder, *out), path)
+    options = ("--out", tmp_path / "page.html") if command == "report" else (command,)
+    check_line(run_psotrack("report", sweep_folder, *options), path)
     assert path.read_bytes() == junk
     assert not (tmp_path / "page.html").exists()
 

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import click
 import cv2
 import numpy as np
 import pytest
-from helpers import Output
-from hypothesis import HealthCheck, given, settings
+from helpers import Output as Printed
+from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack import cli
-from psotrack.cli.live import live
-from psotrack.cli.output import print_drones
-from psotrack.cli.run_files import config_text
-from psotrack.cli.track import track
-from psotrack.errors import InputError
+from psotrack.cli.output import Output
+from psotrack.cli.settings import config_text, read_config
+from psotrack.errors import PsotrackError
+from psotrack.settings import TrackSettings
 from psotrack.trajectories import Status, Trajectories
 
 #: A line of a log: local time with its offset, level, and what was said.
 LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (info|warning|error) (.*)")
 
-Run = Callable[..., Output]
+Run = Callable[..., Printed]
 
 
 @pytest.fixture
@@ -40,11 +36,11 @@ def run(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
 
 @pytest.fixture
 def command(tmp_path: Path) -> list[object]:
-    """Arguments of a command that takes a moment: `detect-markers` in a photograph of a marker."""
+    """Arguments of a command that takes a moment: `onboard detect` in a photograph of a marker."""
     path = tmp_path / "photograph.png"
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 100)
     cv2.imwrite(str(path), np.pad(marker, 40, constant_values=255))
-    return ["detect-markers", path, "--out", tmp_path / "markers.csv", "--force", "--json", "-"]
+    return ["onboard", "detect", path, "--out", tmp_path / "markers.csv", "--force", "--json", "-"]
 
 
 def said_in(log: Path) -> list[tuple[str, str]]:
@@ -75,7 +71,7 @@ class TestProgress:
 class TestLog:
     def test_a_log_grows(self, run: Run, command: list[object], tmp_path: Path) -> None:
         log = tmp_path / "logs" / "all.log"
-        command = [*command[:4], "--log", log]
+        command = [*command[:5], "--log", log]
         out = run(*command)[1]
         lines = said_in(log)
         assert lines[0][1].startswith("psotrack ")
@@ -129,129 +125,67 @@ class TestLog:
         ]
 
 
-def parameters(command: click.Command, *arguments: object) -> dict[str, object]:
-    """Parameters that a command gets from arguments."""
-    with command.make_context(command.name, [str(argument) for argument in arguments]) as context:
-        return dict(context.params)
-
-
-def saved(command: click.Command, path: Path, *arguments: object) -> dict[str, object]:
-    """Parameters of a command, which are saved to a file too."""
-    with command.make_context(command.name, [str(argument) for argument in arguments]) as context:
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(config_text(context, path.parent), encoding="utf-8")
-        return dict(context.params)
-
-
 numbers = st.floats(-1e9, 1e9)
 texts = st.text(st.characters(exclude_categories=("Cs", "Cc")), min_size=1).filter(
     lambda text: not text.startswith("-")
 )
 
 
-@st.composite
-def options_of_track(draw: st.DrawFn) -> list[str]:
-    """Arguments of `track` with some options and any values that the command line takes."""
-    values = {
-        "--particles": st.integers(-5, 10**6),
-        "--max-speed": numbers,
+#: Any values that some settings may have.
+SETTINGS = st.fixed_dictionaries(
+    {},
+    optional={
+        "swarm.particles": st.integers(2, 100_000),
+        "motion.max_speed_m_s": st.floats(1e-3, 1e9),
         # Files have no numbers above 1e60.
-        "--rate": st.floats(1e-300, 1e60),
-        "--drone-size": st.tuples(numbers, numbers, numbers).map(lambda each: ",".join(map(str, each))),
-        "--bounds": st.tuples(*[numbers] * 6).map(lambda each: ",".join(map(str, each))),
-        "--clocks": st.sampled_from(["given", "auto"]),
-        "--method": texts,
-        "--cameras": texts,
-        "--jobs": st.integers(1, 64),
-        "--most-drones": st.integers(1, 64),
-        "--init": st.sampled_from(["auto", "truth"]),
-        "--detections": st.sampled_from(["yolo", "blobs"]),
-        "--progress": st.sampled_from(["auto", "bar", "lines", "none"]),
-    }
-    chosen = draw(st.lists(st.sampled_from(sorted(values)), unique=True))
-    flags = draw(st.lists(st.sampled_from(["--smooth", "--causal", "--quiet"]), unique=True))
-    typed = [f"{name}={draw(values[name])}" for name in chosen]
-    return ["flight", "--out", "tracks.csv", *typed, *flags]
+        "rate_hz": st.floats(1e-300, 1e60),
+        "drones.size_m": st.tuples(*[st.floats(1e-3, 1e9)] * 3),
+        "clocks": st.sampled_from(["given", "auto"]),
+        "method": texts,
+        "smooth": st.booleans(),
+        "silhouettes.reduction": st.integers(1, 64),
+    },
+)
 
 
 class TestConfig:
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-    @given(arguments=options_of_track())
-    def test_a_saved_run_has_the_same_parameters(self, tmp_path: Path, arguments: list[str]) -> None:
-        file = Path("run.toml")
-        before = Path.cwd()
-        os.chdir(tmp_path)
-        try:
-            wanted = saved(track, file, *arguments)
-            assert parameters(track, "--config", file) == wanted
-        finally:
-            os.chdir(before)
-
-    def test_the_file_has_every_option_and_the_version(self, tmp_path: Path) -> None:
-        saved(track, tmp_path / "run.toml", "flight", "--out", "tracks.csv", "--force")
-        text = (tmp_path / "run.toml").read_text(encoding="utf-8")
-        for param in track.params:
-            name = max(param.opts, key=len).lstrip("-")
-            typed = name in ("config", "save-config", "force")
-            assert bool(re.search(rf"^(# )?{name} =", text, re.MULTILINE)) != typed, name
-        assert tomllib.loads(text)["psotrack"] == cli.__version__
-
-    def test_typed_options_have_precedence(self, tmp_path: Path) -> None:
-        file = tmp_path / "run.toml"
-        file.write_text('sequence = "a"\nout = "a.csv"\nparticles = 7\niterations = 8\n', encoding="utf-8")
-        found = parameters(track, "b", "--config", file, "--particles", 9)
-        assert (found["sequence"], found["particles"], found["iterations"]) == (Path("b"), 9, 8)
-
-    def test_relative_paths_start_at_the_folder_of_the_file(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        (tmp_path / "here").mkdir()
-        monkeypatch.chdir(tmp_path / "here")
-        file = tmp_path / "runs" / "run.toml"
-        typed = ["flight", "--out", "/tracks.csv", "--init", "start.csv", "--detections", "boxes"]
-        typed += ["--detector", "net.onnx", "--json", "-"]
-        saved(track, file, *typed)
-        monkeypatch.chdir(tmp_path)
-        found = parameters(track, "--config", "runs/run.toml")
-        places = [Path(str(found[name])).resolve() for name in ("sequence", "init", "detections", "detector")]
-        here = tmp_path / "here"
-        assert places == [here / "flight", here / "start.csv", here / "boxes", here / "net.onnx"]
-        assert (found["out"], found["json_path"]) == (Path("/tracks.csv"), Path("-"))
-        # The name of a plugin is no path.
-        saved(track, file, "flight", "--out", "a.csv", "--detector", "mine")
-        assert parameters(track, "--config", file)["detector"] == "mine"
+    @given(values=SETTINGS)
+    def test_a_saved_file_has_all_settings(self, tmp_path_factory: pytest.TempPathFactory, values: Any) -> None:
+        settings = TrackSettings().changed(values)
+        file = tmp_path_factory.mktemp("config") / "run.toml"
+        file.write_text(config_text(settings), encoding="utf-8")
+        assert TrackSettings().changed(read_config(file)) == settings
 
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("partcles = 3", "partcles: .*found partcles; did you mean particles?"),
-            ("max_speed = 3", "found max_speed; did you mean max-speed?"),
-            ("qqqq = 3", "see `psotrack track --help`"),
-            ("force = true", "found force; it is typed for each run"),
-            ('particles = "many"', 'particles: expected a whole number, found "many"'),
+            ("swarm.partcles = 3", "swarm.partcles: .*found swarm.partcles; did you mean swarm.particles?"),
+            ("force = true", "force: expected the name of a setting"),
+            ('swarm.particles = "many"', "swarm.particles: expected a whole number, found \"many\""),
             ("smooth = 1", "smooth: expected true or false, found 1"),
-            ("out = 7", "out: expected text, found 7"),
-            ("drone-size = [1, 2]", "drone-size: expected a list of length 3"),
-            ('clocks = "atomic"', "clocks: expected one of auto, given, found atomic"),
-            ("jobs = 0", "jobs: expected a whole number of at least 1, found 0"),
-            ("rate = inf", "rate: expected a finite number, found inf"),
-            ('command = "live"', 'command: expected "track", found "live"'),
-            ("rate = [", "expected valid TOML"),
+            ("drones.size_m = [1, 2]", "drones.size_m: expected a list of length 3"),
+            ('clocks = "atomic"', "clocks: expected one of given, auto, found atomic"),
+            ("rate_hz = inf", "rate_hz: expected finite numbers, found inf"),
+            ("rate_hz = [", "expected valid TOML"),
         ],
     )
     def test_a_wrong_file_is_one_line(self, tmp_path: Path, text: str, message: str) -> None:
         file = tmp_path / "run.toml"
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(InputError, match=message.replace("?", r"\?")) as caught:
-            parameters(track, "--config", file)
+        with pytest.raises(PsotrackError, match=message.replace("?", r"\?")) as caught:
+            read_config(file)
         assert str(caught.value).startswith(str(file))
         assert "\n" not in str(caught.value)
 
-    def test_another_version_is_a_warning(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-        file = tmp_path / "run.toml"
-        file.write_text('psotrack = "0.0.1"\nsequence = "a"\nout = "a.csv"\n', encoding="utf-8")
-        assert parameters(track, "--config", file)["sequence"] == tmp_path / "a"
-        assert "written by psotrack 0.0.1" in caplog.text
+    def test_set_has_the_names_of_sweeps(self, run: Run, tmp_path: Path) -> None:
+        for option, message in (
+            ("swarm.particles=many", "swarm.particles: expected a whole number, found \"many\""),
+            ("swarm.partcles=3", "did you mean swarm.particles?"),
+            ("particles", "--set: expected NAME=VALUE, such as swarm.particles=50, found particles"),
+        ):
+            code, _, err = run("track", tmp_path, "--out", tmp_path / "t.csv", "--set", option)
+            assert (code, err.count("\n")) == (2, 1)
+            assert message in err
 
     def test_a_file_that_exists_is_kept(self, run: Run, tmp_path: Path) -> None:
         file = tmp_path / "run.toml"
@@ -267,10 +201,6 @@ class TestConfig:
             run("track", tmp_path, "--out", tmp_path / "t.csv", "--save-config", tmp_path / "b.toml")[0] == 2
         )
         assert sorted(path.name for path in tmp_path.iterdir()) == ["run.toml"]
-
-    def test_live_takes_a_file_too(self, tmp_path: Path) -> None:
-        wanted = saved(live, tmp_path / "live.toml", tmp_path, "--udp", "localhost:9000", "--seconds", 3)
-        assert parameters(live, "--config", tmp_path / "live.toml") == wanted
 
 
 class TestTable:
@@ -297,7 +227,7 @@ class TestTable:
         )
         size_m = np.full((drones, 3), 1.234)
         size_m[4] = np.nan
-        print_drones(False, None, tracks, size_m)
+        Output(0.0).drones(tracks, size_m)
         lines = capsys.readouterr().out.splitlines()
         assert max(map(len, lines)) <= 80
         assert not any("…" in line for line in lines)
@@ -326,8 +256,10 @@ class TestTable:
 
     def test_nothing_with_quiet_or_json_on_stdout(self, capsys: pytest.CaptureFixture[str]) -> None:
         tracks = Trajectories(np.arange(1), np.zeros(1), ("a",), np.zeros((1, 1, 3)))
-        print_drones(True, None, tracks)
-        print_drones(False, Path("-"), tracks)
+        hidden, of_json = Output(0.0), Output(0.0)
+        hidden.quiet, of_json.json_path = True, Path("-")
+        hidden.drones(tracks)
+        of_json.drones(tracks)
         assert capsys.readouterr().out == ""
-        print_drones(False, None, tracks)
+        Output(0.0).drones(tracks)
         assert "100.0%" in capsys.readouterr().out

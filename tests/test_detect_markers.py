@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_pictures import Sheet, picture, rows_of_sheets
 
-from psotrack.cli.detect_markers import detect_markers
+from psotrack.cli.onboard.detect_markers import detect_markers
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.foreground.detection import marker_dictionary
 from psotrack.inside_out.detection import MarkerDetector
@@ -334,7 +334,7 @@ def test_a_damaged_photograph_is_one_line(tmp_path, damage):
     whole = path.read_bytes()
     path.write_bytes(whole[:3000] if damage == "cut" else whole[:5000] + bytes(40) + whole[5040:])
     done = subprocess.run(
-        [sys.executable, "-m", "psotrack", "detect-markers", path, "--out", tmp_path / "markers.csv"],
+        [sys.executable, "-m", "psotrack", "onboard", "detect", path, "--out", tmp_path / "markers.csv"],
         capture_output=True,
         text=True,
     )

@@ -1,4 +1,4 @@
-"""`psotrack fuse` on files: the tracks, the report, and error messages of one line."""
+"""`psotrack onboard fuse` on files: the tracks, the report, and error messages of one line."""
 
 import json
 import re
@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from test_inside_out_fusing import recording, remove_poses, remove_positions, rms
 
-from psotrack.cli.fuse import fuse
+from psotrack.cli.onboard.fuse import fuse
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.inside_out import read_camera_path, write_camera_path
 from psotrack.trajectories import read_trajectories, write_trajectories
@@ -186,5 +186,5 @@ def test_sources_that_never_see_a_drone_at_the_same_time_are_kept_with_a_note(fi
 
 def test_help_shows_examples() -> None:
     shown = run("--help").output
-    assert "psotrack fuse dron1.csv dron2.csv tracks.csv --out fused.csv" in shown
+    assert "psotrack onboard fuse dron1.csv dron2.csv tracks.csv --out fused.csv" in shown
     assert "--max-offset SECONDS" in shown

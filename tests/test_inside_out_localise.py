@@ -1,4 +1,4 @@
-"""`psotrack localise`: from videos, image folders and streams of a drawn room to the path of the camera in the room."""
+"""`psotrack onboard localise`: from videos, image folders and streams of a drawn room to the path of the camera in the room."""
 
 import json
 import signal
@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import lens_of_sensor, lens_of_view
-from psotrack.cli.localise import localise as command
+from psotrack.cli.onboard.localise import localise as command
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project

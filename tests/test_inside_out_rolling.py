@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.cli.localise import localise as localise_command
-from psotrack.cli.map_markers import map_markers as map_command
+from psotrack.cli.onboard.localise import localise as localise_command
+from psotrack.cli.onboard.map_markers import map_markers as map_command
 from psotrack.errors import SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import (
@@ -487,7 +487,7 @@ def blank(tmp_path_factory):
         ),
     ],
 )
-@pytest.mark.parametrize("command", ["localise", "map-markers"])
+@pytest.mark.parametrize("command", ["localise", "map"])
 def test_a_wrong_line_time_is_one_clear_line(blank, tmp_path, options, message, command):
     video, corners, out = (
         str(path) for path in (blank / "grey.avi", blank / "corners.csv", tmp_path / "out.csv")

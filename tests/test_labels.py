@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.cli.labels import labels
+from psotrack.cli.simulate.labels import labels
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
 from psotrack.geometry import look_at, make_camera, make_rig, project

@@ -6,7 +6,7 @@ from test_camera_times import FPS, RIG, alike, make_timeline, positions, sightin
 
 from psotrack.calibration.clocks import camera_offsets, clocks_of_tracks, find_offset
 from psotrack.calibration.doctor import examine
-from psotrack.cli.synchronise import offset_in_words
+from psotrack.cli.doctor import offset_in_words
 from psotrack.geometry import project
 from psotrack.recordings import FrameTimes
 from psotrack.trajectories import Trajectories

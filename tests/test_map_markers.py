@@ -1,4 +1,4 @@
-"""`psotrack map-markers` on real files: measured corners, a video, a sequence of the dataset, and a wrong map."""
+"""`psotrack onboard map` on real files: measured corners, a video, a sequence of the dataset, and a wrong map."""
 
 import json
 import re
@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from test_inside_out_map import ROOM, on_wall, recorded_corners, with_bent_corner
 
-from psotrack.cli.map_markers import FOUND, map_markers
+from psotrack.cli.onboard.map_markers import FOUND, map_markers
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
@@ -218,7 +218,7 @@ def test_measured_corners_in_another_order_are_reported(tmp_path):
     ("words", "error", "message"),
     [
         (["{walk}"], SettingsError, "expected --out FILE or --check MAP, found neither"),
-        (["{walk}", "--out", "{new}", "--check", "{new}"], SettingsError, "found --out and --check"),
+        (["{walk}", "--out", "{new}", "--check", "{new}"], SettingsError, "expected --out FILE or --check MAP, found both"),
         (["{walk}", "--out", "{new}"], SettingsError, "expected numbers of markers that are known"),
         (
             ["{walk}", "--out", "{new}", "--known", "7"],

@@ -230,7 +230,7 @@ def drawn(tmp_path_factory):
 def localise(folder, table, tmp_path, *options):
     arguments = [folder / "flight.avi", "--markers", table, "--camera", folder / "lens.toml",
                  "--out", tmp_path / "track.csv", "--json", tmp_path / "out.json", *options]  # fmt: skip
-    result = CliRunner().invoke(cli, ["localise", *map(str, arguments)], standalone_mode=False)
+    result = CliRunner().invoke(cli, ["onboard", "localise", *map(str, arguments)], standalone_mode=False)
     if result.exception is not None:
         raise result.exception
     return (
@@ -248,7 +248,7 @@ def test_the_command_names_exchanged_markers(drawn, tmp_path):
     write_marker_corners(tmp_path / "wrong.csv", corners)
     path, content, shown = localise(folder, tmp_path / "wrong.csv", tmp_path)
     assert content["wrong_markers"] == [5, 14]
-    assert "elsewhere: markers 5, 14; `psotrack map-markers" in shown
+    assert "elsewhere: markers 5, 14; `psotrack onboard map" in shown
     # Measured 8 mm.
     assert np.linalg.norm(path.position_m - positions, axis=1).max() < 0.03
 

@@ -140,11 +140,11 @@ def test_a_camera_of_a_recording_file(name, tmp_path, run_psotrack):
 @pytest.mark.parametrize(
     "words",
     [
-        ("silhouettes", "{flight}", "--masks", "{out}"),
+        ("detect", "{flight}", "--masks", "{out}"),
         ("detect", "{flight}", "--blobs", "--out", "{out}"),
         ("overlay", "{tracks}", "{flight}", "--out", "{out}"),
         ("export", "{tracks}", "{flight}", "--to", "mot", "--drone-size", "0.3,0.3,0.1", "--out", "{out}"),
-        ("labels", "{flight}", "{other}", "--drone-size", "0.3,0.3,0.1", "--out", "{out}"),
+        ("simulate", "labels", "{flight}", "{other}", "--drone-size", "0.3,0.3,0.1", "--out", "{out}"),
         ("live", "{flight}", "--replay", "--lines", "--record", "{out}"),
         ("track", "{flight}", "--out", "{out}.csv"),
     ],

@@ -35,7 +35,7 @@ def is_device(path):
 
 @pytest.mark.parametrize("force", [[], ["--force"]])
 def test_json_for_the_null_device_needs_no_force(run_psotrack, flight, force):
-    result = run_psotrack("info", flight, "--json", "/dev/null", *force)
+    result = run_psotrack("init", "--show", flight, "--json", "/dev/null", *force)
     assert result.code == 0, result.err
     assert is_device("/dev/null")
 
@@ -56,7 +56,7 @@ def test_json_that_cannot_be_written_is_refused_before_the_work(
 
 @pytest.mark.parametrize("force", [[], ["--force"]])
 def test_a_full_device_is_named_and_not_replaced(run_psotrack, flight, force):
-    result = run_psotrack("info", flight, "--json", "/dev/full", *force)
+    result = run_psotrack("init", "--show", flight, "--json", "/dev/full", *force)
     assert result.code == 2
     assert result.err.count("\n") == 1
     assert "/dev/full: expected a path that can be written, found No space left on device" in result.err
@@ -65,7 +65,7 @@ def test_a_full_device_is_named_and_not_replaced(run_psotrack, flight, force):
 
 @pytest.mark.parametrize("name", ["-", "/dev/stdout"])
 def test_stdout_gets_the_json_only(run_psotrack, flight, name):
-    result = run_psotrack("info", flight, "--json", name)
+    result = run_psotrack("init", "--show", flight, "--json", name)
     assert result.code == 0, result.err
     assert isinstance(json.loads(result.out), dict)
 
@@ -76,7 +76,7 @@ def test_a_pipe_gets_the_bytes(run_psotrack, flight, tmp_path):
     got = []
     reader = threading.Thread(target=lambda: got.append(pipe.read_text(encoding="utf-8")), daemon=True)
     reader.start()
-    assert run_psotrack("info", flight, "--json", pipe).code == 0
+    assert run_psotrack("init", "--show", flight, "--json", pipe).code == 0
     reader.join(10)
     assert isinstance(json.loads(got[0]), dict)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
@@ -219,7 +219,7 @@ def test_a_dash_makes_no_file_of_this_name(run_psotrack, flight, tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    "words", [["silhouettes", "{flight}", "--masks"], ["overlay", "{tracks}", "{flight}", "--out"]]
+    "words", [["detect", "{flight}", "--masks"], ["overlay", "{tracks}", "{flight}", "--out"]]
 )
 def test_a_link_to_a_folder_is_followed(run_psotrack, flight, tmp_path, words):
     (tmp_path / "elsewhere").mkdir()

@@ -114,7 +114,7 @@ def test_an_own_method_beside_projection_lines_needs_videos(folder, tmp_path):
 
 
 def test_doctor_and_info_read_recordings_without_videos(folder):
-    shown = run("info", folder)
+    shown = run("init", "--show", folder)
     assert "no video" in shown
     assert "1280 x 960" in shown
     assert "50 Hz" in shown

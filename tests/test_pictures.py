@@ -168,7 +168,7 @@ def test_a_folder_is_the_video_of_a_camera(pictures):
     recording = open_recording(folder).usable()
     assert recording.videos["left"].num_frames == FRAMES
     assert recording.fps == 20
-    assert "left" in run("info", folder)
+    assert "left" in run("init", "--show", folder)
     (folder / "recording.toml").write_text("version = 1\n" + table.replace("fps = 20\n", ""))
     assert "cameras.left.fps: expected frames per second of the pictures, or timestamps" in refusal(
         "info", folder
@@ -180,7 +180,7 @@ def test_a_folder_is_the_video_of_a_camera(pictures):
     assert open_recording(folder).usable().fps == pytest.approx(10)
     shutil.rmtree(pictures)
     pictures.mkdir()
-    assert "left: expected images, which end in" in refusal("info", folder)
+    assert "left: expected images, which end in" in refusal("init", "--show", folder)
 
 
 def test_blobs_of_pictures_are_detections(pictures, tmp_path):
@@ -228,7 +228,7 @@ def overlap(mask: np.ndarray, index: int) -> float:
 
 def test_masks_of_pictures(pictures, tmp_path):
     out = tmp_path / "masks"
-    assert f"{FRAMES} masks of 1 cameras" in run("silhouettes", pictures, "--masks", out)
+    assert f"{FRAMES} masks of 1 cameras" in run("detect", pictures, "--masks", out)
     files = sorted((out / "left").iterdir())
     assert [file.name for file in files] == [f"{index:06d}.png" for index in range(FRAMES)]
     for index, file in enumerate(files):
@@ -236,9 +236,9 @@ def test_masks_of_pictures(pictures, tmp_path):
         assert (mask.shape, mask.dtype) == ((HEIGHT, WIDTH), np.uint8)
         assert overlap(mask, index) > 0.95
     assert "masks/left: expected a path that does not exist yet" in refusal(
-        "silhouettes", pictures, "--masks", out
+        "detect", pictures, "--masks", out
     )
-    run("silhouettes", pictures, "--masks", out, "--frames", 5, "--force", "--working-reduction", 2)
+    run("detect", pictures, "--masks", out, "--frames", 5, "--force", "--working-reduction", 2)
     assert len(list((out / "left").iterdir())) == 5
     reduced = cv2.imread(str(out / "left" / "000002.png"), cv2.IMREAD_UNCHANGED)
     assert reduced.shape == (HEIGHT, WIDTH)
@@ -248,13 +248,13 @@ def test_masks_of_pictures(pictures, tmp_path):
 
 @pytest.mark.parametrize("name", ["mask.mp4", "mask.avi"])
 def test_masks_as_a_video(pictures, tmp_path, name):
-    run("silhouettes", pictures, "--masks", tmp_path / name)
+    run("detect", pictures, "--masks", tmp_path / name)
     masks = probe(tmp_path / name)
     assert (masks.num_frames, masks.image_size_wh) == (FRAMES, (WIDTH, HEIGHT))
     for index, frame in enumerate(read_frames(masks)):
         assert overlap(frame[..., 0], index) > 0.95
     assert "expected a path that does not exist yet" in refusal(
-        "silhouettes", pictures, "--masks", tmp_path / name
+        "detect", pictures, "--masks", tmp_path / name
     )
 
 
@@ -263,7 +263,7 @@ def test_a_single_video(tmp_path):
     with VideoWriter(tmp_path / "flight.avi", 25.0, (WIDTH, HEIGHT)) as writer:
         for index in range(FRAMES):
             writer.write(picture(index))
-    run("silhouettes", tmp_path / "flight.avi", "--masks", tmp_path / "masks")
+    run("detect", tmp_path / "flight.avi", "--masks", tmp_path / "masks")
     mask = cv2.imread(str(tmp_path / "masks" / "flight" / "000003.png"), cv2.IMREAD_UNCHANGED)
     assert overlap(mask, 3) > 0.6
     run(
@@ -281,7 +281,7 @@ def test_a_single_video(tmp_path):
 def test_where_masks_cannot_go(pictures, tmp_path):
     (tmp_path / "file").write_text("")
     assert "expected a folder, or a file that ends in .mp4, .avi" in refusal(
-        "silhouettes", pictures, "--masks", tmp_path / "file"
+        "detect", pictures, "--masks", tmp_path / "file"
     )
     shutil.copytree(pictures, tmp_path / "right")
     table = "".join(
@@ -289,26 +289,26 @@ def test_where_masks_cannot_go(pictures, tmp_path):
         for turn, name in enumerate(("left", "right"))
     )
     (tmp_path / "recording.toml").write_text("version = 1\n" + table)
-    found = refusal("silhouettes", tmp_path, "--masks", tmp_path / "a.mp4")
+    found = refusal("detect", tmp_path, "--masks", tmp_path / "a.mp4")
     assert "expected a folder, or one camera by --cameras, found a.mp4 for 2 cameras" in found
-    run("silhouettes", tmp_path, "--masks", tmp_path / "masks", "--jobs", 1)
+    run("detect", tmp_path, "--masks", tmp_path / "masks", "--jobs", 1)
     assert sorted(path.name for path in (tmp_path / "masks").iterdir()) == ["left", "right"]
 
 
 def test_cameras_without_a_place_have_masks_and_blobs(pictures, tmp_path):
     """Neither needs a calibration."""
     (tmp_path / "recording.toml").write_text('version = 1\n[cameras.left]\nvideo = "left"\nfps = 20\n')
-    run("silhouettes", tmp_path, "--masks", tmp_path / "masks")
+    run("detect", tmp_path, "--masks", tmp_path / "masks")
     assert len(list((tmp_path / "masks" / "left").iterdir())) == FRAMES
     run("detect", tmp_path, "--blobs", "--out", tmp_path / "boxes", "--cache", tmp_path / "cache")
     assert len(read_detections(tmp_path / "boxes" / "left.csv")) >= FRAMES
-    shown = run("silhouettes", tmp_path / "left", "--cache", tmp_path / "cache")
+    shown = run("detect", "--silhouettes", tmp_path / "left", "--cache", tmp_path / "cache")
     assert "1 cameras, 12 frames: already there" in shown
 
 
 def test_a_picture_that_is_none_ends_masks_and_blobs_in_one_line(pictures, tmp_path):
     shutil.copy(pictures / "notes.txt", pictures / "frame7.png")
-    for arguments in (["silhouettes", pictures, "--masks", tmp_path / "m"],
+    for arguments in (["detect", pictures, "--masks", tmp_path / "m"],
                       ["detect", pictures, "--blobs", "--out", tmp_path / "b", "--cache", tmp_path / "c"]):  # fmt: skip
         assert "frame7.png: expected an image" in refusal(*arguments)
     assert not (tmp_path / "m").exists() or not list((tmp_path / "m").iterdir())
@@ -318,7 +318,7 @@ def test_a_picture_that_is_none_ends_masks_and_blobs_in_one_line(pictures, tmp_p
 def test_masks_that_cannot_be_written(pictures, tmp_path):
     (tmp_path / "blocked").write_text("")
     with pytest.raises((OutputError, InputError, SettingsError)):
-        run("silhouettes", pictures, "--masks", tmp_path / "blocked" / "masks")
+        run("detect", pictures, "--masks", tmp_path / "blocked" / "masks")
 
 
 def test_pictures_are_read_as_the_sensor_saw_them(tmp_path):

@@ -48,7 +48,7 @@ def run_command(*arguments):
 
 
 def test_info(sequence):
-    content = json.loads(run_command("info", sequence, "--json", "-").stdout)
+    content = json.loads(run_command("init", "--show", sequence, "--json", "-").stdout)
     assert list(content["cameras"]) == list(SERIALS)
     assert content["cameras"][SERIALS[0]]["focal_length_px"] == pytest.approx(0.35 * 1158.7)
 
@@ -60,7 +60,7 @@ def test_doctor_finds_the_clock_of_the_reference_and_nothing_else(sequence):
 
 
 def test_synchronise_finds_the_offset_and_evaluate_removes_it(sequence, tracks):
-    found = json.loads(run_command("synchronise", tracks, sequence, "--json", "-").stdout)
+    found = json.loads(run_command("doctor", sequence, "--tracks", tracks, "--json", "-").stdout)
     assert found["offset_s"] == pytest.approx(OFFSET_S, abs=OFFSET_TOLERANCE_S)
 
     def errors(*arguments):

@@ -473,7 +473,7 @@ class TestFaults:
             folder / "left.csv", Detections(np.array([6]), np.array([[1.0, 2, 3, 4]]), np.ones(1))
         )
         path = write(folder, LEFT.replace("\nK =", '\ndetections = "left.csv"\nK ='), RIGHT)
-        for command in ("info", "doctor"):
+        for command in ("init", "--show", "doctor"):
             done = CliRunner().invoke(cli, [command, str(path)])
             assert isinstance(done.exception, InputError)
             assert re.search(

@@ -596,10 +596,10 @@ def test_the_keyboard_flies_in_a_window_that_shows_keys_and_position(pyglet):
 
 @pytest.fixture
 def run_fly(monkeypatch, run_psotrack, tmp_path):
-    """Runs `psotrack fly` in a folder that holds a script of sticks."""
+    """Runs `psotrack simulate fly` in a folder that holds a script of sticks."""
     monkeypatch.chdir(tmp_path)
     write_sticks(tmp_path / "script.csv", SCRIPT)
-    return functools.partial(run_psotrack, "fly")
+    return functools.partial(run_psotrack, "simulate", "fly")
 
 
 def test_the_command_writes_a_flight_and_sticks_that_reproduce_it(run_fly, tmp_path):

@@ -108,7 +108,7 @@ def inputs(tmp_path_factory, root):
         sequence = root / "Simulated_Data" / "S01_D2_A"
         simulated = psotrack(root, *CORNERS.split(), "--out", folder / "corners")
         assert simulated.returncode == 0, simulated.stderr
-        packed = psotrack(root, "pack", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack")
+        packed = psotrack(root, "archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack")
         assert packed.returncode == 0, packed.stderr
         grid_file(folder, [2, 3]).rename(folder / "grid.toml")
 
@@ -144,11 +144,11 @@ COMMANDS = {
     ("tracks.parquet", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.parquet",
     (
         "flight.psotrack",
-    ): "pack {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --out flight.psotrack --force",
+    ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --out flight.psotrack --force",
     (
         "videos.psotrack",
-    ): "pack {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
-    ("folder",): "unpack {inputs}/packed.psotrack --out folder",
+    ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
+    ("folder",): "archive {inputs}/packed.psotrack --out folder",
     (
         "rig.toml",
     ): "calibrate extrinsics --pairs {inputs}/pairs.csv --intrinsics {inputs}/lenses.yml --out rig.toml "
@@ -162,16 +162,16 @@ COMMANDS = {
     "--out lens.toml --force --quiet",
     ("better.csv",): "calibrate adjust {inputs}/boxes --tracks {inputs}/boxes/tracks.csv --out better.csv "
     "--force --quiet",
-    ("Real_Data/R02_D4",): "as-real {inputs}/corners/Simulated_Data/S02_D4_A --out . --quiet",
-    ("camera.csv",): "localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    ("Real_Data/R02_D4",): "simulate as-real {inputs}/corners/Simulated_Data/S02_D4_A --out . --quiet",
+    ("camera.csv",): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
     "--out camera.csv --force --frames 8 --quiet",
-    ("corners.csv",): "map-markers {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    ("corners.csv",): "onboard map {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
     "--known 7 --out corners.csv --force --quiet",
     (
         "markers.csv",
-    ): "detect-markers {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
-    ("fused.csv",): "fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
-    ("offset.png",): "synchronise {inputs}/clocks/tracks.csv {inputs}/clocks/Real_Data/R12_D2 --max-offset 1 "
+    ): "onboard detect {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
+    ("fused.csv",): "onboard fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
+    ("offset.png",): "doctor {inputs}/clocks/Real_Data/R12_D2 --tracks {inputs}/clocks/tracks.csv --max-offset 1 "
     "--plot offset.png --force",
     ("doctor.json",): "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
 }
@@ -214,7 +214,7 @@ def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, mon
 #: Output folders of commands that go on where the last call has ended -> words of the command.
 GO_ON = {
     "data": "simulate S01_D2_A --out data --frames 3 --scale 0.1 --jobs 1 --no-onboard --quiet",
-    "cache": "silhouettes {inputs}/flight --cache cache --jobs 1 --quiet",
+    "cache": "detect --silhouettes {inputs}/flight --cache cache --jobs 1 --quiet",
     "videos": "overlay {inputs}/flight_tracks.csv {inputs}/flight --out videos --jobs 1 --quiet",
 }
 
@@ -347,15 +347,15 @@ REFUSED = [
     "live {flight} --replay --out out/tracks.csv",
     "sweep {flight}/grid.toml --data {flight}/.. --out out/results",
     "simulate S01_D2_A --out out/data",
-    "silhouettes {flight} --cache out/cache",
-    "silhouettes {flight} --masks out/masks",
+    "detect --silhouettes {flight} --cache out/cache",
+    "detect {flight} --masks out/masks",
     "detect {flight} --blobs --out out/boxes",
-    "labels {flight} {flight}/../second --drone-size 0.3,0.3,0.15 --out out/yolo",
+    "simulate labels {flight} {flight}/../second --drone-size 0.3,0.3,0.15 --out out/yolo",
     "overlay {flight}/tracks.csv {flight} --out out/videos",
     "report {flight}/tracks.csv {flight} --out out/page.html",
     "evaluate {flight}/tracks.csv {flight} --plot out/errors.png",
     "export {flight}/tracks.csv --to tum --out out/tum",
-    "pack {flight}/tracks.csv {flight} --out out/flight.psotrack",
+    "archive {flight}/tracks.csv {flight} --out out/flight.psotrack",
     "doctor {flight} --detections blobs --json out/doctor.json",
     "calibrate adjust {flight} --tracks {flight}/tracks.csv --out out/rig.toml",
 ]
@@ -420,7 +420,7 @@ main()
 
 @pytest.mark.slow
 def test_two_processes_make_silhouettes_on_a_slow_disk(run_psotrack, flight, tmp_path):
-    words = ["silhouettes", str(flight), "--jobs", "1", "--quiet", "--cache"]
+    words = ["detect", "--silhouettes", str(flight), "--jobs", "1", "--quiet", "--cache"]
     both = [
         subprocess.Popen(
             [sys.executable, "-c", SLOW, *words, str(tmp_path / "slow")],

@@ -180,19 +180,19 @@ def test_finished_cells_are_not_run_again(root: Path, swept: Path) -> None:
 
 @pytest.mark.slow
 def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("table", swept / "results", "--rows", "iterations", "--columns", "method", "--format", "csv")
+    words = ("report", swept / "results", "--rows", "iterations", "--columns", "method", "--table", "csv")
     code, lines, _ = called(capsys, *words)
     assert code == 0
     assert "usual" in lines[0]
     assert "calm" in lines[0]
-    code, lines, _ = called(capsys, *words[:-2], "--value", "real_time_factor")
+    code, lines, _ = called(capsys, *words[:-1], "--value", "real_time_factor")
     assert code == 0
     assert lines[0].startswith("real_time_factor: mean")
     # If the rows are methods, the default columns are the sequences.
-    code, lines, _ = called(capsys, "table", swept / "results", "--rows", "method")
+    code, lines, _ = called(capsys, "report", swept / "results", "--table", "--rows", "method")
     assert code == 0
     assert "S01_D2_A" in lines[2]
-    code, _, wrong = called(capsys, "table", swept / "results", "--value", "mean_eror_m")
+    code, _, wrong = called(capsys, "report", swept / "results", "--table", "--value", "mean_eror_m")
     assert code == 2
     assert wrong.count("\n") == 1
     assert "mean_error_m" in wrong

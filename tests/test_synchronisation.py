@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration.clocks import find_offset
 from psotrack.calibration.clocks.synchronisation import camera_offsets
-from psotrack.cli.synchronise import synchronise
+from psotrack.cli.doctor import synchronise
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera
 from psotrack.recordings import VideoWriter

@@ -67,7 +67,7 @@ def flight(name: str, seed: int, data: Path) -> tuple[pd.DataFrame, list[dict[st
     assert reference is not None, "the simulator writes a reference"
     paths = [work / f"{drone}.csv" for drone in reference.drones]
     for drone, path in zip(reference.drones, paths, strict=True):
-        psotrack("localise", folder, "--drone", drone, "--no-filter", "--out", path)
+        psotrack("onboard", "localise", folder, "--drone", drone, "--no-filter", "--out", path)
     compared = compare_drones(folder, paths, tracks)
     labels = {"sequence": name, "seed": seed}
     rows = pd.concat([ranges(one, RANGE_FRAMES).assign(**labels) for one in compared])

@@ -3,7 +3,7 @@
     python experiments/two_ways/two_ways.py data/Simulated_Data/S01_D2_A dron1.csv dron2.csv tracks.csv
     python experiments/two_ways/two_ways.py SEQ INSIDE.csv [INSIDE.csv ...] OUTSIDE.csv --range 25 --out rows.csv
 
-INSIDE are paths of `psotrack localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of `psotrack
+INSIDE are paths of `psotrack onboard localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of `psotrack
 track`. The constant offset of each track from the reference is removed in the axes of the body, because a camera, the
 middle of a silhouette and a body's origin are different points. Only frames that both methods cover count.
 """
@@ -68,7 +68,7 @@ def compare_drones(sequence: Path, inside: Sequence[Path], outside: Path) -> lis
 
     Args:
         sequence: folder of the sequence.
-        inside: files of `psotrack localise`, whose drones are named as in the reference.
+        inside: files of `psotrack onboard localise`, whose drones are named as in the reference.
         outside: a file of `psotrack track`.
     """
     paths = {name: path for path, name in map(read_camera_path, inside)}

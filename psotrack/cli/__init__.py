@@ -3,7 +3,7 @@
 In: arguments and files. Out: files, text on stdout, and one line on stderr where something is wrong. Commands contain
 no numerics. A command's module is imported when the command runs, and the module imports the functions that it calls
 when they are called, so that `--help` and shell completion are quick. The exit code is 0 if everything was done, and 2
-for every error; it is 2 also if `doctor` or `map-markers --check` finds a fault. No other room uses this room;
+for every error, and 1 if `doctor` or `onboard map --check` finds a fault. No other room uses this room;
 `psotrack.__main__`, which the installed script and `python -m psotrack` run, calls `main` and answers Ctrl-C and
 SIGTERM (`psotrack.support.interrupts`).
 """
@@ -17,108 +17,117 @@ import sys
 import click
 
 from psotrack import __version__
-from psotrack.cli.lazy import LazyCommand, LazyGroup
+from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
 from psotrack.cli.log_file import FirstOnly
 from psotrack.errors import PsotrackError, SettingsError, one_short_line
 
 __all__ = ["cli", "main"]
 
-#: Commands by name: the module that defines the command, and the first sentence of its help. A test holds the sentences
-#: equal to the commands' own.
+START, RESULTS, RESEARCH, ON_BOARD = "Start", "Results", "Research", "On-board"
+#: Commands by name: where the command is, the first sentence of its help, and its heading in the list. A test holds the
+#: sentences equal to the commands' own.
 COMMANDS = {
-    "as-real": LazyCommand(
-        "psotrack.cli.as_real", "Write the simulated sequence SEQ in the form of the dataset's real half."
-    ),
-    "cache": LazyCommand(
-        "psotrack.cli.cache", "List, check, prune and empty the cache of silhouettes and compiled programs."
-    ),
-    "calibrate": LazyCommand("psotrack.cli.calibrate", "Calibrate cameras, and convert calibration files."),
     "demo": LazyCommand(
-        "psotrack.cli.demo",
+        "psotrack.cli.demo:demo",
         "Simulate four drones, track them in eight videos, print the errors and save a picture.",
-    ),
-    "detect": LazyCommand(
-        "psotrack.cli.detect",
-        "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.",
-    ),
-    "detect-markers": LazyCommand(
-        "psotrack.cli.detect_markers", "Find the ArUco markers and AprilTags in IMAGES, and their corners."
-    ),
-    "doctor": LazyCommand(
-        "psotrack.cli.doctor",
-        "Check the calibration of SEQ against the detections of its cameras, before tracking.",
-    ),
-    "evaluate": LazyCommand("psotrack.cli.evaluate", "Compare TRACKS with the reference of SEQ."),
-    "export": LazyCommand("psotrack.cli.export", "Write TRACKS in a format of another program."),
-    "fly": LazyCommand(
-        "psotrack.cli.fly", "Fly a simulated drone by hand and record the flight for a scenario."
-    ),
-    "fuse": LazyCommand(
-        "psotrack.cli.fuse",
-        "Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.",
-    ),
-    "info": LazyCommand(
-        "psotrack.cli.info",
-        "Show what SEQ contains, and check all of its files, of the videos only the last frame.",
+        START,
     ),
     "init": LazyCommand(
-        "psotrack.cli.init",
-        "Write the recording.toml of the videos, images and detections in FOLDER, which other commands take as SEQ.",
+        "psotrack.cli.init:init",
+        "Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.",
+        START,
     ),
-    "labels": LazyCommand(
-        "psotrack.cli.labels", "Write a YOLO training set from sequences with a reference."
+    "calibrate": LazyCommand(
+        "psotrack.cli.calibrate:calibrate",
+        "Calibrate cameras, and convert calibration files.",
+        START,
     ),
-    "live": LazyCommand(
-        "psotrack.cli.live",
-        "Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.",
-    ),
-    "localise": LazyCommand(
-        "psotrack.cli.localise",
-        "Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.",
-    ),
-    "map-markers": LazyCommand(
-        "psotrack.cli.map_markers",
-        "Write the table of a room's marker corners from SOURCE, or check such a table.",
-    ),
-    "overlay": LazyCommand(
-        "psotrack.cli.overlay",
-        "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
-    ),
-    "pack": LazyCommand(
-        "psotrack.cli.pack",
-        "Pack TRACKS and what is needed to compute them again from SEQ into one file.",
-    ),
-    "report": LazyCommand(
-        "psotrack.cli.report",
-        "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
-    ),
-    "silhouettes": LazyCommand(
-        "psotrack.cli.silhouettes",
-        "Compute and store the silhouettes of SEQ, which `track` reads, or write them as images or as a video.",
-    ),
-    "simulate": LazyCommand(
-        "psotrack.cli.simulate",
-        "Simulate a sequence: videos, calibration, ground truth, masks and detections.",
-    ),
-    "sweep": LazyCommand(
-        "psotrack.cli.sweep", "Track with every combination of a grid's settings, and keep one row per run."
-    ),
-    "synchronise": LazyCommand(
-        "psotrack.cli.synchronise",
-        "Find the offset between the clocks of SEQ's reference and of its videos, from the motion in TRACKS.",
-    ),
-    "table": LazyCommand(
-        "psotrack.cli.sweep", "Show a table of the results in DIR: mean +- standard deviation over runs."
+    "doctor": LazyCommand(
+        "psotrack.cli.doctor:doctor",
+        "Check the calibration of SEQ against the detections of its cameras, before tracking.",
+        START,
     ),
     "track": LazyCommand(
-        "psotrack.cli.track", "Track the drones of SEQ from its videos, or from detections in them."
+        "psotrack.cli.track:track",
+        "Track the drones of SEQ from its videos, or from detections in them.",
+        START,
     ),
-    "unpack": LazyCommand(
-        "psotrack.cli.pack", "Unpack the archive FILE into a folder, which other commands take as SEQ."
+    "live": LazyCommand(
+        "psotrack.cli.live:live",
+        "Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.",
+        START,
+    ),
+    "evaluate": LazyCommand(
+        "psotrack.cli.evaluate:evaluate",
+        "Compare TRACKS with the reference of SEQ.",
+        RESULTS,
     ),
     "view": LazyCommand(
-        "psotrack.cli.view", "Show TRACKS and their recording in space and time, in the viewer Rerun."
+        "psotrack.cli.view:view",
+        "Show TRACKS and their recording in space and time, in the viewer Rerun.",
+        RESULTS,
     ),
+    "report": LazyCommand(
+        "psotrack.cli.report:report",
+        "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
+        RESULTS,
+    ),
+    "overlay": LazyCommand(
+        "psotrack.cli.overlay:overlay",
+        "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
+        RESULTS,
+    ),
+    "export": LazyCommand(
+        "psotrack.cli.export:export",
+        "Write TRACKS in a format of another program.",
+        RESULTS,
+    ),
+    "archive": LazyCommand(
+        "psotrack.cli.archive:archive",
+        "Pack TRACKS and what is needed to compute them again into one file, or unpack such a file.",
+        RESULTS,
+    ),
+    "simulate": LazyCommand(
+        "psotrack.cli.simulate:simulate",
+        "Simulate sequences: videos, calibration, ground truth, masks and detections.",
+        RESEARCH,
+    ),
+    "sweep": LazyCommand(
+        "psotrack.cli.sweep:sweep",
+        "Track with every combination of a grid's settings, and keep one row per run.",
+        RESEARCH,
+    ),
+    "detect": LazyCommand(
+        "psotrack.cli.detect:detect",
+        "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.",
+        RESEARCH,
+    ),
+    "cache": LazyCommand(
+        "psotrack.cli.cache:cache",
+        "List, check, prune and empty the cache of silhouettes and compiled programs.",
+        RESEARCH,
+    ),
+    "onboard": LazyCommand(
+        "psotrack.cli.onboard:onboard",
+        "Localise drones by their own cameras, from ArUco markers of known place.",
+        ON_BOARD,
+    ),
+}
+#: Commands that there were once, and what replaces them.
+RENAMED = {
+    "as-real": "simulate as-real",
+    "detect-markers": "onboard detect",
+    "fly": "simulate fly",
+    "fuse": "onboard fuse",
+    "info": "init SEQ --show",
+    "labels": "simulate labels",
+    "localise": "onboard localise",
+    "map-markers": "onboard map",
+    "pack": "archive",
+    "silhouettes": "detect --silhouettes",
+    "synchronise": "doctor --tracks",
+    "table": "report --table",
+    "unpack": "archive",
 }
 
 _COMPLETION_VARIABLE = "_PSOTRACK_COMPLETE"
@@ -127,7 +136,8 @@ _COMPLETION_VARIABLE = "_PSOTRACK_COMPLETE"
 @click.group(
     cls=LazyGroup,
     lazy_commands=COMMANDS,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    renamed=RENAMED,
+    context_settings=SETTINGS,
 )
 @click.version_option(__version__, prog_name="psotrack")
 @click.option("--verbose", "-v", is_flag=True, help="Log the steps of the work on stderr.")
@@ -136,11 +146,10 @@ def cli(verbose: bool) -> None:
 
     \b
     Try it:          psotrack demo
-    Own cameras:     psotrack init flight --calibration rig.toml
-                     psotrack track flight --out tracks.csv
-    Step by step:    psotrack simulate S02_D4_A --out data
-                     psotrack track data/Simulated_Data/S02_D4_A --out tracks.csv
-                     psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --plot
+    Own cameras:     psotrack calibrate rig my_lab/board --square 0.04 --out my_lab/rig.toml
+                     psotrack init my_lab
+                     psotrack track my_lab
+    Look at it:      psotrack report my_lab/results/tracks.csv
 
     \b
     Completion with the Tab key needs one line in the start-up file of your shell:

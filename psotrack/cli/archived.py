@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
-from click.core import ParameterSource
 
-from psotrack.cli.options import setting_name
+from psotrack.cli.records import is_given
 from psotrack.errors import InputError
 from psotrack.settings import TrackSettings
 
@@ -82,24 +80,6 @@ def archive_of(context: click.Context) -> OpenedArchive | None:
     return context.meta.get(_ARCHIVE)
 
 
-def chosen_settings(options: Mapping[str, Any]) -> TrackSettings:
-    """The settings of a run: those that the user chose, and else those of the archive, or the defaults.
-
-    Args:
-        options: values of the options that are settings, by the options' names.
-
-    Raises:
-        InputError: the archive has settings that this version does not know.
-        SettingsError: a value is not allowed.
-    """
-    context = click.get_current_context()
-    archive, settings = archive_of(context), TrackSettings()
-    if archive is not None:
-        settings = archive.settings
-        options = {name: value for name, value in options.items() if _is_chosen(context, name)}
-    return settings.changed({setting_name(name): value for name, value in options.items()})
-
-
 def chosen_extent(num_frames: int | None, causal: bool, most_drones: int) -> tuple[int | None, bool, int]:
     """The values of --frames, --causal and --most-drones: those of an archive where the user chose none."""
     context = click.get_current_context()
@@ -107,7 +87,7 @@ def chosen_extent(num_frames: int | None, causal: bool, most_drones: int) -> tup
     if archive is None:
         return num_frames, causal, most_drones
     packed = archive.manifest
-    if packed.most_drones is not None and not _is_chosen(context, "most_drones"):
+    if packed.most_drones is not None and not is_given(context, "most_drones"):
         most_drones = packed.most_drones
     return num_frames or packed.frames, causal or packed.causal, most_drones
 
@@ -137,7 +117,3 @@ def with_comparison(
     comparison = compare_with_archive(archive.folder, archive.manifest, tracks, record, asked)
     of_archive = {"file": archive.path.name, **comparison.to_dict()}
     return {**record, "archive": of_archive}, f"; {comparison.sentence(archive.path.name)}"
-
-
-def _is_chosen(context: click.Context, option: str) -> bool:
-    return context.get_parameter_source(option) is not ParameterSource.DEFAULT

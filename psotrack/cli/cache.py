@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psotrack.cli.options import CACHE, FORCE, JSON, QUIET, cache_folder
-from psotrack.cli.output import output_json, print_line, print_table
+from psotrack.cli.output import Output, pass_output
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ def cache() -> None:
 @QUIET
 @FORCE
 @JSON
-def list_command(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) -> None:
+@pass_output
+def list_command(output: Output, cache: Path | None) -> None:
     """List the entries: key, video, size and the days since the last use.
 
     \b
@@ -49,16 +50,14 @@ def list_command(cache: Path | None, quiet: bool, force: bool, json_path: Path |
 
     folder, now_s = cache_folder(cache), time.time()
     entries = list_entries(folder)
-    output_json(
-        json_path, {"cache": str(folder), "entries": [_described(each, now_s) for each in entries]}, force
-    )
+    output.json({"cache": str(folder), "entries": [_described(each, now_s) for each in entries]})
     stored = [each for each in entries if each.kind == "silhouettes"]
     rows = (
         (each.path.name, each.video, f"{each.size_bytes / 1e6:.1f}", f"{_days(each, now_s):.1f}")
         for each in stored
     )
-    print_table(quiet, json_path, ("silhouettes", "video", "MB", "days unused"), rows)
-    print_line(quiet, json_path, f"{folder}: {_counted(entries)}")
+    output.table(("silhouettes", "video", "MB", "days unused"), rows)
+    output.say(f"{folder}: {_counted(entries)}")
 
 
 @cache.command()
@@ -66,7 +65,8 @@ def list_command(cache: Path | None, quiet: bool, force: bool, json_path: Path |
 @QUIET
 @FORCE
 @JSON
-def check(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) -> None:
+@pass_output
+def check(output: Output, cache: Path | None) -> None:
     """Check every byte of the silhouettes and of the stored programs, and name what is damaged.
 
     The exit code is 2 if an entry is damaged. The next run that needs a damaged entry makes it anew.
@@ -81,12 +81,12 @@ def check(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) 
     folder = cache_folder(cache)
     entries = list_entries(folder)
     damaged = [str(entry.path) for entry in entries if is_damaged(entry)]
-    output_json(json_path, {"cache": str(folder), "entries": len(entries), "damaged": damaged}, force)
+    output.json({"cache": str(folder), "entries": len(entries), "damaged": damaged})
     for path in damaged:
-        print_line(quiet, json_path, f"damaged: {path}")
-    print_line(quiet, json_path, f"{folder}: {_counted(entries)}, {len(damaged)} damaged")
+        output.say(f"damaged: {path}")
+    output.say(f"{folder}: {_counted(entries)}, {len(damaged)} damaged")
     if damaged:
-        print_line(quiet, json_path, "the next run that needs a damaged entry makes it anew")
+        output.say("the next run that needs a damaged entry makes it anew")
         sys.exit(2)
 
 
@@ -109,14 +109,9 @@ def check(cache: Path | None, quiet: bool, force: bool, json_path: Path | None) 
 @QUIET
 @FORCE
 @JSON
+@pass_output
 def prune(
-    older_than_days: float | None,
-    max_gb: float | None,
-    dry_run: bool,
-    cache: Path | None,
-    quiet: bool,
-    force: bool,
-    json_path: Path | None,
+    output: Output, older_than_days: float | None, max_gb: float | None, dry_run: bool, cache: Path | None
 ) -> None:
     """Remove entries that were not used for some days, or that make the cache larger than a size.
 
@@ -132,15 +127,16 @@ def prune(
     folder, now_s = cache_folder(cache), time.time()
     max_bytes = None if max_gb is None else 1e9 * max_gb
     chosen = choose_to_prune(list_entries(folder), now_s, older_than_days, max_bytes)
-    _remove(folder, chosen, dry_run, quiet, force, json_path)
+    _remove(output, folder, chosen, dry_run)
 
 
 @cache.command()
-@click.option("--force", is_flag=True, help="Do not ask; also replace an existing file of --json.")
+@FORCE
 @CACHE
 @QUIET
 @JSON
-def empty(force: bool, cache: Path | None, quiet: bool, json_path: Path | None) -> None:
+@pass_output
+def empty(output: Output, cache: Path | None) -> None:
     """Remove all entries, after a question.
 
     \b
@@ -152,7 +148,7 @@ def empty(force: bool, cache: Path | None, quiet: bool, json_path: Path | None) 
 
     folder = cache_folder(cache)
     entries = list_entries(folder)
-    if entries and not force:
+    if entries and not output.force:
         question = f"{folder}: remove {_counted(entries)}?"
         # Nobody is there to answer where stdin is no terminal.
         if not sys.stdin.isatty():
@@ -160,14 +156,12 @@ def empty(force: bool, cache: Path | None, quiet: bool, json_path: Path | None) 
                 "cache empty", expected="an answer to a question", found="no terminal", remedy="pass --force"
             )
         if not click.confirm(question, err=True):
-            print_line(quiet, json_path, f"{folder}: nothing was removed")
+            output.say(f"{folder}: nothing was removed")
             return
-    _remove(folder, entries, False, quiet, force, json_path)
+    _remove(output, folder, entries, False)
 
 
-def _remove(
-    folder: Path, chosen: list[CacheEntry], dry_run: bool, quiet: bool, force: bool, json_path: Path | None
-) -> None:
+def _remove(output: Output, folder: Path, chosen: list[CacheEntry], dry_run: bool) -> None:
     """Remove entries, and say which."""
     from psotrack.foreground.silhouettes import remove_entry
 
@@ -181,9 +175,9 @@ def _remove(
         "removed": [str(each.path) for each in chosen],
         "in_use": [],
     }
-    output_json(json_path, content, force)
+    output.json(content)
     words = "would be removed" if dry_run else "removed"
-    print_line(quiet, json_path, f"{folder}: {words}: {_counted(chosen)}")
+    output.say(f"{folder}: {words}: {_counted(chosen)}")
 
 
 def _counted(entries: list[CacheEntry]) -> str:

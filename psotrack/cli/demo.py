@@ -6,38 +6,29 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, compiled_folder, reporting
-from psotrack.cli.output import report_to
+from psotrack.cli.options import FORCE, JOBS, compiled_folder, out_option, reporting
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
 
 
-@click.command()
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("psotrack-demo"),
-    show_default=True,
-    help="Folder of the results.",
-)
+@click.command(cls=HelpfulCommand)
+@out_option("Folder of the results.", default=Path("psotrack-demo"), show_default=True)
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of flights, noise and swarm.")
 @JOBS
 @FORCE
 @reporting
-def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> None:
+@pass_output
+def demo(output: Output, out: Path, seed: int, jobs: int | None) -> None:
     """Simulate four drones, track them in eight videos, print the errors and save a picture.
 
     \b
     Example:
       psotrack demo --out demo
     """
-    from rich.console import Console
-
     from psotrack.demo import run
     from psotrack.support import keep_compiled
 
     keep_compiled(compiled_folder(None))
-    result = run(out, seed=seed, jobs=jobs, force=force, report=report_to(quiet))
-    if not quiet:
-        console = Console()
-        console.print(result.errors)
-        console.print(result.stages)
-        console.print(f"picture: {result.picture}", soft_wrap=True)
+    result = run(out, seed=seed, jobs=jobs, force=output.force, report=output.report)
+    output.show(result.errors, result.stages)
+    output.say(f"picture: {result.picture}")

@@ -1,4 +1,4 @@
-"""`psotrack detect`: drones in videos as 2D boxes, by a neural network or as blobs of foreground."""
+"""`psotrack detect`: what each camera shows of drones, as boxes, as stored silhouettes or as masks."""
 
 from __future__ import annotations
 
@@ -6,36 +6,38 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 from msgspec.structs import replace
 
 from psotrack.cli.options import (
-    CACHE,
-    CAMERAS,
     DETECTOR_SIZE,
     FORCE,
-    JOBS,
     JSON,
     SEQUENCE,
-    cache_folder,
+    Extent,
+    beside,
+    extent_options,
     filmed_recording,
-    frames_option,
+    out_option,
     reporting,
-    silhouette_options,
 )
-from psotrack.cli.output import output_json, print_line, report_to
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.settings import settings_options
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import SilhouetteSettings
+from psotrack.settings import TrackSettings
 
 if TYPE_CHECKING:
-    from psotrack.recordings import Detections, Recording
+    from psotrack.recordings import Recording
+
+#: Image pixels per pixel in which masks are computed: all, because masks are looked at and compared pixel by pixel.
+MASKS_REDUCTION = 1
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @SEQUENCE
 @click.option(
     "--detector",
-    "chosen",
     metavar="MODEL.onnx|NAME",
     help="YOLO network (v5 to v11) that was trained on drones, or the detector that an installed package adds under "
     "NAME.",
@@ -43,7 +45,15 @@ if TYPE_CHECKING:
 @click.option(
     "--blobs", is_flag=True, help="Write the blobs of foreground instead of a network's detections."
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the detections.")
+@click.option("--silhouettes", is_flag=True, help="Compute and store the silhouettes, which `track` reads.")
+@click.option(
+    "--masks",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER|FILE.mp4",
+    help="Write the foreground of every frame at the size of the video, 0 to 255: as FOLDER/CAMERA/000000.png and so "
+    "on, or as one video (.mp4, or .avi without loss).",
+)
+@out_option("Folder of the detections.  [default: SEQ/results/detections]")
 @click.option(
     "--confidence",
     type=float,
@@ -65,97 +75,100 @@ if TYPE_CHECKING:
     show_default=True,
     help="Side of the network's square input, in pixels.",
 )
-@silhouette_options
-@CAMERAS
-@frames_option
-@CACHE
-@JOBS
+@settings_options("silhouettes.background", "silhouettes.drone_px", part="silhouettes.")
+@extent_options
 @FORCE
 @reporting
 @JSON
+@pass_output
 def detect(
+    output: Output,
     sequence: Path,
-    chosen: str | None,
+    detector: str | None,
     blobs: bool,
-    out: Path,
-    confidence: float,
-    nms: float,
-    size: int,
-    cameras: str | None,
-    num_frames: int | None,
-    cache: Path | None,
-    jobs: int | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
-    **settings: Any,
+    silhouettes: bool,
+    masks: Path | None,
+    out: Path | None,
+    settings: dict[str, Any],
+    extent: Extent,
+    **network: Any,
 ) -> None:
     """Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.
 
     Writes OUT/CAMERA.csv for every camera, in the layout of the dataset's dl_data; `track --detections OUT` reads them.
     SEQ may also be a single video or a folder of pictures, without any calibration; CAMERA is then its name.
 
-    --blobs takes what moves in a still image, as `track --detections blobs` does; the options of `psotrack silhouettes`
-    apply, but boxes end at pixels of the image that the background model sees, unless --reduction is given. The others
-    are those of the network.
+    --blobs takes what moves in a still image, as `track --detections blobs` does; boxes end at pixels of the image that
+    the background model sees, unless --reduction is given. --silhouettes and --masks write the foreground itself.
+    Silhouettes are stored under a key of the video's content, all settings and the background model: a second call
+    finds them.
 
     \b
     Examples:
-      psotrack detect data/Simulated_Data/S02_D4_A --detector drones.onnx --out boxes
-      psotrack detect data/Real_Data/R12_D4 --detector drones.onnx --out boxes --size 1280 --confidence 0.4
-      psotrack detect data/Simulated_Data/S02_D4_A --blobs --out boxes
-      psotrack detect flight.mp4 --blobs --out boxes
+      psotrack detect my_lab --blobs
+      psotrack detect my_lab --detector drones.onnx --out boxes --size 1280 --confidence 0.4
       psotrack detect pictures/ --blobs --out boxes --min-blob 16
+      psotrack detect my_lab --silhouettes --frames 100 --json -
+      psotrack detect flight.mp4 --masks flight_mask.mp4
     """
-    from psotrack.recordings import write_detections
-    from psotrack.support import check_file_name, refuse_to_overwrite
+    wanted = {
+        "--detector": detector is not None,
+        "--blobs": blobs,
+        "--silhouettes": silhouettes,
+        "--masks": masks,
+    }
+    given = [name for name, value in wanted.items() if value]
+    if len(given) != 1:
+        found = " and ".join(given) or "none of them"
+        raise SettingsError("detect", expected=f"one of {', '.join(wanted)}", found=found)
+    recording = filmed_recording(sequence, extent)
+    if masks is not None:
+        _write_masks(output, recording, masks, settings, extent)
+    elif silhouettes:
+        _store(output, recording, _silhouettes(settings), extent)
+    elif blobs:
+        _write(output, sequence, recording, out, _by_blobs(output, recording, _silhouettes(settings), extent))
+    else:
+        _write(output, sequence, recording, out, _by_network(output, recording, str(detector), network))
 
-    if blobs == (chosen is not None):
-        raise SettingsError(
-            "detect", expected="--detector MODEL.onnx or --blobs", found="both" if blobs else "neither"
-        )
-    recording = filmed_recording(sequence, cameras, num_frames)
+
+def _silhouettes(settings: dict[str, Any]) -> SilhouetteSettings:
+    return TrackSettings().changed(settings).silhouettes
+
+
+def _write(output: Output, sequence: Path, recording: Recording, out: Path | None, found: Any) -> None:
+    """Write the boxes of each camera as they are found."""
+    from psotrack.recordings import write_detections
+    from psotrack.support import check_file_name
+
+    out = out or beside(sequence, "detections")
     files = {name: out / f"{check_file_name(name, sequence)}.csv" for name in recording.videos}
-    for path in files.values():
-        refuse_to_overwrite(path, force)
+    output.refuse(*files.values())
     counts: dict[str, int] = {}
-    found = (
-        _by_blobs(recording, SilhouetteSettings(**settings), cache, jobs, quiet)
-        if chosen is None
-        else _by_network(recording, chosen, confidence, nms, size, quiet)
-    )
     for name, detections in found:
         write_detections(files[name], detections)
         counts[name] = len(detections)
     frames = sum(video.num_frames for video in recording.videos.values())
-    output_json(json_path, {"out": str(out), "frames": recording.num_frames, "detections": counts}, force)
+    output.json({"out": str(out), "frames": recording.num_frames, "detections": counts})
     per_frame = sum(counts.values()) / frames
-    print_line(
-        quiet,
-        json_path,
-        f"{out}: {len(counts)} cameras, {recording.num_frames} frames, {per_frame:.2f} boxes per frame and camera",
+    output.say(
+        f"{out}: {len(counts)} cameras, {recording.num_frames} frames, {per_frame:.2f} boxes per frame and camera"
     )
 
 
-def _by_network(
-    recording: Recording, chosen: str, confidence: float, nms: float, size: int, quiet: bool
-) -> Any:
+def _by_network(output: Output, recording: Recording, chosen: str, network: dict[str, Any]) -> Any:
     """Detections of each camera by a network, one camera after the other."""
     from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
 
-    detector = find_detector(chosen, DetectorSettings(confidence, nms, size))
+    detector = find_detector(chosen, DetectorSettings(**network))
     for name, video in recording.videos.items():
-        yield name, detect_drones(detector, name, video, report=report_to(quiet))
+        yield name, detect_drones(detector, name, video, report=output.report)
 
 
-def _by_blobs(
-    recording: Recording,
-    settings: SilhouetteSettings,
-    cache: Path | None,
-    jobs: int | None,
-    quiet: bool,
-) -> list[tuple[str, Detections]]:
+def _by_blobs(output: Output, recording: Recording, settings: SilhouetteSettings, extent: Extent) -> Any:
     """Detections of each camera by the blobs of its silhouettes."""
+    import numpy as np
+
     from psotrack.foreground.silhouettes import blob_detections, compute
 
     sizes_wh = [video.image_size_wh for video in recording.videos.values()]
@@ -163,6 +176,46 @@ def _by_blobs(
         # The boxes are as fine as the images allow, not as coarse as the tracker can do with.
         working = settings.scaled(sizes_wh).working_reduction
         settings = replace(settings, reduction=working, working_reduction=working)
-    made = compute(recording, settings, cache=cache_folder(cache), jobs=jobs, report=report_to(quiet))
+    made = compute(recording, settings, cache=extent.silhouettes, jobs=extent.jobs, report=output.report)
     sizes = np.array([recording.videos[name].image_size_wh for name in made.cameras], float)
-    return list(blob_detections(made, sizes, report_to(quiet)).items())
+    yield from blob_detections(made, sizes, output.report).items()
+
+
+def _store(output: Output, recording: Recording, settings: SilhouetteSettings, extent: Extent) -> None:
+    """Compute and store silhouettes."""
+    from psotrack.foreground.silhouettes import compute
+
+    where = extent.silhouettes
+    stored = compute(recording, settings, cache=where, jobs=extent.jobs, report=output.report)
+    output.json(
+        {
+            "cache": str(where),
+            "keys": dict(stored.keys),
+            "frames": stored.num_frames,
+            "shape": list(stored.shape),
+            "seconds": dict(stored.seconds),
+        }
+    )
+    made = "made" if any(stored.seconds.values()) else "already there"
+    output.say(f"{len(stored.cameras)} cameras, {stored.num_frames} frames: {made}, in {where}")
+
+
+def _write_masks(
+    output: Output, recording: Recording, out: Path, settings: dict[str, Any], extent: Extent
+) -> None:
+    """Write the masks of all cameras, whose stored size plays no part."""
+    from psotrack.foreground.silhouettes import write_masks
+
+    working = settings.get("silhouettes.working_reduction", MASKS_REDUCTION)
+    sizes = {"silhouettes.working_reduction": working, "silhouettes.reduction": working}
+    places = write_masks(
+        recording,
+        _silhouettes(settings | sizes),
+        out,
+        jobs=extent.jobs,
+        force=output.force,
+        report=output.report,
+    )
+    frames = {name: recording.videos[name].num_frames for name in places}
+    output.json({"masks": frames, "files": {name: str(path) for name, path in places.items()}})
+    output.say(f"{out}: {sum(frames.values())} masks of {len(places)} cameras")

@@ -10,8 +10,18 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
-from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
-from psotrack.cli.output import output_json
+from psotrack.cli.options import (
+    BODIES,
+    FORCE,
+    JSON,
+    QUIET,
+    TRACKS,
+    plot_option,
+    sequence_argument,
+    sequence_of,
+)
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
@@ -22,9 +32,9 @@ if TYPE_CHECKING:
 RATE_TOLERANCE = 1e-3
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @TRACKS
-@SEQUENCE
+@sequence_argument
 @plot_option("3D paths and error over time", "beside TRACKS, as .png")
 @click.option(
     "--offset",
@@ -35,36 +45,36 @@ RATE_TOLERANCE = 1e-3
 @FORCE
 @QUIET
 @JSON
+@pass_output
 def evaluate(
+    output: Output,
     tracks: Path,
-    sequence: Path,
+    sequence: Path | None,
     plot: Path | None,
     offset: str | None,
     bodies: dict[str, tuple[str, ...]],
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Compare TRACKS with the reference of SEQ.
+
+    SEQ is the recording of TRACKS; the record beside TRACKS names it.
 
     TRACKS is a file of `psotrack track`, or tracks of any other program: CSV, Parquet, JSON, TUM, KITTI, MOTChallenge
     with positions, C3D or MCAP, as a file or a folder.
 
     \b
     Examples:
-      psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A
+      psotrack evaluate my_lab/results/tracks.csv
       psotrack evaluate tracks.csv data/Simulated_Data/S02_D4_A --json errors.json --plot errors.png
       psotrack evaluate tracks.csv data/Real_Data/R12_D4 --offset auto
       psotrack evaluate tracks.csv flight --body cf1=M1,M2,M3,M4 --body cf2
       psotrack evaluate folder_of_tum_files data/Simulated_Data/S02_D4_A
     """
-    from rich.console import Console
-
     from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
     from psotrack.recordings.datasets import open_recording
     from psotrack.recordings.exchange import read_tracks
 
+    sequence = sequence_of(tracks, sequence)
     recording = open_recording(sequence, bodies=bodies)
     if recording.truth is None:
         raise InputError(sequence, expected="a reference to compare with", found="none")
@@ -77,13 +87,13 @@ def evaluate(
     with errors_name(both):
         evaluation = compare(estimate, truth)
     content = evaluation.to_dict() | ({"reference_offset_s": offset_s} if offset else {})
-    output_json(json_path, content, force)
+    output.json(content)
+    title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
+    output.show(tables.render(evaluation, title=title))
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
-        plots.save_overview(picture, estimate, truth, force=force)
-    if not quiet and json_path != Path("-"):
-        title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
-        Console().print(tables.render(evaluation, title=title))
+        plots.save_overview(picture, estimate, truth, force=output.force)
+        output.say(f"picture: {picture}")
 
 
 def _at_rate_of(estimate: Trajectories, recording: Recording) -> Recording:

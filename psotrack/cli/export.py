@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.options import FORCE, QUIET, TRACKS, Numbers, SequencePath
-from psotrack.cli.output import print_line, report_to
+from psotrack.cli.options import FORCE, QUIET, TRACKS, out_option, sequence_argument
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import Numbers
 from psotrack.errors import OutputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
@@ -16,18 +18,18 @@ if TYPE_CHECKING:
 
     from psotrack.trajectories import Trajectories
 
+#: Ends of the files of formats that have one file.
+_SUFFIXES = {"c3d": ".c3d", "mcap": ".mcap", "csv": ".csv", "parquet": ".parquet", "json": ".json"}
 FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @TRACKS
-@click.argument("sequence", metavar="[SEQ]", type=SequencePath(path_type=Path), required=False)
+@sequence_argument
 @click.option("--to", type=click.Choice(FORMAT_NAMES), required=True, help="Format of the output.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="File of the output; a folder for tum with several drones, kitti, and mot with SEQ; either for mcap.",
+@out_option(
+    "File of the output; a folder for tum with several drones, kitti, and mot with SEQ; either for mcap.  [default: "
+    "beside TRACKS, with the format in its name]"
 )
 @click.option("--images", is_flag=True, help="Write the images of SEQ's cameras too; only with --to mcap.")
 @click.option(
@@ -40,15 +42,15 @@ FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
 )
 @FORCE
 @QUIET
+@pass_output
 def export(
+    output: Output,
     tracks: Path,
     sequence: Path | None,
     to: str,
-    out: Path,
+    out: Path | None,
     images: bool,
     drone_size_m: tuple[float, ...] | None,
-    force: bool,
-    quiet: bool,
 ) -> None:
     """Write TRACKS in a format of another program.
 
@@ -65,6 +67,7 @@ def export(
     from psotrack.recordings.datasets import open_recording
     from psotrack.recordings.exchange import Footage, export_tracks, read_tracks
 
+    out = out or tracks.with_name(f"{tracks.stem}_{to}{_SUFFIXES.get(to, '')}")
     _check_options(tracks, sequence, to, out, images)
     recording = None if sequence is None else open_recording(sequence)
     trajectories = read_tracks(tracks, recording=recording)
@@ -73,10 +76,10 @@ def export(
         sizes_m = _sizes_m(trajectories, tracks, drone_size_m) if to == "mot" else None
         footage = Footage(recording, sizes_m, images)
     with errors_name(tracks):
-        lost = export_tracks(trajectories, to, out, footage=footage, force=force, report=report_to(quiet))
+        lost = export_tracks(trajectories, to, out, footage=footage, force=output.force, report=output.report)
     left = f"; not in this format: {', '.join(lost)}" if lost else ""
     drones = f"{trajectories.num_drones} drone{'s' if trajectories.num_drones != 1 else ''}"
-    print_line(quiet, None, f"{out}: {to}, {drones}, {trajectories.num_frames} frames{left}")
+    output.say(f"{out}: {to}, {drones}, {trajectories.num_frames} frames{left}")
 
 
 def _check_options(tracks: Path, sequence: Path | None, to: str, out: Path, images: bool) -> None:

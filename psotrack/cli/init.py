@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, Size
-from psotrack.cli.output import output_json, print_inventory, print_line
+from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, out_option
+from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import SequencePath, Size
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
     from psotrack.recordings.datasets import Draft
 
 
-@click.command("init")
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.command("init", cls=HelpfulCommand)
+@click.argument("folder", type=SequencePath(path_type=Path))
 @click.option(
     "--calibration",
     type=click.Path(path_type=Path),
@@ -48,60 +50,91 @@ if TYPE_CHECKING:
     metavar="W,H",
     help="Size of the images of cameras that have detections only, if the rig file does not state it.",
 )
+@out_option("[default: FOLDER/recording.toml]", metavar="FILE")
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FILE", help="[default: FOLDER/recording.toml]"
+    "--show",
+    "shown",
+    is_flag=True,
+    help="Show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.",
 )
 @BODIES
 @FORCE
 @QUIET
 @JSON
-def init(
+@pass_output
+def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: Any) -> None:
+    """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
+
+    Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to GoPro
+    3. Nothing is guessed: where a name does not say whose a file is, the command asks, or elsewhere than on a terminal
+    wants --match or --leave-out. Detections, frame times (frame,time_s), images of what is ignored (a name with
+    "ignore" or "mask"), references and marker corners are found by name and content.
+
+    Without a rig file, the cameras have the names of their files, and no place yet.
+
+    With --show, FOLDER is a recording that is there already: a recording.toml or its folder, a folder of the DPJAIT
+    dataset, or an archive.
+
+    \b
+    Examples:
+      psotrack init my_lab
+      psotrack init my_lab --calibration rig.toml --match left=GX010123.MP4 --leave-out test.mp4
+      psotrack init my_lab --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
+      psotrack init data/Simulated_Data/S02_D4_A --show
+    """
+    from psotrack.recordings import RECORDING_FILE
+
+    if shown:
+        _show(output, folder, chosen["bodies"])
+    else:
+        _draft(output, folder, out or folder / RECORDING_FILE, **chosen)
+
+
+def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
+    """Show a recording, and check its files."""
+    from psotrack.recordings import check_end, describe_recording, inventory_table
+    from psotrack.recordings.datasets import open_recording
+
+    recording = open_recording(sequence, bodies=bodies)
+    for video in recording.videos.values():
+        check_end(video)
+    recording.check_detections(recording.detections or {})
+    if recording.marker_corners is not None:
+        from psotrack.inside_out import read_marker_table
+
+        read_marker_table(recording.marker_corners)
+    content = describe_recording(recording)
+    output.json(content)
+    output.show(inventory_table(content), wide=True)
+
+
+def _draft(
+    output: Output,
     folder: Path,
+    path: Path,
+    *,
     calibration: Path | None,
     unit: Literal["m", "cm", "mm"] | None,
     matches: tuple[str, ...],
     leave_out: tuple[str, ...],
     fps: float | None,
     size_wh: tuple[int, int] | None,
-    out: Path | None,
     bodies: dict[str, tuple[str, ...]],
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
-    """Write the recording.toml of the videos, images and detections in FOLDER, which other commands take as SEQ.
-
-    Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to
-    GoPro 3. Nothing is guessed: where a name does not say whose a file is, the command asks for --match or --leave-out.
-    Detections, frame times (frame,time_s), images of what is ignored (a name with "ignore" or "mask"), references and
-    marker corners are found by name and content.
-
-    Without a rig file, the cameras have the names of their files, and no place yet.
-
-    \b
-    Examples:
-      psotrack init flight
-      psotrack init flight --calibration rig.toml
-      psotrack init flight --calibration rig.toml --match left=GX010123.MP4 --leave-out test.mp4
-      psotrack init flight --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
-    """
+    """Write the file of a recording."""
     from psotrack.errors import check_positive
     from psotrack.recordings import (
-        RECORDING_FILE,
         describe_recording,
         inventory_table,
         recording_file_text,
         write_recording_file,
     )
     from psotrack.recordings.datasets import DraftOptions, draft_recording
-    from psotrack.support import refuse_to_overwrite
 
-    path = out or folder / RECORDING_FILE
-    if path.suffix.lower() != ".toml":
-        raise SettingsError("--out", expected="a file that ends in .toml", found=path.name)
+    check_suffix("--out", path, ".toml")
     if fps is not None:
         check_positive("--fps", fps)
-    refuse_to_overwrite(path, force)
+    output.refuse(path)
     options = DraftOptions(
         calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh, bodies
     )
@@ -109,11 +142,9 @@ def init(
     content = describe_recording(draft.recording)
     kept = _keep_older(path, recording_file_text(draft.content))
     write_recording_file(path, draft.content)
-    output_json(json_path, _content(path, draft, content), force)
-    if not quiet and json_path != Path("-"):
-        print_inventory(inventory_table(content))
-    for line in [*_lines(path, draft), *kept]:
-        print_line(quiet, json_path, line)
+    output.json(_content(path, draft, content))
+    output.show(inventory_table(content), wide=True)
+    output.say(*_lines(path, draft), *kept)
 
 
 def _keep_older(path: Path, text: str) -> list[str]:

@@ -11,36 +11,73 @@ import click
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
+#: Settings of the contexts of groups and of their commands.
+SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+
 
 class LazyCommand(NamedTuple):
     """Place and summary of a command that is not imported yet.
 
     Attributes:
-        module: module that defines the command, as a function of the command's name with `_` for `-`.
+        place: module and function of the command, such as `psotrack.cli.track:track`.
         summary: first sentence of the command's help; repeated here so that `--help` need not import the module.
+        heading: heading of the command in the group's help.
     """
 
-    module: str
+    place: str
     summary: str
+    heading: str = "Commands"
 
 
 class LazyGroup(click.Group):
     """Group whose `--help` and completion of names import no command.
 
     Args:
-        lazy_commands: module and summary of each command, by the command's name.
+        lazy_commands: place and summary of each command, by the command's name.
+        default: command that is meant where the first argument names no command; "" for none.
+        renamed: what replaces commands that there were once, by their names.
         attributes: all other arguments of `click.Group`.
     """
 
-    def __init__(self, *, lazy_commands: Mapping[str, LazyCommand], **attributes: Any) -> None:
+    def __init__(
+        self,
+        *,
+        lazy_commands: Mapping[str, LazyCommand],
+        default: str = "",
+        renamed: Mapping[str, str] | None = None,
+        **attributes: Any,
+    ) -> None:
         super().__init__(**attributes)
-        self.lazy_commands = lazy_commands
+        self.lazy_commands, self.default, self.renamed = lazy_commands, default, renamed or {}
         self.commands = _Importer(lazy_commands)
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put the default command before arguments that name no command."""
+        if self.default and args and args[0] not in {*self.lazy_commands, *ctx.help_option_names}:
+            args = [self.default, *args]
+        return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        """Find the command; the error for one that has another name now says the name."""
+        if args[0] in self.renamed and not ctx.resilient_parsing:
+            raise click.UsageError(f"{args[0]} is `psotrack {self.renamed[args[0]]}` now", ctx)
+        return super().resolve_command(ctx, args)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order in which they were given."""
+        return list(self.lazy_commands)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands with their summaries."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, self.lazy_commands[name].summary) for name in self.list_commands(ctx)])
+        """Write the commands with their summaries, under their headings."""
+        for heading in dict.fromkeys(each.heading for each in self.lazy_commands.values()):
+            with formatter.section(heading):
+                formatter.write_dl(
+                    [
+                        (name, each.summary)
+                        for name, each in self.lazy_commands.items()
+                        if each.heading == heading
+                    ]
+                )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Commands and options whose names begin with `incomplete`."""
@@ -60,8 +97,8 @@ class _Importer(MutableMapping[str, click.Command]):
 
     def __getitem__(self, name: str) -> click.Command:
         if name not in self._added:
-            module = import_module(self._lazy[name].module)
-            self._added[name] = getattr(module, name.replace("-", "_"))
+            module, _, function = self._lazy[name].place.partition(":")
+            self._added[name] = getattr(import_module(module), function)
         return self._added[name]
 
     def __setitem__(self, name: str, command: click.Command) -> None:

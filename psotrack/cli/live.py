@@ -7,35 +7,32 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 
 from psotrack.cli.options import (
     CACHE,
     CAMERAS,
     FORCE,
-    ITERATIONS,
     JSON,
     LOG,
     MOST_DRONES,
-    PARTICLES,
     QUIET,
     SEQUENCE,
-    camera_names,
     compiled_folder,
-    setting_name,
-    silhouette_options,
+    out_option,
 )
-from psotrack.cli.output import output_json, print_line, write_json
-from psotrack.cli.run_files import run_file_options
+from psotrack.cli.output import Output, check_suffix, pass_output, write_json
+from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.settings import config_options, settings_options
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
-from psotrack.support import refuse_to_overwrite
 from psotrack.support.interrupts import unhurried_end
 
 if TYPE_CHECKING:
@@ -47,37 +44,45 @@ if TYPE_CHECKING:
 _SHOWN_S = 0.5
 
 
-@click.command()
+@dataclass(frozen=True)
+class Replay:
+    """How videos are played instead of cameras.
+
+    Attributes:
+        replay: play the videos of SEQ at their own rate, instead of cameras.
+        speed: seconds of video per second, for --replay.
+        loops: how often the videos are played, for --replay.
+    """
+
+    replay: bool = False
+    speed: Annotated[float, Meta(gt=0)] = 1.0
+    loops: Annotated[int, Meta(ge=1)] = 1
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Where rows go.
+
+    Attributes:
+        lines: write each row as a line of JSON to stdout.
+        udp: send each row as a line of JSON by UDP.
+        websocket: send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer;
+            without HOST, only programs on this computer reach the server.
+    """
+
+    lines: bool = False
+    udp: Annotated[str, Meta(extra={"metavar": "HOST:PORT"})] | None = None
+    websocket: Annotated[str, Meta(extra={"metavar": "[HOST:]PORT"})] | None = None
+
+
+@click.command(cls=HelpfulCommand)
 @SEQUENCE
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="File of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end.",
+@out_option(
+    "File of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end."
 )
-@click.option("--replay", is_flag=True, help="Play the videos of SEQ at their own rate, instead of cameras.")
-@click.option(
-    "--speed",
-    type=click.FloatRange(min=0, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Seconds of video per second, for --replay.",
-)
-@click.option(
-    "--loops",
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help="How often the videos are played, for --replay.",
-)
+@options_of(Replay, "replay", names={"replay": "replay"})
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after this time.")
-@click.option("--lines", is_flag=True, help="Write each row as a line of JSON to stdout.")
-@click.option("--udp", metavar="HOST:PORT", help="Send each row as a line of JSON by UDP.")
-@click.option(
-    "--websocket",
-    metavar="[HOST:]PORT",
-    help="Send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer. "
-    "[default of HOST: 127.0.0.1, which only programs on this computer reach]",
-)
+@options_of(Rows, "targets")
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
@@ -93,37 +98,34 @@ _SHOWN_S = 0.5
     help="Show drones in space and their values over time, in a window of Rerun or on a page for a browser.  [without "
     "a value: window]",
 )
-@PARTICLES
-@ITERATIONS
-@click.option("--drones", type=int, metavar="N", help="Number of drones, if it is known.")
+@settings_options(
+    "swarm.particles",
+    "swarm.iterations",
+    "drones.count",
+    without=["method", "detections", "init", "smooth", "clocks", "rate_hz"],
+)
 @MOST_DRONES
-@silhouette_options
 @CAMERAS
 @CACHE
+@config_options
 @FORCE
-@run_file_options
 @QUIET
 @LOG
 @JSON
+@pass_output
 def live(
+    output: Output,
     sequence: Path,
     out: Path | None,
-    replay: bool,
-    speed: float,
-    loops: int,
+    replay: Replay,
     seconds: float | None,
-    lines: bool,
-    udp: str | None,
-    websocket: str | None,
+    targets: Rows,
     record: Path | None,
     viewer: str | None,
     most_drones: int,
-    cameras: str | None,
+    cameras: list[str] | None,
     cache: Path | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
-    **settings: Any,
+    settings: dict[str, Any],
 ) -> None:
     """Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.
 
@@ -141,7 +143,6 @@ def live(
       psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
     """
-    started = click.get_current_context().obj or time.perf_counter()
     from psotrack.live import (
         WAIT_S,
         CameraRecorder,
@@ -157,25 +158,24 @@ def live(
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
-    if out is None and not lines and udp is None and websocket is None and viewer is None:
+    if out is None and targets == Rows() and viewer is None:
         expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
-    if out is not None and out.suffix not in {".csv", ".parquet"}:
-        raise SettingsError("--out", expected="a file that ends in .csv or .parquet", found=out.name)
-    for path in () if out is None else (out, out.with_suffix(".json")):
-        refuse_to_overwrite(path, force)
+    if out is not None:
+        check_suffix("--out", out, ".csv", ".parquet")
+        output.refuse(out, out.with_suffix(".json"))
     if viewer is not None:
         _check_viewer(viewer)
-    chosen = TrackSettings().changed({setting_name(option): value for option, value in settings.items()})
+    chosen = TrackSettings().changed(settings)
     keep_compiled(compiled_folder(cache))
-    start_s = time.perf_counter() - started
+    start_s = time.perf_counter() - output.started_s
     recording = open_recording(sequence)
-    if replay:
-        recording = recording.usable(camera_names(cameras))
-    used = live_cameras(recording, camera_names(cameras), replay=replay, speed=speed, loops=loops)
+    if replay.replay:
+        recording = recording.usable(cameras)
+    used = live_cameras(recording, cameras, **vars(replay))
     if record is not None:
         used = [replace(each, recorder=CameraRecorder(record, each.name, each.fps)) for each in used]
-    first_s = float(recording.timeline().time_s[0]) if replay else 0.0
+    first_s = float(recording.timeline().time_s[0]) if replay.replay else 0.0
     session = LiveSession(
         recording,
         used,
@@ -183,28 +183,28 @@ def live(
         most_drones=most_drones,
         first_s=first_s,
         # In a slow replay everything may take longer.
-        wait_s=WAIT_S / min(1.0, speed) if replay else WAIT_S,
+        wait_s=WAIT_S / min(1.0, replay.speed) if replay.replay else WAIT_S,
     )
+    hidden = output.quiet or targets.lines
     with contextlib.ExitStack() as stack:
         if record is not None:
             names = [camera.name for camera in used]
-            stack.enter_context(recording_folder(record, recording, names, force=force))
-        outputs: list[RowsOutput] = [partial(write_lines, sys.stdout)] if lines else []
-        if udp is not None:
-            outputs.append(stack.enter_context(contextlib.closing(UdpLines(udp))).write)
-        server = (
-            None if websocket is None else stack.enter_context(contextlib.closing(WebSocketLines(websocket)))
-        )
-        if server is not None:
+            stack.enter_context(recording_folder(record, recording, names, force=output.force))
+        outputs: list[RowsOutput] = [partial(write_lines, sys.stdout)] if targets.lines else []
+        if targets.udp is not None:
+            outputs.append(stack.enter_context(contextlib.closing(UdpLines(targets.udp))).write)
+        server = None
+        if targets.websocket is not None:
+            server = stack.enter_context(contextlib.closing(WebSocketLines(targets.websocket)))
             outputs.append(server.write)
-            if not quiet:
+            if not output.quiet:
                 click.echo(f"rows are sent to clients of {server.address}", err=True)
         if out is not None:
-            rows = stack.enter_context(RowStream(out, force=force, record=out.with_suffix(".json")))
+            rows = stack.enter_context(RowStream(out, force=output.force, record=out.with_suffix(".json")))
             outputs.insert(0, rows.write)
-        shown = None if viewer is None else stack.enter_context(_open_view(viewer, recording, quiet or lines))
+        shown = None if viewer is None else stack.enter_context(_open_view(viewer, recording, hidden))
         outputs += [] if shown is None else [shown.write]
-        table = stack.enter_context(_Table(quiet or lines, shown))
+        table = stack.enter_context(_Table(hidden, shown))
         stack.enter_context(_ended_by_ctrl_c(session))
 
         def show(result: LiveResult) -> None:
@@ -217,16 +217,15 @@ def live(
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients}
-    report = with_real_time(report, time.perf_counter() - started, start_s=start_s)
+    report = with_real_time(report, time.perf_counter() - output.started_s, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)
-    output_json(json_path, report, force)
-    print_line(
-        quiet or lines,
-        json_path,
-        f"{out or 'live'}: {report['drones']} drones, {result.instants} frames, "
-        f"delay {1e3 * report['delay_s']['median']:.0f} ms, {result.left_out} frames left out",
-    )
+    output.json(report)
+    if not targets.lines:
+        output.say(
+            f"{out or 'live'}: {report['drones']} drones, {result.instants} frames, "
+            f"delay {1e3 * report['delay_s']['median']:.0f} ms, {result.left_out} frames left out"
+        )
     # Said before, while the other outputs went on.
     if result.failed_outputs:
         raise result.failed_outputs[0]

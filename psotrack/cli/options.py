@@ -1,119 +1,84 @@
-"""Arguments and options that several commands share, with the defaults of the settings."""
+"""Arguments and options that several commands share."""
 
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import click
 import platformdirs
 
 from psotrack.cli.log_file import LogFile
-from psotrack.cli.output import CHOSEN_PROGRESS, PROGRESS
+from psotrack.cli.output import PROGRESS, Output, current_output
+from psotrack.cli.records import Command, Option
+from psotrack.cli.types import Numbers, SequencePath, names_of
 from psotrack.errors import InputError, SettingsError
-from psotrack.foreground.silhouettes import Shadows, SilhouetteSettings
-from psotrack.settings import TrackSettings, setting_names
-from psotrack.support import ARCHIVE_SUFFIX, refuse_files, whole_number
+from psotrack.settings import BLOBS, YOLO
+from psotrack.support import refuse_files
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
 
-#: Settings whose values are the defaults of the command line.
-TRACK = TrackSettings()
-SILHOUETTES = SilhouetteSettings()
 #: Side of a detector network's square input, pixels: the size that YOLO networks are trained with.
 DETECTOR_SIZE = 640
-
-Command = Callable[..., None]
-
-
-class Numbers(click.ParamType):
-    """`count` numbers with commas between them, such as 0.5,0.5,0.2."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self.name = ",".join(["NUMBER"] * count)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Tuple of floats from a string; a value that is not a string is returned as it is."""
-        if not isinstance(value, str):
-            return value
-        try:
-            numbers = tuple(float(word) for word in value.split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != self.count:
-            self.fail(f"expected {self.count} numbers with commas between them, found {value!r}", param, ctx)
-        return numbers
-
-
-class Size(click.ParamType):
-    """Two whole numbers above 0, such as 1920,1080 or 7x5."""
-
-    name = "W,H"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Pair of integers from a string; a value that is not a string is returned as it is."""
-        if not isinstance(value, str):
-            return value
-        words = value.replace("x", ",").split(",")
-        numbers = [whole_number(word) for word in words]
-        if len(numbers) != 2 or not all(numbers):
-            self.fail(f"expected two whole numbers above 0, such as 1920,1080, found {value!r}", param, ctx)
-        return tuple(numbers)
-
-
-class SequencePath(click.Path):
-    """Path of a sequence. An archive is unpacked, and its folder is the path until the command ends."""
-
-    name = "sequence"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path; that of a temporary folder with the content of an archive."""
-        path = Path(os.fsdecode(super().convert(value, param, ctx)))
-        if ctx is None or ctx.resilient_parsing or path.suffix.lower() != ARCHIVE_SUFFIX or path.is_dir():
-            return path
-        from psotrack.cli.archived import opened_archive
-
-        return opened_archive(ctx, path)
-
+#: Heading of the options that are not about the work itself.
+RUNNING = "Running"
 
 TRACKS = click.argument("tracks", type=click.Path(path_type=Path))
 SEQUENCE = click.argument("sequence", metavar="SEQ", type=SequencePath(path_type=Path))
-FORCE = click.option("--force", is_flag=True, help="Replace existing files.")
-QUIET = click.option("--quiet", "-q", is_flag=True, help="Print no progress and no results, only errors.")
 
 
-def reporting(command: Command) -> Command:
-    """Options of commands with long work: `QUIET`; `--progress`, which `report_to` obeys; and `--log`."""
-
-    def choose(context: click.Context, _: click.Parameter, chosen: str) -> str:
-        context.meta[CHOSEN_PROGRESS] = chosen
-        return chosen
-
-    progress = click.option(
-        "--progress",
-        type=click.Choice(list(PROGRESS)),
-        default="auto",
-        show_default=True,
-        envvar="PSOTRACK_PROGRESS",
-        callback=choose,
-        expose_value=False,
-        help="Progress on stderr. auto: a bar on a terminal, else lines now and then about work that takes long; bar: "
-        "a bar in any case; lines: lines, and the seconds of each stage; none: nothing.",
+def sequence_argument(command: Command) -> Command:
+    """Add [SEQ], which a command does without where the record of the tracks names the recording."""
+    return click.argument("sequence", metavar="[SEQ]", type=SequencePath(path_type=Path), required=False)(
+        command
     )
-    return QUIET(progress(LOG(command)))
 
 
-def _open_log(context: click.Context, _: click.Parameter, path: Path | None) -> Path | None:
-    context.meta["psotrack.log"] = path
+def _flag(name: str, words: str, *more: str) -> Callable[[Command], Command]:
+    """A flag that sets an attribute of the command's `Output`."""
+
+    def choose(_: click.Context, __: click.Parameter, value: bool) -> None:
+        setattr(current_output(), name, value)
+
+    return click.option(
+        f"--{name}",
+        *more,
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=choose,
+        cls=Option,
+        heading=RUNNING,
+        help=words,
+    )
+
+
+FORCE = _flag("force", "Replace existing files.")
+QUIET = _flag("quiet", "Print no progress and no results, only errors.", "-q")
+
+
+def _take_progress(_: click.Context, __: click.Parameter, chosen: str) -> None:
+    current_output().progress = chosen
+
+
+def _open_log(context: click.Context, _: click.Parameter, path: Path | None) -> None:
     if path is not None and not context.resilient_parsing:
         # The outermost context ends after everything that the command says, its errors included.
         context.find_root().with_resource(LogFile(path))
-    return path
+
+
+def _take_json(context: click.Context, _: click.Parameter, path: Path | None) -> None:
+    """A file that cannot be written, or must not be replaced, is refused before the work."""
+    # /dev/stdout is stdout, which then gets nothing but the JSON.
+    path = Path("-") if path == Path("/dev/stdout") else path
+    output = current_output()
+    if path is not None and path != Path("-") and not context.resilient_parsing:
+        refuse_files(path, force=output.force)
+    output.json_path = path
 
 
 LOG = click.option(
@@ -122,69 +87,88 @@ LOG = click.option(
     metavar="FILE",
     callback=_open_log,
     expose_value=False,
+    cls=Option,
+    heading=RUNNING,
     help="Add warnings, steps, seconds of each stage, results and errors to the end of FILE, with times.",
 )
-
-
-def _stdout_as_dash(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
-    """/dev/stdout is stdout, which then gets nothing but the JSON."""
-    return Path("-") if path == Path("/dev/stdout") else path
-
-
-def JSON(command: Command) -> Command:
-    """Add `--json`; a file that cannot be written, or must not be replaced, is refused before the work."""
-
-    @functools.wraps(command)
-    def checking(*args: Any, json_path: Path | None, **options: Any) -> None:
-        if json_path is not None and json_path != Path("-"):
-            refuse_files(json_path, force=click.get_current_context().params.get("force", False))
-        command(*args, json_path=json_path, **options)
-
-    option = click.option(
-        "--json",
-        "json_path",
-        type=click.Path(path_type=Path),
-        metavar="OUT",
-        callback=_stdout_as_dash,
-        help="Write the results as JSON to OUT; - is stdout.",
-    )
-    return option(checking)
-
-
-JOBS = click.option(
-    "--jobs", type=click.IntRange(min=1), help="Largest number of processes.  [default: one per processor]"
+_PROGRESS = click.option(
+    "--progress",
+    type=click.Choice(list(PROGRESS)),
+    default="auto",
+    show_default=True,
+    envvar="PSOTRACK_PROGRESS",
+    callback=_take_progress,
+    expose_value=False,
+    cls=Option,
+    heading=RUNNING,
+    help="Progress on stderr. auto: a bar on a terminal, else lines now and then about work that takes long; bar: "
+    "a bar in any case; lines: lines, and the seconds of each stage; none: nothing.",
+)
+JSON = click.option(
+    "--json",
+    "json_path",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    callback=_take_json,
+    expose_value=False,
+    cls=Option,
+    heading=RUNNING,
+    help="Write the results as JSON to OUT; - is stdout.",
 )
 CACHE = click.option(
     "--cache",
     type=click.Path(path_type=Path),
     envvar="PSOTRACK_CACHE",
+    cls=Option,
+    heading=RUNNING,
     help="Folder of silhouettes and compiled programs.  [default: $PSOTRACK_CACHE, or psotrack in your cache folder]",
 )
+JOBS = click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    cls=Option,
+    heading=RUNNING,
+    help="Largest number of processes.  [default: one per processor]",
+)
+
+
+def reporting(command: Command) -> Command:
+    """Options of commands with long work: --quiet, --progress and --log."""
+    return QUIET(_PROGRESS(LOG(command)))
+
+
+def out_option(words: str, **attributes: Any) -> Callable[[Command], Command]:
+    """Option `--out`: a path."""
+    return click.option("--out", type=click.Path(path_type=Path), help=words, **attributes)
+
+
 CAMERAS = click.option(
     "--cameras",
     metavar="NAME,NAME...",
+    callback=lambda _, __, given: names_of("--cameras", given),
     help="Use these cameras only.  [default: all cameras of the calibration]",
-)
-PARTICLES = click.option(
-    "--particles",
-    type=int,
-    default=TRACK.swarm.particles,
-    show_default=True,
-    help="Number of particles of every swarm.",
-)
-ITERATIONS = click.option(
-    "--iterations",
-    type=click.IntRange(min=1),
-    default=TRACK.swarm.iterations,
-    show_default=True,
-    help="Number of iterations per frame.",
 )
 MOST_DRONES = click.option(
     "--most-drones",
     type=click.IntRange(1, 1000),
     default=16,
     show_default=True,
+    cls=Option,
+    rare=True,
+    heading="Drones",
     help="Largest number of drones at one time, where no frame uses a later one.",
+)
+FOV = click.option(
+    "--fov",
+    "fov_deg",
+    type=Numbers(2),
+    metavar="H,V",
+    help="Horizontal and vertical field of view in degrees, instead of intrinsics.",
+)
+SCALE_CAMERA = click.option(
+    "--scale-camera",
+    is_flag=True,
+    help="Scale the intrinsics to the size of the images; both must show the same field of view.",
 )
 
 
@@ -233,18 +217,43 @@ def frames_option(command: Command) -> Command:
     )(with_way_out)
 
 
-FOV = click.option(
-    "--fov",
-    "fov_deg",
-    type=Numbers(2),
-    metavar="H,V",
-    help="Horizontal and vertical field of view in degrees, instead of intrinsics.",
-)
-SCALE_CAMERA = click.option(
-    "--scale-camera",
-    is_flag=True,
-    help="Scale the intrinsics to the size of the images; both must show the same field of view.",
-)
+@dataclass(frozen=True)
+class Extent:
+    """What of a recording is used, and by what.
+
+    Attributes:
+        cameras: names of the cameras; None are all.
+        num_frames: number of frames from the first one; None are all.
+        cache: folder of silhouettes and compiled programs; None is the usual one.
+        jobs: largest number of processes; None is one per processor.
+    """
+
+    cameras: list[str] | None
+    num_frames: int | None
+    cache: Path | None
+    jobs: int | None
+
+    @property
+    def silhouettes(self) -> Path:
+        """Folder of the stored silhouettes."""
+        return cache_folder(self.cache)
+
+
+def extent_options(command: Command) -> Command:
+    """Add --cameras, --frames, --cache and --jobs; the command gets them as `extent`."""
+
+    @functools.wraps(command)
+    def with_extent(
+        *args: Any,
+        cameras: list[str] | None,
+        num_frames: int | None,
+        cache: Path | None,
+        jobs: int | None,
+        **options: Any,
+    ) -> None:
+        command(*args, **options, extent=Extent(cameras, num_frames, cache, jobs))
+
+    return CAMERAS(frames_option(CACHE(JOBS(with_extent))))
 
 
 def dictionary_option(default: str = "4x4_1000") -> Callable[[Command], Command]:
@@ -276,91 +285,7 @@ def plot_option(content: str, default_path: str) -> Callable[[Command], Command]
     )
 
 
-def silhouette_options(command: Command) -> Command:
-    """Options of `SilhouetteSettings`, for the commands that compute silhouettes."""
-    for option in (
-        click.option(
-            "--background",
-            default=SILHOUETTES.background,
-            show_default=True,
-            metavar="living|mog2|NAME",
-            help="Background model: living goes on learning, for light, skies and plants that change; mog2 keeps the "
-            "background as it was learned; NAME is a model that an installed package adds.",
-        ),
-        click.option(
-            "--drone-px",
-            type=float,
-            default=None,
-            metavar="PX",
-            help="Width of the smallest drone in the images, from which reduction and smallest blob follow.  "
-            "[default: the images' longer side / 48]",
-        ),
-        click.option(
-            "--reduction",
-            type=int,
-            default=None,
-            metavar="N",
-            help="Image pixels per silhouette pixel, along each side.  [default: from --drone-px]",
-        ),
-        click.option(
-            "--shadows",
-            type=click.Choice(get_args(Shadows)),
-            default=SILHOUETTES.shadows,
-            show_default=True,
-            help="Treatment of pixels that mog2 labels as shadow: shadows, but also dark bodies and rotor discs.",
-        ),
-        click.option(
-            "--shadow-weight",
-            type=float,
-            default=SILHOUETTES.shadow_weight,
-            show_default=True,
-            help="Weight of a shadow pixel, for --shadows weight.",
-        ),
-        click.option(
-            "--var-threshold",
-            type=float,
-            default=SILHOUETTES.var_threshold,
-            show_default=True,
-            help="Smallest squared distance of a foreground pixel from the background, in variances of the background, "
-            "for mog2.",
-        ),
-        click.option(
-            "--min-blob",
-            "min_blob_px",
-            type=int,
-            default=None,
-            metavar="N",
-            help="Smallest foreground blob that is kept, in pixels.  [default: from --drone-px; 9 for living without "
-            "--drone-px]",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
-#: Options whose settings have other names.
-_SETTINGS = {
-    "swarm": "swarm.kind",
-    "score": "score.kind",
-    "drones": "drones.count",
-    "drone_size_m": "drones.size_m",
-}
-
-
-def setting_name(option: str) -> str:
-    """Dotted name of the setting of `TrackSettings` that an option sets; the option's own name where there is none."""
-    named = [name for name in setting_names() if name.rpartition(".")[2] == option]
-    return _SETTINGS.get(option) or (named[0] if named else option)
-
-
-def usable_recording(folder: str | Path, cameras: str | None, num_frames: int | None) -> Recording:
-    """Recording with the cameras and frames that the options `CAMERAS` and `--frames` select."""
-    from psotrack.recordings.datasets import open_recording
-
-    return open_recording(folder).usable(camera_names(cameras), num_frames)
-
-
-def filmed_recording(source: Path, cameras: str | None, num_frames: int | None) -> Recording:
+def filmed_recording(source: Path, extent: Extent) -> Recording:
     """The videos of a recording, calibrated or not, or a single video, or a folder of pictures as a recording."""
     from psotrack.recordings import is_picture_folder, open_video, recording_of_video, with_all_videos
     from psotrack.recordings.datasets import is_recording, open_recording
@@ -374,15 +299,7 @@ def filmed_recording(source: Path, cameras: str | None, num_frames: int | None) 
         recording = recording_of_video(open_video(source, 1.0 if is_picture_folder(source) else None))
     else:
         recording = with_all_videos(open_recording(source))
-    return recording.usable(camera_names(cameras), num_frames)
-
-
-def camera_names(cameras: str | None) -> list[str] | None:
-    """Names of the option `CAMERAS`; None where it is not given."""
-    names = None if cameras is None else [name.strip() for name in cameras.split(",")]
-    if names is not None and not all(names):
-        raise SettingsError("--cameras", expected="names with commas between them", found=repr(cameras))
-    return names
+    return recording.usable(extent.cameras, extent.num_frames)
 
 
 def cache_folder(chosen: str | Path | None) -> Path:
@@ -393,3 +310,40 @@ def cache_folder(chosen: str | Path | None) -> Path:
 def compiled_folder(chosen: str | Path | None) -> Path:
     """Folder of compiled programs, inside the folder of the silhouettes."""
     return cache_folder(chosen) / "compiled"
+
+
+def beside(sequence: Path, name: str) -> Path:
+    """Default of `--out`: `name` in the folder `results` of a recording, or beside an archive."""
+    from psotrack.cli.archived import archive_of
+
+    archive = archive_of(click.get_current_context())
+    if archive is not None:
+        return archive.path.with_suffix("") / name
+    return (sequence if sequence.is_dir() else sequence.parent) / "results" / name
+
+
+def detections_of(output: Output, recording: Recording) -> str:
+    """Default of `--detections`: the recording's own, or the blobs of its silhouettes where there are none."""
+    if recording.detections:
+        return YOLO
+    output.say(f"{recording.name} has no detections: the blobs of its silhouettes take their place")
+    return BLOBS
+
+
+def sequence_of(tracks: Path, given: Path | None) -> Path:
+    """The recording of tracks: the one that the user names, or the one that their record names.
+
+    Raises:
+        InputError: no record beside the tracks names a recording that is there.
+    """
+    from psotrack.show.flights import find_recording
+
+    found = given or find_recording(tracks)
+    if found is None:
+        raise InputError(
+            tracks,
+            expected="a record beside the tracks that names their recording",
+            found="none",
+            remedy="name SEQ",
+        )
+    return found

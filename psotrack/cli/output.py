@@ -1,14 +1,16 @@
-"""Output of the commands: progress, sentences and tables for people, JSON for programs.
+"""What commands print and write: progress, sentences and tables for people, JSON for programs.
 
-Most functions take the values of three options: `quiet` (--quiet), `json_path` (--json; `-` is stdout) and `force`
-(--force).
+`Output` holds the options that are about nothing else: --quiet, --force, --json and --progress. A command gets it by
+`@pass_output`.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,22 +25,19 @@ from psotrack.support import (
     no_progress,
     progress_bar,
     progress_lines,
-    refuse_to_overwrite,
+    refuse_files,
     terminal_bar,
 )
 
 if TYPE_CHECKING:
     import numpy as np
-    from rich.table import Table
 
     from psotrack.trajectories import Trajectories
 
-#: Heading of a column of positions; `print_table` keeps each of its cells on one line.
+#: Heading of a column of positions; `Output.table` keeps each of its cells on one line.
 POSITION = "centre (m)"
-#: Width of an inventory in a file or a pipe, characters.
+#: Width of a wide table in a file or a pipe, characters.
 _WIDE = 200
-
-
 #: Values of --progress.
 PROGRESS: dict[str, Report] = {
     "auto": progress_bar,
@@ -46,83 +45,130 @@ PROGRESS: dict[str, Report] = {
     "lines": progress_lines(),
     "none": no_progress,
 }
-#: Key of the value of --progress in `click.Context.meta`.
-CHOSEN_PROGRESS = "psotrack.progress"
+_STDOUT = Path("-")
 
 
-def report_to(quiet: bool) -> Report:
-    """Progress display for long work: none with --quiet, else as --progress says; and stages in the log of --log."""
-    context = click.get_current_context(silent=True)
-    chosen = "auto" if context is None else context.meta.get(CHOSEN_PROGRESS, "auto")
-    shown = no_progress if quiet else PROGRESS[chosen]
-    return joined(shown, progress_lines(said.info)) if said.handlers else shown
+class Output:
+    """What a command prints and writes.
 
-
-def print_inventory(table: Table) -> None:
-    """Print a table; in its full width where the output is no terminal."""
-    from rich.console import Console
-
-    console = Console()
-    Console(width=None if console.is_terminal else max(console.width, _WIDE)).print(table)
-
-
-def print_line(quiet: bool, json_path: Path | None, sentence: str) -> None:
-    """Print a sentence on stdout, and log it; print nothing with --quiet or if stdout takes the JSON."""
-    said.info("%s", sentence)
-    if not quiet and json_path != Path("-"):
-        click.echo(sentence)
-
-
-def print_table(
-    quiet: bool, json_path: Path | None, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]]
-) -> None:
-    """Print a table on stdout, names in the first column and numbers in the others; see `print_line`."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    if quiet or json_path == Path("-"):
-        return
-    table = Table(box=box.HORIZONTALS, show_edge=False)
-    for index, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if index else "left", no_wrap=heading == POSITION)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table)
-
-
-def print_drones(
-    quiet: bool, json_path: Path | None, tracks: Trajectories, size_m: np.ndarray | None = None
-) -> None:
-    """Print a table of the drones, at most 80 characters wide; see `print_line`.
-
-    Args:
-        quiet: --quiet.
-        json_path: --json.
-        tracks: the tracks of the drones.
-        size_m: (drones, 3), learned sizes, metres; None where they are not known.
+    Attributes:
+        quiet: whether nothing is printed but errors.
+        force: whether existing files are replaced.
+        json_path: file of the results as JSON; `-` is stdout, which then gets nothing else; None is no file.
+        progress: one of `PROGRESS`.
+        started_s: value of `time.perf_counter` when the program started.
     """
-    if quiet or json_path == Path("-"):
-        return
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
-    from psotrack.trajectories import summary_columns
+    def __init__(self, started_s: float) -> None:
+        self.quiet, self.force, self.progress = False, False, "auto"
+        self.json_path: Path | None = None
+        self.started_s = started_s
 
-    columns = summary_columns(tracks, size_m)
-    # These two would make the table wider than 80 characters; notebooks show them.
-    for heading in ("extent (m)", "speed (m/s)"):
-        columns.pop(heading, None)
-    table = Table(box=box.HORIZONTALS, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
-    for heading in columns:
-        # Long names are folded; numbers are on one line.
-        style = {"min_width": 5} if heading == "drone" else {"justify": "right", "no_wrap": True}
-        table.add_column(heading, overflow="fold", **style)
-    for row in zip(*columns.values(), strict=True):
-        table.add_row(*map(Text, row))
-    Console().print(table)
+    @property
+    def shows(self) -> bool:
+        """Whether people get sentences and tables on stdout."""
+        return not self.quiet and self.json_path != _STDOUT
+
+    @property
+    def report(self) -> Report:
+        """Progress of long work: none with --quiet, else as --progress says; and stages in the log of --log."""
+        shown = no_progress if self.quiet else PROGRESS[self.progress]
+        return joined(shown, progress_lines(said.info)) if said.handlers else shown
+
+    def refuse(self, *paths: Path | None) -> None:
+        """Refuse files that exist already without --force, that cannot be written, or that --json is to write.
+
+        Raises:
+            OutputError: a file exists and --force was not given, or is a folder.
+            SettingsError: a file is that of --json.
+        """
+        files = [path for path in paths if path is not None]
+        for path in files:
+            if path == self.json_path:
+                raise SettingsError("--json", expected="another file than --out", found=f"{path} twice")
+        refuse_files(*files, force=self.force)
+
+    def say(self, *sentences: str, always: bool = False) -> None:
+        """Print sentences, a line each, and log them; with `always` they are printed with --quiet too."""
+        for sentence in sentences:
+            said.info("%s", sentence)
+            if self.shows or (always and self.json_path != _STDOUT):
+                click.echo(sentence)
+
+    def show(self, *shown: object, wide: bool = False) -> None:
+        """Print tables and other things of rich; a wide one in its full width where stdout is no terminal."""
+        from rich.console import Console
+
+        if self.shows:
+            console = Console()
+            if wide and not console.is_terminal:
+                console = Console(width=max(console.width, _WIDE))
+            for each in shown:
+                console.print(each)
+
+    def table(self, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]], title: str = "") -> None:
+        """Print a table, names in the first column and numbers in the others."""
+        from rich import box
+        from rich.table import Table
+
+        table = Table(box=box.HORIZONTALS, show_edge=False, title=title or None)
+        for index, heading in enumerate(headings):
+            table.add_column(heading, justify="right" if index else "left", no_wrap=heading == POSITION)
+        for row in rows:
+            table.add_row(*row)
+        self.show(table)
+
+    def drones(self, tracks: Trajectories, size_m: np.ndarray | None = None) -> None:
+        """Print a table of the drones, at most 80 characters wide.
+
+        Args:
+            tracks: the tracks of the drones.
+            size_m: (drones, 3), learned sizes, metres; None where they are not known.
+        """
+        if not self.shows:
+            return
+        from rich import box
+        from rich.table import Table
+        from rich.text import Text
+
+        from psotrack.trajectories import summary_columns
+
+        columns = summary_columns(tracks, size_m)
+        # These two would make the table wider than 80 characters; notebooks show them.
+        for heading in ("extent (m)", "speed (m/s)"):
+            columns.pop(heading, None)
+        table = Table(box=box.HORIZONTALS, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
+        for heading in columns:
+            # Long names are folded; numbers are on one line.
+            style = {"min_width": 5} if heading == "drone" else {"justify": "right", "no_wrap": True}
+            table.add_column(heading, overflow="fold", **style)
+        for row in zip(*columns.values(), strict=True):
+            table.add_row(*map(Text, row))
+        self.show(table)
+
+    def json(self, content: Any) -> None:
+        """Write the results for programs, as --json says; a missing number, NaN, is written as null."""
+        if self.json_path == _STDOUT:
+            click.echo(_json_text(content))
+        elif self.json_path is not None:
+            refuse_files(self.json_path, force=self.force)
+            write_json(self.json_path, content)
+
+
+def current_output() -> Output:
+    """The output of the command that runs."""
+    context = click.get_current_context()
+    return context.meta.setdefault("psotrack.output", Output(context.find_root().obj or time.perf_counter()))
+
+
+def pass_output(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command its `Output` as the first argument."""
+
+    @functools.wraps(command)
+    def with_output(*args: Any, **options: Any) -> None:
+        command(current_output(), *args, **options)
+
+    return with_output
 
 
 def finite_or_none(value: float) -> float | None:
@@ -135,32 +181,10 @@ def format_numbers(values: Iterable[float], digits: int) -> str:
     return " ".join(f"{value:.{digits}f}" for value in values)
 
 
-def check_outputs(out: Path | None, json_path: Path | None, force: bool) -> None:
-    """Check the output files before any work; the option `--json` itself checks that its file can be written.
-
-    Raises:
-        SettingsError: `out` is not a CSV file, or `json_path` is the same file.
-        OutputError: `out` exists and `force` is not set, or it cannot be written.
-    """
-    if out is not None and out.suffix != ".csv":
-        raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
-    if out is not None:
-        refuse_to_overwrite(out, force)
-    if out is not None and json_path == out:
-        raise SettingsError("--json", expected="another file than --out", found=f"{out} twice")
-
-
-def output_json(json_path: Path | None, content: Any, force: bool) -> None:
-    """Write JSON for programs, to stdout or to a new file; a missing number, NaN, is written as null.
-
-    Raises:
-        OutputError: the file exists and `force` is not set.
-    """
-    if json_path == Path("-"):
-        click.echo(_json_text(content))
-    elif json_path is not None:
-        refuse_to_overwrite(json_path, force)
-        write_json(json_path, content)
+def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
+    """Raise `SettingsError` for a file that ends otherwise than an option wants."""
+    if path is not None and path.suffix not in suffixes:
+        raise SettingsError(option, expected=f"a file that ends in {' or '.join(suffixes)}", found=path.name)
 
 
 def write_json(path: str | Path, content: Any) -> None:

@@ -7,24 +7,23 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import (
-    CAMERAS,
     FORCE,
-    JOBS,
-    SEQUENCE,
     TRACKS,
-    camera_names,
-    frames_option,
+    Extent,
+    extent_options,
+    out_option,
     reporting,
+    sequence_argument,
+    sequence_of,
 )
-from psotrack.cli.output import report_to
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @TRACKS
-@SEQUENCE
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder of the videos, CAMERA.mp4."
-)
+@sequence_argument
+@out_option("Folder of the videos, CAMERA.mp4.  [default: overlay beside TRACKS]")
 @click.option(
     "--mosaic",
     is_flag=True,
@@ -37,41 +36,38 @@ from psotrack.cli.output import report_to
     show_default=True,
     help="Size of the videos per size of the cameras' videos; the mosaic is 1920 pixels wide.",
 )
-@CAMERAS
-@frames_option
-@JOBS
+@extent_options
 @FORCE
 @reporting
+@pass_output
 def overlay(
+    output: Output,
     tracks: Path,
-    sequence: Path,
-    out: Path,
+    sequence: Path | None,
+    out: Path | None,
     mosaic: bool,
     scale: float,
-    cameras: str | None,
-    num_frames: int | None,
-    jobs: int | None,
-    force: bool,
-    quiet: bool,
+    extent: Extent,
 ) -> None:
     """Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.
 
-    Finished videos of the same TRACKS are kept, so that a run that was interrupted can be continued.
+    SEQ is the recording of TRACKS; the record beside TRACKS names it. Finished videos of the same TRACKS are kept, so
+    that a run that was interrupted can be continued.
 
     \b
     Examples:
-      psotrack overlay tracks.csv data/Simulated_Data/S02_D4_A --out videos
-      psotrack overlay tracks.csv data/Simulated_Data/S02_D4_A --out videos --mosaic
-      psotrack overlay tracks.csv flight --out videos --cameras cam1,cam2 --scale 0.5
+      psotrack overlay my_lab/results/tracks.csv
+      psotrack overlay tracks.csv my_lab --out videos --mosaic
+      psotrack overlay tracks.csv my_lab --out videos --cameras cam1,cam2 --scale 0.5
     """
     from psotrack.show.flights import first_instants, read_flight
     from psotrack.show.overlay import OverlayOptions, write_overlays
 
-    flight = read_flight([tracks], sequence, cameras=camera_names(cameras))
-    if num_frames is not None:
-        flight = first_instants(flight, num_frames)
-    options = OverlayOptions(mosaic=mosaic, scale=scale, force=force)
-    written = write_overlays(out, flight, options, jobs=jobs, report=report_to(quiet))
-    if not quiet:
-        kept = f", {len(written.kept)} were there already" if written.kept else ""
-        click.echo(f"{out}: {len(written.written)} videos in {written.codec.name}{kept}")
+    out = out or tracks.parent / "overlay"
+    flight = read_flight([tracks], sequence_of(tracks, sequence), cameras=extent.cameras)
+    if extent.num_frames is not None:
+        flight = first_instants(flight, extent.num_frames)
+    options = OverlayOptions(mosaic=mosaic, scale=scale, force=output.force)
+    written = write_overlays(out, flight, options, jobs=extent.jobs, report=output.report)
+    kept = f", {len(written.kept)} were there already" if written.kept else ""
+    output.say(f"{out}: {len(written.written)} videos in {written.codec.name}{kept}")

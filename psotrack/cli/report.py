@@ -1,22 +1,27 @@
-"""`psotrack report`: one HTML page about a flight, a sweep or a calibration."""
+"""`psotrack report`: one HTML page about a flight, a sweep or a calibration, or a table of a sweep."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, SequencePath, reporting
-from psotrack.cli.output import print_line, report_to
-from psotrack.errors import SettingsError
+from psotrack.cli.options import FORCE, JOBS, out_option, reporting, sequence_argument
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import Command, HelpfulCommand, Option
+from psotrack.errors import SettingsError, errors_name
 
 
-@click.command()
+def _table_option(name: str, words: str, **attributes: Any) -> Callable[[Command], Command]:
+    return click.option(name, cls=Option, heading="With --table", help=words, **attributes)
+
+
+@click.command(cls=HelpfulCommand)
 @click.argument("source", metavar="SOURCE", type=click.Path(path_type=Path))
-@click.argument("sequence", metavar="[SEQ]", type=SequencePath(path_type=Path), required=False)
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Page to write; it ends in .html."
-)
+@sequence_argument
+@out_option("Page to write; it ends in .html.  [default: beside SOURCE, with the same name]")
 @click.option(
     "--compare",
     type=click.Path(path_type=Path),
@@ -27,30 +32,58 @@ from psotrack.errors import SettingsError
 @click.option(
     "--no-pictures", is_flag=True, help="Show events without pictures, which need the videos of SEQ."
 )
+@click.option(
+    "--table",
+    "layout",
+    type=click.Choice(["text", "markdown", "latex", "csv"]),
+    is_flag=False,
+    flag_value="text",
+    help="Print a table of a sweep's results instead: mean +- standard deviation over runs.  [without a value: text]",
+)
+@_table_option(
+    "--rows",
+    "Columns of the results, with commas between them, that label the rows.",
+    default="sequence",
+    show_default=True,
+)
+@_table_option(
+    "--columns",
+    "Columns of the results that label the table's columns.  [default: method; sequence if --rows names method]",
+)
+@_table_option("--value", "Column of the numbers in the table.", default="mean_error_m", show_default=True)
+@_table_option(
+    "--scale", "Factor of the numbers; 1000 turns m into mm.", type=float, default=1.0, show_default=True
+)
 @JOBS
 @FORCE
 @reporting
+@pass_output
 def report(
+    output: Output,
     source: Path,
     sequence: Path | None,
-    out: Path,
+    out: Path | None,
     compare: tuple[Path, ...],
     no_pictures: bool,
+    layout: str | None,
     jobs: int | None,
-    force: bool,
-    quiet: bool,
+    **labels: str | float | None,
 ) -> None:
     """Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.
 
     SOURCE is a file of tracks, the folder of a sweep, or the JSON file of `psotrack calibrate rig --json`. With SEQ,
-    the recording of the tracks, the page of a flight has errors, cameras, and pictures of events. The page needs no
-    network and no other file: a browser opens it by a double click.
+    the recording of the tracks, which the record beside the tracks names, the page of a flight has errors, cameras, and
+    pictures of events. The page needs no network and no other file: a browser opens it by a double click.
+
+    In a table of a sweep, the end of a column's name is enough if no other column ends with it: particles is
+    settings.swarm.particles.
 
     \b
     Examples:
-      psotrack report tracks.csv data/Simulated_Data/S02_D4_A --out report.html
-      psotrack report tracks.csv flight --compare lines.csv --out report.html
-      psotrack report results --out sweep.html
+      psotrack report my_lab/results/tracks.csv
+      psotrack report tracks.csv my_lab --compare lines.csv --out report.html
+      psotrack report results
+      psotrack report results --table --rows sequence,particles --columns iterations --scale 1000
       psotrack report calibration.json --out calibration.html
     """
     from psotrack.show.flights import read_flight
@@ -62,19 +95,36 @@ def report(
     )
     from psotrack.sweep import is_results_folder
 
+    if layout is not None:
+        click.echo(_table(source, layout, **labels))  # type: ignore[arg-type]
+        return
     is_sweep = is_results_folder(source)
     is_calibration = source.suffix == ".json" and is_calibration_record(source)
     if (is_sweep or is_calibration) and (sequence is not None or compare):
         what = "the results of a sweep" if is_sweep else "a calibration"
         found = f"{sequence}" if sequence is not None else f"--compare {compare[0]}"
         raise SettingsError("report", expected=f"no further files with {what}", found=found)
+    out = out or (source / "report.html" if is_sweep else source.with_suffix(".html"))
     if is_sweep:
-        write_sweep_report(out, source, force=force)
+        write_sweep_report(out, source, force=output.force)
     elif is_calibration:
-        write_calibration_report(out, source, force=force)
+        write_calibration_report(out, source, force=output.force)
     else:
         flight = read_flight([source, *compare], sequence)
         write_flight_report(
-            out, flight, pictures=not no_pictures, jobs=jobs, force=force, report=report_to(quiet)
+            out, flight, pictures=not no_pictures, jobs=jobs, force=output.force, report=output.report
         )
-    print_line(quiet, None, f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+    output.say(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+
+
+def _table(folder: Path, layout: str, rows: str, columns: str | None, value: str, scale: float) -> str:
+    """A table of the results of a sweep."""
+    from psotrack.sweep import Store, pivot, render_table
+
+    rows_by = [name for name in rows.split(",") if name]
+    if columns is None:
+        columns = next((name for name in ("method", "sequence") if name not in rows_by), "")
+    columns_by = [name for name in columns.split(",") if name]
+    with errors_name(folder):
+        shown = pivot(Store(folder).rows(), rows_by=rows_by, columns_by=columns_by, value=value, scale=scale)
+    return render_table(shown, layout).rstrip("\n")

@@ -1,4 +1,4 @@
-"""`psotrack sweep` and `psotrack table`: run grids of settings, store the results, and show tables of the results."""
+"""`psotrack sweep`: run grids of settings, and store the results."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from psotrack.cli.options import (
     JSON,
     cache_folder,
     compiled_folder,
+    out_option,
     reporting,
 )
-from psotrack.cli.output import output_json, print_line, report_to
-from psotrack.errors import SettingsError, errors_name
-from psotrack.support import Device, Report, refuse_to_overwrite
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.errors import SettingsError
+from psotrack.support import Device, Report
 
 if TYPE_CHECKING:
     from psotrack.sweep import Cluster, Grid, Inputs, Store, SweepOutcome
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @click.argument("grid_file", metavar="GRID.toml", type=click.Path(path_type=Path), required=False)
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Folder of the results; it is made if it does not exist."
+@out_option(
+    "Folder of the results; it is made if it does not exist.  [default: beside GRID.toml, named GRID_results]"
 )
 @click.option(
     "--data",
@@ -64,7 +66,9 @@ if TYPE_CHECKING:
 @reporting
 @FORCE
 @JSON
+@pass_output
 def sweep(
+    output: Output,
     grid_file: Path | None,
     out: Path | None,
     data: Path,
@@ -75,9 +79,6 @@ def sweep(
     device: Device | None,
     cache: Path | None,
     jobs: int | None,
-    quiet: bool,
-    force: bool,
-    json_path: Path | None,
 ) -> None:
     """Track with every combination of a grid's settings, and keep one row per run.
 
@@ -91,10 +92,10 @@ def sweep(
       psotrack sweep grid.toml --data data --out results
       psotrack sweep grid.toml --data data --out results --cluster tls://10.0.0.5:8786
       psotrack sweep --status results
-      psotrack table results --rows particles --columns iterations --value mean_error_m
+      psotrack report results --table --rows particles --columns iterations --value mean_error_m
     """
     if status is not None:
-        _status(status, quiet, force, json_path)
+        _status(output, status)
         return
     if grid_file is None:
         raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
@@ -104,27 +105,21 @@ def sweep(
 
     where_to_run = None if cluster is None else Cluster(cluster, workers, device)
     grid = read_grid(grid_file)
+    out = out or grid_file.with_name(f"{grid_file.stem}_results")
     if dry_run:
         from psotrack.sweep import Inputs, Store
 
         inputs = Inputs(data, cache_folder(cache), jobs)
-        _show(grid, inputs, Store(out) if out else None, quiet, force, json_path)
+        _show(output, grid, inputs, Store(out) if out.is_dir() else None)
         return
-    if out is None:
-        raise SettingsError("--out", expected="the folder to write to", found="none")
-    if json_path not in (None, Path("-")):
-        # The error must come before the sweep, which may take hours.
-        refuse_to_overwrite(json_path, force)
     if where_to_run is None:
-        outcome = _run_here(grid, out, data, cache, jobs, device, report_to(quiet))
+        outcome = _run_here(grid, out, data, cache, jobs, device, output.report)
     else:
-        outcome = _run_on_cluster(grid, out, data, cache, where_to_run, quiet)
+        outcome = _run_on_cluster(output, grid, out, data, cache, where_to_run)
     counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
-    output_json(json_path, counts, force)
+    output.json(counts)
     failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
-    print_line(
-        quiet, json_path, f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}"
-    )
+    output.say(f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}")
     if counts["failed"]:
         sys.exit(2)
 
@@ -150,7 +145,7 @@ def _run_here(
 
 
 def _run_on_cluster(
-    grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster, quiet: bool
+    output: Output, grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster
 ) -> SweepOutcome:
     """Run the cells as tasks of a cluster's workers."""
     from psotrack.support import use_device
@@ -159,71 +154,15 @@ def _run_on_cluster(
     use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
 
     def say(address: str) -> None:
-        if not quiet:
+        if not output.quiet:
             click.echo(f"the cluster listens at {address}, for programs on this computer only", err=True)
 
     return run_on_cluster(
-        grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=report_to(quiet), say=say
+        grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=output.report, say=say
     )
 
 
-@click.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option(
-    "--rows",
-    "rows_by",
-    default="sequence",
-    show_default=True,
-    help="Columns of the results, with commas between them, that label the rows.",
-)
-@click.option(
-    "--columns",
-    "columns_by",
-    help="Columns of the results that label the table's columns.  [default: method; sequence if --rows names method]",
-)
-@click.option(
-    "--value", default="mean_error_m", show_default=True, help="Column of the numbers in the table."
-)
-@click.option(
-    "--scale", type=float, default=1.0, show_default=True, help="Factor of the numbers; 1000 turns m into mm."
-)
-@click.option(
-    "--format",
-    "layout",
-    type=click.Choice(["text", "markdown", "latex", "csv"]),
-    default="text",
-    show_default=True,
-    help="Format of the table.",
-)
-def table(folder: Path, rows_by: str, columns_by: str | None, value: str, scale: float, layout: str) -> None:
-    """Show a table of the results in DIR: mean +- standard deviation over runs.
-
-    The end of a column's name is enough if no other column ends with it: particles is settings.swarm.particles.
-
-    \b
-    Examples:
-      psotrack table results --rows sequence,particles --columns iterations --value mean_error_m --scale 1000
-      psotrack table results --columns method --value missed_rate --format latex
-    """
-    from psotrack.sweep import Store, pivot, render_table
-
-    rows = [name for name in rows_by.split(",") if name]
-    if columns_by is None:
-        columns_by = next((name for name in ("method", "sequence") if name not in rows), "")
-    with errors_name(folder):
-        shown = pivot(
-            Store(folder).rows(),
-            rows_by=rows,
-            columns_by=[name for name in columns_by.split(",") if name],
-            value=value,
-            scale=scale,
-        )
-    click.echo(render_table(shown, layout).rstrip("\n"))
-
-
-def _show(
-    grid: Grid, inputs: Inputs, store: Store | None, quiet: bool, force: bool, json_path: Path | None
-) -> None:
+def _show(output: Output, grid: Grid, inputs: Inputs, store: Store | None) -> None:
     """Print the cells of a grid, and an estimate of the time that they take."""
     from psotrack.sweep import cameras_label, estimate
 
@@ -239,29 +178,25 @@ def _show(
         for cell in cells
     ]
     expected = estimate(cells, inputs, store)
-    output_json(
-        json_path, {"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}}, force
-    )
+    output.json({"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}})
     for number, cell in enumerate(listed):
-        print_line(
-            quiet, json_path, f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items())
-        )
-    print_line(quiet, json_path, f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
+        output.say(f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items()))
+    output.say(f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
     for fault in expected.faults:
-        print_line(quiet, json_path, f"cannot be read: {fault}")
-    print_line(quiet, json_path, f"{expected}")
+        output.say(f"cannot be read: {fault}")
+    output.say(f"{expected}")
 
 
-def _status(folder: Path, quiet: bool, force: bool, json_path: Path | None) -> None:
+def _status(output: Output, folder: Path) -> None:
     """Print the numbers of finished, failed and locked cells in a folder, and the processes at work."""
     from psotrack.sweep import Store
 
     content = Store(folder).status()
-    output_json(json_path, content, force)
+    output.json(content)
     for failure in content["errors"]:
-        print_line(quiet, json_path, f"failed: {failure}")
+        output.say(f"failed: {failure}")
     for worker in content["at_work"]:
-        print_line(quiet, json_path, f"at work: {worker}")
+        output.say(f"at work: {worker}")
     words = {"finished": "finished", "failed": "failed", "claimed": "locked"}
     numbers = ", ".join(f"{content[key]} {word}" for key, word in words.items())
-    print_line(quiet, json_path, f"{folder}: {numbers}")
+    output.say(f"{folder}: {numbers}")

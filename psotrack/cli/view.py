@@ -11,34 +11,25 @@ from typing import TYPE_CHECKING
 import click
 
 from psotrack.cli.options import (
-    CACHE,
-    CAMERAS,
     FORCE,
-    JOBS,
-    SequencePath,
-    cache_folder,
-    camera_names,
+    Extent,
     dictionary_option,
-    frames_option,
+    extent_options,
     reporting,
 )
-from psotrack.cli.output import report_to
+from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import opened_sequence
 from psotrack.errors import SettingsError
-from psotrack.support import refuse_to_overwrite
+from psotrack.support import ARCHIVE_SUFFIX
 
 if TYPE_CHECKING:
     from psotrack.show.flights import TrackedFlight
     from psotrack.show.viewer import WrittenFlight
 
 
-@click.command()
-@click.argument("tracks", nargs=-1, type=click.Path(path_type=Path))
-@click.option(
-    "--sequence",
-    metavar="SEQ",
-    type=SequencePath(path_type=Path),
-    help="The recording: its cameras with their images, and its reference.",
-)
+@click.command(cls=HelpfulCommand)
+@click.argument("tracks", nargs=-1, metavar="TRACKS... [SEQ]", type=click.Path(path_type=Path))
 @click.option(
     "--save",
     type=click.Path(path_type=Path),
@@ -62,40 +53,34 @@ if TYPE_CHECKING:
     "--onboard", is_flag=True, help="Show the cameras on drones too, with the markers that they see."
 )
 @dictionary_option()
-@CAMERAS
-@frames_option
-@CACHE
-@JOBS
+@extent_options
 @FORCE
 @reporting
+@pass_output
 def view(
+    output: Output,
     tracks: tuple[Path, ...],
-    sequence: Path | None,
     save: Path | None,
     web: bool,
     max_size_mb: float | None,
     silhouettes: bool,
     onboard: bool,
     dictionary: str,
-    cameras: str | None,
-    num_frames: int | None,
-    cache: Path | None,
-    jobs: int | None,
-    force: bool,
-    quiet: bool,
+    extent: Extent,
 ) -> None:
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
 
-    Several files of TRACKS are compared: each has a colour. Rerun is an extra: pip install 'psotrack[view]'.
+    SEQ is the recording, with its cameras, their images and its reference; the record beside TRACKS names it. Several
+    files of TRACKS are compared: each has a colour. Rerun is an extra: pip install '.[view]' in the checkout.
 
     \b
     Examples:
-      psotrack view tracks.csv --sequence data/Simulated_Data/S02_D4_A
-      psotrack view tracks.csv --sequence data/Simulated_Data/S02_D4_A --save flight.rrd
-      psotrack view swarm.csv lines.csv --sequence flight --web
-      psotrack view --sequence flight --frames 250
+      psotrack view my_lab/results/tracks.csv
+      psotrack view tracks.csv my_lab --save flight.rrd
+      psotrack view swarm.csv lines.csv my_lab --web
+      psotrack view my_lab --frames 250
     """
-    from psotrack.show.flights import first_instants, read_flight
+    from psotrack.show.flights import first_instants, read_flight, split_sequence
     from psotrack.show.viewer import (
         check_display,
         check_installed,
@@ -106,24 +91,27 @@ def view(
 
     if save is not None and web:
         raise SettingsError("--web", expected="either --save or --web", found="both")
-    if save is not None and save.suffix != ".rrd":
-        raise SettingsError("--save", expected="a file that ends in .rrd", found=save.name)
+    check_suffix("--save", save, ".rrd")
     check_installed()
     # These names need Rerun.
     from psotrack.show.viewer import ViewContent, write_flight
 
     if save is not None:
-        refuse_to_overwrite(save, force)
+        output.refuse(save)
     elif not web:
         check_display()
-    flight = read_flight(tracks, sequence, cameras=camera_names(cameras))
-    if num_frames is not None:
-        flight = first_instants(flight, num_frames)
+    if not tracks:
+        raise SettingsError("view", expected="TRACKS, SEQ or both", found="neither")
+    archive = tracks[-1].suffix == ARCHIVE_SUFFIX
+    files, sequence = split_sequence((*tracks[:-1], opened_sequence(tracks[-1])) if archive else tracks)
+    flight = read_flight(files, sequence, cameras=extent.cameras)
+    if extent.num_frames is not None:
+        flight = first_instants(flight, extent.num_frames)
     if onboard and (flight.recording is None or not flight.recording.onboard):
         raise SettingsError("--onboard", expected="a recording with cameras on drones", found="none")
-    report = report_to(quiet)
+    report, jobs = output.report, extent.jobs
     content = ViewContent(
-        silhouettes=find_silhouettes(flight, cache_folder(cache), make=silhouettes, jobs=jobs, report=report),
+        silhouettes=find_silhouettes(flight, extent.silhouettes, make=silhouettes, jobs=jobs, report=report),
         onboard=onboard,
         dictionary=dictionary,
         max_bytes=None if max_size_mb is None else 1e6 * max_size_mb,
@@ -131,8 +119,7 @@ def view(
 
     def write(path: Path, name: str) -> None:
         written = write_flight(path, flight, content, jobs=jobs, report=report)
-        if not quiet:
-            click.echo(_sentence(name, flight, content.silhouettes is not None, written))
+        output.say(_sentence(name, flight, content.silhouettes is not None, written))
 
     if save is not None:
         write(save, str(save))
@@ -163,5 +150,5 @@ def _sentence(name: str, flight: TrackedFlight, has_silhouettes: bool, written: 
         if not has_silhouettes:
             parts.append("no silhouettes are stored; --silhouettes computes them")
     elif flight.recording is None:
-        parts.append("--sequence shows the cameras, too")
+        parts.append("SEQ shows the cameras, too")
     return ", ".join(parts)

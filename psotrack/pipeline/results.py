@@ -197,7 +197,7 @@ def _no_drones(run: Run) -> InputError:
     found = "none in any frame"
     least_m, most_m = BirthRules(size_m=run.settings.drones.lengths_m).spans_m
     remedy = (
-        "look at what the cameras see (`psotrack silhouettes`), give the drones' first positions (--init), "
+        "look at what the cameras see (`psotrack detect --silhouettes`), give the drones' first positions (--init), "
         f"or their size (--drone-size) if they are not {least_m:.2g} to {most_m:.2g} m wide"
     )
     recording = run.recording

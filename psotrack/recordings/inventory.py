@@ -1,4 +1,4 @@
-"""Inventory of a recording, as a JSON record and as a table: the command `psotrack info`."""
+"""Inventory of a recording, as a JSON record and as a table: the command `psotrack init --show`."""
 
 from __future__ import annotations
 

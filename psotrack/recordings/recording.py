@@ -101,7 +101,7 @@ class Recording:
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the table of `psotrack info`."""
+        """What a notebook shows: the table of `psotrack init --show`."""
         from psotrack.recordings.inventory import describe_recording, inventory_html
 
         return inventory_html(describe_recording(self))

@@ -48,7 +48,7 @@ Read = Callable[[Path], object]
 SIZE_WH = (1280, 720)
 _CONVERT = "calibrate convert {file} {out}/rig.toml --size 1280,720"
 _EXPORT = "export {file} --to json --out {out}/tracks.json"
-_INFO = "info {folder}"
+_INFO = "init --show {folder}"
 
 
 @dataclass(frozen=True)
@@ -348,7 +348,7 @@ def _video(file: str) -> Format:
         for _ in recordings.read_frames(video):
             pass
 
-    command = "detect-markers {file} --out {out}/markers.csv"
+    command = "onboard detect {file} --out {out}/markers.csv"
     return Format(make, file, (read,), command, is_slow=True)
 
 
@@ -358,7 +358,7 @@ def _image(file: str) -> Format:
         cv2.imwrite(str(folder / file), image)
 
     reads = (recordings.read_image, recordings.read_grey, recordings.read_mask)
-    return Format(make, file, reads, "detect-markers {file} --out {out}/markers.csv")
+    return Format(make, file, reads, "onboard detect {file} --out {out}/markers.csv")
 
 
 _PICTURES = {
@@ -427,14 +427,14 @@ _TABLES = {
         _path_of_camera,
         "inside.csv",
         (inside_out.read_camera_path,),
-        "fuse {file} {folder}/tracks.csv --out {out}/fused.csv",
+        "onboard fuse {file} {folder}/tracks.csv --out {out}/fused.csv",
     ),
     "marker-centres": _table("centres.csv", _CENTRES, inside_out.read_marker_table, read_marker_centres),
     "measured-corners": Format(
         lambda folder: write_marker_corners(folder / "corners.csv", _corners()),
         "corners.csv",
         (inside_out.read_measured_corners, inside_out.read_marker_table),
-        "map-markers {file} --out {out}/corners.csv",
+        "onboard map {file} --out {out}/corners.csv",
     ),
     "measured-c3d": Format(
         lambda folder: mocap.write_c3d(
@@ -447,7 +447,7 @@ _TABLES = {
         ),
         "room.c3d",
         (inside_out.read_measured_corners, mocap.read_c3d),
-        "map-markers {file} --out {out}/corners.csv",
+        "onboard map {file} --out {out}/corners.csv",
     ),
     "image-points": _table(
         "pairs.csv",
@@ -584,7 +584,7 @@ def _unpacked(file: str) -> Format:
         lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
         f"flight/silhouettes/cam1/{file}",
         (_frames_of_silhouettes,),
-        "pack {folder}/flight/tracks.csv {folder}/flight --out {out}/a.psotrack",
+        "archive {folder}/flight/tracks.csv {folder}/flight --out {out}/a.psotrack",
     )
 
 
@@ -618,7 +618,7 @@ _OTHERS = {
         "track {folder}/nowhere --config {file} --out {out}/tracks.csv",
         is_refused=True,
     ),
-    "sweep-rows": _stored(f"cells/{'a' * 40}.parquet", "table {folder}", columns),
+    "sweep-rows": _stored(f"cells/{'a' * 40}.parquet", "report {folder} --table", columns),
     "sweep-errors": _stored(f"_errors/{'a' * 40}.parquet", "report {folder} --out {out}/page.html", columns),
     "sweep-failure": _stored(f"cells/_{'c' * 40}.error.json", "sweep --status {folder}"),
     "sweep-manifest": _stored("_manifest.json", "sweep --status {folder}"),
@@ -632,7 +632,7 @@ _OTHERS = {
         _archive,
         "a.psotrack",
         (_unpack,),
-        "unpack {file} --out {out}/unpacked",
+        "archive {file} --out {out}/unpacked",
         members(lambda content: test_archives.sealed(content + bytes(test_archives.SEAL_DIGITS))),
     ),
     "stored-silhouettes": _unpacked("zarr.json"),
@@ -648,7 +648,7 @@ _OTHERS = {
         lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
         f"flight/{archives.MANIFEST_FILE}",
         (lambda path: archives.read_manifest(path.parent),),
-        "info {folder}/flight",
+        "init --show {folder}/flight",
     ),
     "onnx": Format(
         _network,

@@ -160,7 +160,7 @@ def describe_reference(fit: ReferenceFit, fps: float) -> list[Finding]:
         message = (
             f"the reference: its clock is {frames} frames ({seconds:.2f} s) {where} the videos' {numbers}"
         )
-        remedy = "find it to a fraction of a frame with `psotrack synchronise`"
+        remedy = "find it to a fraction of a frame with `psotrack doctor --tracks`"
         return [Finding("reference clock", (), message, remedy)]
     kind, how = _motion_of(fit)
     remedy = "bring both into one world"

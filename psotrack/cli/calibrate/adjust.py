@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from psotrack.cli.calibrate.options import OUT
 from psotrack.cli.calibrate.shown import row_of, show_cameras
 from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
-from psotrack.cli.output import print_line
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError
-from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import DroneViews, Improved
@@ -30,7 +30,7 @@ ALL_OFF = (
 )
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @SEQUENCE
 @click.option(
     "--tracks",
@@ -51,16 +51,15 @@ ALL_OFF = (
 @FORCE
 @QUIET
 @JSON
+@pass_output
 def adjust(
+    output: Output,
     sequence: Path,
     tracks: Path,
     fixed: str,
     refine_focal_length: bool,
     noise_px: float | None,
     out: Path,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.
 
@@ -85,7 +84,7 @@ def adjust(
     from psotrack.recordings.datasets import open_recording
     from psotrack.trajectories import read_trajectories
 
-    refuse_to_overwrite(out, force)
+    output.refuse(out)
     recording = open_recording(sequence)
     if not recording.detections:
         raise InputError(
@@ -106,19 +105,19 @@ def adjust(
         recording.rig, views, noise_px, fixed=held, refine_focal_length=refine_focal_length
     )
     improved = checked.improved
-    write_rig(out, improved.rig, force=force)
+    write_rig(out, improved.rig, force=output.force)
     rows = _rows(recording.rig, improved, views, held)
-    show_cameras(rows, out, quiet, json_path, force)
+    show_cameras(output, rows, out)
     if checked.all_off:
-        print_line(quiet, json_path, ALL_OFF)
+        output.say(ALL_OFF)
     elif checked.better:
-        print_line(quiet, json_path, _in_words(improved, rows))
+        output.say(_in_words(improved, rows))
     for line in _check_in_words(checked):
-        print_line(quiet, json_path, line)
+        output.say(line)
     if refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
-        print_line(quiet, json_path, f"focal lengths x {scale:.5f} ± {std:.5f}{done}")
+        output.say(f"focal lengths x {scale:.5f} ± {std:.5f}{done}")
 
 
 def _is_synchronous(recording: Recording) -> bool:

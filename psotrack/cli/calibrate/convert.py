@@ -10,14 +10,15 @@ import click
 
 from psotrack.cli.calibrate.options import SIZE
 from psotrack.cli.options import FORCE, JSON, QUIET
-from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table
+from psotrack.cli.output import POSITION, Output, format_numbers, pass_output
+from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
     from psotrack.geometry import Rig
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @click.argument("source", metavar="IN", type=click.Path(path_type=Path))
 @click.argument("out", metavar="OUT", type=click.Path(path_type=Path))
 @SIZE
@@ -39,7 +40,9 @@ if TYPE_CHECKING:
 @FORCE
 @QUIET
 @JSON
+@pass_output
 def convert(
+    output: Output,
     source: Path,
     out: Path,
     image_size_wh: tuple[int, int] | None,
@@ -48,9 +51,6 @@ def convert(
     out_format: str | None,
     lenses: bool,
     undistorted: bool,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Convert the calibration IN, of any program in the list below, to OUT.
 
@@ -79,21 +79,19 @@ def convert(
     if undistorted:
         rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
     if lenses:
-        write_lenses(out, rig, force=force)
+        write_lenses(out, rig, force=output.force)
     else:
-        write_rig(out, rig, force=force, file_format=out_format)
-    _show(rig, out, quiet, json_path, force, placed=not lenses)
+        write_rig(out, rig, force=output.force, file_format=out_format)
+    _show(output, rig, out, placed=not lenses)
 
 
-def _show(rig: Rig, out: Path, quiet: bool, json_path: Path | None, force: bool, *, placed: bool) -> None:
+def _show(output: Output, rig: Rig, out: Path, *, placed: bool) -> None:
     rows: dict[str, dict[str, Any]] = {
         name: ({"centre_m": centre.tolist()} if placed else {}) | {"focal_length_px": float(K[0, 0])}
         for name, centre, K in zip(rig.names, rig.cameras.centre_world, rig.cameras.K, strict=True)
     }
-    output_json(json_path, {"rig": str(out), "cameras": rows}, force)
-    print_table(
-        quiet,
-        json_path,
+    output.json({"rig": str(out), "cameras": rows})
+    output.table(
         ("camera", *((POSITION,) if placed else ()), "f (px)"),
         (
             (
@@ -104,4 +102,4 @@ def _show(rig: Rig, out: Path, quiet: bool, json_path: Path | None, force: bool,
             for name, row in rows.items()
         ),
     )
-    print_line(quiet, json_path, f"{out}")
+    output.say(f"{out}")

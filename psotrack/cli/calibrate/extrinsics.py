@@ -11,15 +11,17 @@ import click
 from psotrack.cli.calibrate.located import locate_cameras
 from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
 from psotrack.cli.calibrate.shown import show_cameras
-from psotrack.cli.options import FORCE, FOV, JSON, QUIET, Numbers, dictionary_option
+from psotrack.cli.options import FORCE, FOV, JSON, QUIET, dictionary_option
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import Numbers
 from psotrack.errors import InputError, SettingsError, errors_name
-from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import ImagePoints
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @click.option(
     "--pairs",
     type=click.Path(path_type=Path),
@@ -59,16 +61,15 @@ if TYPE_CHECKING:
 @FORCE
 @QUIET
 @JSON
+@pass_output
 def extrinsics(
+    output: Output,
     pairs: Path | None,
     points: Path | None,
     markers: Path | None,
     dictionary: str,
     noise_px: float,
     out: Path,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
     **lens: Any,
 ) -> None:
     """Find the poses of cameras, from points whose positions in the world and in the images are known.
@@ -88,13 +89,13 @@ def extrinsics(
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
         raise SettingsError("extrinsics", expected="--pairs FILE or --markers SEQ", found=found)
-    refuse_to_overwrite(out, force)
+    output.refuse(out)
     marks = read_image_points(pairs, points) if pairs else _find_markers(Path(str(markers)), dictionary)
     lenses = _lenses(list(marks), **lens)
     with errors_name(pairs or markers):
         rig, rows = locate_cameras(marks, lenses, noise_px)
-    write_rig(out, rig, force=force)
-    show_cameras(rows, out, quiet, json_path, force)
+    write_rig(out, rig, force=output.force)
+    show_cameras(output, rows, out)
 
 
 def _lenses(

@@ -7,41 +7,29 @@ from pathlib import Path
 import click
 import numpy as np
 
-from psotrack.cli.calibrate.options import LENS, OUT, board_of, board_options
+from psotrack.cli.calibrate.options import BOARD_NAMES, LENS, OUT, BoardOptions
 from psotrack.cli.options import FORCE, JSON, reporting
-from psotrack.cli.output import output_json, print_line, print_table, report_to
-from psotrack.errors import SettingsError, errors_name
-from psotrack.support import refuse_to_overwrite
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.errors import errors_name
 
 #: Names of the distortion coefficients in OpenCV's order.
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @click.argument("video", type=click.Path(path_type=Path))
-@board_options()
+@options_of(BoardOptions, "board", names=BOARD_NAMES)
 @LENS
 @click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
 @FORCE
 @reporting
 @JSON
+@pass_output
 def intrinsics(
-    video: Path,
-    kind: str | None,
-    squares_wh: tuple[int, int] | None,
-    square_m: float | None,
-    marker_m: float | None,
-    separation_m: float | None,
-    dictionary: str,
-    first_marker: int,
-    lens: str,
-    name: str | None,
-    out: Path,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
+    output: Output, video: Path, board: BoardOptions, lens: str, name: str | None, out: Path
 ) -> None:
     """Estimate a camera's lens from VIDEO, in which a board is moved.
 
@@ -63,17 +51,14 @@ def intrinsics(
     from psotrack.geometry import make_rig
     from psotrack.geometry.rig_files import write_lenses, write_rig
 
-    refuse_to_overwrite(out, force)
-    if squares_wh is None:
-        raise SettingsError("board", expected="--squares, the number of squares", found="none")
-    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary, first_marker)
+    output.refuse(out)
     (images,) = open_images([video], [name] if name else None)
     model = parse_lens_model(lens)
     with errors_name(video):
-        found = lens_of_board(images, board, model, report_to(quiet))
+        found = lens_of_board(images, board.board(), model, output.report)
     # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.
     write = write_lenses if out.suffix.lower() == ".toml" else write_rig
-    write(out, make_rig({images.name: found.camera}), force=force)
+    write(out, make_rig({images.name: found.camera}), force=output.force)
     K, dist = found.camera.K, np.asarray(found.camera.dist)[: found.model.coefficients]
     values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist]
     known = _FISHEYE if found.model.fisheye else _COEFFICIENTS
@@ -87,25 +72,20 @@ def intrinsics(
         "frames": found.frame.tolist(),
         "residual_px": found.residual_px.tolist(),
     }
-    output_json(json_path, content, force)
+    output.json(content)
     rows = zip(names, values, found.std, strict=True)
-    print_table(
-        quiet,
-        json_path,
-        ("", "value", "standard deviation"),
-        ((key, f"{value:.5g}", f"{std:.2g}") for key, value, std in rows),
+    output.table(
+        ("", "value", "standard deviation"), ((key, f"{value:.5g}", f"{std:.2g}") for key, value, std in rows)
     )
     if found.compared_px:
         errors = ", ".join(f"{model} {error:.3f}" for model, error in found.compared_px.items())
-        print_line(quiet, json_path, f"lens {found.model}; median errors on views left out (px): {errors}")
+        output.say(f"lens {found.model}; median errors on views left out (px): {errors}")
     elif parse_lens_model(lens) is None:
-        print_line(quiet, json_path, say_not_compared({images.name: len(found.frame)}))
+        output.say(say_not_compared({images.name: len(found.frame)}))
     for sentence in say_searched({images.name: (found.searched, len(images.frames))}):
-        print_line(quiet, json_path, sentence)
+        output.say(sentence)
     rms = float(np.sqrt(np.mean(found.residual_px**2)))
     worst = found.frame[found.residual_px.argmax()]
-    print_line(
-        quiet,
-        json_path,
-        f"{out}: {len(found.frame)} views, residual {rms:.2f} px, {found.residual_px.max():.2f} px in frame {worst}",
+    output.say(
+        f"{out}: {len(found.frame)} views, residual {rms:.2f} px, {found.residual_px.max():.2f} px in frame {worst}"
     )

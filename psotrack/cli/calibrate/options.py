@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.options import Size, dictionary_option
+from psotrack.cli.options import out_option
+from psotrack.cli.types import Size
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
     from psotrack.calibration import Board
 
-OUT = click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="Calibration to write: a file that ends in .toml, .yml or .csv.",
+OUT = out_option(
+    "Calibration to write: a file that ends in .toml, .yml or .csv.",
+    default=Path("rig.toml"),
+    show_default=True,
 )
 SIZE = click.option(
     "--size",
@@ -49,74 +51,59 @@ LENS = click.option(
 )
 
 
-def board_options() -> Any:
-    """Options that describe a board; `board_of` makes the board."""
-    options: list[Any] = [
-        click.option(
-            "--board",
-            "kind",
-            type=click.Choice(["charuco", "chessboard", "grid"]),
-            help="Kind of the board; a grid is one of ArUco markers or AprilTags.  "
-            "[default: grid with --separation or --squares 1x1, charuco with --marker, else chessboard]",
-        ),
-        click.option(
-            "--squares",
-            "squares_wh",
-            type=Size(),
-            metavar="COLUMNSxROWS",
-            help="Number of squares of the board, of markers for a grid, such as 4x5.",
-        ),
-        click.option("--square", "square_m", type=float, help="Side of a square in metres."),
-        click.option("--marker", "marker_m", type=float, help="Side of a marker in metres."),
-        click.option(
-            "--separation", "separation_m", type=float, help="Gap between the markers of a grid in metres."
-        ),
-        dictionary_option(),
-        click.option(
-            "--first-marker",
-            type=click.IntRange(min=0),
-            default=0,
-            show_default=True,
-            help="Number of the first marker of a grid; the others count on from it, row by row.",
-        ),
-    ]
+@dataclass(frozen=True)
+class BoardOptions:
+    """The board that is moved before the cameras.
 
-    def decorate(command: Any) -> Any:
-        for option in reversed(options):
-            command = option(command)
-        return command
+    Attributes:
+        kind: kind of the board; a grid is one of ArUco markers or AprilTags; None: grid with --separation or --squares
+            1x1, charuco with --marker, else chessboard.
+        squares: number of squares of the board, of markers for a grid, such as 4x5.
+        square_m: side of a square in metres.
+        marker_m: side of a marker in metres.
+        separation_m: gap between the markers of a grid in metres.
+        dictionary: dictionary of the markers; any dictionary of OpenCV.
+        first_marker: number of the first marker of a grid; the others count on from it, row by row.
+    """
 
-    return decorate
+    kind: Literal["charuco", "chessboard", "grid"] | None = None
+    squares: Annotated[tuple[int, int], Meta(extra={"metavar": "COLUMNSxROWS", "type": Size()})] | None = None
+    square_m: float | None = None
+    marker_m: float | None = None
+    separation_m: float | None = None
+    dictionary: str = "4x4_1000"
+    first_marker: Annotated[int, Meta(ge=0)] = 0
+
+    def board(self) -> Board:
+        """The board of the options.
+
+        Raises:
+            SettingsError: the options do not say what the board is like.
+        """
+        from psotrack.calibration import Board
+
+        if self.squares is None:
+            raise SettingsError("board", expected="--squares, the number of squares", found="none")
+        kind, marker_m, separation_m = self.kind, self.marker_m, self.separation_m
+        if kind is None:
+            is_grid = separation_m is not None or self.squares == (1, 1)
+            kind = "grid" if is_grid else "charuco" if marker_m is not None else "chessboard"
+        if kind == "grid":
+            if marker_m is not None and self.squares == (1, 1):
+                # A single marker has no gap to another one.
+                separation_m = 0.0
+            if marker_m is None or separation_m is None:
+                raise SettingsError(
+                    "board",
+                    expected="--marker and --separation of a grid",
+                    found="--marker only" if marker_m else "no --marker",
+                )
+            side_m = marker_m + separation_m
+            return Board(self.squares, side_m, marker_m, self.dictionary, "grid", self.first_marker)
+        if self.square_m is None:
+            raise SettingsError("board", expected="--square, the side of a square in metres", found="none")
+        return Board(self.squares, self.square_m, marker_m, self.dictionary, kind)
 
 
-def board_of(
-    kind: str | None,
-    squares_wh: tuple[int, int],
-    square_m: float | None,
-    marker_m: float | None,
-    separation_m: float | None,
-    dictionary: str,
-    first_marker: int,
-) -> Board:
-    """The board of the options."""
-    from psotrack.calibration import Board
-
-    if kind is None:
-        is_grid = separation_m is not None or squares_wh == (1, 1)
-        kind = "grid" if is_grid else "charuco" if marker_m is not None else "chessboard"
-    if kind == "grid":
-        if marker_m is not None and squares_wh == (1, 1):
-            # A single marker has no gap to another one.
-            separation_m = 0.0
-        if marker_m is None or separation_m is None:
-            raise SettingsError(
-                "board",
-                expected="--marker and --separation of a grid",
-                found="--marker only" if marker_m else "no --marker",
-            )
-        return Board(squares_wh, marker_m + separation_m, marker_m, dictionary, "grid", first_marker)
-    if square_m is None:
-        raise SettingsError("board", expected="--square, the side of a square in metres", found="none")
-    if kind == "chessboard":
-        return Board(squares_wh, square_m, marker_m, dictionary, "chessboard")
-    return Board(squares_wh, square_m, marker_m, dictionary)
+#: Names of the options of `BoardOptions`.
+BOARD_NAMES = {"kind": "board"}

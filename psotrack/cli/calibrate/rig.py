@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.calibrate.options import LENS, OUT, board_of, board_options, noise_option
+from psotrack.cli.calibrate.options import BOARD_NAMES, OUT, BoardOptions, noise_option
 from psotrack.cli.calibrate.rig_points import (
     Distance,
     calibrate_pairs,
@@ -19,28 +20,62 @@ from psotrack.cli.calibrate.rig_points import (
 )
 from psotrack.cli.calibrate.shown import show_cameras
 from psotrack.cli.options import FORCE, JSON, plot_option, reporting
-from psotrack.cli.output import POSITION, format_numbers, output_json, print_line, print_table, report_to
+from psotrack.cli.output import POSITION, Output, format_numbers, pass_output
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import SettingsError, errors_name
-from psotrack.support import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from psotrack.calibration import Board, CalibratedRig, CameraFigures, LensChoice
 
 
-@click.command()
+@dataclass(frozen=True)
+class LensOptions:
+    """The lenses of the cameras.
+
+    Attributes:
+        lens: number of distortion coefficients of OpenCV's lens model, or its fisheye model; auto chooses by views that
+            are left out.
+        same_lens: all cameras have one lens, as equal cameras at equal zoom nearly do.
+        lenses: calibration whose lenses are kept; a camera that is not in the file gets a lens from the board.
+    """
+
+    lens: Annotated[str, Meta(extra={"metavar": "auto|0|4|5|8|12|14|fisheye"})] = "auto"
+    same_lens: bool = False
+    lenses: Path | None = None
+
+    def choice(self) -> LensChoice:
+        """The lenses of the options."""
+        from psotrack.calibration import LensChoice, known_lenses, parse_lens_model
+        from psotrack.geometry.rig_files import read_lenses
+
+        known = None if self.lenses is None else known_lenses(read_lenses(self.lenses))
+        return LensChoice(parse_lens_model(self.lens), known, self.same_lens)
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """What is seen instead of a board.
+
+    Attributes:
+        points: a single moving point instead of a board: the detections of the recording, or a CSV file with
+            camera,frame,x_px,y_px (and point, for the two ends of a stick). Needs --lenses.
+        distance: distance between two cameras' centres in metres, for --points: a,b=4.20.
+        stick_m: distance of the two points in metres, for --points.
+        pairs: points of known place instead of a board: camera,point,x_px,y_px,x_m,y_m,z_m. Needs --lenses.
+        markers: ArUco markers of known place instead of a board: a map of their corners. Needs --lenses.
+    """
+
+    points: bool = False
+    distance: Annotated[str, Meta(extra={"metavar": "NAME,NAME=METRES", "type": Distance()})] | None = None
+    stick_m: float | None = None
+    pairs: Path | None = None
+    markers: Path | None = None
+
+
+@click.command(cls=HelpfulCommand)
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
-@board_options()
-@LENS
-@click.option(
-    "--same-lens", is_flag=True, help="All cameras have one lens, as equal cameras at equal zoom nearly do."
-)
-@click.option(
-    "--lenses",
-    "lenses_path",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Calibration whose lenses are kept; a camera that is not in FILE gets a lens from the board.",
-)
+@options_of(BoardOptions, "board", names=BOARD_NAMES, heading="Board")
+@options_of(LensOptions, "lens", heading="Lenses")
 @click.option(
     "--names", metavar="NAME,NAME...", help="Names of the cameras.  [default: from the files' names]"
 )
@@ -58,63 +93,26 @@ if TYPE_CHECKING:
     help="Three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a frame of the "
     "moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.",
 )
-@click.option(
-    "--points",
-    "is_point",
-    is_flag=True,
-    help="A single moving point instead of a board: the detections of the recording, or a CSV file with "
-    "camera,frame,x_px,y_px (and point, for the two ends of a stick). Needs --lenses.",
-)
-@click.option(
-    "--distance",
-    type=Distance(),
-    help="Distance between two cameras' centres in metres, for --points: a,b=4.20.",
-)
-@click.option("--stick", "stick_m", type=float, help="Distance of the two points in metres, for --points.")
-@click.option(
-    "--pairs",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Points of known place instead of a board: camera,point,x_px,y_px,x_m,y_m,z_m. Needs --lenses.",
-)
-@click.option(
-    "--markers",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="ArUco markers of known place instead of a board: a map of their corners. Needs --lenses.",
-)
+@options_of(PointOptions, "points", heading="Instead of a board")
 @noise_option(1.0)
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
 @OUT
 @FORCE
 @reporting
 @JSON
+@pass_output
 def rig(
+    output: Output,
     sources: tuple[Path, ...],
-    kind: str | None,
-    squares_wh: tuple[int, int] | None,
-    square_m: float | None,
-    marker_m: float | None,
-    separation_m: float | None,
-    dictionary: str,
-    first_marker: int,
-    lens: str,
-    same_lens: bool,
-    lenses_path: Path | None,
+    board: BoardOptions,
+    lens: LensOptions,
+    points: PointOptions,
     names: str | None,
     floor: int | None,
     world: Path | None,
-    is_point: bool,
-    distance: tuple[str, str, float] | None,
-    stick_m: float | None,
-    pairs: Path | None,
-    markers: Path | None,
     noise_px: float,
     plot: Path | None,
     out: Path,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
@@ -132,42 +130,42 @@ def rig(
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
     """
-    refuse_to_overwrite(out, force)
+    output.refuse(out)
     modes = {
-        "--squares": squares_wh is not None,
-        "--points": is_point,
-        "--pairs": pairs is not None,
-        "--markers": markers is not None,
+        "--squares": board.squares is not None,
+        "--points": points.points,
+        "--pairs": points.pairs is not None,
+        "--markers": points.markers is not None,
     }
     chosen = [name for name, is_chosen in modes.items() if is_chosen]
     if len(chosen) != 1:
         raise SettingsError(
             "rig", expected=f"one of {', '.join(modes)}", found=" and ".join(chosen) if chosen else "none"
         )
-    if (distance is not None or stick_m is not None) and not is_point:
+    if (points.distance is not None or points.stick_m is not None) and not points.points:
         raise SettingsError("rig", expected="--distance and --stick with --points", found=chosen[0])
-    if not sources and pairs is None:
+    if not sources and points.pairs is None:
         raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
-    if squares_wh is None:
+    if board.squares is None:
         if floor is not None or plot is not None:
             raise SettingsError("rig", expected="--floor and --plot with --squares", found=chosen[0])
-        if is_point:
-            found, points, sentences = calibrate_points(sources, lenses_path, distance, stick_m, world)
-        else:
-            found, points, sentences = calibrate_pairs(
-                sources, pairs, markers, dictionary, lenses_path, noise_px, world
+        if points.points:
+            found, rows, sentences = calibrate_points(
+                sources, lens.lenses, points.distance, points.stick_m, world
             )
-        _write(out, found, force)
-        show_cameras(points, out, quiet, json_path, force, sentences)
+        else:
+            found, rows, sentences = calibrate_pairs(
+                sources, points.pairs, points.markers, board.dictionary, lens.lenses, noise_px, world
+            )
+        _write(output, out, found)
+        show_cameras(output, rows, out, sentences)
         return
     from psotrack.calibration import fit_world, in_new_world, read_world
 
-    board = board_of(kind, squares_wh, square_m, marker_m, separation_m, dictionary, first_marker)
     if world is not None and floor is not None:
         raise SettingsError("rig", expected="--floor or --world", found="both")
     given = None if world is None else read_world(world)
-    lenses = _lenses(lens, same_lens, lenses_path)
-    calibrated, said = _by_board(sources, names, board, lenses, floor, quiet, json_path)
+    calibrated, said = _by_board(output, sources, names, board.board(), lens.choice(), floor)
     if given is None:
         place = (
             f"the board in frame {floor}: its first corner is the origin, z points up"
@@ -178,28 +176,27 @@ def rig(
         with errors_name(given.path):
             change, left_m = fit_world(calibrated.rig, given, with_scale=False)
         calibrated, place = in_new_world(calibrated, change), in_words(given.path, left_m)
-    _write(out, calibrated.rig, force)
+    _write(output, out, calibrated.rig)
     if plot is not None:
         from psotrack.calibration import save_coverage
 
-        save_coverage(plot if plot != Path("") else out.with_suffix(".png"), calibrated, force=force)
-    _report(calibrated, said, place, out, force, quiet, json_path)
+        save_coverage(plot if plot != Path("") else out.with_suffix(".png"), calibrated, force=output.force)
+    _report(output, calibrated, said, place, out)
 
 
-def _write(out: Path, rig: Any, force: bool) -> None:
+def _write(output: Output, out: Path, rig: Any) -> None:
     from psotrack.geometry.rig_files import write_rig
 
-    write_rig(out, rig, force=force)
+    write_rig(out, rig, force=output.force)
 
 
 def _by_board(
+    output: Output,
     sources: tuple[Path, ...],
     names: str | None,
     board: Board,
     lenses: LensChoice,
     floor: int | None,
-    quiet: bool,
-    json_path: Path | None,
 ) -> tuple[CalibratedRig, list[str]]:
     """Calibrate by a board; also sentences on how the board was printed, which are printed at once."""
     from psotrack.calibration import (
@@ -218,7 +215,7 @@ def _by_board(
     else:
         cameras = open_images(sources, names.split(",") if names else None)
         instants = instants_of_numbers(cameras, floor)
-    report = report_to(quiet)
+    report = output.report
     named = f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else f"{sources[0]}"
     with errors_name(named):
         found = find_views(board, cameras, instants, report)
@@ -226,21 +223,13 @@ def _by_board(
     searched = dict(zip(found.views.names, found.searched.tolist(), strict=True))
     said = say_print(found)
     for sentence in [*say_searched({name: (count, every[name]) for name, count in searched.items()}), *said]:
-        print_line(quiet, json_path, sentence)
+        output.say(sentence)
     with errors_name(named):
         calibrated = calibrate_rig(found.recognised.board, found.views, lenses, floor=floor, report=report)
     return calibrated, said
 
 
-def _report(
-    calibrated: CalibratedRig,
-    said: list[str],
-    place: str,
-    out: Path,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
-) -> None:
+def _report(output: Output, calibrated: CalibratedRig, said: list[str], place: str, out: Path) -> None:
     """Print the cameras, the worst views and what to do, or write them as JSON."""
     from psotrack.calibration import advise, figures_of, worst_views
 
@@ -255,32 +244,21 @@ def _report(
         "advice": advice,
         "world": place,
     }
-    output_json(json_path, content, force)
-    _show(rows, quiet, json_path)
+    output.json(content)
+    _show(output, rows)
     models = ", ".join(f"{name} {row.lens}" for name, row in rows.items())
-    print_line(quiet, json_path, f"lens models (distortion coefficients): {models}")
+    output.say(f"lens models (distortion coefficients): {models}")
     views = ", ".join(f"{name} {frame} {residual:.2f}" for name, frame, residual in worst)
-    print_line(quiet, json_path, f"worst views (camera, frame, px): {views}")
+    output.say(f"worst views (camera, frame, px): {views}")
     for sentence in advice:
-        print_line(quiet, json_path, sentence)
-    print_line(quiet, json_path, f"the world is {place}")
-    print_line(quiet, json_path, f"{out}")
+        output.say(sentence)
+    output.say(f"the world is {place}")
+    output.say(f"{out}")
 
 
-def _lenses(lens: str, is_shared: bool, path: Path | None) -> LensChoice:
-    """The lenses of the options."""
-    from psotrack.calibration import LensChoice, known_lenses, parse_lens_model
-    from psotrack.geometry.rig_files import read_lenses
-
-    known = None if path is None else known_lenses(read_lenses(path))
-    return LensChoice(parse_lens_model(lens), known, is_shared)
-
-
-def _show(rows: dict[str, CameraFigures], quiet: bool, json_path: Path | None) -> None:
+def _show(output: Output, rows: dict[str, CameraFigures]) -> None:
     """Table of the cameras."""
-    print_table(
-        quiet,
-        json_path,
+    output.table(
         ("camera", "views", "rms (px)", "f (px)", POSITION, "std (mm)"),
         (
             (

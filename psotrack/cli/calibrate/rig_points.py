@@ -45,7 +45,7 @@ class Distance(click.ParamType):
 def calibrate_points(
     sources: tuple[Path, ...],
     lenses_path: Path | None,
-    distance: tuple[str, str, float] | None,
+    distance: Any,
     stick_m: float | None,
     world: Path | None,
 ) -> tuple[Rig, dict[str, dict[str, Any]], list[str]]:

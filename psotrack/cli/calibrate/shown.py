@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.cli.output import POSITION, finite_or_none, format_numbers, output_json, print_line, print_table
+from psotrack.cli.output import POSITION, Output, finite_or_none, format_numbers
 
 #: Number of points that are shown by name for each camera, those that fit worst.
 _WORST = 5
@@ -43,21 +43,14 @@ def row_of(
 
 
 def show_cameras(
-    rows: dict[str, dict[str, Any]],
-    out: Path,
-    quiet: bool,
-    json_path: Path | None,
-    force: bool,
-    sentences: Sequence[str] = (),
+    output: Output, rows: dict[str, dict[str, Any]], out: Path, sentences: Sequence[str] = ()
 ) -> None:
     """Show the cameras, as JSON or as a table with the points that fit worst, and sentences on them."""
-    output_json(json_path, {"rig": str(out), "cameras": rows, "notes": list(sentences)}, force)
+    output.json({"rig": str(out), "cameras": rows, "notes": list(sentences)})
     adjusted = any("moved_m" in row for row in rows.values())
     # An adjusted camera's movement matters more than its position, and a line has no room for both.
     place = ("moved (mm)", "turned (deg)", "std (mm)", "verdict") if adjusted else (POSITION, "std (mm)")
-    print_table(
-        quiet,
-        json_path,
+    output.table(
         ("camera", "points", "rms (px)", *place),
         (
             (
@@ -71,10 +64,10 @@ def show_cameras(
     )
     # Names of points may be too long for a column.
     for name, row in rows.items():
-        print_line(quiet, json_path, f"{name}, worst points (px): {', '.join(map(_worst, row['worst']))}")
+        output.say(f"{name}, worst points (px): {', '.join(map(_worst, row['worst']))}")
     for sentence in sentences:
-        print_line(quiet, json_path, sentence)
-    print_line(quiet, json_path, f"{out}")
+        output.say(sentence)
+    output.say(f"{out}")
 
 
 def _placed(row: dict[str, Any]) -> tuple[str, str]:

@@ -108,11 +108,13 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         background: name of the background model: "living", "mog2" or a plugin.
         drone_px: width of the smallest drone in the images, pixels; sets the next three where they are None. None: the
             longer side of the images / 48, which is 40 pixels in an image of 1920; smaller drones are found as well.
-        reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`.
+        reduction: each stored value covers `reduction` x `reduction` pixels; a multiple of `working_reduction`;
+            None: from `drone_px`.
         working_reduction: whole factor by which the image is reduced, by area, before the background model sees the
             image; 1 is the full image. None: from `drone_px`; where the rig says that drones of 0.3 m are wide in the
             images (see `usual_drone_px`), the reduction.
-        min_blob_px: 8-connected blobs with fewer pixels of the full image are removed.
+        min_blob_px: 8-connected blobs with fewer pixels of the full image are removed; None: from
+            `drone_px`; 9 for "living" without `drone_px`.
         num_learning_frames: largest number of frames, spread over the video, from which the background is learned.
         learning_rate: learning rate per frame in the second pass of "mog2", in [0, 1]; 0 keeps the learned background.
         var_threshold: squared Mahalanobis distance from the background beyond which a pixel is foreground, for "mog2".
@@ -125,7 +127,7 @@ class SilhouetteSettings(_CommonSettings, frozen=True, kw_only=True, forbid_unkn
         SettingsError: a value is out of range, or belongs to another background model.
     """
 
-    background: str = LIVING
+    background: Annotated[str, Meta(extra={"metavar": "living|mog2|NAME"})] = LIVING
     drone_px: float | None = None
     reduction: _OneOrMore | None = None
     working_reduction: _OneOrMore | None = None

@@ -162,7 +162,7 @@ def _fault(
     if not words:
         return None
     kind = "moved" if moved else "turned" if turned else "side"
-    remedy = "measure it again; `psotrack map-markers --known` with sound markers builds a map from the video"
+    remedy = "measure it again; `psotrack onboard map --known` with sound markers builds a map from the video"
     return MapFinding(kind, (marker,), f"marker {marker}: it is {' and '.join(words)}", remedy)
 
 

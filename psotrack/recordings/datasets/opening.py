@@ -74,7 +74,7 @@ def reference_files(recording: Recording) -> tuple[Path, ...]:
 def _no_recording(path: Path) -> InputError:
     expected = f"a {RECORDING_FILE}, a folder that holds one, or a folder of the DPJAIT dataset"
     if path.suffix.lower() == ARCHIVE_SUFFIX and path.is_file():
-        remedy = f"`psotrack unpack {shlex.quote(f'{path}')} --out FOLDER` makes such a folder"
+        remedy = f"`psotrack archive {shlex.quote(f'{path}')} --out FOLDER` makes such a folder"
         return InputError(path, expected=expected, found="an archive", remedy=remedy)
     if path.suffix.lower() == ".zip" and path.is_file():
         return InputError(path, expected=expected, found="an archive", remedy="unpack it first")

@@ -74,7 +74,7 @@ class PygletPanel:
         window = self._pyglet["window"]
         try:
             self._window = window.Window(
-                *(round(side) for side in size_px), caption="psotrack fly", vsync=False
+                *(round(side) for side in size_px), caption="psotrack simulate fly", vsync=False
             )
         except (
             Exception

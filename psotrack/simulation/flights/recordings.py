@@ -1,4 +1,4 @@
-"""Recorded flights, from motion capture, a simulator or `psotrack fly`: reading, writing and replaying."""
+"""Recorded flights, from motion capture, a simulator or `psotrack simulate fly`: reading, writing and replaying."""
 
 from __future__ import annotations
 

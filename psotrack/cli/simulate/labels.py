@@ -1,4 +1,4 @@
-"""`psotrack labels`: write a training set for detectors from sequences with a reference."""
+"""`psotrack simulate labels`: write a training set for detectors from sequences with a reference."""
 
 from __future__ import annotations
 
@@ -6,21 +6,17 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import (
-    FORCE,
-    JOBS,
-    JSON,
-    Numbers,
-    reporting,
-)
-from psotrack.cli.output import output_json, print_line, report_to
+from psotrack.cli.options import FORCE, JOBS, JSON, out_option, reporting
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import Numbers
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @click.argument(
     "sequences", metavar="SEQ [SEQ ...]", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the training set.")
+@out_option("Folder of the training set.", default=Path("yolo"), show_default=True)
 @click.option(
     "--drone-size",
     "drone_size_m",
@@ -67,7 +63,9 @@ from psotrack.cli.output import output_json, print_line, report_to
 @FORCE
 @reporting
 @JSON
+@pass_output
 def labels(
+    output: Output,
     sequences: tuple[Path, ...],
     out: Path,
     drone_size_m: tuple[float, float, float],
@@ -77,9 +75,6 @@ def labels(
     min_inside: float,
     max_hidden: float,
     jobs: int | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Write a YOLO training set from sequences with a reference.
 
@@ -89,8 +84,8 @@ def labels(
 
     \b
     Examples:
-      psotrack labels data/Simulated_Data/S0* --out yolo --drone-size 0.43,0.43,0.23 --every 5
-      psotrack labels R01_D2 R12_D4 --out yolo --drone-size 0.4,0.4,0.2 --offset 0,0,-0.117 --validation R12_D4
+      psotrack simulate labels data/Simulated_Data/S0* --out yolo --drone-size 0.43,0.43,0.23 --every 5
+      psotrack simulate labels R01_D2 R12_D4 --out yolo --drone-size 0.4,0.4,0.2 --offset 0,0,-0.117 --validation R12_D4
     """
     from psotrack.foreground.detection import DATA_SET, LabelSettings, write_data_set
     from psotrack.recordings.datasets import open_recording
@@ -100,10 +95,10 @@ def labels(
         out,
         LabelSettings(drone_size_m, offset_m, min_inside, max_hidden, every),
         validation=validation.split(",") if validation else (),
-        force=force,
+        force=output.force,
         jobs=jobs,
-        report=report_to(quiet),
+        report=output.report,
     )
-    output_json(json_path, counts, force)
+    output.json(counts)
     shown = "; ".join(f"{part}: {of['images']} images, {of['labels']} labels" for part, of in counts.items())
-    print_line(quiet, json_path, f"{out / DATA_SET}: {shown}")
+    output.say(f"{out / DATA_SET}: {shown}")

@@ -1,26 +1,28 @@
-"""`psotrack localise`: poses of a drone's camera from markers with known positions."""
+"""`psotrack onboard localise`: poses of a drone's camera from markers with known positions."""
 
 from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 
+from psotrack.cli.onboard.shutter import Shutter, shutter_content, shutter_sentence
+from psotrack.cli.onboard.sources import LENS_NAMES, Lenses
 from psotrack.cli.options import (
     FORCE,
-    FOV,
     JSON,
-    SCALE_CAMERA,
     dictionary_option,
     frames_option,
+    out_option,
     plot_option,
     reporting,
 )
-from psotrack.cli.output import check_outputs, output_json, print_line, report_to
-from psotrack.cli.shutter import given_shutter, shutter_content, shutter_options, shutter_sentence
+from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import InputError, SettingsError
 from psotrack.support.interrupts import unhurried_end
 
@@ -47,8 +49,28 @@ class _Input:
     markers: Path | None = None
 
 
-@click.command()
+@dataclass(frozen=True)
+class Poses:
+    """How poses are estimated.
+
+    Attributes:
+        min_markers: smallest number of markers for a pose; poses from fewer than 4 markers are flagged.
+        filter: filter the poses with a motion model.
+        smooth: smooth the path: every pose is estimated from all frames.
+        map_error: standard deviation of each marker's position in the table, in millimetres.
+        focal_error: standard deviation of the focal length, in percent.
+    """
+
+    min_markers: Annotated[int, Meta(ge=1)] = 4
+    filter: bool = True
+    smooth: bool = False
+    map_error: Annotated[float, Meta(ge=0, lt=1000, extra={"metavar": "MM"})] = 0.0
+    focal_error: Annotated[float, Meta(ge=0, lt=100, extra={"metavar": "PERCENT"})] = 0.0
+
+
+@click.command(cls=HelpfulCommand)
 @click.argument("video")
+@out_option("CSV file of the poses, one row per frame.  [default: NAME.csv, by the drone's name]")
 @click.option(
     "--markers",
     type=click.Path(path_type=Path),
@@ -61,62 +83,14 @@ class _Input:
     metavar="METRES",
     help="Side of the markers, if --markers has only their centres.  [default: estimated for each marker]",
 )
-@click.option(
-    "--camera",
-    "camera_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Intrinsics of the camera: .csv, .toml or .yml.  [default: the sequence's]",
-)
-@click.option(
-    "--camera-name", metavar="NAME", help="Name of the camera in FILE, if FILE has several cameras."
-)
-@SCALE_CAMERA
-@FOV
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="CSV file of the poses, one row per frame."
-)
+@options_of(Lenses, "lenses", names=LENS_NAMES)
 @click.option("--drone", metavar="NAME", help="Drone whose video is used, if VIDEO is a sequence's folder.")
 @click.option(
     "--name", metavar="NAME", help="Name of the drone in the table.  [default: --drone, or VIDEO's name]"
 )
 @dictionary_option()
-@click.option(
-    "--min-markers",
-    type=click.IntRange(min=1),
-    default=4,
-    show_default=True,
-    help="Smallest number of markers for a pose; poses from fewer than 4 markers are flagged.",
-)
-@click.option(
-    "--filter/--no-filter",
-    "filtered",
-    default=True,
-    show_default=True,
-    help="Filter the poses with a motion model.",
-)
-@click.option(
-    "--smooth", "smoothed", is_flag=True, help="Smooth the path: every pose is estimated from all frames."
-)
-@click.option(
-    "--map-error",
-    "map_error_mm",
-    type=click.FloatRange(min=0, max=1000, max_open=True),
-    default=0.0,
-    show_default=True,
-    metavar="MM",
-    help="Standard deviation of each marker's position in the table, in millimetres.",
-)
-@click.option(
-    "--focal-error",
-    "focal_error_percent",
-    type=click.FloatRange(min=0, max=100, max_open=True),
-    default=0.0,
-    show_default=True,
-    metavar="PERCENT",
-    help="Standard deviation of the focal length, in percent.",
-)
-@shutter_options
+@options_of(Poses, "poses")
+@options_of(Shutter, "given_shutter")
 @click.option("--fps", type=float, help="Frames per second of a folder of images.")
 @click.option(
     "--live", is_flag=True, help="VIDEO is a camera's number or a stream; always use the newest frame."
@@ -126,32 +100,23 @@ class _Input:
 @FORCE
 @reporting
 @JSON
+@pass_output
 def localise(
+    output: Output,
     video: str,
+    out: Path | None,
     markers: Path | None,
     side_m: float | None,
-    camera_file: Path | None,
-    camera_name: str | None,
-    scale_camera: bool,
-    fov_deg: tuple[float, float] | None,
-    out: Path,
+    lenses: Lenses,
     drone: str | None,
     name: str | None,
     dictionary: str,
-    min_markers: int,
-    filtered: bool,
-    smoothed: bool,
-    map_error_mm: float,
-    focal_error_percent: float,
-    line_time_s: float | None,
-    readout_s: float | None,
+    poses: Poses,
+    given_shutter: Shutter,
     fps: float | None,
     live: bool,
     plot: Path | None,
     num_frames: int | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.
 
@@ -172,14 +137,14 @@ def localise(
 
     \b
     Examples:
-      psotrack localise flight.mp4 --markers corners.csv --camera lens.toml --out track.csv
-      psotrack localise GOPR0017.MP4 --markers corners.csv --fov 92.45,60.83 --out track.csv --smooth
-      psotrack localise data/Simulated_Data/S01_D2_A --drone dron1 --out dron1.csv
-      psotrack localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
-      psotrack localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv --plot
-      psotrack localise phone.mp4 --markers corners.csv --camera lens.yml --readout 0.02 --out track.csv
-      psotrack localise flight.mp4 --markers centres.csv --camera lens.toml --out track.csv --map-error 5
-      psotrack localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
+      psotrack onboard localise flight.mp4 --markers corners.csv --camera lens.toml --out track.csv
+      psotrack onboard localise GOPR0017.MP4 --markers corners.csv --fov 92.45,60.83 --out track.csv --smooth
+      psotrack onboard localise data/Simulated_Data/S01_D2_A --drone dron1 --out dron1.csv
+      psotrack onboard localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
+      psotrack onboard localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv --plot
+      psotrack onboard localise phone.mp4 --markers corners.csv --camera lens.yml --readout 0.02 --out track.csv
+      psotrack onboard localise flight.mp4 --markers centres.csv --camera lens.toml --out track.csv --map-error 5
+      psotrack onboard localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
     """
     from dataclasses import replace
 
@@ -195,13 +160,13 @@ def localise(
         write_camera_path,
     )
     from psotrack.inside_out import localise_video as localise_camera
-    from psotrack.support import refuse_to_overwrite
 
-    check_outputs(out, json_path, force)
-    picture = None if plot is None else plot if plot.name else out.with_suffix(".png")
-    if picture is not None:
-        refuse_to_overwrite(picture, force)
     given = _input(video, drone, fps, live)
+    drone_name = name or given.name
+    out = out or Path(f"{drone_name}.csv")
+    check_suffix("--out", out, ".csv")
+    picture = None if plot is None else plot if plot.name else out.with_suffix(".png")
+    output.refuse(out, picture)
     if markers is None and given.markers is None:
         raise SettingsError("--markers", expected="a table of marker corners", found="none")
     table = Path(str(markers or given.markers))
@@ -213,41 +178,44 @@ def localise(
             raise SettingsError(
                 "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
             )
-    lens = _lens(given, camera_file, camera_name, scale_camera, fov_deg)
+    lens = _lens(given, lenses)
     source = given.source.first(num_frames)
     rows = source.image_size_wh[1]
-    shutter = given_shutter(line_time_s, readout_s, rows, source.fps)
+    shutter = given_shutter.of(rows, source.fps)
     settings = LocaliseSettings(
         dictionary=dictionary,
         pose=PoseSettings(
-            min_markers=min_markers, map_error_m=map_error_mm / 1e3, focal_error=focal_error_percent / 100
+            min_markers=poses.min_markers,
+            map_error_m=poses.map_error / 1e3,
+            focal_error=poses.focal_error / 100,
         ),
-        filter=PoseFilterParams() if filtered else None,
+        filter=PoseFilterParams() if poses.filter else None,
         shutter=shutter,
     ).within(source.num_frames)
     # What a stream has shown is kept: no one can show the stream again.
     with unhurried_end() if source.stream else contextlib.nullcontext():
-        found = localise_camera(
-            source, marker_map, lens, settings, report_to(quiet or json_path == Path("-")), side_m=side_m
-        )
-        if smoothed:
+        found = localise_camera(source, marker_map, lens, settings, output.report, side_m=side_m)
+        if poses.smooth:
             found = replace(found, path=smooth(found.raw, settings.filter))
-        drone_name = name or given.name
-        write_camera_path(out, found.path, drone_name, force=force)
+        write_camera_path(out, found.path, drone_name, force=output.force)
     if picture is not None:
         save_flight(
-            picture, found.path, found.marker_map, caption=f"{drone_name}: {given.source.name}", force=force
+            picture,
+            found.path,
+            found.marker_map,
+            caption=f"{drone_name}: {given.source.name}",
+            force=output.force,
         )
     content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
-    content |= {"track": str(out), "filtered": filtered, "smoothed": smoothed}
+    content |= {"track": str(out), "filtered": poses.filter, "smoothed": poses.smooth}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
     content |= {"shutter": shutter_content(shutter, found.shutter, found.line_time, rows)}
     content |= {"map": "centres" if centres_only else "corners"}
-    output_json(json_path, content, force)
+    output.json(content)
     of_shutter = shutter_sentence(shutter, found.line_time)
-    print_line(quiet, json_path, _sentence(out, content) + (f"; {of_shutter}" if of_shutter else ""))
+    output.say(_sentence(out, content) + (f"; {of_shutter}" if of_shutter else ""))
     for line in _lines_on_map(table, found, centres_only, video):
-        print_line(quiet, json_path, line)
+        output.say(line)
 
 
 def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
@@ -296,19 +264,13 @@ def _nothing_to_localise(folder: Path) -> InputError:
     )
 
 
-def _lens(
-    given: _Input,
-    camera_file: Path | None,
-    camera_name: str | None,
-    scale: bool,
-    fov_deg: tuple[float, float] | None,
-) -> Camera:
-    from psotrack.inside_out import choose_lens, lens_from_matrix
+def _lens(given: _Input, lenses: Lenses) -> Camera:
+    from psotrack.inside_out import lens_from_matrix
 
-    size_wh, K = given.source.image_size_wh, None if given.onboard is None else given.onboard.K
-    if camera_file is None and fov_deg is None and K is not None:
-        return lens_from_matrix(K, size_wh)
-    return choose_lens(size_wh, path=camera_file, fov_deg=fov_deg, name=camera_name, scale=scale)
+    K = None if given.onboard is None else given.onboard.K
+    if lenses.file is None and lenses.fov_deg is None and K is not None:
+        return lens_from_matrix(K, given.source.image_size_wh)
+    return lenses.of(given.source.image_size_wh)
 
 
 def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:
@@ -370,7 +332,7 @@ def _lines_on_map(table: Path, found: LocalisedVideo, centres_only: bool, video:
         names = ", ".join(map(str, wrong))
         lines.append(
             f"{table}: left out, because the other markers of the video say that they are elsewhere: markers {names}; "
-            f"`psotrack map-markers {video} --check {table}` says what is wrong"
+            f"`psotrack onboard map {video} --check {table}` says what is wrong"
         )
     return lines
 

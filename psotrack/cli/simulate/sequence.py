@@ -4,20 +4,57 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tomllib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.options import FORCE, JOBS, JSON, reporting
-from psotrack.cli.output import output_json, print_line, report_to
+from psotrack.cli.options import FORCE, JOBS, JSON, out_option, reporting
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import change_of
 from psotrack.errors import SettingsError, errors_name
 
 
-@click.command()
+@dataclass(frozen=True)
+class Made:
+    """What of a sequence is made.
+
+    Attributes:
+        num_frames: simulate the first N frames only; None: all.
+        scale: scale of the image size; 1 is full size.
+        seed: seed of flights and noise.
+        masks: write drone_masks.zip.
+        onboard: render the videos of on-board cameras.
+    """
+
+    num_frames: Annotated[int, Meta(extra={"metavar": "N"})] | None = None
+    scale: float = 1.0
+    seed: int = 0
+    masks: bool = True
+    onboard: bool = True
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is shown instead of a sequence.
+
+    Attributes:
+        list: list the scenarios, and end.
+        show: print the scenario's file, as a start for your own, and end.
+        preview: save one page of pictures, OUT/NAME.png, instead of the sequence.
+    """
+
+    list: bool = False
+    show: bool = False
+    preview: bool = False
+
+
+@click.command(cls=HelpfulCommand)
 @click.argument("name", required=False)
-@click.option("--out", type=click.Path(path_type=Path), help="Root folder of the data.")
+@out_option("Root folder of the data.  [default: data]")
 @click.option(
     "--scenario",
     "scenario_file",
@@ -37,22 +74,8 @@ from psotrack.errors import SettingsError, errors_name
     is_flag=True,
     help="Add an automatic exposure, a lamp that goes off, a screen and a plant.",
 )
-@click.option("--list", "listed", is_flag=True, help="List the scenarios, and end.")
-@click.option("--show", is_flag=True, help="Print the scenario's file, as a start for your own, and end.")
-@click.option(
-    "--preview", is_flag=True, help="Save one page of pictures, OUT/NAME.png, instead of the sequence."
-)
-@click.option(
-    "--frames", "num_frames", type=int, metavar="N", help="Simulate the first N frames only.  [default: all]"
-)
-@click.option(
-    "--scale", type=float, default=1.0, show_default=True, help="Scale of the image size; 1 is full size."
-)
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of flights and noise.")
-@click.option("--masks/--no-masks", default=True, show_default=True, help="Write drone_masks.zip.")
-@click.option(
-    "--onboard/--no-onboard", default=True, show_default=True, help="Render the videos of on-board cameras."
-)
+@options_of(Shown, "shown")
+@options_of(Made, "made", names={"num_frames": "frames"})
 @click.option(
     "--as-own-cameras",
     "own_cameras",
@@ -63,25 +86,18 @@ from psotrack.errors import SettingsError, errors_name
 @FORCE
 @reporting
 @JSON
-def simulate(
+@pass_output
+def sequence(
+    output: Output,
     name: str | None,
     out: Path | None,
     scenario_file: Path | None,
     changes: tuple[str, ...],
     restless: bool,
-    listed: bool,
-    show: bool,
-    preview: bool,
-    num_frames: int | None,
-    scale: float,
-    seed: int,
-    masks: bool,
-    onboard: bool,
+    shown: Shown,
+    made: Made,
     own_cameras: bool,
     jobs: int | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Simulate a sequence: videos, calibration, ground truth, masks and detections.
 
@@ -99,8 +115,11 @@ def simulate(
       psotrack simulate S02_D4_A --show > mine.toml
       psotrack simulate --scenario mine.toml --out data --set camera_spread.focal_length=0.02
     """
-    if listed:
-        _list(json_path, quiet, force)
+    if shown.list:
+        from psotrack.simulation import catalogue, render
+
+        output.json(catalogue())
+        output.show(render(catalogue()))
         return
     from psotrack.simulation import (
         RESTLESS,
@@ -120,7 +139,7 @@ def simulate(
             found="neither" if name is None else "both",
             remedy="psotrack simulate --list shows the names",
         )
-    if show:
+    if shown.show:
         if name is None:
             raise SettingsError("--show", expected="the NAME of a scenario", found="none")
         for option, found in (("--set", changes[:1]), ("--restless", ("--restless",) * restless)):
@@ -133,57 +152,33 @@ def simulate(
                 )
         click.echo(preset_text(str(name)), nl=False)
         return
-    if out is None:
-        raise SettingsError("--out", expected="the folder to write to", found="none")
+    out = out or Path("data")
     recipe = load(scenario_file) if scenario_file else scenario(str(name))
     recipe = change_scenario(recipe, RESTLESS if restless else {})
-    recipe = change_scenario(recipe, dict(_change(change) for change in changes))
-    if preview:
+    recipe = change_scenario(recipe, dict(map(change_of, changes)))
+    if shown.preview:
         from psotrack.simulation import save_preview
 
         page = save_preview(
             out / f"{recipe.name}.png",
             recipe,
-            num_frames=num_frames,
-            seed=seed,
-            force=force,
+            num_frames=made.num_frames,
+            seed=made.seed,
+            force=output.force,
             jobs=jobs or os.cpu_count() or 1,
-            report=report_to(quiet),
+            report=output.report,
         )
-        output_json(json_path, {"preview": str(page)}, force)
-        print_line(quiet, json_path, f"{page}")
+        output.json({"preview": str(page)})
+        output.say(f"{page}")
         return
     with errors_name(scenario_file) if scenario_file else contextlib.nullcontext():
         folder = (simulate_own_cameras if own_cameras else make)(
             recipe,
             out,
-            SimulationSettings(num_frames, scale, seed, masks, onboard),
-            force=force,
+            SimulationSettings(*vars(made).values()),
+            force=output.force,
             jobs=jobs,
-            report=report_to(quiet),
+            report=output.report,
         )
-    output_json(json_path, {"sequence": str(folder)}, force)
-    print_line(quiet, json_path, f"{folder}")
-
-
-def _list(json_path: Path | None, quiet: bool, force: bool) -> None:
-    from rich.console import Console
-
-    from psotrack.simulation import catalogue, render
-
-    rows = catalogue()
-    output_json(json_path, rows, force)
-    if not quiet and json_path != Path("-"):
-        Console().print(render(rows))
-
-
-def _change(text: str) -> tuple[str, Any]:
-    """Field and value of `FIELD=VALUE`; the value is parsed as TOML, and kept as a string if it is not valid TOML."""
-    field, equals, value = text.partition("=")
-    if not equals or not field.strip():
-        raise SettingsError("--set", expected="FIELD=VALUE, such as imaging.shutter_s=0.01", found=text)
-    try:
-        return field.strip(), tomllib.loads(f"value = {value}")["value"]
-    except ValueError:
-        # Not valid TOML, or an integer of thousands of digits.
-        return field.strip(), value
+    output.json({"sequence": str(folder)})
+    output.say(f"{folder}")

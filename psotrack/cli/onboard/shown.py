@@ -1,4 +1,4 @@
-"""Tables and JSON of `map-markers`."""
+"""Tables and JSON of `onboard map`."""
 
 from __future__ import annotations
 
@@ -7,25 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psotrack.cli.output import POSITION, finite_or_none, format_numbers, output_json, print_line, print_table
-from psotrack.cli.shutter import shutter_content, shutter_sentence
+from psotrack.cli.onboard.shutter import shutter_content, shutter_sentence
+from psotrack.cli.output import POSITION, Output, finite_or_none, format_numbers
 
 if TYPE_CHECKING:
     from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap, RollingShutter
 
 
-def show_measured(
-    squares: FittedSquares, out: Path, quiet: bool, json_path: Path | None, force: bool
-) -> None:
+def show_measured(output: Output, squares: FittedSquares, out: Path) -> None:
     """Show a map from measured corners, and the distances of the corners from squares."""
     rows = {
         marker: {**_place(squares.marker_map, marker), "residual_m": squares.residual_m[marker].tolist()}
         for marker in squares.marker_map.ids.tolist()
     }
-    output_json(json_path, {"map": str(out), "reordered": list(squares.reordered), "markers": rows}, force)
-    print_table(
-        quiet,
-        json_path,
+    output.json({"map": str(out), "reordered": list(squares.reordered), "markers": rows})
+    output.table(
         ("marker", POSITION, "side (mm)", "corners off (mm)"),
         [
             (
@@ -38,25 +34,13 @@ def show_measured(
         ],
     )
     for marker in squares.reordered:
-        print_line(
-            quiet,
-            json_path,
-            f"marker {marker}: its corners were labelled in another order; the order was corrected",
-        )
+        output.say(f"marker {marker}: its corners were labelled in another order; the order was corrected")
     worst = max(max(row["residual_m"]) for row in rows.values())
-    print_line(
-        quiet, json_path, f"{out}: {len(rows)} markers, corners within {1e3 * worst:.1f} mm of squares"
-    )
+    output.say(f"{out}: {len(rows)} markers, corners within {1e3 * worst:.1f} mm of squares")
 
 
 def show_built(
-    built: BuiltMap,
-    rows_px: dict[str, int],
-    given: RollingShutter | None,
-    out: Path,
-    quiet: bool,
-    json_path: Path | None,
-    force: bool,
+    output: Output, built: BuiltMap, rows_px: dict[str, int], given: RollingShutter | None, out: Path
 ) -> None:
     """Show a map from videos, with the standard deviation of each marker's position.
 
@@ -65,7 +49,6 @@ def show_built(
         rows_px: height of the images by video.
         given: the shutter that the options give.
         out: table of the map.
-        quiet, json_path, force: as in `cli.output`.
     """
     rows = {}
     for index, marker in enumerate(built.ids.tolist()):
@@ -88,10 +71,8 @@ def show_built(
         "unplaced": list(built.unplaced),
         "markers": rows,
     }
-    output_json(json_path, content, force)
-    print_table(
-        quiet,
-        json_path,
+    output.json(content)
+    output.table(
         ("marker", "frames", "left out", "rms (px)", POSITION, "std (mm)", "turn std (deg)"),
         [
             (
@@ -108,21 +89,15 @@ def show_built(
     )
     if built.unplaced:
         names = ", ".join(map(str, built.unplaced))
-        print_line(quiet, json_path, f"not placed, because too rarely seen beside other markers: {names}")
+        output.say(f"not placed, because too rarely seen beside other markers: {names}")
     for name, shown in zip(rows_px, built.line_times, strict=True):
         if of_shutter := shutter_sentence(given, shown):
-            print_line(quiet, json_path, f"{name}: {of_shutter}")
-    print_line(quiet, json_path, f"{out}: {len(rows)} markers from {built.num_views} frames")
+            output.say(f"{name}: {of_shutter}")
+    output.say(f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 
 def show_check(
-    checkup: MapCheck,
-    rows_px: dict[str, int],
-    given: RollingShutter | None,
-    path: Path,
-    quiet: bool,
-    json_path: Path | None,
-    force: bool,
+    output: Output, checkup: MapCheck, rows_px: dict[str, int], given: RollingShutter | None, path: Path
 ) -> None:
     """Show the markers of a map that videos see elsewhere.
 
@@ -131,7 +106,6 @@ def show_check(
         rows_px: height of the images by video.
         given: the shutter that the options give.
         path: table of the map.
-        quiet, json_path, force: as in `cli.output`.
     """
     rows = {
         marker: {
@@ -154,10 +128,8 @@ def show_check(
         "shutter": _shutters(checkup, rows_px, given),
         "markers": rows,
     }
-    output_json(json_path, content, force)
-    print_table(
-        quiet,
-        json_path,
+    output.json(content)
+    output.table(
         ("marker", "frames", "median off (px)"),
         [
             (
@@ -170,11 +142,11 @@ def show_check(
     )
     for name, shown in zip(rows_px, checkup.line_times, strict=True):
         if of_shutter := shutter_sentence(given, shown, "the check uses the given one"):
-            print_line(quiet, json_path, f"{name}: {of_shutter}")
+            output.say(f"{name}: {of_shutter}")
     for finding in checkup.findings:
-        print_line(False, json_path, str(finding))
+        output.say(str(finding))
     if not checkup.findings:
-        print_line(quiet, json_path, f"{path}: nothing disagrees")
+        output.say(f"{path}: nothing disagrees")
 
 
 def _shutters(

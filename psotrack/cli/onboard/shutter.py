@@ -3,81 +3,66 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
+from msgspec import Meta
 
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
     from psotrack.inside_out import LineTime, RollingShutter
 
-Command = Callable[..., Any]
 
+@dataclass(frozen=True)
+class Shutter:
+    """The rolling shutter of a camera.
 
-def shutter_options(command: Command) -> Command:
-    """Add `--line-time` and `--readout`."""
-    for option in (
-        click.option(
-            "--readout",
-            "readout_s",
-            type=float,
-            metavar="S",
-            help="Time that the camera takes to expose all rows of a frame one after the other, seconds; instead of"
-            " --line-time.",
-        ),
-        click.option(
-            "--line-time",
-            "line_time_s",
-            type=float,
-            metavar="S",
-            help="Rolling shutter: time from the exposure of one row to that of the next row, seconds; 0 is a global"
-            " shutter.  [default: estimated from the video]",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
-def given_shutter(
-    line_time_s: float | None, readout_s: float | None, rows: int, fps: float | None
-) -> RollingShutter | None:
-    """The shutter that the options give; None if neither is given.
-
-    Args:
-        line_time_s: value of `--line-time`.
-        readout_s: value of `--readout`.
-        rows: height of the images, pixels.
-        fps: frames per second; None if unknown.
-
-    Raises:
-        SettingsError: both options are given, or a value is negative, not finite, or longer than a frame allows.
+    Attributes:
+        line_time_s: time from the exposure of one row to that of the next row, seconds; 0 is a global shutter; None:
+            estimated from the video.
+        readout_s: time that the camera takes to expose all rows of a frame one after the other, seconds; instead of
+            `line_time_s`.
     """
-    from psotrack.inside_out import RollingShutter
 
-    if line_time_s is not None and readout_s is not None:
-        raise SettingsError(
-            "--line-time",
-            expected="--line-time or --readout, which say the same",
-            found=f"both, {line_time_s:g} and {readout_s:g}",
-        )
-    name, value = ("--line-time", line_time_s) if readout_s is None else ("--readout", readout_s)
-    if value is None:
-        return None
-    largest = math.inf if fps is None else 1 / fps / (rows if readout_s is None else 1)
-    if not 0 <= value <= largest * (1 + 1e-9) or not math.isfinite(value):
-        of_frame = "" if fps is None else f", the time between two frames at {fps:g} frames per second"
-        of_rows = f" ({rows} rows take {value * rows:.3g} s)" if readout_s is None and value > largest else ""
-        most = "" if fps is None else f" to {largest:.3g} s"
-        share = f", {rows} rows in {1 / fps:.3g} s" if readout_s is None and fps is not None else ""
-        raise SettingsError(
-            name,
-            expected=f"0{most or ' s or more'}{share}{of_frame}",
-            found=f"{value:g}{of_rows}",
-            remedy="the unit is seconds",
-        )
-    return RollingShutter(value if readout_s is None else value / rows)
+    line_time_s: Annotated[float, Meta(extra={"metavar": "S"})] | None = None
+    readout_s: Annotated[float, Meta(extra={"metavar": "S"})] | None = None
+
+    def of(self, rows: int, fps: float | None) -> RollingShutter | None:
+        """The shutter; None if neither option is given.
+
+        Args:
+            rows: height of the images, pixels.
+            fps: frames per second; None if unknown.
+
+        Raises:
+            SettingsError: both are given, or a value is negative, not finite, or longer than a frame allows.
+        """
+        from psotrack.inside_out import RollingShutter
+
+        if self.line_time_s is not None and self.readout_s is not None:
+            raise SettingsError(
+                "--line-time",
+                expected="--line-time or --readout, which say the same",
+                found=f"both, {self.line_time_s:g} and {self.readout_s:g}",
+            )
+        by_row = self.readout_s is None
+        name, value = ("--line-time", self.line_time_s) if by_row else ("--readout", self.readout_s)
+        if value is None:
+            return None
+        largest = math.inf if fps is None else 1 / fps / (rows if by_row else 1)
+        if not 0 <= value <= largest * (1 + 1e-9) or not math.isfinite(value):
+            of_frame = "" if fps is None else f", the time between two frames at {fps:g} frames per second"
+            of_rows = f" ({rows} rows take {value * rows:.3g} s)" if by_row and value > largest else ""
+            most = "" if fps is None else f" to {largest:.3g} s"
+            share = f", {rows} rows in {1 / fps:.3g} s" if by_row and fps is not None else ""
+            raise SettingsError(
+                name,
+                expected=f"0{most or ' s or more'}{share}{of_frame}",
+                found=f"{value:g}{of_rows}",
+                remedy="the unit is seconds",
+            )
+        return RollingShutter(value if by_row else value / rows)
 
 
 def shutter_content(

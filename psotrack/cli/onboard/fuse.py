@@ -1,4 +1,4 @@
-"""`psotrack fuse`: fuse the paths of on-board cameras with the tracks of static cameras."""
+"""`psotrack onboard fuse`: fuse the paths of on-board cameras with the tracks of static cameras."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, QUIET
-from psotrack.cli.output import check_outputs, output_json, print_line
+from psotrack.cli.options import FORCE, JSON, QUIET, out_option
+from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, check_positive
 
 if TYPE_CHECKING:
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
     from psotrack.trajectories import Trajectories
 
 
-@click.command()
+@click.command(cls=HelpfulCommand)
 @click.argument("inside", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.argument("outside", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="CSV file of the fused tracks.")
+@out_option("CSV file of the fused tracks.  [default: fused.csv beside OUTSIDE]")
 @click.option(
     "--at",
     "point",
@@ -40,35 +41,36 @@ if TYPE_CHECKING:
 @FORCE
 @QUIET
 @JSON
+@pass_output
 def fuse(
+    output: Output,
     inside: tuple[Path, ...],
     outside: Path,
-    out: Path,
+    out: Path | None,
     point: Any,
     max_offset_s: float | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
 ) -> None:
     """Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.
 
-    INSIDE are files of `psotrack localise`, one per drone. OUTSIDE is a file of `psotrack track`; its drones may have
-    other names. Positions are weighted by their covariances. The command estimates the scales of the covariances and
-    the lever arm from the camera to the middle of the drone, and assigns the tracks to the drones. Drones that occur
-    in one input only are kept unchanged. If no track is near any path, the files are not of one recording: nothing is
-    written.
+    INSIDE are files of `psotrack onboard localise`, one per drone. OUTSIDE is a file of `psotrack track`; its drones
+    may have other names. Positions are weighted by their covariances. The command estimates the scales of the
+    covariances and the lever arm from the camera to the middle of the drone, and assigns the tracks to the drones.
+    Drones that occur in one input only are kept unchanged. If no track is near any path, the files are not of one
+    recording: nothing is written.
 
     \b
     Examples:
-      psotrack fuse dron1.csv dron2.csv tracks.csv --out fused.csv
-      psotrack fuse dron1.csv tracks.csv --out fused.csv --max-offset 5 --json -
+      psotrack onboard fuse dron1.csv dron2.csv tracks.csv --out fused.csv
+      psotrack onboard fuse dron1.csv tracks.csv --out fused.csv --max-offset 5 --json -
       psotrack evaluate fused.csv data/Simulated_Data/S01_D2_A
     """
     from psotrack.inside_out import fuse as fuse_paths
     from psotrack.inside_out import read_camera_path, write_fused
-    from psotrack.trajectories import read_trajectories
+    from psotrack.recordings.exchange import read_tracks
 
-    check_outputs(out, json_path, force)
+    out = out or outside.with_name("fused.csv")
+    check_suffix("--out", out, ".csv")
+    output.refuse(out)
     if max_offset_s is not None:
         check_positive("--max-offset", max_offset_s)
     paths: dict[str, CameraPath] = {}
@@ -77,7 +79,7 @@ def fuse(
         if name in paths:
             raise InputError(file, expected="the path of another drone", found=f"a second path of {name}")
         paths[name] = path
-    tracks = read_trajectories(outside)
+    tracks = read_tracks(outside)
     if not any(path.seen.any() for path in paths.values()):
         where = ", ".join(map(str, inside))
         raise InputError(where, expected="a pose in at least one frame", found="none")
@@ -87,20 +89,16 @@ def fuse(
         _check_times(paths, tracks, outside)
     fused = fuse_paths(paths, tracks, point=point, max_offset_s=max_offset_s)
     _check_near(fused, outside)
-    write_fused(out, fused, force=force)
-    output_json(json_path, _content(fused), force)
+    write_fused(out, fused, force=output.force)
+    output.json(_content(fused))
     for drone in fused.drones:
-        print_line(quiet, json_path, _sentence(drone))
+        output.say(_sentence(drone))
     for exchange in fused.identity_swaps:
-        print_line(
-            quiet,
-            json_path,
-            f"from frame {exchange.frame}: {exchange.drone} is track {exchange.after} instead of {exchange.before}",
+        output.say(
+            f"from frame {exchange.frame}: {exchange.drone} is track {exchange.after} instead of {exchange.before}"
         )
-    print_line(
-        quiet,
-        json_path,
-        f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames{_doubt(fused)}",
+    output.say(
+        f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames{_doubt(fused)}"
     )
 
 

@@ -1,4 +1,4 @@
-"""`psotrack as-real`: convert a simulated sequence to the form of the dataset's real half."""
+"""`psotrack simulate as-real`: convert a simulated sequence to the form of the dataset's real half."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, SEQUENCE, reporting
-from psotrack.cli.output import output_json, print_line, report_to
+from psotrack.cli.options import FORCE, JSON, SEQUENCE, out_option, reporting
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
 
 
-@click.command("as-real")
+@click.command("as-real", cls=HelpfulCommand)
 @SEQUENCE
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Root folder of the data.")
+@out_option("Root folder of the data.", default=Path("data"), show_default=True)
 @click.option(
     "--offset",
     "offset_s",
@@ -31,16 +32,9 @@ from psotrack.cli.output import output_json, print_line, report_to
 @FORCE
 @reporting
 @JSON
+@pass_output
 def as_real(
-    sequence: Path,
-    out: Path,
-    offset_s: float,
-    rate_hz: float,
-    three_videos: bool,
-    seed: int,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
+    output: Output, sequence: Path, out: Path, offset_s: float, rate_hz: float, three_videos: bool, seed: int
 ) -> None:
     """Write the simulated sequence SEQ in the form of the dataset's real half.
 
@@ -51,7 +45,7 @@ def as_real(
     \b
     Example:
       psotrack simulate S02_D4_A --set cameras=laboratory_corners --no-masks --no-onboard --out data
-      psotrack as-real data/Simulated_Data/S02_D4_A --out data
+      psotrack simulate as-real data/Simulated_Data/S02_D4_A --out data
     """
     from psotrack.simulation import RealFormSettings, write_as_real
 
@@ -59,8 +53,8 @@ def as_real(
         sequence,
         out,
         RealFormSettings(rate_hz, offset_s, three_videos, seed),
-        force=force,
-        report=report_to(quiet),
+        force=output.force,
+        report=output.report,
     )
-    output_json(json_path, {"sequence": str(folder)}, force)
-    print_line(quiet, json_path, f"{folder}")
+    output.json({"sequence": str(folder)})
+    output.say(f"{folder}")

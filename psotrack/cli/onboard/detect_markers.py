@@ -1,4 +1,4 @@
-"""`psotrack detect-markers`: ArUco markers and AprilTags in photographs and videos."""
+"""`psotrack onboard detect`: ArUco markers and AprilTags in photographs and videos."""
 
 from __future__ import annotations
 
@@ -13,31 +13,28 @@ from psotrack.cli.options import (
     JSON,
     dictionary_option,
     frames_option,
+    out_option,
     reporting,
 )
-from psotrack.cli.output import check_outputs, output_json, print_line, report_to
+from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from psotrack.inside_out.detection import DetectedMarkers
 
 
-@click.command()
+@click.command("detect", cls=HelpfulCommand)
 @click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="CSV file of the markers.")
+@out_option("CSV file of the markers.", default=Path("markers.csv"), show_default=True)
 @dictionary_option("4x4_50")
 @frames_option
 @FORCE
 @reporting
 @JSON
+@pass_output
 def detect_markers(
-    images: tuple[Path, ...],
-    out: Path,
-    dictionary: str,
-    num_frames: int | None,
-    force: bool,
-    quiet: bool,
-    json_path: Path | None,
+    output: Output, images: tuple[Path, ...], out: Path, dictionary: str, num_frames: int | None
 ) -> None:
     """Find the ArUco markers and AprilTags in IMAGES, and their corners.
 
@@ -51,27 +48,28 @@ def detect_markers(
 
     \b
     Examples:
-      psotrack detect-markers photo.jpg --dictionary 4x4_50 --out markers.csv
-      psotrack detect-markers photos --dictionary apriltag_36h11 --out markers.csv
-      psotrack detect-markers a.jpg b.png c.tif --dictionary 6x6_250 --out markers.csv --json -
-      psotrack detect-markers flight.mp4 --dictionary 4x4_1000 --out markers.csv --frames 100
+      psotrack onboard detect photo.jpg --dictionary 4x4_50 --out markers.csv
+      psotrack onboard detect photos --dictionary apriltag_36h11 --out markers.csv
+      psotrack onboard detect a.jpg b.png c.tif --dictionary 6x6_250 --out markers.csv --json -
+      psotrack onboard detect flight.mp4 --dictionary 4x4_1000 --out markers.csv --frames 100
     """
     from psotrack.foreground.detection import marker_dictionary
     from psotrack.inside_out import markers_of_images, markers_of_video, open_source, write_marker_table
 
-    check_outputs(out, json_path, force)
+    check_suffix("--out", out, ".csv")
+    output.refuse(out)
     marker_dictionary(dictionary)
     photographs = _photographs(images)
     found: list[DetectedMarkers]
     if photographs is None:
         names, what = None, "frames"
-        found = list(markers_of_video(open_source(images[0]).first(num_frames), dictionary, report_to(quiet)))
+        found = list(markers_of_video(open_source(images[0]).first(num_frames), dictionary, output.report))
     else:
         if num_frames is not None:
             raise SettingsError("--frames", expected="a video", found="images")
         names, what = _names(photographs), "images"
-        found = list(markers_of_images(photographs, dictionary, report_to(quiet)))
-    write_marker_table(out, found, names, force=force)
+        found = list(markers_of_images(photographs, dictionary, output.report))
+    write_marker_table(out, found, names, force=output.force)
     counts = Counter(marker for markers in found for marker in markers.ids.tolist())
     showing = sum(len(markers) > 0 for markers in found)
     content = {
@@ -82,10 +80,10 @@ def detect_markers(
         "markers": counts.total(),
         "by_id": {f"{marker}": count for marker, count in sorted(counts.items())},
     }
-    output_json(json_path, content, force)
+    output.json(content)
     doubt = "" if counts else "; check that --dictionary names the printed markers"
     sentence = f"{out}: {counts.total()} markers in {showing} of {len(found)} {what}{doubt}"
-    print_line(quiet, json_path, sentence)
+    output.say(sentence)
 
 
 def _photographs(images: tuple[Path, ...]) -> list[Path] | None:

@@ -1,16 +1,18 @@
-"""Inputs of `map-markers`: the corners of known markers, and videos with their lenses."""
+"""Inputs of `onboard map`: the corners of known markers, and videos with their lenses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+from msgspec import Meta
 
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from psotrack.geometry import Camera
     from psotrack.recordings import VideoInfo
 
@@ -51,15 +53,22 @@ def known_corners(
 
 @dataclass(frozen=True)
 class Lenses:
-    """Options that give the lenses of the videos."""
+    """Options that give the lenses of the videos.
 
-    file: Path | None
-    names: str | None
-    scale: bool
-    fov_deg: tuple[float, float] | None
+    Attributes:
+        file: intrinsics of the cameras: .csv, .toml or .yml; None: the sequence's.
+        names: names of the cameras in the file, if it has several: one for all videos, or one for each video.
+        scale: scale the intrinsics to the size of the images; both must show the same field of view.
+        fov_deg: horizontal and vertical field of view in degrees, instead of intrinsics.
+    """
 
-    def of(self, video: VideoInfo, index: int, count: int) -> Camera:
-        """Lens of a video, number `index` of `count` videos."""
+    file: Path | None = None
+    names: Annotated[str, Meta(extra={"metavar": "NAME,NAME..."})] | None = None
+    scale: bool = False
+    fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
+
+    def of(self, size_wh: tuple[int, int], index: int = 0, count: int = 1) -> Camera:
+        """Lens of video number `index` of `count` videos, whose images have `size_wh` pixels."""
         from psotrack.inside_out import choose_lens
 
         names = [None] if self.names is None else self.names.split(",")
@@ -67,9 +76,11 @@ class Lenses:
             expected = f"one name, or one for each of {count} videos"
             raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
         name = names[index % len(names)]
-        return choose_lens(
-            video.image_size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale
-        )
+        return choose_lens(size_wh, path=self.file, fov_deg=self.fov_deg, name=name, scale=self.scale)
+
+
+#: Names of the options of `Lenses`.
+LENS_NAMES = {"file": "camera", "names": "camera-name", "scale": "scale-camera"}
 
 
 def videos_of(
@@ -88,7 +99,8 @@ def videos_of(
     rates = [fps or (PICTURES_FPS if is_picture_folder(path) else None) for path in sources]
     infos = [open_video(path, rate) for path, rate in zip(sources, rates, strict=True)]
     return {
-        str(video.path): (video, lenses.of(video, index, len(infos))) for index, video in enumerate(infos)
+        str(video.path): (video, lenses.of(video.image_size_wh, index, len(infos)))
+        for index, video in enumerate(infos)
     }
 
 
@@ -109,7 +121,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, 
     for index, name in enumerate(chosen):
         video, K = onboard[name].video, onboard[name].K
         if K is None or lenses.file is not None or lenses.fov_deg is not None:
-            lens = lenses.of(video, index, len(chosen))
+            lens = lenses.of(video.image_size_wh, index, len(chosen))
         else:
             lens = lens_from_matrix(K, video.image_size_wh)
         videos[name] = (video, lens)

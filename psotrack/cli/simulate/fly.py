@@ -1,4 +1,4 @@
-"""`psotrack fly`: fly a simulated drone by hand and record the flight for scenarios."""
+"""`psotrack simulate fly`: fly a simulated drone by hand and record the flight for scenarios."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, QUIET, Numbers
+from psotrack.cli.options import FORCE, QUIET, out_option
+from psotrack.cli.output import Output, pass_output
+from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import Numbers
 from psotrack.errors import errors_name
-from psotrack.support import refuse_to_overwrite
 from psotrack.support.interrupts import unhurried_end
 
 
-@click.command()
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FILE.csv",
-    help="CSV file of the recorded flight.",
+@click.command(cls=HelpfulCommand)
+@out_option(
+    "CSV file of the recorded flight.", default=Path("flight.csv"), show_default=True, metavar="FILE.csv"
 )
 @click.option(
     "--device",
@@ -57,27 +55,27 @@ from psotrack.support.interrupts import unhurried_end
 )
 @FORCE
 @QUIET
+@pass_output
 def fly(
+    output: Output,
     out: Path,
     device: str,
     rate_hz: float,
     hall: str,
     start_m: tuple[float, float, float],
     max_seconds: float,
-    force: bool,
-    quiet: bool,
 ) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in
     .sticks.csv. --device repeats a flight from such a file. The buttons start and back, the key Esc and Ctrl-C end the
-    flight; the flight until then is kept. Controllers and the keyboard need: pip install 'psotrack[control]'
+    flight; the flight until then is kept. Controllers and the keyboard need: pip install '.[control]'
 
     \b
     Examples:
-      psotrack fly --out loop.csv --device gamepad
-      psotrack fly --out loop.csv --device keyboard --start -2,0,1.5
-      psotrack fly --out again.csv --device loop.sticks.csv --start -2,0,1.5 --rate 100
+      psotrack simulate fly --out loop.csv --device gamepad
+      psotrack simulate fly --out loop.csv --device keyboard --start -2,0,1.5
+      psotrack simulate fly --out again.csv --device loop.sticks.csv --start -2,0,1.5 --rate 100
     """
     import numpy as np
 
@@ -85,8 +83,7 @@ def fly(
     from psotrack.simulation.flights import devices, piloting
 
     sticks_path = out.with_suffix(".sticks.csv")
-    refuse_to_overwrite(out, force)
-    refuse_to_overwrite(sticks_path, force)
+    output.refuse(out, sticks_path)
     space = flight_space(hall)
     start = np.array(start_m)
     piloting.check(start, space, rate_hz)
@@ -98,7 +95,8 @@ def fly(
         recorded = flown.recorded
         write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
         piloting.write_sticks(sticks_path, flown.samples)
-    if not quiet:
-        click.echo(f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s")
-        click.echo(f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}')
-        click.echo(f"the same again: --device {sticks_path}, with the same --start and --hall")
+    output.say(
+        f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s",
+        f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}',
+        f"the same again: --device {sticks_path}, with the same --start and --hall",
+    )

@@ -1,0 +1,163 @@
+"""The command `psotrack onboard map`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import click
+from msgspec import Meta
+
+from psotrack.cli.onboard.shown import show_built, show_check, show_measured
+from psotrack.cli.onboard.shutter import Shutter
+from psotrack.cli.onboard.sources import LENS_NAMES, PICTURES_FPS, Lenses, known_corners, leading, videos_of
+from psotrack.cli.options import FORCE, JSON, dictionary_option, frames_option, out_option, reporting
+from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.errors import SettingsError, check_positive
+
+#: Exit code if a marker of a map was reported.
+FOUND = 1
+#: Suffixes of files with measured corners; all other files are videos.
+_MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
+
+
+@dataclass(frozen=True)
+class World:
+    """The markers that define the world, and how large markers are.
+
+    Attributes:
+        known: markers that define the world's axes: markers in `markers`, or one marker with a `side_m`.
+        markers: table with the corners of the known markers; None: SEQ's, if there is no --side.
+        side_m: side of the markers' black squares, in metres.
+        estimate_sides: estimate the sides of unknown markers, too.
+        seen_from_m: position that all measured markers face, in metres; None: the mean of their corners.
+    """
+
+    known: Annotated[str, Meta(extra={"metavar": "ID,ID..."})] | None = None
+    markers: Path | None = None
+    side_m: float | None = None
+    estimate_sides: bool = False
+    seen_from_m: Annotated[tuple[float, float, float], Meta(extra={"metavar": "X,Y,Z"})] | None = None
+
+
+@click.command("map", cls=HelpfulCommand)
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@out_option("Table of corners to write.  [default: aruco_corners.csv]")
+@click.option(
+    "--check",
+    "checked",
+    type=click.Path(path_type=Path),
+    metavar="MAP",
+    help="Check the table MAP instead of writing one.",
+)
+@options_of(World, "world")
+@click.option(
+    "--drone",
+    "drones",
+    metavar="NAME,NAME...",
+    help="Drones of a sequence whose videos are used.  [default: all]",
+)
+@options_of(Lenses, "lenses", names=LENS_NAMES)
+@dictionary_option()
+@options_of(Shutter, "given_shutter")
+@click.option(
+    "--fps",
+    type=float,
+    help=f"Frames per second of folders of images, on which only the time from row to row depends.  "
+    f"[default: {PICTURES_FPS:g}]",
+)
+@frames_option
+@FORCE
+@reporting
+@JSON
+@pass_output
+def map_markers(
+    output: Output,
+    sources: tuple[Path, ...],
+    out: Path | None,
+    checked: Path | None,
+    world: World,
+    drones: str | None,
+    lenses: Lenses,
+    dictionary: str,
+    given_shutter: Shutter,
+    fps: float | None,
+    num_frames: int | None,
+) -> None:
+    """Write the table of a room's marker corners from SOURCE, or check such a table.
+
+    SOURCE is a .c3d file or a table of measured corners with labels such as Marker7:1, or videos of the room, each a
+    file or a folder of images, or a sequence whose drones carry cameras. In videos, markers are placed relative to the
+    --known markers. Known markers that --markers lists keep their corners. A single known marker with a --side defines
+    the world: origin in the marker's centre, x to its right, y up, z out of the print.
+
+    --check MAP reports the markers of MAP that videos see elsewhere. The exit code is then 1 if a marker was reported.
+
+    Most cameras expose the rows of a frame one after the other (rolling shutter). The time from row to row is estimated
+    from each video, unless --line-time or --readout gives it for all.
+
+    \b
+    Examples:
+      psotrack onboard map room.c3d --out corners.csv
+      psotrack onboard map walk.mp4 --known 7 --side 0.2 --camera lens.toml --out corners.csv
+      psotrack onboard map a.mp4 b.mp4 --known 7,12 --markers measured.csv --fov 92.45,60.83 --out corners.csv
+      psotrack onboard map photos/ --known 7 --side 0.2 --camera lens.toml --out corners.csv
+      psotrack onboard map data/Simulated_Data/S01_D2_A --drone dron1 --known 7 --out corners.csv --json -
+      psotrack onboard map data/Simulated_Data/S01_D2_A --check corners.csv
+    """
+    from psotrack.inside_out import (
+        build_map,
+        check_map,
+        find_sightings,
+        fit_squares,
+        read_marker_map,
+        read_measured_corners,
+    )
+    from psotrack.recordings.datasets.dpjait import write_marker_corners
+
+    if out is not None and checked is not None:
+        raise SettingsError("onboard map", expected="--out FILE or --check MAP", found="both")
+    if checked is None:
+        out = out or Path("aruco_corners.csv")
+        check_suffix("--out", out, ".csv")
+        output.refuse(out)
+    if world.side_m is not None:
+        check_positive("--side", world.side_m)
+    if fps is not None:
+        check_positive("--fps", fps)
+    if out is not None and sources[0].suffix.lower() in _MEASURED:
+        if len(sources) > 1:
+            raise SettingsError(
+                "SOURCE", expected="one file of measured corners", found=f"{len(sources)} files"
+            )
+        import numpy as np
+
+        viewer = None if world.seen_from_m is None else np.array(world.seen_from_m)
+        measured = fit_squares(read_measured_corners(sources[0]), side_m=world.side_m, seen_from_m=viewer)
+        write_marker_corners(out, measured.marker_map.corners_m)
+        show_measured(output, measured, out)
+        return
+    # Errors of small files are found before the videos are read, which takes long.
+    marker_map = None if checked is None else read_marker_map(checked)
+    known = {} if out is None else known_corners(world.known, world.markers, world.side_m, sources)
+    videos = videos_of(sources, drones, lenses, fps)
+    videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
+    shutter = None
+    for video, _ in videos.values():
+        shutter = given_shutter.of(video.image_size_wh[1], video.fps)
+    sightings = find_sightings(list(videos.values()), dictionary, consecutive=True, report=output.report)
+    rows = {name: video.image_size_wh[1] for name, (video, _) in videos.items()}
+    if marker_map is not None:
+        checkup = check_map(sightings, marker_map, shutter)
+        show_check(output, checkup, rows, shutter, Path(str(checked)))
+        if checkup.findings:
+            sys.exit(FOUND)
+    elif out is not None:
+        built = build_map(
+            sightings, known, side_m=world.side_m, estimate_sides=world.estimate_sides, shutter=shutter
+        )
+        write_marker_corners(out, built.marker_map.corners_m)
+        show_built(output, built, rows, shutter, out)
