@@ -20,7 +20,15 @@ from .files import (
 )
 from .html import html_block, html_lines, html_paths, html_table
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
-from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
+from .plugins import (
+    PluginKind,
+    check_interface,
+    identify,
+    lasting_name,
+    make_plugin,
+    plugin_names,
+    register_plugin,
+)
 from .processes import map_in_processes, with_traceback, worker_processes
 from .program_seals import is_whole_program
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
@@ -70,6 +78,7 @@ __all__ = [
     "is_whole_program",
     "joined",
     "keep_compiled",
+    "lasting_name",
     "left_over",
     "load_ahead",
     "make_plugin",
