@@ -58,7 +58,7 @@ def main() -> None:
         cache = ("--cache", root / "cache")
         run("simulate", SCENARIO, "--out", root, "--frames", options.frames, "--scale", options.scale)
         run("track", sequence, "--out", tracks, *cache)
-        run("view", tracks, "--sequence", sequence, "--save", root / "flight.rrd", *cache)
+        run("view", tracks, sequence, "--save", root / "flight.rrd", *cache)
         run("overlay", tracks, sequence, "--out", root, "--mosaic")
         pictures = {
             "viewer": photograph(root / "flight.rrd", options.browser),

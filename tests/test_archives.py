@@ -116,7 +116,7 @@ class TestOldArchives:
         assert "<h2>Cameras</h2>" in (tmp_path / "r.html").read_text(encoding="utf-8")
         run("export", tracks, OLD, "--to", "mot", "--out", tmp_path / "mot")
         assert list((tmp_path / "mot").rglob("*cam8*"))
-        run("view", tracks, "--sequence", OLD, "--save", tmp_path / "f.rrd")
+        run("view", tracks, OLD, "--save", tmp_path / "f.rrd")
         assert (tmp_path / "f.rrd").stat().st_size > 10_000
 
     def test_the_old_archive_has_what_was_packed(self, flight: Path) -> None:

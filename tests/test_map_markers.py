@@ -217,7 +217,6 @@ def test_measured_corners_in_another_order_are_reported(tmp_path):
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (["{walk}"], SettingsError, "expected --out FILE or --check MAP, found neither"),
         (["{walk}", "--out", "{new}", "--check", "{new}"], SettingsError, "expected --out FILE or --check MAP, found both"),
         (["{walk}", "--out", "{new}"], SettingsError, "expected numbers of markers that are known"),
         (

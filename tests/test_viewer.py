@@ -75,7 +75,7 @@ def read_entities(path):
 def saved(folder):
     """Entities of a file with tracks, images, silhouettes and reference."""
     path = folder / "flight.rrd"
-    command = [sys.executable, "-m", "psotrack", "view", "tracks.csv", "--sequence", "flight", "--save", path]
+    command = [sys.executable, "-m", "psotrack", "view", "tracks.csv", "flight", "--save", path]
     result = subprocess.run(
         [*command, "--silhouettes", "--cache", "cache", "--jobs", "2"],
         cwd=folder,
@@ -220,7 +220,7 @@ def test_two_files_of_tracks_are_two_colours(run, folder, tmp_path):
 
 
 def test_a_line_says_that_silhouettes_are_not_stored(run, folder, tmp_path):
-    arguments = (folder / "tracks.csv", "--sequence", folder / "flight", "--save", tmp_path / "x.rrd")
+    arguments = (folder / "tracks.csv", folder / "flight", "--save", tmp_path / "x.rrd")
     code, out, _ = run(*arguments, "--cache", tmp_path / "empty")
     assert code == 0
     assert "--silhouettes computes them" in out
@@ -242,7 +242,7 @@ def test_files_are_not_larger_than_demanded(folder, tmp_path, share):
 
 
 def test_the_first_frames_only(run, folder, tmp_path):
-    arguments = (folder / "tracks.csv", "--sequence", folder / "flight", "--frames", 5, "--cameras", "c0,c2")
+    arguments = (folder / "tracks.csv", folder / "flight", "--frames", 5, "--cameras", "c0,c2")
     assert run(*arguments, "--save", tmp_path / "part.rrd")[0] == 0
     entities = read_entities(tmp_path / "part.rrd")
     assert entities["/world/cameras/c0/image"]["EncodedImage:blob"][0] == list(range(5))
@@ -252,7 +252,7 @@ def test_the_first_frames_only(run, folder, tmp_path):
 
 
 def test_a_recording_without_tracks(run, folder, tmp_path):
-    assert run("--sequence", folder / "flight", "--save", tmp_path / "only.rrd")[0] == 0
+    assert run(folder / "flight", "--save", tmp_path / "only.rrd")[0] == 0
     entities = read_entities(tmp_path / "only.rrd")
     assert {f"/world/truth/{name}/point" for name in REFERENCE} <= set(entities)
     assert not any("drones" in path for path in entities)
@@ -268,11 +268,11 @@ def assert_one_line(result, *words):
 
 def test_wrong_input_is_one_line(run, folder, tmp_path, monkeypatch):
     tracks, sequence = folder / "tracks.csv", folder / "flight"
-    assert_one_line(run("--save", tmp_path / "x.rrd"), "files of tracks, or a recording")
+    assert_one_line(run("--save", tmp_path / "x.rrd"), "expected TRACKS, SEQ or both")
     assert_one_line(run(tracks, "--save", tmp_path / "x.html"), "ends in .rrd")
     assert_one_line(run(tracks, "--save", tmp_path / "x.rrd", "--web"), "both")
     assert_one_line(
-        run(tracks, "--sequence", sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard"
+        run(tracks, sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard"
     )
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

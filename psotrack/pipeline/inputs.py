@@ -190,7 +190,7 @@ def prepare(
         sightings, keys = read_sightings(recording, silhouettes, source, report)
     read_s = time.perf_counter() - began
     bounds_m, speed_m_s = settings.bounds_m or recording.bounds_m, settings.motion.max_speed_m_s
-    size_m = settings.drones.lengths_m
+    size_m = settings.drones.size_m
     key = source, size_m
     if key not in points and (bounds_m is None or speed_m_s is None):
         if sightings is not None:

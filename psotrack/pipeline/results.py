@@ -195,7 +195,7 @@ def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:
 def _no_drones(run: Run) -> InputError:
     """The error that says why no drone was found, as far as that is known."""
     found = "none in any frame"
-    least_m, most_m = BirthRules(size_m=run.settings.drones.lengths_m).spans_m
+    least_m, most_m = BirthRules(size_m=run.settings.drones.size_m).spans_m
     remedy = (
         "look at what the cameras see (`psotrack detect --silhouettes`), give the drones' first positions (--init), "
         f"or their size (--drone-size) if they are not {least_m:.2g} to {most_m:.2g} m wide"

@@ -144,7 +144,7 @@ def show_check(
         if of_shutter := shutter_sentence(given, shown, "the check uses the given one"):
             output.say(f"{name}: {of_shutter}")
     for finding in checkup.findings:
-        output.say(str(finding))
+        output.say(str(finding), always=True)
     if not checkup.findings:
         output.say(f"{path}: nothing disagrees")
 

@@ -199,7 +199,7 @@ def first_drones(
     sightings = from_silhouettes(silhouettes, stop=count)
     births = Births(
         rig.cameras,
-        BirthRules(num_frames=silhouettes.num_frames, size_m=drones.lengths_m),
+        BirthRules(num_frames=silhouettes.num_frames, size_m=drones.size_m),
         fps=fps,
         bounds_m=bounds_m,
         max_speed_m_s=max_speed_m_s,

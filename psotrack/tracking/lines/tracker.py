@@ -108,7 +108,7 @@ class _Tracker:
             BirthRules(
                 settings.status.min_cameras_to_begin,
                 num_frames=sightings.num_frames,
-                size_m=settings.drones.lengths_m,
+                size_m=settings.drones.size_m,
             ),
             fps=fps,
             bounds_m=bounds_m,

@@ -184,7 +184,7 @@ class SwarmRun:
                 # A recording's background is known from the start, that of a stream is learned from its first frames.
                 ghosts_from=0 if num_frames is None else WINDOW_FRAMES,
                 num_frames=num_frames,
-                size_m=settings.drones.lengths_m,
+                size_m=settings.drones.size_m,
             ),
             fps=setting.fps,
             bounds_m=inputs.bounds_m,
@@ -296,7 +296,7 @@ class SwarmRun:
         if not again:
             self._births_before = self._births
         is_first = not self._memory and not self._num_born
-        rules = self._settings.status.min_cameras_to_begin, self._settings.drones.lengths_m
+        rules = self._settings.status.min_cameras_to_begin, self._settings.drones.size_m
         key = self._bounds_m.tobytes(), self.max_speed_m_s, *rules
         if is_first and key in block.births:
             # Before the first drone, all runs that look for the same drones find the same.
