@@ -102,11 +102,13 @@ COMMANDS = {
     "two sweeps": replace(SWEEP, processes=2),
     "cluster": replace(SWEEP, words=f"{SWEEP.words} --cluster local --workers 2", has_workers=True),
     "labels": Command(
-        f"simulate labels {FLIGHT} {{given}}/Simulated_Data/S01_D2_A --out {{out}}/labels --drone-size 0.3,0.3,0.15 --force",
+        f"simulate labels {FLIGHT} {{given}}/Simulated_Data/S01_D2_A --out {{out}}/labels "
+        "--drone-size 0.3,0.3,0.15 --force",
         ("labels",),
     ),
     "localise": Command(
-        "onboard localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force", ("poses.csv",)
+        "onboard localise {given}/Simulated_Data/S01_D2_A --drone dron1 --out {out}/poses.csv --force",
+        ("poses.csv",),
     ),
     "export": Command(
         f"export {{given}}/tracks.csv {FLIGHT} --to mot --out {{out}}/mot --force",

@@ -271,7 +271,9 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     detections: Annotated[str, _metavar("yolo|blobs|FOLDER")] = YOLO
     seed: Seed = 0
     init: Annotated[str, _metavar("auto|truth|FILE")] = "auto"
-    bounds_m: Annotated[tuple[float, float, float, float, float, float], _metavar("X0,X1,Y0,Y1,Z0,Z1")] | None = None
+    bounds_m: (
+        Annotated[tuple[float, float, float, float, float, float], _metavar("X0,X1,Y0,Y1,Z0,Z1")] | None
+    ) = None
     smooth: bool = False
     rate_hz: Positive | None = None
     clocks: Clocks = "given"

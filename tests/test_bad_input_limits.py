@@ -83,7 +83,7 @@ def check_line(output, *words: object) -> None:
         (("--particles", "1000000000"), "swarm.particles"),
         (("--particles", HUGE[:400]), "swarm.particles"),
         (("--iterations", "1000000000"), "swarm.iterations"),
-        (("--iterations", "0"), "--iterations"),
+        (("--iterations", "-1"), "swarm.iterations"),
         (("--drones", "1000000000"), "drones.count"),
         (("--drones", "0"), "drones.count"),
         (("--seed", "9" * 30), "seed"),
@@ -212,10 +212,14 @@ def test_a_parquet_file_of_one_repeated_row(tmp_path, little_memory):
 def test_a_marker_of_thousands_of_digits(header, flight, run_psotrack, tmp_path):
     values = ";".join(["0"] * header.count(";"))
     path = write(tmp_path / "m.csv", f"{header}\n{HUGE[:900]};{values}\n")
-    output = run_psotrack("onboard", "localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv")
+    output = run_psotrack(
+        "onboard", "localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv"
+    )
     check_line(output, path)
     path.write_text(f"{header}\n{HUGE};{values}\n")
-    output = run_psotrack("onboard", "localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv")
+    output = run_psotrack(
+        "onboard", "localise", flight / "c0.avi", "--markers", path, "--out", tmp_path / "o.csv"
+    )
     check_line(output, path)
 
 

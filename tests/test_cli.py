@@ -194,7 +194,9 @@ def test_a_saved_config_gives_the_same_tracks_and_a_log_says_what_was_done(
     assert said.splitlines()[-1].endswith(lines[0])
 
     assert_one_line(run(*track(sequence, tracks, "--config", config)), "tracks.csv", "--force")
-    again = run("track", sequence, "--config", config, "--out", tmp_path / "again.csv", "--json", "-", "--causal")
+    again = run(
+        "track", sequence, "--config", config, "--out", tmp_path / "again.csv", "--json", "-", "--causal"
+    )
     assert (again.code, json.loads(again.out)["seed"]) == (0, 5)
     assert (tmp_path / "again.csv").read_bytes() != tracks.read_bytes(), "what is typed is ignored"
     assert run("track", sequence, "--config", config, "--out", tmp_path / "same.csv").code == 0
@@ -352,7 +354,9 @@ def test_missing_and_empty_detections_are_errors(run: Run, sequence: Path, tmp_p
     nowhere = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "nowhere"))
     assert_one_line(nowhere, "nowhere", "cam1.csv", "no such folder")
     shutil.rmtree(sequence / "dl_data")
-    assert_one_line(run(*track(sequence, tmp_path / "t.csv", *lines)), "dl_data", "--detections blobs")
+    assert_one_line(run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", "yolo")), "dl_data")
+    fallen_back = run(*track(sequence, tmp_path / "t.csv", *lines, "--frames", 20))
+    assert (fallen_back.code, "blobs of its silhouettes take their place" in fallen_back.out) == (0, True)
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "cam1i.csv").touch()
     none = run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", tmp_path / "empty"))
@@ -478,7 +482,9 @@ class TestBadInput:
         header = "id;" + ";".join(f"{axis}{corner}[m]" for corner in range(1, 5) for axis in "xyz")
         row = ";".join(map(str, [7, *corners]))
         (sequence / "aruco_corners.csv").write_text(f"{header}\n{row}\n{row}\n")
-        assert_one_line(run("init", "--show", sequence), "aruco_corners.csv, line 3", "each marker once, found 7 again")
+        assert_one_line(
+            run("init", "--show", sequence), "aruco_corners.csv, line 3", "each marker once, found 7 again"
+        )
 
     def test_a_table_without_positions_is_no_file_of_tracks(
         self, run: Run, sequence: Path, tmp_path: Path

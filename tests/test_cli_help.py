@@ -80,7 +80,10 @@ def test_help_and_names_of_commands_import_no_heavy_package() -> None:
 @pytest.mark.parametrize("command", ["onboard localise", "detect", "simulate sequence", "sweep", "track"])
 def test_help_of_a_command_imports_the_defaults_of_settings_alone(command: str) -> None:
     result = subprocess.run(
-        [sys.executable, "-c", REPORT_IMPORTS, *command.split(), "--help"], capture_output=True, text=True, check=True
+        [sys.executable, "-c", REPORT_IMPORTS, *command.split(), "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert result.stdout.splitlines()[-1] == "imported: msgspec"
 

@@ -150,7 +150,9 @@ SETTINGS = st.fixed_dictionaries(
 
 class TestConfig:
     @given(values=SETTINGS)
-    def test_a_saved_file_has_all_settings(self, tmp_path_factory: pytest.TempPathFactory, values: Any) -> None:
+    def test_a_saved_file_has_all_settings(
+        self, tmp_path_factory: pytest.TempPathFactory, values: Any
+    ) -> None:
         settings = TrackSettings().changed(values)
         file = tmp_path_factory.mktemp("config") / "run.toml"
         file.write_text(config_text(settings), encoding="utf-8")
@@ -161,7 +163,7 @@ class TestConfig:
         [
             ("swarm.partcles = 3", "swarm.partcles: .*found swarm.partcles; did you mean swarm.particles?"),
             ("force = true", "force: expected the name of a setting"),
-            ('swarm.particles = "many"', "swarm.particles: expected a whole number, found \"many\""),
+            ('swarm.particles = "many"', 'swarm.particles: expected a whole number, found "many"'),
             ("smooth = 1", "smooth: expected true or false, found 1"),
             ("drones.size_m = [1, 2]", "drones.size_m: expected a list of length 3"),
             ('clocks = "atomic"', "clocks: expected one of given, auto, found atomic"),
@@ -179,7 +181,7 @@ class TestConfig:
 
     def test_set_has_the_names_of_sweeps(self, run: Run, tmp_path: Path) -> None:
         for option, message in (
-            ("swarm.particles=many", "swarm.particles: expected a whole number, found \"many\""),
+            ("swarm.particles=many", 'swarm.particles: expected a whole number, found "many"'),
             ("swarm.partcles=3", "did you mean swarm.particles?"),
             ("particles", "--set: expected NAME=VALUE, such as swarm.particles=50, found particles"),
         ):

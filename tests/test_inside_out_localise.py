@@ -1,4 +1,4 @@
-"""`psotrack onboard localise`: from videos, image folders and streams of a drawn room to the path of the camera in the room."""
+"""`psotrack onboard localise`: from videos, image folders and streams of a drawn room to the path of the camera."""
 
 import json
 import signal

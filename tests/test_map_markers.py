@@ -217,7 +217,11 @@ def test_measured_corners_in_another_order_are_reported(tmp_path):
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (["{walk}", "--out", "{new}", "--check", "{new}"], SettingsError, "expected --out FILE or --check MAP, found both"),
+        (
+            ["{walk}", "--out", "{new}", "--check", "{new}"],
+            SettingsError,
+            "--check MAP, found both",
+        ),
         (["{walk}", "--out", "{new}"], SettingsError, "expected numbers of markers that are known"),
         (
             ["{walk}", "--out", "{new}", "--known", "7"],

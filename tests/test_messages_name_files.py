@@ -52,7 +52,7 @@ BY_POINT = ("--points", "--lenses", "{flight}/rig.toml", "--out", "out.toml")
 
 
 def test_a_setting_of_a_config_names_the_file_and_a_typed_one_does_not(files, flight, run_psotrack):
-    (files / "run.toml").write_text("particles = -5\n")
+    (files / "run.toml").write_text("swarm.particles = -5\n")
     words = ("track", flight, "--config", "run.toml", "--out", "out.csv")
     check_line(run_psotrack(*words), "run.toml, swarm.particles: expected", "found -5")
     typed = run_psotrack(*words, "--particles", "-6")

@@ -211,9 +211,7 @@ def test_blobs_of_pictures_are_detections(pictures, tmp_path):
 
 
 def test_detect_takes_blobs_or_a_detector(pictures, tmp_path):
-    assert "found none of them" in refusal(
-        "detect", pictures, "--out", tmp_path
-    )
+    assert "found none of them" in refusal("detect", pictures, "--out", tmp_path)
     both = refusal("detect", pictures, "--out", tmp_path, "--blobs", "--detector", "a.onnx")
     assert "--detector and --blobs" in both
 

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from psotrack.cli.as_real import as_real
+from psotrack.cli.simulate.as_real import as_real
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import project
 from psotrack.recordings import read_frames

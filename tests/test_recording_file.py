@@ -473,8 +473,8 @@ class TestFaults:
             folder / "left.csv", Detections(np.array([6]), np.array([[1.0, 2, 3, 4]]), np.ones(1))
         )
         path = write(folder, LEFT.replace("\nK =", '\ndetections = "left.csv"\nK ='), RIGHT)
-        for command in ("init", "--show", "doctor"):
-            done = CliRunner().invoke(cli, [command, str(path)])
+        for command in (["init", "--show"], ["doctor"]):
+            done = CliRunner().invoke(cli, [*command, str(path)])
             assert isinstance(done.exception, InputError)
             assert re.search(
                 r"left.csv: expected detections in the frames 0 to 5 of camera left \(left.avi\), "

@@ -108,7 +108,9 @@ def inputs(tmp_path_factory, root):
         sequence = root / "Simulated_Data" / "S01_D2_A"
         simulated = psotrack(root, *CORNERS.split(), "--out", folder / "corners")
         assert simulated.returncode == 0, simulated.stderr
-        packed = psotrack(root, "archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack")
+        packed = psotrack(
+            root, "archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack"
+        )
         assert packed.returncode == 0, packed.stderr
         grid_file(folder, [2, 3]).rename(folder / "grid.toml")
 
@@ -163,7 +165,9 @@ COMMANDS = {
     ("better.csv",): "calibrate adjust {inputs}/boxes --tracks {inputs}/boxes/tracks.csv --out better.csv "
     "--force --quiet",
     ("Real_Data/R02_D4",): "simulate as-real {inputs}/corners/Simulated_Data/S02_D4_A --out . --quiet",
-    ("camera.csv",): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    (
+        "camera.csv",
+    ): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
     "--out camera.csv --force --frames 8 --quiet",
     ("corners.csv",): "onboard map {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
     "--known 7 --out corners.csv --force --quiet",
@@ -171,7 +175,9 @@ COMMANDS = {
         "markers.csv",
     ): "onboard detect {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
     ("fused.csv",): "onboard fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
-    ("offset.png",): "doctor {inputs}/clocks/Real_Data/R12_D2 --tracks {inputs}/clocks/tracks.csv --max-offset 1 "
+    (
+        "offset.png",
+    ): "doctor {inputs}/clocks/Real_Data/R12_D2 --tracks {inputs}/clocks/tracks.csv --max-offset 1 "
     "--plot offset.png --force",
     ("doctor.json",): "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
 }

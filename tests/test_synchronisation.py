@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration.clocks import find_offset
 from psotrack.calibration.clocks.synchronisation import camera_offsets
-from psotrack.cli.doctor import synchronise
+from psotrack.cli.doctor import doctor
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera
 from psotrack.recordings import VideoWriter
@@ -464,7 +464,7 @@ class TestCommand:
     def run(self, recording, *arguments):
         folder, tracks = recording
         return CliRunner().invoke(
-            synchronise, [str(tracks), str(folder), *map(str, arguments)], catch_exceptions=False
+            doctor, [str(folder), "--tracks", str(tracks), *map(str, arguments)], catch_exceptions=False
         )
 
     def test_a_recording_at_its_own_rate(self, recording):

@@ -271,9 +271,7 @@ def test_wrong_input_is_one_line(run, folder, tmp_path, monkeypatch):
     assert_one_line(run("--save", tmp_path / "x.rrd"), "expected TRACKS, SEQ or both")
     assert_one_line(run(tracks, "--save", tmp_path / "x.html"), "ends in .rrd")
     assert_one_line(run(tracks, "--save", tmp_path / "x.rrd", "--web"), "both")
-    assert_one_line(
-        run(tracks, sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard"
-    )
+    assert_one_line(run(tracks, sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert_one_line(run(tracks), "--save", "--web", "a screen")

@@ -3,9 +3,9 @@
     python experiments/two_ways/two_ways.py data/Simulated_Data/S01_D2_A dron1.csv dron2.csv tracks.csv
     python experiments/two_ways/two_ways.py SEQ INSIDE.csv [INSIDE.csv ...] OUTSIDE.csv --range 25 --out rows.csv
 
-INSIDE are paths of `psotrack onboard localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of `psotrack
-track`. The constant offset of each track from the reference is removed in the axes of the body, because a camera, the
-middle of a silhouette and a body's origin are different points. Only frames that both methods cover count.
+INSIDE are paths of `psotrack onboard localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of
+`psotrack track`. The constant offset of each track from the reference is removed in the axes of the body, because a
+camera, the middle of a silhouette and a body's origin are different points. Only frames that both methods cover count.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class PointOptions:
     """
 
     points: bool = False
-    distance: Annotated[str, Meta(extra={"metavar": "NAME,NAME=METRES", "type": Distance()})] | None = None
+    distance: Annotated[tuple[str, str, float], Meta(extra={"type": Distance()})] | None = None
     stick_m: float | None = None
     pairs: Path | None = None
     markers: Path | None = None

@@ -45,7 +45,7 @@ class Distance(click.ParamType):
 def calibrate_points(
     sources: tuple[Path, ...],
     lenses_path: Path | None,
-    distance: Any,
+    distance: tuple[str, str, float] | None,
     stick_m: float | None,
     world: Path | None,
 ) -> tuple[Rig, dict[str, dict[str, Any]], list[str]]:

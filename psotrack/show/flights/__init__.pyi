@@ -2,8 +2,6 @@ from .colours import colour_rgb, status_colours, status_rgb, statuses
 from .ellipsoids import Ellipsoids, ellipsoids_90
 from .events import Event, EventKind, find_events
 from .flight import (
-    find_recording as find_recording,
-    split_sequence as split_sequence,
     USUAL_SIZE_M,
     FlightTracks,
     TrackedFlight,

@@ -221,17 +221,3 @@ def _check_fits(tracks: FlightTracks, recording: Recording) -> None:
             found=f"{first_s:.2f} to {last_s:.2f} s",
             remedy="name the recording that was tracked",
         )
-
-
-def split_sequence(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
-    """TEMPORARY."""
-    from psotrack.recordings.datasets import is_recording
-
-    if paths and is_recording(paths[-1]):
-        return tuple(paths[:-1]), paths[-1]
-    return tuple(paths), None
-
-
-def find_recording(tracks: Path | str) -> Path | None:
-    """TEMPORARY."""
-    return None
