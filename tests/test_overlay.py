@@ -27,7 +27,7 @@ from flight_files import (
 from psotrack import cli
 from psotrack.errors import OutputError
 from psotrack.recordings import probe, read_frames
-from psotrack.show.flights import boxes_in_images, colour_rgb, read_flight, status_rgb
+from psotrack.show.flights import read_flight, status_rgb, view_in_images
 from psotrack.show.overlay import Codec, find_codec, write_overlays
 from psotrack.support import COLOURS
 from psotrack.trajectories import Status, write_trajectories
@@ -53,7 +53,7 @@ def names_in(folder):
 
 
 def colour_bgr(drone, status):
-    return np.array(status_rgb(int(status), colour_rgb(COLOURS[drone], 0.2))[::-1], float)
+    return status_rgb(np.array([int(status)]), [COLOURS[drone]], lighter=0.2)[0, ::-1].astype(float)
 
 
 def nearest_colour(image, box_px, colour):
@@ -73,7 +73,7 @@ def test_boxes_are_drawn_where_the_drones_are(run, folder, tmp_path, scale):
     assert out.endswith("3 videos in MPEG-4\n") or out.endswith("3 videos in H.264\n")
     assert names_in(tmp_path / "videos") == [*(f"{name}.mp4" for name in CAMERAS), "overlay.json"]
     flight = read_flight([folder / "tracks.csv"], folder / "flight")
-    boxes_px = boxes_in_images(flight.recording, flight.tracks[0].trajectories, flight.tracks[0].size_m)
+    views = view_in_images(flight.recording, flight.tracks[0].trajectories, flight.tracks[0].size_m)
     for index, name in enumerate(CAMERAS):
         video = probe(tmp_path / "videos" / f"{name}.mp4")
         width, height = (round(scale * side) for side in IMAGE_SIZE_WH)
@@ -81,7 +81,7 @@ def test_boxes_are_drawn_where_the_drones_are(run, folder, tmp_path, scale):
         for frame, image in enumerate(read_frames(video)):
             for drone in range(2):
                 status = make_tracks().status[frame, drone]
-                box_px = boxes_px[frame, drone, index] * scale
+                box_px = views.boxes_px[frame, drone, index] * scale
                 if status == Status.LOST:
                     assert np.isnan(box_px).all()
                     continue

@@ -25,7 +25,7 @@ from psotrack.show.viewer.entity_log import EntityLog
 from psotrack.show.viewer.image_marks import log_images, log_marks
 from psotrack.show.viewer.layout import blueprint_of
 from psotrack.show.viewer.plots import log_plots
-from psotrack.show.viewer.space import log_drones, log_world
+from psotrack.show.viewer.space import log_flight, log_world
 from psotrack.support import Report, atomic_write, map_in_processes, no_progress
 
 #: Largest size by default: this number of bytes per second of the recording, up to the second number.
@@ -115,7 +115,7 @@ def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, r
         log = EntityLog(stream)
         stream.send_blueprint(blueprint_of(flight, has_images=bool(videos), has_onboard=content.onboard))
         log_world(log, flight)
-        log_drones(log, flight)
+        log_flight(log, flight)
         log_plots(log, flight)
         _flush(stream)
         most = _max_bytes(flight, content)
@@ -128,7 +128,8 @@ def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, r
                 encoded = map_in_processes(encode_images, list(tasks.values()), jobs=jobs, advance=advance)
             for camera, images in zip(tasks, encoded, strict=True):
                 task = tasks[camera]
-                log_images(log, flight, camera, images, (task.reduction, task.cell_px))
+                assert flight.recording is not None
+                log_images(log, flight.recording, camera, images, (task.reduction, task.cell_px))
     finally:
         stream.disconnect()
     return plan

@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from psotrack.show.flights import TrackedFlight
+from psotrack.show.flights import QUANTITIES, TrackedFlight
 from psotrack.show.viewer.camera_images import CameraKey
 from psotrack.show.viewer.entity_log import FRAME, TIME, camera_path, drone_path
 
@@ -16,13 +16,6 @@ from psotrack.show.viewer.entity_log import FRAME, TIME, camera_path, drone_path
 _TRAIL_S = 3.0
 #: Background of the view of space, also where the browser's page is light: colours of drones are made for it.
 _BACKGROUND = (18, 20, 24)
-#: Quantities that are plotted, and the names of their plots.
-_PLOTS = {
-    "error_mm": "error against the reference (mm)",
-    "score": "score",
-    "deviation_mm": "standard deviation (mm)",
-    "cameras": "cameras that see the drone",
-}
 
 
 def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool = False) -> rrb.Blueprint:
@@ -61,8 +54,7 @@ def live_blueprint() -> rrb.Blueprint:
         rrb.Horizontal(
             rrb.Spatial3DView(origin="/world", name="space", background=_BACKGROUND),
             rrb.Vertical(
-                rrb.TimeSeriesView(origin="/plots/height_m", name="height (m)"),
-                rrb.TimeSeriesView(origin="/plots/deviation_mm", name="standard deviation (mm)"),
+                *(_plot(quantity) for quantity in QUANTITIES if quantity != "error_mm"),
                 rrb.TimeSeriesView(origin="/plots/delay_ms", name="delay (ms)"),
                 _states(),
             ),
@@ -83,7 +75,7 @@ def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
     trails: dict[Any, Any] = {
-        f"{drone_path('world/drones', flight, tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
+        f"{drone_path('world/drones', tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
         for tracks in flight.tracks
         for drone in tracks.trajectories.drones
     }
@@ -125,19 +117,16 @@ def _eye(flight: TrackedFlight) -> rrb.EyeControls3D | None:
 
 
 def _plots(flight: TrackedFlight) -> rrb.Tabs:
-    has_truth = flight.truth is not None
-    return rrb.Tabs(
-        *(
-            rrb.TimeSeriesView(
-                origin=f"/plots/{quantity}",
-                name=name,
-                axis_y=rrb.ScalarAxis(range=(0.0, 1.0)) if quantity == "score" else None,
-                plot_legend=rrb.PlotLegend(visible=True),
-            )
-            for quantity, name in _PLOTS.items()
-            if has_truth or quantity != "error_mm"
-        ),
-        active_tab=0,
+    shown = [quantity for quantity in QUANTITIES if flight.truth is not None or quantity != "error_mm"]
+    return rrb.Tabs(*map(_plot, shown), active_tab=0)
+
+
+def _plot(quantity: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=f"/plots/{quantity}",
+        name=QUANTITIES[quantity],
+        axis_y=rrb.ScalarAxis(range=(0.0, 1.0)) if quantity == "score" else None,
+        plot_legend=rrb.PlotLegend(visible=True),
     )
 
 
