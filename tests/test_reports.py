@@ -1,6 +1,7 @@
 """Reports and 3D views: what is in the pages, and, in a real browser, that they work."""
 
 import base64
+import html
 import json
 import re
 import shutil
@@ -18,8 +19,16 @@ from psotrack.cli import cli
 from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings.datasets import open_recording
-from psotrack.show.flights import flight_of
-from psotrack.show.reports import MOST_BYTES, MOST_ROWS, PointCloud, Scene3D, view_3d, write_page
+from psotrack.show.flights import flight_of, read_flight
+from psotrack.show.reports import (
+    MOST_BYTES,
+    MOST_ROWS,
+    PointCloud,
+    Scene3D,
+    view_3d,
+    write_flight_report,
+    write_page,
+)
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.sweep import Store
 from psotrack.trajectories import Status, write_trajectories
@@ -126,6 +135,37 @@ class TestFlight:
         outside = re.findall(r"(?:src|href)=\"(?!data:|#)([^\"]*)\"", text)
         assert outside == []
         assert len(text) < MOST_BYTES / 4
+
+    def test_the_page_explains_its_figures(self, page):
+        text = page.read_text(encoding="utf-8")
+        assert (
+            "In 90 % ellipsoid: share of the frames in which the ellipsoid that the run states holds" in text
+        )
+        assert "<b>1.5 times</b><span>faster than the video</span>" in text
+
+    def test_the_same_tracks_again_is_a_script_that_processes_may_import(self, page):
+        """Processes that make silhouettes import the script again, under another name: it must not track again."""
+        (script,) = re.findall(
+            r"<pre>(import psotrack.*?)</pre>", page.read_text(encoding="utf-8"), re.DOTALL
+        )
+        ran = {"__name__": "__mp_main__"}
+        exec(html.unescape(script), ran)
+        assert "tracked" not in ran
+        assert "particles" in script
+
+    @pytest.mark.parametrize("shown", ["a recording without tracks", "a reference of another time"])
+    def test_what_the_viewer_shows_has_a_report(self, flight, tmp_path, shown):
+        sequence = flight / "Simulated_Data" / "S01_D2_A"
+        if shown == "a recording without tracks":
+            read = read_flight([], sequence)
+        else:
+            read = read_flight([flight / "tracks.csv"], sequence)
+            late = replace(read.truth, frame=read.truth.frame + 1000, time_s=read.truth.time_s + 100)
+            read = replace(read, recording=replace(read.recording, truth=late))
+        write_flight_report(tmp_path / "page.html", read, pictures=False)
+        text = (tmp_path / "page.html").read_text(encoding="utf-8")
+        assert "psotrackScene(document" in text
+        assert "Errors against the reference" not in text
 
     def test_pictures_show_the_place_of_the_event(self, page):
         """The box of the drone, in the drone's colour, is in the picture of the event in which the drone is found."""

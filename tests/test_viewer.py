@@ -273,6 +273,7 @@ def test_wrong_input_is_one_line(run, folder, tmp_path, monkeypatch):
     assert_one_line(
         run(tracks, "--sequence", sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard"
     )
+    assert_one_line(run(tracks, sequence, "--save", tmp_path / "x.rrd"), "found a recording", "--sequence")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert_one_line(run(tracks), "--save", "--web", "a screen")

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-#: Quantities over time, and what is written beside their plots.
+#: Quantities over time: their names with units, and what they mean.
 QUANTITIES = {
-    "error_mm": "error against the reference (mm)",
-    "score": "score: how well the images fit",
-    "deviation_mm": "standard deviation (mm)",
-    "cameras": "cameras that see the drone",
+    "error_mm": ("error (mm)", "Distance of each drone of the reference from its track."),
+    "score": ("score", "How well the images fit the position of each drone, from 0 to 1."),
+    "deviation_mm": ("std (mm)", "Standard deviation of each position in space, as the run states it."),
+    "cameras": ("cameras", "Number of cameras that see each drone."),
 }
 
 

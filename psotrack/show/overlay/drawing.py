@@ -98,7 +98,8 @@ def draw_drones(
     """
     width = line_width_px(image)
     boxes_px = (places.boxes_px[max(row - trail_rows, 0) : row + 1] - np.tile(corner_px, 2)) * scale
-    shown = np.flatnonzero(np.isfinite(boxes_px[-1]).all(axis=1)).tolist()
+    inside = (boxes_px[-1, :, 2:] > 0).all(axis=1) & (boxes_px[-1, :, :2] < image.shape[1::-1]).all(axis=1)
+    shown = np.flatnonzero(inside).tolist()
     # Names first, so that a name does not hide the box of another drone.
     for drone in shown:
         left, top = boxes_px[-1, drone, :2].tolist()

@@ -38,8 +38,8 @@ from psotrack.support import (
 INPUTS_FILE = "overlay.json"
 #: Raise it when the same inputs give other videos than before.
 _DRAWING = 2
-#: Width of the mosaic, pixels.
-_MOSAIC_WIDTH_PX = 1920
+#: Width of the mosaic as a video and as a picture, pixels.
+_VIDEO_WIDTH_PX, _PICTURE_WIDTH_PX = 1920, 1440
 #: Size of the video with which a codec is tried, pixels.
 _TRIED_WH = (320, 240)
 
@@ -127,7 +127,7 @@ def write_overlays(
         check_file_name(name, recording.folder)
     codec, scene = find_codec(), _Scene(flight, recording)
     if options.mosaic:
-        videos = {"mosaic.mp4": scene.mosaic(cameras, codec)}
+        videos = {"mosaic.mp4": scene.mosaic(cameras, codec, _VIDEO_WIDTH_PX)}
     else:
         videos = {f"{name}.mp4": scene.of_camera(name, codec, options.scale) for name in cameras}
     kept = _begin(folder, flight, {name: _digest(video) for name, video in videos.items()}, options.force)
@@ -139,11 +139,11 @@ def write_overlays(
     return WrittenOverlays(folder, codec, written, tuple(folder / name for name in kept))
 
 
-def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 8, force: bool = False) -> None:
+def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 5, force: bool = False) -> None:
     """Save the middle moment of a flight as a picture: its first cameras, and the map from above.
 
     Args:
-        path: file that ends in .png or .jpg.
+        path: path of the PNG file.
         flight: tracks and a recording.
         most_cameras: largest number of cameras.
         force: replace an existing file.
@@ -154,7 +154,7 @@ def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 8, fo
     """
     refuse_to_overwrite(path, force)
     recording, cameras = _filmed(flight)
-    video = _Scene(flight, recording).mosaic(cameras[:most_cameras], _CODECS[0])
+    video = _Scene(flight, recording).mosaic(cameras[:most_cameras], _CODECS[0], _PICTURE_WIDTH_PX)
     instant = len(video.time_s) // 2
     frames = [
         next(read_frames_at(camera.video, [number]))[1]
@@ -162,7 +162,7 @@ def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 8, fo
         else None
         for index, camera in enumerate(video.cameras)
     ]
-    _, coded = cv2.imencode(path.suffix, video.image(instant, frames))
+    _, coded = cv2.imencode(".png", video.image(instant, frames))
     with atomic_write(path) as temporary:
         temporary.write_bytes(coded.tobytes())
 
@@ -291,11 +291,11 @@ class _Scene:
             codec.fourcc, video.fps, size_wh, cameras, self._tracks, frame, self._rows_at(time_s), time_s
         )
 
-    def mosaic(self, names: Sequence[str], codec: Codec) -> DrawnVideo:
+    def mosaic(self, names: Sequence[str], codec: Codec, width_px: int) -> DrawnVideo:
         """The video of some cameras at the recording's instants, with the map; images keep their aspect ratios."""
         columns = int(np.ceil(np.sqrt(len(names) + 1)))
         width, height = self._recording.videos[names[0]].image_size_wh
-        tile_wh = _even(_MOSAIC_WIDTH_PX / columns * np.array([1.0, height / width]))
+        tile_wh = _even(width_px / columns * np.array([1.0, height / width]))
         timeline = self._recording.timeline()
         cameras = []
         for name in names:

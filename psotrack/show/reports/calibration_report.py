@@ -12,26 +12,26 @@ from psotrack.errors import InputError, PsotrackError
 from psotrack.geometry.rig_files import read_rig
 from psotrack.show.reports.page import check_page_path, render, write_page
 from psotrack.show.reports.scene import Scene3D
-from psotrack.show.reports.tables import Column, make_table, percent
+from psotrack.show.reports.tables import PageColumn, make_table, percent
 from psotrack.support import convert, read_json
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=10**9)]
 Side = Annotated[int, msgspec.Meta(ge=1, le=10**9)]
 
 _CAMERAS = (
-    Column("camera", "camera"),
-    Column("lens", "lens"),
-    Column("views", "views", 0),
-    Column("corners", "corners", 0),
-    Column("rms (px)", "rms_px", 2),
-    Column("median (px)", "median_px", 2),
-    Column("within views (px)", "own_median_px", 2),
+    PageColumn("camera", "camera"),
+    PageColumn("lens", "lens"),
+    PageColumn("views", "views", 0),
+    PageColumn("corners", "corners", 0),
+    PageColumn("rms (px)", "rms_px", 2),
+    PageColumn("median (px)", "median_px", 2),
+    PageColumn("within views (px)", "own_median_px", 2),
     percent("covered", "covered", 0),
-    Column("f (px)", "focal", 1),
-    Column("std f (px)", "focal_std", 1),
-    Column("centre (m)", "centre"),
-    Column("std (mm)", "centre_std", 1, 1e3),
-    Column("shares most views with", "partner"),
+    PageColumn("f (px)", "focal", 1),
+    PageColumn("std f (px)", "focal_std", 1),
+    PageColumn("centre (m)", "centre"),
+    PageColumn("std (mm)", "centre_std", 1, 1e3),
+    PageColumn("shares most views with", "partner"),
 )
 _NOTE = (
     "rms: of the corners that count. Within views: errors of the corners and of the lens alone. Covered: share of the "

@@ -58,7 +58,7 @@ def quantity_svg(quantity: Quantity) -> Markup:
     axes.spines[["left", "bottom"]].set_color(_INK)
     axes.tick_params(colors=_INK, labelsize=8)
     axes.set_xlabel("time (s)", color=_INK, fontsize=9)
-    axes.set_ylabel(QUANTITIES[quantity.key].partition(":")[0], color=_INK, fontsize=9)
+    axes.set_ylabel(QUANTITIES[quantity.key][0], color=_INK, fontsize=9)
     if np.nan_to_num(quantity.values).min(initial=0) >= 0:
         axes.set_ylim(bottom=0)
     if len(quantity.names) > 1:

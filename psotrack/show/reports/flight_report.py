@@ -25,46 +25,46 @@ from psotrack.show.reports.charts import quantity_svg
 from psotrack.show.reports.moments import Moment, choose_events, take_pictures
 from psotrack.show.reports.page import check_page_path, render, write_page
 from psotrack.show.reports.scene import row_step, scene_of_flight
-from psotrack.show.reports.tables import Column, PageTable, make_table, percent
+from psotrack.show.reports.tables import PageColumn, PageTable, make_table, percent
 from psotrack.support import Report, no_progress
 
 #: Largest number of events with a picture; a picture has about 20 kB.
 MOST_PICTURES = 40
 _DRONES = (
-    Column("drone", "drone"),
+    PageColumn("drone", "drone"),
     percent("seen", "seen"),
     percent("coasting", "coasting"),
-    Column("first (s)", "first_s", 2),
-    Column("last (s)", "last_s", 2),
-    Column("score", "fitness", 2),
-    Column("cameras", "num_cameras", 1),
-    Column("90 % radius (mm)", "radius_90_m", 1, 1e3),
-    Column("speed (m/s)", "speed_m_s", 2),
-    Column("size (cm)", "size_cm"),
+    PageColumn("first (s)", "first_s", 2),
+    PageColumn("last (s)", "last_s", 2),
+    PageColumn("score", "fitness", 2),
+    PageColumn("cameras", "num_cameras", 1),
+    PageColumn("90 % radius (mm)", "radius_90_m", 1, 1e3),
+    PageColumn("speed (m/s)", "speed_m_s", 2),
+    PageColumn("size (cm)", "size_cm"),
 )
 _DRONES_NOTE = (
     "Score: soft IoU in [0, 1], mean. 90 % radius: longest half axis of the ellipsoid that holds the position with "
     "probability 0.9, median."
 )
 _CAMERAS = (
-    Column("camera", "camera"),
+    PageColumn("camera", "camera"),
     percent("frames there", "frames", 0),
     percent("drones in view", "in_view"),
-    Column("width of a drone (px)", "width_px", 0),
-    Column("noise (px)", "noise_px", 2),
-    Column("left out", "left_out", 0),
+    PageColumn("width of a drone (px)", "width_px", 0),
+    PageColumn("noise (px)", "noise_px", 2),
+    PageColumn("left out", "left_out", 0),
 )
 _CAMERAS_NOTE = (
     "Noise: of a drone's place in the image, as the run learned it. Left out: frames full of foreground."
 )
 _ERRORS = (
-    Column("reference", "drone"),
-    Column("track", "estimate"),
-    Column("mean (mm)", "mean_error_m", 1, 1e3),
-    Column("median (mm)", "median_error_m", 1, 1e3),
-    Column("95 % (mm)", "p95_error_m", 1, 1e3),
-    Column("largest (mm)", "max_error_m", 1, 1e3),
-    Column("without offset (mm)", "offset_removed_mean_error_m", 1, 1e3),
+    PageColumn("reference", "drone"),
+    PageColumn("track", "estimate"),
+    PageColumn("mean (mm)", "mean_error_m", 1, 1e3),
+    PageColumn("median (mm)", "median_error_m", 1, 1e3),
+    PageColumn("95 % (mm)", "p95_error_m", 1, 1e3),
+    PageColumn("largest (mm)", "max_error_m", 1, 1e3),
+    PageColumn("without offset (mm)", "offset_removed_mean_error_m", 1, 1e3),
     percent("missed", "missed_rate"),
     percent("in 90 % ellipsoid", "inside_90_rate", 0),
 )
@@ -157,7 +157,7 @@ def _section(
         drones=make_table(_DRONES, drones.to_dict("records"), _DRONES_NOTE, tracks.colours),
         cameras=cameras,
         errors=None if evaluation is None else _error_table(evaluation),
-        charts=[(QUANTITIES[each.key], quantity_svg(each)) for each in quantities(flight, tracks)],
+        charts=[(QUANTITIES[each.key][1], quantity_svg(each)) for each in quantities(flight, tracks)],
         moments=moments,
         more_events=len(events) - len(chosen),
         run=None if record is None or not record.settings else _run(tracks.path.name, record, flight.name),
@@ -168,7 +168,7 @@ def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[
     flown, seen = tracks.trajectories, percent("", "").text
     shown = [(f"{flown.num_drones}", "drones"), (seen(float(flown.seen.mean())), "of all frames seen")]
     if evaluation is not None:
-        error = Column("", "", 1, 1e3, " mm").text
+        error = PageColumn("", "", 1, 1e3, " mm").text
         shown += [
             (error(evaluation.mean_error_m), "mean error"),
             (error(evaluation.offset_removed_mean_error_m), "without offsets"),

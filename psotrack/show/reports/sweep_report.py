@@ -11,21 +11,21 @@ from markupsafe import Markup
 from psotrack.errors import SettingsError
 from psotrack.show.reports.charts import figure_svg
 from psotrack.show.reports.page import check_page_path, render, write_page
-from psotrack.show.reports.tables import Column, PageTable, make_table, percent
+from psotrack.show.reports.tables import PageColumn, PageTable, make_table, percent
 from psotrack.sweep import Store
 from psotrack.sweep.figures import error_against_work, error_per_drone, pareto_front
 
 #: Figures of the table of cells.
 _FIGURES = (
-    Column("mean (mm)", "mean_error_m", 1, 1e3),
-    Column("std (mm)", "std", 1, 1e3),
-    Column("95 % (mm)", "p95_error_m", 1, 1e3),
-    Column("without offset (mm)", "offset_removed_mean_error_m", 1, 1e3),
-    Column("HOTA", "hota", 3),
-    Column("ms per frame", "track_ms_per_frame", 1),
+    PageColumn("mean (mm)", "mean_error_m", 1, 1e3),
+    PageColumn("std (mm)", "std", 1, 1e3),
+    PageColumn("95 % (mm)", "p95_error_m", 1, 1e3),
+    PageColumn("without offset (mm)", "offset_removed_mean_error_m", 1, 1e3),
+    PageColumn("HOTA", "hota", 3),
+    PageColumn("ms per frame", "track_ms_per_frame", 1),
     percent("missed", "missed_rate"),
-    Column("runs", "runs", 0),
-    Column("front", "on_front"),
+    PageColumn("runs", "runs", 0),
+    PageColumn("front", "on_front"),
 )
 _NOTE = "Means over runs, best first; std over runs. Front: no cell of the sequence is better in error and in time."
 #: Largest number of cells whose errors per drone are drawn.
@@ -92,7 +92,9 @@ def _cells(rows: pd.DataFrame, shown: list[str]) -> pd.DataFrame:
 
 
 def _table(cells: pd.DataFrame, shown: list[str]) -> PageTable:
-    settings = [Column(name.removeprefix("settings.").removeprefix("perturbation."), name) for name in shown]
+    settings = [
+        PageColumn(name.removeprefix("settings.").removeprefix("perturbation."), name) for name in shown
+    ]
     return make_table([*settings, *_FIGURES], cells.to_dict("records"), _NOTE)
 
 

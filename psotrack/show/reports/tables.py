@@ -10,7 +10,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Column:
+class PageColumn:
     """A column of a table.
 
     Attributes:
@@ -34,9 +34,9 @@ class Column:
         return f"{value}" if self.decimals is None else f"{self.factor * value:.{self.decimals}f}{self.unit}"
 
 
-def percent(heading: str, key: str, decimals: int = 1) -> Column:
+def percent(heading: str, key: str, decimals: int = 1) -> PageColumn:
     """A column of shares as percentages."""
-    return Column(heading, key, decimals, 100.0, " %")
+    return PageColumn(heading, key, decimals, 100.0, " %")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PageTable:
 
 
 def make_table(
-    columns: Iterable[Column],
+    columns: Iterable[PageColumn],
     rows: Iterable[Mapping[Any, Any]],
     note: str = "",
     colours: tuple[str, ...] = (),
@@ -75,7 +75,7 @@ def make_table(
     return PageTable(tuple(column.heading for column in columns), cells, colours, note)
 
 
-def _cell(column: Column, value: Any) -> tuple[str, float | None]:
+def _cell(column: PageColumn, value: Any) -> tuple[str, float | None]:
     text = column.text(value)
     is_number = isinstance(value, int | float) and np.isfinite(value)
     return text, float(value) if is_number else None

@@ -14,8 +14,6 @@ from psotrack.show.viewer.entity_log import FRAME, TIME, camera_path, drone_path
 
 #: Time for which a drone's trail is shown, seconds.
 _TRAIL_S = 3.0
-#: Background of the view of space, also where the browser's page is light: colours of drones are made for it.
-_BACKGROUND = (18, 20, 24)
 
 
 def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool = False) -> rrb.Blueprint:
@@ -52,7 +50,7 @@ def live_blueprint() -> rrb.Blueprint:
     """The arrangement for tracks that come while cameras film."""
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial3DView(origin="/world", name="space", background=_BACKGROUND),
+            rrb.Spatial3DView(origin="/world", name="space"),
             rrb.Vertical(
                 *(_plot(quantity) for quantity in QUANTITIES if quantity != "error_mm"),
                 rrb.TimeSeriesView(origin="/plots/delay_ms", name="delay (ms)"),
@@ -93,7 +91,6 @@ def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
         name="space",
         overrides=trails,
         eye_controls=_eye(flight),
-        background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0),
     )
 
@@ -124,7 +121,7 @@ def _plots(flight: TrackedFlight) -> rrb.Tabs:
 def _plot(quantity: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=f"/plots/{quantity}",
-        name=QUANTITIES[quantity],
+        name=QUANTITIES[quantity][0],
         axis_y=rrb.ScalarAxis(range=(0.0, 1.0)) if quantity == "score" else None,
         plot_legend=rrb.PlotLegend(visible=True),
     )

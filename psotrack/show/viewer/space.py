@@ -26,7 +26,7 @@ from psotrack.trajectories import Status
 
 MARKER_RGB = (255, 90, 200)
 _GREY_RGB = (110, 110, 110)
-_TRUTH_RGBA = (255, 255, 255, 130)
+_TRUTH_RGBA = (128, 128, 128, 200)
 #: Opacity of the whole path of a drone, 0 to 255: the trail is in front of it.
 _PATH_OPACITY = 110
 #: Distance of the images from the cameras, metres.
