@@ -166,7 +166,7 @@ def test_a_video_of_other_inputs_is_not_kept(folder, tmp_path, change):
     assert len(write_overlays(tmp_path / "out", flight, jobs=1).kept) == 1
     recording = flight.recording
     if change == "lens":
-        cameras = replace(recording.rig.cameras, fisheye=np.array([True]))
+        cameras = replace(recording.rig.cameras, dist=np.zeros((1, 4)), fisheye=np.array([True]))
         flight = replace(flight, recording=replace(recording, rig=replace(recording.rig, cameras=cameras)))
     elif change == "times":
         late = {"c0": replace(recording.frame_times["c0"], time_offset_s=0.01)}
