@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import threading
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +13,12 @@ import rerun as rr
 
 from psotrack.errors import OutputError
 from psotrack.foreground.silhouettes import Silhouettes
-from psotrack.recordings import VideoInfo
+from psotrack.recordings import Recording, VideoInfo
 from psotrack.show.flights import TrackedFlight
 from psotrack.show.viewer.camera_images import (
     CameraKey,
-    EncodingTask,
     ImagePlan,
-    encode_images,
+    ImageSource,
     plan_images,
 )
 from psotrack.show.viewer.entity_log import EntityLog
@@ -26,7 +26,7 @@ from psotrack.show.viewer.image_marks import log_images, log_marks
 from psotrack.show.viewer.layout import blueprint_of
 from psotrack.show.viewer.plots import log_plots
 from psotrack.show.viewer.space import log_flight, log_world
-from psotrack.support import Report, atomic_write, map_in_processes, no_progress
+from psotrack.support import Report, atomic_write, no_progress
 
 #: Largest size by default: this number of bytes per second of the recording, up to the second number.
 _BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
@@ -122,14 +122,9 @@ def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, r
         plan = plan_images(videos, _left_bytes(path, most))
         log_marks(log, flight, plan.step)
         _flush(stream)
-        with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
-            tasks = _tasks(content, videos, plan, Path(folder), _left_bytes(path, most))
-            with report("images", plan.num_images) as advance:
-                encoded = map_in_processes(encode_images, list(tasks.values()), jobs=jobs, advance=advance)
-            for camera, images in zip(tasks, encoded, strict=True):
-                task = tasks[camera]
-                assert flight.recording is not None
-                log_images(log, flight.recording, camera, images, (task.reduction, task.cell_px))
+        sources = _sources(content, videos, plan, _left_bytes(path, most))
+        if flight.recording is not None:
+            _log_all_images(log, flight.recording, sources, plan.num_images, jobs, report)
     finally:
         stream.disconnect()
     return plan
@@ -177,19 +172,14 @@ def _videos(flight: TrackedFlight, with_onboard: bool) -> dict[CameraKey, VideoI
     return videos
 
 
-def _tasks(
-    content: ViewContent,
-    videos: Mapping[CameraKey, VideoInfo],
-    plan: ImagePlan,
-    folder: Path,
-    max_bytes: float,
-) -> dict[CameraKey, EncodingTask]:
+def _sources(
+    content: ViewContent, videos: Mapping[CameraKey, VideoInfo], plan: ImagePlan, max_bytes: float
+) -> dict[CameraKey, ImageSource]:
     silhouettes = content.silhouettes
     arrays = {} if silhouettes is None else dict(zip(silhouettes.cameras, silhouettes.arrays, strict=True))
     return {
-        camera: EncodingTask(
+        camera: ImageSource(
             video=video,
-            path=folder / f"{number}.images",
             step=plan.step,
             reduction=plan.reduction[camera],
             bytes_per_image=max_bytes / max(plan.num_images, 1),
@@ -197,5 +187,33 @@ def _tasks(
             cell_px=1 if silhouettes is None else silhouettes.reduction,
             dictionary=content.dictionary if camera.on_drone else None,
         )
-        for number, (camera, video) in enumerate(videos.items())
+        for camera, video in videos.items()
     }
+
+
+def _log_all_images(
+    log: EntityLog,
+    recording: Recording,
+    sources: Mapping[CameraKey, ImageSource],
+    num_images: int,
+    jobs: int,
+    report: Report,
+) -> None:
+    """Log the images of all cameras, several cameras at the same time: OpenCV decodes and encodes in threads."""
+    stop = threading.Event()
+    with report("images", num_images) as advance, ThreadPoolExecutor(jobs) as threads:
+
+        def log_one(camera: CameraKey) -> None:
+            def goes_on(steps: int) -> None:
+                if stop.is_set():
+                    raise InterruptedError
+                advance(steps)
+
+            log_images(log, recording, camera, sources[camera], goes_on)
+
+        try:
+            list(threads.map(log_one, sources))
+        except BaseException:
+            # The other threads end with their next image.
+            stop.set()
+            raise

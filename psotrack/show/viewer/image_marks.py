@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from jaxtyping import Int
 from psotrack.geometry.rotations import rotation_matrices
 from psotrack.recordings import OnboardVideo, Recording, read_detections
 from psotrack.show.flights import FlightTracks, TrackedFlight, ellipse_outlines_px, view_in_images
-from psotrack.show.viewer.camera_images import CameraKey, EncodedImages, split_images
+from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSource, encode_images
 from psotrack.show.viewer.entity_log import EntityLog, Instants, camera_path, instants, shown_rgb, tracks_path
 from psotrack.show.viewer.space import MARKER_RGB, pinhole
+from psotrack.support import Advance
 
 _DETECTION_RGB = (255, 214, 10)
 _BLOB_RGB = (120, 255, 190)
@@ -49,11 +51,7 @@ def log_marks(log: EntityLog, flight: TrackedFlight, step: int) -> None:
 
 
 def log_images(
-    log: EntityLog,
-    recording: Recording,
-    camera: CameraKey,
-    images: EncodedImages,
-    pixels: tuple[int, int],
+    log: EntityLog, recording: Recording, camera: CameraKey, source: ImageSource, advance: Advance
 ) -> None:
     """Log the images of a camera: of the rig with silhouettes and blobs, on a drone with its path and markers.
 
@@ -61,40 +59,77 @@ def log_images(
         log: receives the values.
         recording: the recording.
         camera: the camera.
-        images: its images.
-        pixels: pixels of the video per pixel of the images, and per pixel of the silhouettes, along each side.
+        source: its images.
+        advance: receives the number of images.
+
+    Raises:
+        InputError: the video ends early.
     """
-    path = camera_path(camera)
-    for kind, reduction in zip(("image", "silhouettes"), pixels, strict=True):
-        if kind == "image" or images.blobs_px:
-            log.static(f"{path}/{kind}", rr.Transform3D(scale=[reduction, reduction, 1]))
+    path, instant, shown = camera_path(camera), _shown_at(recording, camera, source.step), []
+    kinds = [("image", source.reduction), ("silhouettes", source.cell_px)]
+    for kind, reduction in kinds if source.silhouettes is not None else kinds[:1]:
+        log.static(f"{path}/{kind}", rr.Transform3D(scale=[reduction, reduction, 1]))
     if camera.on_drone:
         assert recording.onboard is not None
-        video = recording.onboard[camera.name]
-        _log_path(log, path, video)
-        chosen, at = np.arange(len(images.frame)), Instants(images.frame, images.frame / video.video.fps)
-    else:
-        timeline = recording.timeline()
-        shown = timeline.frame[:, timeline.cameras.index(camera.name)]
-        frame = np.flatnonzero(_is_new(shown) & np.isin(shown, images.frame))
-        chosen, at = np.searchsorted(images.frame, shown[frame]), Instants(frame, timeline.time_s[frame])
-    for first in range(0, len(chosen), _TOGETHER):
-        rows = slice(first, first + _TOGETHER)
-        jpegs, pngs = zip(*split_images(images, chosen[rows].tolist()), strict=True)
-        own = Instants(at.frame[rows], at.time_s[rows])
-        _log_encoded(log, f"{path}/image", own, jpegs, "image/jpeg", 0.0)
-        if images.blobs_px:
-            _log_encoded(log, f"{path}/silhouettes", own, pngs, "image/png", 1.0)
-    if images.blobs_px:
-        _log_boxes(log, f"{path}/blobs", at, [images.blobs_px[index] for index in chosen], _BLOB_RGB)
-    if images.markers:
+        _log_path(log, path, recording.onboard[camera.name])
+    together: list[EncodedImage] = []
+    for image in encode_images(source):
+        if image.frame in instant:
+            together.append(image)
+            shown.append(replace(image, jpeg=b"", silhouette=b""))
+        if len(together) == _TOGETHER:
+            _log_encoded(log, path, together, instant)
+            together = []
+        advance(1)
+    _log_encoded(log, path, together, instant)
+    at = _instants(shown, instant)
+    if source.silhouettes is not None:
+        _log_boxes(log, f"{path}/blobs", at, [image.blobs_px for image in shown], _BLOB_RGB)
+    if source.dictionary is not None:
+        counts = np.array([len(image.marker_ids) for image in shown], int)
+        corners_px = np.concatenate([np.zeros((0, 4, 2)), *(image.marker_corners_px for image in shown)])
+        labels = [f"{marker}" for image in shown for marker in image.marker_ids.tolist()]
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
-        corners_px = (
-            np.concatenate([corners_px for _, corners_px in images.markers])[:, [0, 1, 2, 3, 0]] + 0.5
+        outlines_px = corners_px[:, [0, 1, 2, 3, 0]] + 0.5
+        log.lines(f"{path}/markers", at, counts, outlines_px, MARKER_RGB, labels)
+
+
+def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, tuple[int, float]]:
+    """Number and time of the instant at which each frame of a camera is shown first."""
+    if camera.on_drone:
+        assert recording.onboard is not None
+        video = recording.onboard[camera.name].video
+        return {frame: (frame, frame / video.fps) for frame in range(0, video.num_frames, step)}
+    timeline = recording.timeline()
+    frame = timeline.frame[:, timeline.cameras.index(camera.name)]
+    rows = _rows_shown(frame, step)
+    return dict(
+        zip(
+            frame[rows].tolist(), zip(rows.tolist(), timeline.time_s[rows].tolist(), strict=True), strict=True
         )
-        labels = [f"{marker}" for ids, _ in images.markers for marker in ids.tolist()]
-        counts = np.array([len(ids) for ids, _ in images.markers], int)
-        log.lines(f"{path}/markers", at, counts, corners_px, MARKER_RGB, labels)
+    )
+
+
+def _instants(images: Sequence[EncodedImage], instant: Mapping[int, tuple[int, float]]) -> Instants:
+    at = np.array([instant[image.frame] for image in images], float).reshape(-1, 2)
+    return Instants(at[:, 0].astype(int), at[:, 1])
+
+
+def _log_encoded(
+    log: EntityLog, path: str, images: Sequence[EncodedImage], instant: Mapping[int, tuple[int, float]]
+) -> None:
+    """Log some images together, and their silhouettes, which are in front."""
+
+    def encoded(blobs: list[bytes], kind: str, order: float) -> Callable[[slice], Any]:
+        count = len(blobs)
+        found = rr.EncodedImage.columns(blob=blobs, media_type=[kind] * count, draw_order=[order] * count)
+        return lambda _: found
+
+    at = _instants(images, instant)
+    if images:
+        log.rows(f"{path}/image", at, encoded([each.jpeg for each in images], "image/jpeg", 0.0))
+    if images and images[0].silhouette:
+        log.rows(f"{path}/silhouettes", at, encoded([each.silhouette for each in images], "image/png", 1.0))
 
 
 def _log_boxes(
@@ -103,20 +138,6 @@ def _log_boxes(
     """Log the boxes of each row, without names."""
     counts = np.array([len(each) for each in boxes_px], int)
     log.boxes(path, at, counts, np.concatenate([np.zeros((0, 4)), *boxes_px]), rgb)
-
-
-def _log_encoded(
-    log: EntityLog, path: str, at: Instants, blobs: Sequence[bytes], kind: str, order: float
-) -> None:
-    """Log encoded images; those of a higher order are in front."""
-    count = len(blobs)
-
-    def columns(_: slice) -> Any:
-        return rr.EncodedImage.columns(
-            blob=list(blobs), media_type=[kind] * count, draw_order=[order] * count
-        )
-
-    log.rows(path, at, columns)
 
 
 def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
