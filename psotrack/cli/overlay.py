@@ -73,5 +73,4 @@ def overlay(
     options = OverlayOptions(mosaic=mosaic, scale=scale, force=force)
     written = write_overlays(out, flight, options, jobs=jobs, report=report_to(quiet))
     if not quiet:
-        kept = f", {len(written.kept)} were there already" if written.kept else ""
-        click.echo(f"{out}: {len(written.written)} videos in {written.codec.name}{kept}")
+        click.echo(written)

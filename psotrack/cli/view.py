@@ -6,7 +6,6 @@ import sys
 import tempfile
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -25,10 +24,6 @@ from psotrack.cli.options import (
 from psotrack.cli.output import report_to
 from psotrack.errors import SettingsError
 from psotrack.support import refuse_to_overwrite
-
-if TYPE_CHECKING:
-    from psotrack.show.flights import TrackedFlight
-    from psotrack.show.viewer import WrittenFlight
 
 
 @click.command()
@@ -129,17 +124,17 @@ def view(
         max_bytes=None if max_size_mb is None else 1e6 * max_size_mb,
     )
 
-    def write(path: Path, name: str) -> None:
+    def write(path: Path) -> None:
         written = write_flight(path, flight, content, jobs=jobs, report=report)
         if not quiet:
-            click.echo(_sentence(name, flight, content.silhouettes is not None, written))
+            click.echo(written)
 
     if save is not None:
-        write(save, str(save))
+        write(save)
         return
     with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
         path = Path(folder) / "flight.rrd"
-        write(path, flight.name)
+        write(path)
         if web:
             show_in_browser(path, _say_page)
         else:
@@ -150,18 +145,3 @@ def _say_page(page: str) -> None:
     click.echo(f"{page}  (Ctrl-C ends)")
     if sys.stdout.isatty():
         webbrowser.open(page)
-
-
-def _sentence(name: str, flight: TrackedFlight, has_silhouettes: bool, written: WrittenFlight) -> str:
-    """What was made smaller or left out, in one line."""
-    parts = [f"{name}: {written.num_bytes / 1e6:.1f} MB"]
-    if written.plan.num_images:
-        smallest = max(written.plan.reduction.values())
-        frames = "every frame" if written.plan.step == 1 else f"1 frame in {written.plan.step}"
-        size = "full size" if smallest == 1 else f"1/{smallest} of the width and height"
-        parts.append(f"{written.plan.num_images} images ({frames}, {size})")
-        if not has_silhouettes:
-            parts.append("no silhouettes are stored; --silhouettes computes them")
-    elif flight.recording is None:
-        parts.append("--sequence shows the cameras, too")
-    return ", ".join(parts)

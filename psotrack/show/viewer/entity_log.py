@@ -13,7 +13,7 @@ Rerun has no lens distortion: marks are drawn in the pixels of the raw images, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +41,20 @@ class Instants(NamedTuple):
 
     frame: Int[np.ndarray, " rows"]
     time_s: Float[np.ndarray, " rows"]
+
+
+class Marks(NamedTuple):
+    """How marks in images look.
+
+    Attributes:
+        counts: (rows,), number of marks of each row.
+        rgb: colours of all marks of all rows, or one colour.
+        labels: names of all marks of all rows; None: no names.
+    """
+
+    counts: Int[np.ndarray, " rows"]
+    rgb: UInt8[np.ndarray, "marks 3"] | tuple[int, int, int]
+    labels: list[str] | None = None
 
 
 class EntityLog:
@@ -109,56 +123,30 @@ class EntityLog:
         numbers = np.flatnonzero(there)
         self.rows(path, at, lambda values: columns(numbers[values]), there.astype(int))
 
-    def boxes(
-        self,
-        path: str,
-        at: Instants,
-        counts: Int[np.ndarray, " rows"],
-        boxes_px: Float[np.ndarray, "boxes 4"],
-        rgb: UInt8[np.ndarray, "boxes 3"] | tuple[int, int, int],
-        labels: Sequence[str] | None = None,
-    ) -> None:
-        """Log boxes in images over time.
-
-        Args:
-            path: path of the entity.
-            at: the instants of the rows.
-            counts: (rows,), number of boxes of each row.
-            boxes_px: the boxes of all rows.
-            rgb: colours of all boxes, or of each box.
-            labels: names of the boxes; None: no names, and thin lines.
-        """
-        radius = -0.75 if labels is None else -1.5  # negative: in pixels of the screen
-        self.static(path, rr.Boxes2D.from_fields(radii=[radius], show_labels=labels is not None))
+    def boxes(self, path: str, at: Instants, marks: Marks, boxes_px: Float[np.ndarray, "boxes 4"]) -> None:
+        """Log boxes in images over time; without names, they have thin lines."""
+        radius = -0.75 if marks.labels is None else -1.5  # negative: in pixels of the screen
         centre_px, half_px = (boxes_px[:, 2:] + boxes_px[:, :2]) / 2, (boxes_px[:, 2:] - boxes_px[:, :2]) / 2
-        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(boxes_px), 3))
-
-        def columns(part: slice) -> Any:
-            names = None if labels is None else list(labels[part])
-            return rr.Boxes2D.columns(
-                centers=centre_px[part], half_sizes=half_px[part], colors=colours[part], labels=names
-            )
-
-        self.rows(path, at, columns, counts)
+        self._marks(path, at, marks, rr.Boxes2D, radius, centers=centre_px, half_sizes=half_px)
 
     def lines(
-        self,
-        path: str,
-        at: Instants,
-        counts: Int[np.ndarray, " rows"],
-        lines_px: Float[np.ndarray, "lines points 2"],
-        rgb: UInt8[np.ndarray, "lines 3"] | tuple[int, int, int],
-        labels: Sequence[str] | None = None,
+        self, path: str, at: Instants, marks: Marks, lines_px: Float[np.ndarray, "lines points 2"]
     ) -> None:
-        """Log lines in images over time; the arguments are those of `boxes`."""
-        self.static(path, rr.LineStrips2D.from_fields(radii=[-1.0], show_labels=labels is not None))
-        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(lines_px), 3))
+        """Log lines in images over time."""
+        self._marks(path, at, marks, rr.LineStrips2D, -1.0, strips=lines_px)
+
+    def _marks(
+        self, path: str, at: Instants, marks: Marks, kind: Any, radius: float, **places: np.ndarray
+    ) -> None:
+        labels = marks.labels
+        self.static(path, kind.from_fields(radii=[radius], show_labels=labels is not None))
+        rgb = np.broadcast_to(np.array(marks.rgb, np.uint8), (int(marks.counts.sum()), 3))
 
         def columns(part: slice) -> Any:
-            names = None if labels is None else list(labels[part])
-            return rr.LineStrips2D.columns(strips=list(lines_px[part]), colors=colours[part], labels=names)
+            own = {key: list(values[part]) for key, values in places.items()}
+            return kind.columns(**own, colors=rgb[part], labels=None if labels is None else labels[part])
 
-        self.rows(path, at, columns, counts)
+        self.rows(path, at, columns, marks.counts)
 
 
 def part(name: str) -> str:

@@ -43,12 +43,29 @@ class WrittenFlight:
     """What was written.
 
     Attributes:
+        path: the file.
         num_bytes: size of the file.
         plan: how the images were reduced.
+        has_silhouettes: whether silhouettes are shown.
     """
 
+    path: Path
     num_bytes: int
     plan: ImagePlan
+    has_silhouettes: bool
+
+    def __str__(self) -> str:
+        parts = [f"{self.path}: {self.num_bytes / 1e6:.1f} MB"]
+        if self.plan.num_images:
+            smallest = max(self.plan.reduction.values())
+            frames = "every frame" if self.plan.step == 1 else f"1 frame in {self.plan.step}"
+            size = "full size" if smallest == 1 else f"1/{smallest} of the width and height"
+            parts.append(f"{self.plan.num_images} images ({frames}, {size})")
+            if not self.has_silhouettes:
+                parts.append("no silhouettes are stored; --silhouettes computes them")
+        else:
+            parts.append("without images; the recording with its videos shows the cameras, too")
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -94,19 +111,15 @@ def write_flight(
     with atomic_write(path) as temporary:
         try:
             plan = _write(temporary, flight, content, jobs or os.cpu_count() or 1, report)
-            _check_end(temporary)
-        except _FileError as error:
+        except RuntimeError as error:
             expected, found = "to write the whole file", "that Rerun could not"
             raise OutputError(path, expected=expected, found=found, remedy="is the disk full?") from error
         num_bytes = temporary.stat().st_size
-    return WrittenFlight(num_bytes, plan)
-
-
-class _FileError(Exception):
-    """Rerun could not write the file."""
+    return WrittenFlight(path, num_bytes, plan, content.silhouettes is not None)
 
 
 def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, report: Report) -> ImagePlan:
+    """Write the file; raises `RuntimeError` where Rerun cannot."""
     stream = rr.RecordingStream(APPLICATION, recording_id=flight.name, send_properties=False)
     stream.save(path)
     try:
@@ -117,33 +130,21 @@ def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, r
         log_world(log, flight)
         log_flight(log, flight)
         log_plots(log, flight)
-        _flush(stream)
+        stream.flush()
         most = _max_bytes(flight, content)
         plan = plan_images(videos, _left_bytes(path, most))
         log_marks(log, flight, plan.step)
-        _flush(stream)
+        stream.flush()
         sources = _sources(content, videos, plan, _left_bytes(path, most))
         if flight.recording is not None:
             _log_all_images(log, flight.recording, sources, plan.num_images, jobs, report)
     finally:
         stream.disconnect()
-    return plan
-
-
-def _check_end(path: Path) -> None:
-    """Raise `_FileError` for a file without its end."""
     with path.open("rb") as file:
         file.seek(-min(len(_END), path.stat().st_size), os.SEEK_END)
         if file.read() != _END:
-            raise _FileError
-
-
-def _flush(stream: rr.RecordingStream) -> None:
-    """Wait until the file has everything that was logged."""
-    try:
-        stream.flush()
-    except RuntimeError as error:
-        raise _FileError from error
+            raise RuntimeError("the end is missing")
+    return plan
 
 
 def _left_bytes(path: Path, max_bytes: float) -> float:
@@ -154,7 +155,6 @@ def _left_bytes(path: Path, max_bytes: float) -> float:
 def _max_bytes(flight: TrackedFlight, content: ViewContent) -> float:
     if content.max_bytes is not None:
         return content.max_bytes
-    assert flight.recording is not None or not content.onboard
     if flight.recording is None or not flight.recording.num_frames:
         return _MOST_BYTES
     return min(_MOST_BYTES, _BYTES_PER_S * max(1.0, flight.recording.num_frames / flight.recording.fps))
@@ -165,11 +165,11 @@ def _videos(flight: TrackedFlight, with_onboard: bool) -> dict[CameraKey, VideoI
     recording = flight.recording
     if recording is None:
         return {}
-    names = [name for name in recording.rig.names if name in recording.videos]
-    videos = {CameraKey(name): recording.videos[name] for name in names}
-    for name, camera in (recording.onboard or {}).items() if with_onboard else ():
-        videos[CameraKey(name, on_drone=True)] = camera.video
-    return videos
+    videos = {
+        CameraKey(name): recording.videos[name] for name in recording.rig.names if name in recording.videos
+    }
+    onboard = (recording.onboard or {}) if with_onboard else {}
+    return videos | {CameraKey(name, on_drone=True): camera.video for name, camera in onboard.items()}
 
 
 def _sources(

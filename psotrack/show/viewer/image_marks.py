@@ -14,7 +14,15 @@ from psotrack.geometry.rotations import rotation_matrices
 from psotrack.recordings import OnboardVideo, Recording, read_detections
 from psotrack.show.flights import FlightTracks, TrackedFlight, ellipse_outlines_px, view_in_images
 from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSource, encode_images
-from psotrack.show.viewer.entity_log import EntityLog, Instants, camera_path, instants, shown_rgb, tracks_path
+from psotrack.show.viewer.entity_log import (
+    EntityLog,
+    Instants,
+    Marks,
+    camera_path,
+    instants,
+    shown_rgb,
+    tracks_path,
+)
 from psotrack.show.viewer.space import MARKER_RGB, pinhole
 from psotrack.support import Advance
 
@@ -91,7 +99,7 @@ def log_images(
         labels = [f"{marker}" for image in shown for marker in image.marker_ids.tolist()]
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
         outlines_px = corners_px[:, [0, 1, 2, 3, 0]] + 0.5
-        log.lines(f"{path}/markers", at, counts, outlines_px, MARKER_RGB, labels)
+        log.lines(f"{path}/markers", at, Marks(counts, MARKER_RGB, labels), outlines_px)
 
 
 def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, tuple[int, float]]:
@@ -137,7 +145,7 @@ def _log_boxes(
 ) -> None:
     """Log the boxes of each row, without names."""
     counts = np.array([len(each) for each in boxes_px], int)
-    log.boxes(path, at, counts, np.concatenate([np.zeros((0, 4)), *boxes_px]), rgb)
+    log.boxes(path, at, Marks(counts, rgb), np.concatenate([np.zeros((0, 4)), *boxes_px]))
 
 
 def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
@@ -167,15 +175,16 @@ def _log_tracks(log: EntityLog, recording: Recording, tracks: FlightTracks, step
         boxes_px = views.boxes_px[rows, :, index]
         there = np.isfinite(boxes_px).all(axis=-1)
         labels = [tracks.names[drone] for drone in np.nonzero(there)[1]]
-        counts = there.sum(axis=1)
-        log.boxes(tracks_path(f"{path}/boxes", tracks), at, counts, boxes_px[there], rgb[rows][there], labels)
+        marks = Marks(there.sum(axis=1), rgb[rows][there], labels)
+        log.boxes(tracks_path(f"{path}/boxes", tracks), at, marks, boxes_px[there])
+        if tracks.trajectories.covariance_m2 is None:
+            continue
         middle_px, shape_px2 = views.middle_px[rows, :, index], views.shape_px2[rows, :, index]
         there = np.isfinite(middle_px).all(axis=-1) & np.isfinite(shape_px2).all(axis=(-2, -1))
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
         outlines_px = ellipse_outlines_px(middle_px[there] + 0.5, shape_px2[there])
-        counts = there.sum(axis=1)
-        if tracks.trajectories.covariance_m2 is not None:
-            log.lines(tracks_path(f"{path}/ellipses", tracks), at, counts, outlines_px, rgb[rows][there])
+        marks = Marks(there.sum(axis=1), rgb[rows][there])
+        log.lines(tracks_path(f"{path}/ellipses", tracks), at, marks, outlines_px)
 
 
 def _is_new(frame: Int[np.ndarray, " instants"]) -> np.ndarray:
