@@ -24,13 +24,14 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from psotrack.demo import save_picture
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
 from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
+from psotrack.show.flights import flight_of
+from psotrack.show.overlay import save_picture
 from psotrack.show.reports import view_3d
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
@@ -107,16 +108,16 @@ pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
 
 # %%
 picture = DATA / "quickstart.png"
-save_picture(picture, recording, tracked)
+save_picture(picture, flight_of(tracked, recording))
 figure, axes = plt.subplots(figsize=(13, 4.6), dpi=68, layout="constrained")
 axes.imshow(plt.imread(picture))
 axes.set_axis_off()
 plt.show()
 
 # %% [markdown]
-# *What to see. Left: four of the cameras half-way through the recording; each box is the tracked position with the
-# learned size, projected into the camera, and sits on its drone. A colour is one drone in all pictures. Right: the
-# tracked paths (solid), the true paths (dashed), and the shadows of both on the floor. Axes are in metres.*
+# *What to see: five of the cameras half-way through the recording; each box is the tracked position with the learned
+# size, projected into the camera, and sits on its drone. A colour is one drone in all pictures. Lines are the paths of
+# the last two seconds. The map from above shows all cameras, and the drones with their heights.*
 #
 # The flight in 3D turns with the mouse and plays:
 

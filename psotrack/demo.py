@@ -7,19 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from jaxtyping import Float, UInt8
-
-from psotrack.evaluation import evaluate, plots, tables
+from psotrack.evaluation import evaluate, tables
 from psotrack.foreground.silhouettes import SilhouetteSettings
-from psotrack.geometry import make_extents, project_boxes
-from psotrack.pipeline import TrackedRecording, track_recording
-from psotrack.recordings import Recording, read_frames
+from psotrack.pipeline import track_recording
 from psotrack.recordings.datasets.dpjait import read_sequence
 from psotrack.settings import TrackSettings
+from psotrack.show.flights import flight_of
+from psotrack.show.overlay import save_picture
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.support import Report, atomic_write, atomic_write_all, no_progress, refuse_to_overwrite
-from psotrack.tracking.swarm import on_device
+from psotrack.support import Report, atomic_write_all, no_progress, refuse_files
 from psotrack.trajectories import write_trajectories
 
 if TYPE_CHECKING:
@@ -29,7 +25,6 @@ if TYPE_CHECKING:
 NAME, NUM_FRAMES, SCALE = "S02_D4_A", 75, 0.5
 #: Half the image size needs half the reduction, so that drones have the same number of silhouette pixels.
 SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
-SHOWN_CAMERAS = 4
 
 
 @dataclass(frozen=True)
@@ -52,8 +47,7 @@ def run(
         OutputError: there are results in `out`, or a sequence with another seed, and `force` is not set.
     """
     tracks, picture = out / "tracks.csv", out / "demo.png"
-    for path in (tracks, picture):
-        refuse_to_overwrite(path, force)
+    refuse_files(tracks, picture, force=force)
     began = time.perf_counter()
     folder = simulate(
         NAME,
@@ -73,7 +67,7 @@ def run(
     evaluation = evaluate(tracked.trajectories, recording.truth)
     with atomic_write_all(tracks, picture) as (tracks_file, picture_file):
         write_trajectories(tracks_file, tracked.trajectories)
-        save_picture(picture_file, recording, tracked)
+        save_picture(picture_file, flight_of(tracked, recording))
     seconds = tracked.record["seconds"]
     stages = {
         "simulate": simulated - began,
@@ -84,59 +78,6 @@ def run(
         "all": time.perf_counter() - began,
     }
     return Demo(tables.render(evaluation, title=recording.name), _stage_table(stages), picture)
-
-
-def save_picture(
-    path: Path, recording: Recording, tracked: TrackedRecording, frame: int | None = None
-) -> None:
-    """Save frames of four cameras with the tracked boxes, beside the paths in 3D, as PNG.
-
-    Args:
-        path: path of the picture.
-        recording: recording with a reference.
-        tracked: what was tracked in it.
-        frame: number of the shown frame; None takes the middle frame.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Rectangle
-
-    frame = tracked.trajectories.num_frames // 2 if frame is None else frame
-    assert recording.truth is not None
-    xyxy_px = _boxes(recording, tracked, frame)
-    colours = plots.colours_of_estimates(tracked.trajectories, recording.truth)
-    figure = Figure(figsize=(16, 5.6))
-    FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(2, 2, left=0.005, right=0.55, bottom=0.01, top=0.95, wspace=0.03, hspace=0.12)
-    for shown, name in enumerate(recording.rig.names[:SHOWN_CAMERAS]):
-        axes = figure.add_subplot(grid[shown // 2, shown % 2])
-        axes.imshow(_frame_of(recording, name, frame))
-        for drone, colour in enumerate(colours):
-            # Edges of pixels are half a pixel from their centres, which is what the axes count.
-            x0, y0, x1, y1 = xyxy_px[drone, shown] - 0.5
-            axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=colour, linewidth=1.6))
-        axes.set_title(f"{name}, frame {frame}", fontsize=9)
-        axes.set_axis_off()
-    paths = figure.add_axes((0.56, 0.0, 0.42, 0.88), projection="3d")
-    plots.draw_trajectories(paths, tracked.trajectories, recording.truth)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=120)
-
-
-def _boxes(
-    recording: Recording, tracked: TrackedRecording, frame: int
-) -> Float[np.ndarray, "drones cameras 4"]:
-    cameras = on_device(recording.rig.cameras)
-    seen = make_extents(cameras, np.asarray(tracked.size_m, np.float32))
-    position: Float[np.ndarray, "drones 3"] = tracked.trajectories.position_m[frame].astype(np.float32)
-    return np.asarray(project_boxes(seen, position).xyxy)
-
-
-def _frame_of(recording: Recording, camera: str, frame: int) -> UInt8[np.ndarray, "height width 3"]:
-    for index, image in enumerate(read_frames(recording.videos[camera])):
-        if index == frame:
-            return image[:, :, ::-1]
-    raise AssertionError("expected a frame of every camera, found fewer frames")
 
 
 def _stage_table(seconds: dict[str, float]) -> Table:

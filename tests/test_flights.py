@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from flight_files import make_sequence, make_tracks_file
 from helpers import ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,14 +18,15 @@ from psotrack.recordings import FrameTimes, Recording
 from psotrack.recordings.exchange import export_tracks
 from psotrack.show.flights import (
     EventKind,
-    boxes_in_images,
     camera_quality,
     drone_quality,
-    ellipses_in_images,
     ellipsoids_90,
     find_events,
+    find_recording,
     read_flight,
-    shown_frames,
+    recording_beside,
+    split_sequence,
+    view_in_images,
 )
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
@@ -88,7 +90,7 @@ class TestImages:
     def test_boxes_hold_the_surface_of_each_drone(self):
         """The oracle projects points of the ellipsoids' surfaces by OpenCV."""
         rig, tracks = ring_rig(3, coefficients=5), straight_tracks()
-        boxes_px = boxes_in_images(recording_of(rig), tracks, SIZE_M)
+        boxes_px = view_in_images(recording_of(rig), tracks, SIZE_M).boxes_px
         assert boxes_px.shape == (20, 2, 3, 4)
         direction = np.random.default_rng(0).normal(size=(4000, 3))
         sphere = direction / np.linalg.norm(direction, axis=1, keepdims=True)
@@ -102,22 +104,22 @@ class TestImages:
     def test_a_late_camera_shows_drones_where_they_are_then(self):
         rig, tracks = ring_rig(3), straight_tracks()
         late = recording_of(rig, frame_times={"c1": FrameTimes(20, RATE_HZ, time_offset_s=0.03)})
-        boxes_px = boxes_in_images(late, tracks, SIZE_M)
+        boxes_px = view_in_images(late, tracks, SIZE_M).boxes_px
         moved = replace(tracks, position_m=tracks.position_m + 0.03 * tracks.velocity_m_s)
-        expected = boxes_in_images(recording_of(rig), moved, SIZE_M)
+        expected = view_in_images(recording_of(rig), moved, SIZE_M).boxes_px
         # float32 keeps 320 pixels to 3e-5; each box has about ten operations.
         np.testing.assert_allclose(boxes_px[:, :, 1], expected[:, :, 1], atol=1e-2)
-        assert (shown_frames(late, tracks).frame[:, 1] == np.arange(20)).all()
+        assert (view_in_images(late, tracks, SIZE_M).frame[:, 1] == np.arange(20)).all()
 
     def test_rows_of_a_rolling_shutter_are_exposed_one_after_the_other(self):
         rig, tracks = ring_rig(3), straight_tracks(speed_m_s=3.0)
         rolling = recording_of(rig, line_time_s={"c0": 1e-4})
-        boxes_px = boxes_in_images(rolling, tracks, SIZE_M)[5, 0, 0]
-        row_px = boxes_in_images(recording_of(rig), tracks, SIZE_M)[5, 0, 0, [1, 3]].mean()
+        boxes_px = view_in_images(rolling, tracks, SIZE_M).boxes_px[5, 0, 0]
+        row_px = view_in_images(recording_of(rig), tracks, SIZE_M).boxes_px[5, 0, 0, [1, 3]].mean()
         # A rolling shutter's frame has the time of its middle row: frame 5 is exposed half a readout later.
         late_s = 1e-4 * 240 / 2 + 1e-4 * (row_px - 120)
         moved = replace(tracks, position_m=tracks.position_m + late_s * tracks.velocity_m_s)
-        expected = boxes_in_images(recording_of(rig), moved, SIZE_M)[5, 0, 0]
+        expected = view_in_images(recording_of(rig), moved, SIZE_M).boxes_px[5, 0, 0]
         # During the exposure of the drone the row itself moves by less than two rows, 0.6 mm of flight, 0.05 pixels.
         np.testing.assert_allclose(boxes_px, expected, atol=0.05)
 
@@ -126,7 +128,7 @@ class TestImages:
         tracks = with_status(tracks, 1, slice(3, 5), Status.LOST)
         tracks.position_m[8, 0] = 30.0, 0.0, 1.2
         short = recording_of(rig, frame_times={"c2": FrameTimes(6, RATE_HZ)})
-        boxes_px = boxes_in_images(short, tracks, SIZE_M)
+        boxes_px = view_in_images(short, tracks, SIZE_M).boxes_px
         shown = np.isfinite(boxes_px).all(axis=-1)
         assert not shown[3:5, 1].any()
         assert not shown[7:, :, 2].any()
@@ -136,7 +138,7 @@ class TestImages:
     def test_ellipses_are_the_outlines_of_the_90_percent_ellipsoids(self):
         """The oracle projects points of an ellipsoid's surface by OpenCV: none is outside, some are at the border."""
         rig, tracks = ring_rig(3, coefficients=5), straight_tracks()
-        ellipses = ellipses_in_images(recording_of(rig), tracks)
+        ellipses = view_in_images(recording_of(rig), tracks, SIZE_M)
         direction = np.random.default_rng(1).normal(size=(3000, 3))
         sphere = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         half_m = np.sqrt(np.diag(tracks.covariance_m2[4, 0]) * chi2.ppf(0.9, 3))
@@ -148,7 +150,7 @@ class TestImages:
 
     def test_tracks_without_covariances_have_no_ellipses(self):
         tracks = replace(straight_tracks(), covariance_m2=None)
-        assert ellipses_in_images(recording_of(ring_rig(2)), tracks) is None
+        assert np.isnan(view_in_images(recording_of(ring_rig(2)), tracks, SIZE_M).shape_px2).all()
 
 
 class TestEllipsoids:
@@ -256,9 +258,37 @@ class TestReading:
         paths = [write_flight(folder, straight_tracks()) for folder in (tmp_path / "a", tmp_path / "b")]
         flight = read_flight(paths)
         assert [each.label for each in flight.tracks] == ["a/tracks", "b/tracks"]
-        assert len({*flight.colours(0), *flight.colours(1)}) == 2
+        assert len({*flight.tracks[0].colours, *flight.tracks[1].colours}) == 2
         with pytest.raises(InputError, match="found one file twice"):
             read_flight([paths[0], paths[0]])
+
+    def test_a_recording_among_the_tracks_is_refused(self, tmp_path):
+        path = write_flight(tmp_path, straight_tracks())
+        lab = tmp_path / "lab"
+        lab.mkdir()
+        (lab / "recording.toml").write_text("version = 1", encoding="utf-8")
+        with pytest.raises(
+            InputError, match=r"lab: expected a file of tracks, found a recording.*--sequence"
+        ):
+            read_flight([path, lab])
+        assert split_sequence([path, lab]) == ((path,), lab)
+        assert split_sequence([path]) == ((path,), None)
+
+    @pytest.mark.parametrize("folder", ["flight", "../elsewhere/flight"])
+    def test_tracks_know_their_recording(self, tmp_path, caplog, folder):
+        """A recording in the folder of the tracks is moved with it; another one stays where it is."""
+        sequence = make_sequence(tmp_path / "home" / folder)
+        tracks = make_tracks_file(tmp_path / "home" / "tracks.csv")
+        record = json.loads(tracks.with_suffix(".json").read_text(encoding="utf-8"))
+        record["recording"] = recording_beside(sequence, tracks)
+        tracks.with_suffix(".json").write_text(json.dumps(record), encoding="utf-8")
+        tracks = (tmp_path / "home").rename(tmp_path / "moved") / "tracks.csv"
+        if folder == "../elsewhere/flight":
+            (tmp_path / "home").mkdir()
+        assert read_flight([tracks]).recording.name == "flight"
+        find_recording(tracks).rename(tmp_path / "gone")
+        assert read_flight([tracks]).recording is None
+        assert "flight is not there; name the recording" in caplog.text
 
     @pytest.mark.parametrize(
         ("content", "message"),

@@ -26,9 +26,9 @@ from flight_files import (
 
 from psotrack import cli
 from psotrack.errors import OutputError
-from psotrack.recordings import probe, read_frames
-from psotrack.show.flights import boxes_in_images, colour_rgb, read_flight, status_rgb
-from psotrack.show.overlay import Codec, find_codec, write_overlays
+from psotrack.recordings import VideoWriter, probe, read_frames
+from psotrack.show.flights import read_flight, status_rgb, view_in_images
+from psotrack.show.overlay import Codec, OverlayOptions, find_codec, write_overlays
 from psotrack.support import COLOURS
 from psotrack.trajectories import Status, write_trajectories
 
@@ -53,7 +53,7 @@ def names_in(folder):
 
 
 def colour_bgr(drone, status):
-    return np.array(status_rgb(int(status), colour_rgb(COLOURS[drone], 0.2))[::-1], float)
+    return status_rgb(np.array([int(status)]), [COLOURS[drone]], lighter=0.2)[0, ::-1].astype(float)
 
 
 def nearest_colour(image, box_px, colour):
@@ -73,7 +73,7 @@ def test_boxes_are_drawn_where_the_drones_are(run, folder, tmp_path, scale):
     assert out.endswith("3 videos in MPEG-4\n") or out.endswith("3 videos in H.264\n")
     assert names_in(tmp_path / "videos") == [*(f"{name}.mp4" for name in CAMERAS), "overlay.json"]
     flight = read_flight([folder / "tracks.csv"], folder / "flight")
-    boxes_px = boxes_in_images(flight.recording, flight.tracks[0].trajectories, flight.tracks[0].size_m)
+    views = view_in_images(flight.recording, flight.tracks[0].trajectories, flight.tracks[0].size_m)
     for index, name in enumerate(CAMERAS):
         video = probe(tmp_path / "videos" / f"{name}.mp4")
         width, height = (round(scale * side) for side in IMAGE_SIZE_WH)
@@ -81,7 +81,7 @@ def test_boxes_are_drawn_where_the_drones_are(run, folder, tmp_path, scale):
         for frame, image in enumerate(read_frames(video)):
             for drone in range(2):
                 status = make_tracks().status[frame, drone]
-                box_px = boxes_px[frame, drone, index] * scale
+                box_px = views.boxes_px[frame, drone, index] * scale
                 if status == Status.LOST:
                     assert np.isnan(box_px).all()
                     continue
@@ -129,6 +129,52 @@ def test_the_mosaic_has_all_cameras_and_a_map(run, folder, tmp_path):
             seen[frame, drone] = np.median(columns), np.median(rows)
     assert seen[0, 0][0] < seen[0, 1][0], "drone 0 has the smaller x"
     assert seen[LOST_FROM - 1, 1][1] < seen[0, 1][1], "drones fly towards larger y"
+
+
+def test_cameras_of_another_shape_keep_their_aspect_ratio_in_the_mosaic(folder, tmp_path):
+    """One of three cameras shows the left 200 of 320 columns: its image is narrower, and boxes sit on the drones."""
+    flight = read_flight([folder / "tracks.csv"], folder / "flight")
+    recording, index = flight.recording, CAMERAS.index("c1")
+    with VideoWriter(tmp_path / "narrow.avi", 25.0, (200, 240)) as writer:
+        for frame in read_frames(recording.videos["c1"]):
+            writer.write(frame[:, :200].copy())
+    sizes_wh = recording.rig.cameras.image_size_wh.copy()
+    sizes_wh[index] = 200, 240
+    rig = replace(recording.rig, cameras=replace(recording.rig.cameras, image_size_wh=sizes_wh))
+    videos = {**recording.videos, "c1": probe(tmp_path / "narrow.avi")}
+    flight = replace(flight, recording=replace(recording, rig=rig, videos=videos))
+    write_overlays(tmp_path / "out", flight, OverlayOptions(mosaic=True), jobs=1)
+    tile = next(read_frames(probe(tmp_path / "out" / "mosaic.mp4")))[:720, 960:]
+    # 200 x 240 pixels in a place of 960 x 720 are three times as large, with 180 black columns at both sides.
+    assert tile[:, :170].max() < 40
+    assert tile[:, 790:].max() < 40
+    views = view_in_images(flight.recording, flight.tracks[0].trajectories, flight.tracks[0].size_m)
+    shown = [drone for drone in range(2) if views.boxes_px[0, drone, index, 2] < 200]
+    assert shown
+    for drone in shown:
+        box_px = views.boxes_px[0, drone, index] * 3 + [180, 0, 180, 0]
+        assert nearest_colour(tile, box_px, colour_bgr(drone, Status.TRACKED)) < 40
+
+
+@pytest.mark.parametrize("change", ["lens", "times", "video"])
+def test_a_video_of_other_inputs_is_not_kept(folder, tmp_path, change):
+    flight = read_flight([folder / "tracks.csv"], folder / "flight", cameras=["c0"])
+    video = tmp_path / "c0.avi"
+    video.write_bytes((folder / "flight" / "c0.avi").read_bytes())
+    flight = replace(flight, recording=replace(flight.recording, videos={"c0": probe(video)}))
+    assert len(write_overlays(tmp_path / "out", flight, jobs=1).written) == 1
+    assert len(write_overlays(tmp_path / "out", flight, jobs=1).kept) == 1
+    recording = flight.recording
+    if change == "lens":
+        cameras = replace(recording.rig.cameras, dist=np.zeros((1, 4)), fisheye=np.array([True]))
+        flight = replace(flight, recording=replace(recording, rig=replace(recording.rig, cameras=cameras)))
+    elif change == "times":
+        late = {"c0": replace(recording.frame_times["c0"], time_offset_s=0.01)}
+        flight = replace(flight, recording=replace(recording, frame_times=late))
+    else:
+        video.write_bytes((folder / "flight" / "c1.avi").read_bytes())
+    with pytest.raises(OutputError, match=r"one of other inputs.*--force"):
+        write_overlays(tmp_path / "out", flight, jobs=1)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Reports and 3D views: what is in the pages, and, in a real browser, that they work."""
 
 import base64
+import html
 import json
 import re
 import shutil
@@ -13,17 +14,21 @@ import pytest
 from click.testing import CliRunner
 from evaluation_flights import on_x_axis
 from helpers import make_once, ring_rig
-from hypothesis import given
-from hypothesis import strategies as st
 
 from psotrack.cli import cli
 from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings.datasets import open_recording
-from psotrack.show.reports import PointCloud, Scene3D, scene_of_tracks
-from psotrack.show.reports.charts import thinned
-from psotrack.show.reports.page import MOST_BYTES, write_page
-from psotrack.show.reports.scene import MOST_ROWS
+from psotrack.show.flights import flight_of, read_flight
+from psotrack.show.reports import (
+    MOST_BYTES,
+    MOST_ROWS,
+    PointCloud,
+    Scene3D,
+    view_3d,
+    write_flight_report,
+    write_page,
+)
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.sweep import Store
 from psotrack.trajectories import Status, write_trajectories
@@ -131,11 +136,43 @@ class TestFlight:
         assert outside == []
         assert len(text) < MOST_BYTES / 4
 
+    def test_the_page_explains_its_figures(self, page):
+        text = page.read_text(encoding="utf-8")
+        assert (
+            "In 90 % ellipsoid: share of the frames in which the ellipsoid that the run states holds" in text
+        )
+        assert "<b>1.5 times</b><span>faster than the video</span>" in text
+
+    def test_the_same_tracks_again_is_a_script_that_processes_may_import(self, page):
+        """Processes that make silhouettes import the script again, under another name: it must not track again."""
+        (script,) = re.findall(
+            r"<pre>(import psotrack.*?)</pre>", page.read_text(encoding="utf-8"), re.DOTALL
+        )
+        ran = {"__name__": "__mp_main__"}
+        exec(html.unescape(script), ran)
+        assert "tracked" not in ran
+        assert "particles" in script
+
+    @pytest.mark.parametrize("shown", ["a recording without tracks", "a reference of another time"])
+    def test_what_the_viewer_shows_has_a_report(self, flight, tmp_path, shown):
+        sequence = flight / "Simulated_Data" / "S01_D2_A"
+        if shown == "a recording without tracks":
+            read = read_flight([], sequence)
+        else:
+            read = read_flight([flight / "tracks.csv"], sequence)
+            late = replace(read.truth, frame=read.truth.frame + 1000, time_s=read.truth.time_s + 100)
+            read = replace(read, recording=replace(read.recording, truth=late))
+        write_flight_report(tmp_path / "page.html", read, pictures=False)
+        text = (tmp_path / "page.html").read_text(encoding="utf-8")
+        assert "psotrackScene(document" in text
+        assert "Errors against the reference" not in text
+
     def test_pictures_show_the_place_of_the_event(self, page):
         """The box of the drone, in the drone's colour, is in the picture of the event in which the drone is found."""
         (picture,) = pictures_in(page, "is found again")
         assert picture.shape == (240, 360, 3)
-        off = np.abs(picture.astype(int) - [0x00, 0x5E, 0xD5]).sum(axis=-1)
+        # The colour of drone 1, lighter.
+        off = np.abs(picture.astype(int) - [51, 126, 221]).sum(axis=-1)
         rows, columns = np.nonzero(off < 90)
         # The whole box, with its name, a quarter as high as the picture. JPEG blurs colours of thin lines.
         assert len(rows) > 20
@@ -190,7 +227,7 @@ class TestFlight:
 class TestScene:
     def test_positions_are_those_of_the_tracks(self):
         tracks = on_x_axis([0, 1, None, 3], [5, 6, 7, 8])
-        (first, second) = scene_of_tracks(tracks, rig=ring_rig(3)).data()["drones"]
+        (first, second) = Scene3D(tracks.time_s, flight_of(tracks).tracks, rig=ring_rig(3)).data()["drones"]
         np.testing.assert_array_equal(decoded(first["position_m"])[::3], [0, 1, np.nan, 3])
         np.testing.assert_array_equal(decoded(second["position_m"])[::3], [5, 6, 7, 8])
         np.testing.assert_array_equal(decoded(first["status"]), [0, 0, 2, 0])
@@ -199,13 +236,13 @@ class TestScene:
         """In float32, 500 km are known to 3 cm."""
         tracks = on_x_axis([0, 0.001, 0.002])
         far = replace(tracks, position_m=tracks.position_m + np.array([500_000.0, 5_000_000.0, 120.0]))
-        data = scene_of_tracks(far).data()
+        data = view_3d(far).data()
         shown = decoded(data["drones"][0]["position_m"])[::3].astype(float) + data["origin_m"][0]
         np.testing.assert_allclose(shown - 500_000, [0, 0.001, 0.002], atol=1e-4)
 
     def test_pyramids_of_cameras_open_along_their_view(self):
         rig = ring_rig(3, coefficients=5)
-        for index, camera in enumerate(scene_of_tracks(on_x_axis([0, 1]), rig=rig).data()["cameras"]):
+        for index, camera in enumerate(Scene3D(np.arange(2.0), rig=rig).data()["cameras"]):
             centre_m, corners_m = np.array(camera["centre_m"]), np.array(camera["corners_m"])
             forward = np.asarray(rig.cameras.T_cam_world[index])[2, :3]
             np.testing.assert_allclose(centre_m, rig.cameras.centre_world[index], atol=1e-12)
@@ -215,7 +252,7 @@ class TestScene:
 
     def test_long_flights_show_every_nth_row(self):
         count = 3 * MOST_ROWS
-        scene = scene_of_tracks(on_x_axis(list(range(count))))
+        scene = view_3d(on_x_axis(list(range(count))))
         assert len(decoded(scene.data()["time_s"])) == MOST_ROWS
 
     def test_clouds_must_have_the_rows_of_the_scene(self):
@@ -224,21 +261,7 @@ class TestScene:
 
     def test_names_cannot_leave_the_script(self):
         tracks = replace(on_x_axis([0, 1]), drones=("</script><script>alert(1)</script>",))
-        assert "</script><script>alert" not in scene_of_tracks(tracks)._repr_html_()
-
-
-class TestCharts:
-    @given(seed=st.integers(0, 2**32 - 1), count=st.integers(3000, 20_000))
-    def test_thinned_lines_keep_extremes_and_gaps(self, seed, count):
-        rng = np.random.default_rng(seed)
-        values = rng.normal(size=count)
-        values[rng.integers(count, size=5)] = [50, -50, 40, -40, 30]
-        values[count // 3 : count // 3 + count // 4] = np.nan
-        time_s, shown = thinned(np.arange(count, dtype=float), values)
-        assert len(shown) <= 2500
-        assert (np.diff(time_s) >= 0).all()
-        assert (np.nanmin(shown), np.nanmax(shown)) == (np.nanmin(values), np.nanmax(values))
-        assert np.isnan(shown).sum() > len(shown) / 5
+        assert "</script><script>alert" not in view_3d(tracks)._repr_html_()
 
 
 class TestSweep:
@@ -248,8 +271,8 @@ class TestSweep:
         text = (tmp_path / "sweep.html").read_text(encoding="utf-8")
         rows = re.findall(r"<tr>(<td.*?)</tr>", text)
         cells = [re.findall(r">([^<]*)</td>", row) for row in rows]
-        assert [cell[2] for cell in cells] == ["10", "50"]
-        assert [cell[3] for cell in cells] == ["20.0", "10.0"]
+        assert [cell[2] for cell in cells] == ["50", "10"]
+        assert [cell[3] for cell in cells] == ["10.0", "20.0"]
         assert [cell[-1] for cell in cells] == ["yes", "yes"]
         assert "<svg" in text
         assert "no further files" in refused("report", folder, tmp_path, "--out", tmp_path / "other.html")

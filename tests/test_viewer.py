@@ -34,7 +34,7 @@ from psotrack import cli
 from psotrack.geometry import project
 from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames
 from psotrack.recordings.datasets import open_recording
-from psotrack.show.flights import boxes_in_images, read_flight
+from psotrack.show.flights import read_flight, view_in_images
 from psotrack.show.viewer import LiveView, ViewContent, write_flight
 from psotrack.trajectories import read_trajectories, write_trajectories
 
@@ -103,7 +103,7 @@ def test_positions_are_those_of_the_tracks(saved):
         # A lost drone has none: its ellipsoid would grow to the size of the room.
         shown = NUM_FRAMES if drone else LOST_FROM
         np.testing.assert_allclose(np.array(axes[:shown])[:, 0], [expected] * shown, rtol=1e-4)
-        assert axes[shown:] == [[]] * (not drone)
+        assert axes[shown:] == [[]] * (NUM_FRAMES - shown)
     truth = np.array(saved["/world/truth/dron1/point"]["Points3D:positions"][1])[:, 0]
     np.testing.assert_allclose(truth, make_tracks().position_m[:, 0], atol=1e-6)
 
@@ -118,8 +118,7 @@ def test_in_a_gap_a_drone_is_not_shown(tmp_path):
     for path, component in (("body", "Boxes3D:centers"), ("trail", "LineStrips3D:strips")):
         frames, values = entities[f"/world/drones/0/{path}"][component]
         shown = dict(zip(frames, values, strict=True))
-        assert shown[3] == []
-        assert 4 not in shown
+        assert shown[3] == shown[4] == []
         assert len(shown[6]) == 1
 
 
@@ -172,7 +171,7 @@ def test_images_decode_and_are_those_of_the_videos(saved, folder):
 def test_boxes_and_ellipses_are_about_the_drones(saved, folder):
     flight = read_flight([folder / "tracks.csv"], folder / "flight")
     tracks = flight.tracks[0]
-    expected = boxes_in_images(flight.recording, tracks.trajectories, tracks.size_m)
+    expected = view_in_images(flight.recording, tracks.trajectories, tracks.size_m).boxes_px
     for index, name in enumerate(CAMERAS):
         centres = saved[f"/world/cameras/{name}/boxes"]["Boxes2D:centers"][1]
         halves = saved[f"/world/cameras/{name}/boxes"]["Boxes2D:half_sizes"][1]
@@ -443,10 +442,10 @@ def test_rows_of_a_live_session_arrive_in_the_viewer(folder, tmp_path):
     assert words == ["tracked", "coasting", "tracked"]
     # Lines have the colours of the drones.
     for drone in "01":
-        line = entities[f"/plots/height_m/{drone}"]["SeriesLines:colors"][1]
+        line = entities[f"/plots/score/{drone}"]["SeriesLines:colors"][1]
         assert line[0] == entities[f"/world/drones/{drone}/body"]["Boxes3D:colors"][1][0]
     # A lost drone has no ellipsoid.
-    last_frame = max(entities["/world/drones/0/ellipsoid"]["Ellipsoids3D:half_sizes"][0])
-    assert last_frame == LOST_FROM - 1
+    frames, half_sizes = entities["/world/drones/0/ellipsoid"]["Ellipsoids3D:half_sizes"]
+    assert max(frame for frame, half in zip(frames, half_sizes, strict=True) if half) == LOST_FROM - 1
     assert entities["/plots/delay_ms"]["Scalars:scalars"][1] == [[20.0]] * NUM_FRAMES
     assert "/world/cameras/c0" in entities

@@ -27,6 +27,7 @@ from psotrack.cli.options import (
     SEQUENCE,
     compiled_folder,
     out_option,
+    recording_named,
 )
 from psotrack.cli.output import Output, check_suffix, pass_output, write_json
 from psotrack.cli.records import HelpfulCommand, options_of
@@ -217,6 +218,8 @@ def live(
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients}
+    if out is not None:
+        report["recording"] = recording_named(sequence, out)
     report = with_real_time(report, time.perf_counter() - output.started_s, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)

@@ -347,3 +347,12 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
             remedy="name SEQ",
         )
     return found
+
+
+def recording_named(sequence: Path, tracks: Path) -> str:
+    """How the record beside tracks names their recording: an archive by its own path, not by that of its content."""
+    from psotrack.cli.archived import archive_of
+    from psotrack.show.flights import recording_beside
+
+    archive = archive_of(click.get_current_context())
+    return recording_beside(sequence if archive is None else archive.path, tracks)

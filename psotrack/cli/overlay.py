@@ -69,5 +69,4 @@ def overlay(
         flight = first_instants(flight, extent.num_frames)
     options = OverlayOptions(mosaic=mosaic, scale=scale, force=output.force)
     written = write_overlays(out, flight, options, jobs=extent.jobs, report=output.report)
-    kept = f", {len(written.kept)} were there already" if written.kept else ""
-    output.say(f"{out}: {len(written.written)} videos in {written.codec.name}{kept}")
+    output.say(f"{written}")

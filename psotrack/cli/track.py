@@ -22,6 +22,7 @@ from psotrack.cli.options import (
     detections_of,
     extent_options,
     out_option,
+    recording_named,
     reporting,
 )
 from psotrack.cli.output import Output, check_suffix, pass_output, write_json
@@ -37,8 +38,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Run:
-    """A run of `track`: the recording, the settings, the file of the tracks, and the seconds until the work began."""
+    """A run of `track`: the recording and its path, the settings, the file of the tracks, the seconds before the work."""
 
+    sequence: Path
     recording: Recording
     settings: TrackSettings
     out: Path
@@ -146,13 +148,14 @@ def track(
         opened, chosen, cameras=extent.cameras, num_frames=num_frames, videos=detector is not None
     )
     if causal:
-        _track_causally(output, _Run(recording, chosen, out, extent, start_s), most_drones)
+        _track_causally(output, _Run(sequence, recording, chosen, out, extent, start_s), most_drones)
         return
     tracked = track_recording(
         recording, chosen, cache=extent.silhouettes, jobs=extent.jobs, report=output.report, **parts
     )
     identities, tracks = tracked.identities, tracked.trajectories
     record = with_real_time(tracked.record, time.perf_counter() - output.started_s, start_s=start_s)
+    record = {**record, "recording": recording_named(sequence, out)}
     with atomic_write_all(record_path, ambiguity_path, out) as (record_file, ambiguity_file, tracks_file):
         write_trajectories(tracks_file, tracks)
         write_ambiguity(ambiguity_file, tracks.time_s, identities.pairs, identities.ambiguity)
@@ -189,6 +192,7 @@ def _track_causally(output: Output, run: _Run, most_drones: int) -> None:
         for frame in frames:
             rows.write(frame)
     record = with_real_time(record, time.perf_counter() - output.started_s, start_s=run.start_s)
+    record = {**record, "recording": recording_named(run.sequence, run.out)}
     record, sentence = with_comparison(record, run.out, run.settings)
     write_json(record_path, record)
     output.json(record)

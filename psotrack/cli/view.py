@@ -6,7 +6,6 @@ import sys
 import tempfile
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -22,10 +21,6 @@ from psotrack.cli.records import HelpfulCommand
 from psotrack.cli.types import opened_sequence
 from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX
-
-if TYPE_CHECKING:
-    from psotrack.show.flights import TrackedFlight
-    from psotrack.show.viewer import WrittenFlight
 
 
 @click.command(cls=HelpfulCommand)
@@ -117,16 +112,16 @@ def view(
         max_bytes=None if max_size_mb is None else 1e6 * max_size_mb,
     )
 
-    def write(path: Path, name: str) -> None:
+    def write(path: Path) -> None:
         written = write_flight(path, flight, content, jobs=jobs, report=report)
-        output.say(_sentence(name, flight, content.silhouettes is not None, written))
+        output.say(f"{written}")
 
     if save is not None:
-        write(save, str(save))
+        write(save)
         return
     with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
         path = Path(folder) / "flight.rrd"
-        write(path, flight.name)
+        write(path)
         if web:
             show_in_browser(path, _say_page)
         else:
@@ -137,18 +132,3 @@ def _say_page(page: str) -> None:
     click.echo(f"{page}  (Ctrl-C ends)")
     if sys.stdout.isatty():
         webbrowser.open(page)
-
-
-def _sentence(name: str, flight: TrackedFlight, has_silhouettes: bool, written: WrittenFlight) -> str:
-    """What was made smaller or left out, in one line."""
-    parts = [f"{name}: {written.num_bytes / 1e6:.1f} MB"]
-    if written.plan.num_images:
-        smallest = max(written.plan.reduction.values())
-        frames = "every frame" if written.plan.step == 1 else f"1 frame in {written.plan.step}"
-        size = "full size" if smallest == 1 else f"1/{smallest} of the width and height"
-        parts.append(f"{written.plan.num_images} images ({frames}, {size})")
-        if not has_silhouettes:
-            parts.append("no silhouettes are stored; --silhouettes computes them")
-    elif flight.recording is None:
-        parts.append("SEQ shows the cameras, too")
-    return ", ".join(parts)

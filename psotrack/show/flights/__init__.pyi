@@ -1,43 +1,52 @@
-from .colours import colour_rgb, status_colours, status_rgb, statuses
-from .ellipsoids import Ellipsoids, ellipsoids_90
-from .events import Event, EventKind, find_events
+from .appearance import Ellipsoids, colour_rgb, ellipsoids_90, status_rgb, statuses
+from .events import Event, EventKind, find_events, intervals
 from .flight import (
     USUAL_SIZE_M,
     FlightTracks,
     TrackedFlight,
+    find_recording,
     first_instants,
+    flight_of,
     read_flight,
     read_tracks_file,
+    rows_at,
+    split_sequence,
 )
-from .image_views import ImageEllipses, boxes_in_images, ellipse_outlines_px, ellipses_in_images, shown_frames
-from .quality import camera_quality, drone_quality
-from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record
+from .image_views import ImageViews, ellipse_outlines_px, view_in_images
+from .quality import QUANTITIES, Quantity, camera_quality, drone_quality, quantities
+from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record, recording_beside
 
 __all__ = [
+    "QUANTITIES",
     "USUAL_SIZE_M",
     "Ellipsoids",
     "Event",
     "EventKind",
     "FlightTracks",
-    "ImageEllipses",
+    "ImageViews",
     "LearnedDrone",
     "MeetingRecord",
+    "Quantity",
     "RunRecord",
     "TrackedFlight",
-    "boxes_in_images",
     "camera_quality",
     "colour_rgb",
     "drone_quality",
     "ellipse_outlines_px",
-    "ellipses_in_images",
     "ellipsoids_90",
     "find_events",
+    "find_recording",
     "first_instants",
+    "flight_of",
+    "intervals",
+    "quantities",
     "read_flight",
     "read_run_record",
     "read_tracks_file",
-    "shown_frames",
-    "status_colours",
+    "recording_beside",
+    "rows_at",
+    "split_sequence",
     "status_rgb",
     "statuses",
+    "view_in_images",
 ]

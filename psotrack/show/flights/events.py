@@ -9,14 +9,14 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.errors import InputError
-from psotrack.evaluation import errors_over_time
 from psotrack.recordings import Recording
 from psotrack.show.flights.flight import FlightTracks, TrackedFlight
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import Status
 
 #: Shortest time of coasting that is an event, seconds: shorter gaps are usual where drones cover each other.
 _LONG_COASTING_S = 0.2
+#: Where an event happened whose place is not known.
+_NOWHERE_M = np.full(3, np.nan)
 
 
 class EventKind(StrEnum):
@@ -32,7 +32,7 @@ class EventKind(StrEnum):
     LEFT_OUT = "camera left out"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Event:
     """An event of a flight.
 
@@ -43,7 +43,7 @@ class Event:
         drones: names of the drones that take part; those of the reference for errors against the reference.
         text: a sentence that says what happened.
         tracks: label of the tracks.
-        position_m: where it happened, metres: between the drones, or where a lost drone was last; None if unknown.
+        position_m: where it happened, metres: between the drones, or where a lost drone was last; NaN if unknown.
     """
 
     time_s: float
@@ -52,7 +52,7 @@ class Event:
     drones: tuple[str, ...]
     text: str
     tracks: str
-    position_m: tuple[float, float, float] | None = None
+    position_m: Float[np.ndarray, "3"]
 
 
 def find_events(flight: TrackedFlight) -> tuple[Event, ...]:
@@ -61,57 +61,66 @@ def find_events(flight: TrackedFlight) -> tuple[Event, ...]:
     Begins, losses and coasting come from the status of the tracks; encounters and cameras that were left out from the
     record; identity switches and the largest error of each drone from the reference.
     """
-    found: list[Event] = []
-    for tracks in flight.tracks:
-        found += _of_status(tracks)
-        found += _of_record(tracks, flight.recording)
-        if flight.truth is not None:
-            found += _of_errors(tracks, flight.truth)
+    found = [
+        event
+        for tracks in flight.tracks
+        for event in (*_of_status(tracks), *_of_record(tracks, flight.recording), *_of_errors(flight, tracks))
+    ]
     return tuple(sorted(found, key=lambda event: (event.time_s, event.tracks, event.kind, event.drones)))
 
 
-def _of_status(tracks: FlightTracks) -> Iterator[Event]:
+def _event(
+    tracks: FlightTracks,
+    row: int,
+    kind: EventKind,
+    drones: tuple[str, ...],
+    text: str,
+    position_m: Float[np.ndarray, "3"] = _NOWHERE_M,
+) -> Event:
     trajectories = tracks.trajectories
+    at = float(trajectories.time_s[row]), int(trajectories.frame[row])
+    return Event(*at, kind, drones, text, tracks.label, np.asarray(position_m, np.float64))
+
+
+def _of_status(tracks: FlightTracks) -> Iterator[Event]:
+    trajectories, last = tracks.trajectories, tracks.trajectories.num_frames - 1
     for drone, name in enumerate(trajectories.drones):
-        seen = trajectories.seen[:, drone]
+        seen, position_m = trajectories.seen[:, drone], trajectories.position_m[:, drone]
         for number, (start, stop) in enumerate(intervals(seen)):
             if start > 0:
                 kind = EventKind.FOUND_AGAIN if number else EventKind.BEGINS
                 verb = "is found again" if number else "is first tracked"
-                position_m = trajectories.position_m[start, drone]
-                yield _event(tracks, start, kind, (name,), f"drone {name} {verb}", position_m)
-            if stop < trajectories.num_frames:
-                position_m = trajectories.position_m[stop - 1, drone]
-                yield _event(tracks, stop, EventKind.LOST, (name,), f"drone {name} is lost", position_m)
+                yield _event(tracks, start, kind, (name,), f"drone {name} {verb}", position_m[start])
+            if stop <= last:
+                text = f"drone {name} is lost"
+                yield _event(tracks, stop, EventKind.LOST, (name,), text, position_m[stop - 1])
         if trajectories.status is None:
             continue
         for start, stop in intervals(seen & (trajectories.status[:, drone] == Status.COASTING)):
-            end = min(stop, trajectories.num_frames - 1)
-            lasted_s = float(trajectories.time_s[end] - trajectories.time_s[start])
+            lasted_s = float(trajectories.time_s[min(stop, last)] - trajectories.time_s[start])
             if lasted_s >= _LONG_COASTING_S:
                 text = f"drone {name} is predicted for {lasted_s:.2f} s, without measurements"
-                position_m = trajectories.position_m[start, drone]
-                yield _event(tracks, start, EventKind.COASTING, (name,), text, position_m)
+                yield _event(tracks, start, EventKind.COASTING, (name,), text, position_m[start])
 
 
 def _of_record(tracks: FlightTracks, recording: Recording | None) -> Iterator[Event]:
     if tracks.record is None:
         return
-    frame = tracks.trajectories.frame
+    trajectories = tracks.trajectories
     for met in tracks.record.encounters:
-        if met.closest_frame not in frame:
+        if met.closest_frame not in trajectories.frame:
             continue
         names = tuple(f"{drone}" for drone in met.drones)
         text = f"drones {names[0]} and {names[1]} meet at {met.distance_m:.2f} m; their labels: {met.outcome}"
-        row = int(np.searchsorted(frame, met.closest_frame))
-        together = [drone for drone, name in enumerate(tracks.trajectories.drones) if name in names]
-        position_m = tracks.trajectories.position_m[row, together].mean(axis=0) if together else None
-        yield _event(tracks, row, EventKind.MET, names, text, position_m)
+        row = int(np.searchsorted(trajectories.frame, met.closest_frame))
+        together = [drone for drone, name in enumerate(trajectories.drones) if name in names]
+        between_m = trajectories.position_m[row, together].mean(axis=0) if together else _NOWHERE_M
+        yield _event(tracks, row, EventKind.MET, names, text, between_m)
     for camera, left_out in tracks.record.left_out.items():
         for first, stop in left_out:
-            row = min(_row_of_frame(tracks, recording, camera, first), len(frame) - 1)
+            row = min(_row_of_frame(tracks, recording, camera, first), trajectories.num_frames - 1)
             text = f"camera {camera} is left out in {stop - first} frames: foreground is everywhere"
-            yield _event(tracks, row, EventKind.LEFT_OUT, (), text, None)
+            yield _event(tracks, row, EventKind.LEFT_OUT, (), text)
 
 
 def _row_of_frame(tracks: FlightTracks, recording: Recording | None, camera: str, number: int) -> int:
@@ -123,56 +132,27 @@ def _row_of_frame(tracks: FlightTracks, recording: Recording | None, camera: str
     return int(np.searchsorted(tracks.trajectories.time_s, at_s - 1e-6))
 
 
-def _of_errors(tracks: FlightTracks, truth: Trajectories) -> Iterator[Event]:
-    try:
-        errors = errors_over_time(tracks.trajectories, truth)
-    except InputError:
-        # The reference begins after the tracks end, or knows no position: there is nothing to compare.
+def _of_errors(flight: TrackedFlight, tracks: FlightTracks) -> Iterator[Event]:
+    errors, truth = flight.errors(tracks), flight.truth
+    if errors is None or truth is None:
         return
-    rows = np.searchsorted(tracks.trajectories.frame, errors["frame"].to_numpy())
-    rows = np.minimum(rows, tracks.trajectories.num_frames - 1)
-    names, error_m = errors["drone"].to_numpy(object), errors["error_m"].to_numpy(float)
-    for switched in np.flatnonzero(errors["switch"].to_numpy(bool)):
-        name = f"{names[switched]}"
-        text = f"{name} is followed by another track than before"
-        position_m = _position_m(truth, name, int(errors["frame"].iloc[switched]))
-        yield _event(tracks, int(rows[switched]), EventKind.SWITCH, (name,), text, position_m)
-    for name in dict.fromkeys(names):
-        own_m = np.where((names == name) & np.isfinite(error_m), error_m, -1.0)
-        largest = int(own_m.argmax())
-        if own_m[largest] >= 0:
-            text = f"{name} has its largest error, {1e3 * own_m[largest]:.0f} mm"
-            position_m = _position_m(truth, name, int(errors["frame"].iloc[largest]))
-            yield _event(tracks, int(rows[largest]), EventKind.LARGEST_ERROR, (f"{name}",), text, position_m)
 
+    def happened(kind: EventKind, at: int, text: str) -> Event:
+        """An event in a row of the errors."""
+        name, frame = f"{errors['drone'].iloc[at]}", int(errors["frame"].iloc[at])
+        row = min(int(np.searchsorted(tracks.trajectories.frame, frame)), tracks.trajectories.num_frames - 1)
+        place_m = truth.position_m[np.searchsorted(truth.frame, frame), truth.drones.index(name)]
+        return _event(tracks, row, kind, (name,), f"{name} {text}", place_m)
 
-def _position_m(truth: Trajectories, drone: str, frame: int) -> Float[np.ndarray, "3"]:
-    """Position of a drone of the reference in a frame that the reference has."""
-    return truth.position_m[np.searchsorted(truth.frame, frame), truth.drones.index(drone)]
-
-
-def _event(
-    tracks: FlightTracks,
-    row: int,
-    kind: EventKind,
-    drones: tuple[str, ...],
-    text: str,
-    position_m: Float[np.ndarray, "3"] | None,
-) -> Event:
-    trajectories = tracks.trajectories
-    known = position_m is not None and bool(np.isfinite(position_m).all())
-    return Event(
-        time_s=float(trajectories.time_s[row]),
-        frame=int(trajectories.frame[row]),
-        kind=kind,
-        drones=drones,
-        text=text,
-        tracks=tracks.label,
-        position_m=tuple(float(part) for part in position_m) if known else None,  # type: ignore[arg-type,union-attr]
-    )
+    for at in np.flatnonzero(errors["switch"]).tolist():
+        yield happened(EventKind.SWITCH, at, "is followed by another track than before")
+    known_m = errors["error_m"].dropna()
+    for at in known_m.groupby(errors["drone"], observed=True).idxmax():
+        text = f"has its largest error, {1e3 * known_m[at]:.0f} mm"
+        yield happened(EventKind.LARGEST_ERROR, int(at), text)
 
 
 def intervals(wanted: Bool[np.ndarray, "frames"]) -> list[tuple[int, int]]:
     """The longest runs of True, as first index and index after the last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
+    edges = np.flatnonzero(np.diff(wanted.astype(np.int8), prepend=0, append=0))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from psotrack.errors import InputError, SettingsError
+from psotrack.evaluation import errors_over_time
 from psotrack.foreground.silhouettes import check_whole
-from psotrack.recordings import Recording, VideoInfo
+from psotrack.pipeline import TrackedRecording
+from psotrack.recordings import RECORDING_FILE, Recording, VideoInfo
 from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.datasets.dpjait import CALIBRATION
 from psotrack.recordings.exchange import read_tracks
-from psotrack.show.flights.run_record import RunRecord, read_run_record
-from psotrack.support import COLOURS, short_repr
+from psotrack.show.flights.run_record import RunRecord, as_run_record, read_run_record
+from psotrack.support import drone_colour, short_repr
 from psotrack.trajectories import Trajectories
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+_logger = logging.getLogger(__name__)
 
 #: Full lengths of a drone of whose size the record says nothing, metres: an assumption, for drawing only.
 USUAL_SIZE_M = (0.3, 0.3, 0.3)
+#: Largest distance of a row from a time that it is shown at, in intervals between rows.
+_NEAR = 0.6
 
 
 @dataclass(frozen=True, repr=False)
@@ -33,6 +45,8 @@ class FlightTracks:
         record: the record of the run; None where there is none beside the file.
         size_m: (drones, 3), full lengths of the drones along the world's axes, metres: as the run learned them, else
             `USUAL_SIZE_M`.
+        colours: a colour per drone, as #rrggbb; where several files of tracks are compared, one colour per file.
+        group: the label where several files of tracks are compared; else empty.
     """
 
     label: str
@@ -40,8 +54,15 @@ class FlightTracks:
     trajectories: Trajectories
     record: RunRecord | None
     size_m: Float[np.ndarray, "drones 3"]
+    colours: tuple[str, ...]
+    group: str = ""
 
     __repr__ = short_repr
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The shown name of each drone: with the label where several files of tracks are compared."""
+        return tuple(f"{self.group} {drone}".strip() for drone in self.trajectories.drones)
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,15 +86,15 @@ class TrackedFlight:
         """The reference of the recording; None where there is none."""
         return None if self.recording is None else self.recording.truth
 
-    def colours(self, number: int) -> list[str]:
-        """Colours of the drones of the tracks with a number, as #rrggbb.
+    def errors(self, tracks: FlightTracks) -> DataFrame | None:
+        """Errors of tracks over time, see `errors_over_time`; None where there is nothing to compare.
 
-        One colour per drone; where several files of tracks are compared, one colour per file.
+        The reference may begin after the tracks end, or know no position.
         """
-        count = self.tracks[number].trajectories.num_drones
-        if len(self.tracks) > 1:
-            return [COLOURS[number % len(COLOURS)]] * count
-        return [COLOURS[drone % len(COLOURS)] for drone in range(count)]
+        try:
+            return None if self.truth is None else errors_over_time(tracks.trajectories, self.truth)
+        except InputError:
+            return None
 
 
 def read_flight(
@@ -86,29 +107,93 @@ def read_flight(
 
     Args:
         tracks: files of tracks.
-        sequence: the recording, as for `open_recording`; None: no recording.
+        sequence: the recording, as for `open_recording`; None: the one that the record of the first tracks names, as
+            far as it is there.
         cameras: names of the cameras to keep; None: all.
 
     Raises:
-        InputError: a file cannot be used, there is neither a file of tracks nor a recording, or tracks have no instant
-            of the recording.
+        InputError: a file cannot be used, there is neither a file of tracks nor a recording, a recording stands where
+            tracks are expected, or tracks have no instant of the recording.
         SettingsError: a camera is unknown.
     """
+    paths = [Path(path) for path in tracks]
+    for path in paths:
+        if _is_recording(path):
+            remedy = f"name the recording last, TRACKS [SEQ]"
+            raise InputError(path, expected="a file of tracks", found="a recording", remedy=remedy)
+    sequence = find_recording(paths[0]) if sequence is None and paths else sequence
     recording = None if sequence is None else open_recording(sequence)
     if recording is not None and cameras is not None:
         recording = recording.usable(cameras, videos=False)
     if recording is None and cameras is not None:
         raise SettingsError("cameras", expected="a recording, which has the cameras", found="none")
-    if recording is None and not tracks:
+    if recording is None and not paths:
         raise InputError("flight", expected="files of tracks, or a recording", found="neither")
-    paths = [Path(path) for path in tracks]
-    read = tuple(
+    read = [
         read_tracks_file(path, label, recording) for path, label in zip(paths, _labels(paths), strict=True)
-    )
+    ]
+    if len(read) > 1:
+        read = [
+            replace(each, group=each.label, colours=(drone_colour(number),) * len(each.colours))
+            for number, each in enumerate(read)
+        ]
     for each in read:
         if recording is not None:
             _check_fits(each, recording)
-    return TrackedFlight(recording.name if recording is not None else _name_of(read[0]), read, recording)
+    return TrackedFlight(
+        recording.name if recording is not None else _name_of(read[0]), tuple(read), recording
+    )
+
+
+def split_sequence(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
+    """Files of tracks, and the recording if the last one of some paths is a recording."""
+    if paths and _is_recording(paths[-1]):
+        return tuple(paths[:-1]), paths[-1]
+    return tuple(paths), None
+
+
+def flight_of(
+    tracks: TrackedRecording | Trajectories, recording: Recording | None = None, *, label: str = "tracks"
+) -> TrackedFlight:
+    """The flight of tracks that are in memory.
+
+    Args:
+        tracks: the result of `track`, or trajectories.
+        recording: the recording; None shows the tracks alone.
+        label: name of the tracks.
+    """
+    if isinstance(tracks, TrackedRecording):
+        record = as_run_record(dict(tracks.record), label)
+        own = _flight_tracks(label, Path(label), tracks.trajectories, record)
+    else:
+        own = _flight_tracks(label, Path(label), tracks, None)
+    return TrackedFlight(_name_of(own) if recording is None else recording.name, (own,), recording)
+
+
+def rows_at(trajectories: Trajectories, time_s: Float[np.ndarray, "times"]) -> Int[np.ndarray, "times"]:
+    """The row of trajectories that is nearest to each time; -1 where none is near."""
+    own_s, at_s = np.asarray(trajectories.time_s, np.float64), np.asarray(time_s, np.float64)
+    nearest = np.searchsorted((own_s[:-1] + own_s[1:]) / 2, at_s)
+    interval_s = max(
+        (float(np.median(np.diff(each_s))) for each_s in (own_s, at_s) if len(each_s) > 1), default=0
+    )
+    return np.where(np.abs(own_s[nearest] - at_s) <= _NEAR * interval_s + 1e-9, nearest, -1)
+
+
+def find_recording(tracks: Path | str) -> Path | None:
+    """The recording that the record beside tracks names; None where there is none, with a warning if it is gone.
+
+    Raises:
+        InputError: the record cannot be read.
+    """
+    record = _record_beside(Path(tracks))
+    if record is None or not record.recording:
+        return None
+    path = Path(tracks).parent / record.recording
+    if path.exists():
+        return path
+    _logger.warning("%s: its recording %s is not there; name the recording to see its cameras", tracks, path)
+    return None
 
 
 def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
@@ -170,19 +255,28 @@ def read_tracks_file(path: Path | str, label: str, recording: Recording | None =
         InputError: the file or its record cannot be read.
     """
     path = Path(path)
-    trajectories = read_tracks(path, recording=recording)
-    record_path = path.with_suffix(".json")
-    record = read_run_record(record_path) if record_path.is_file() and record_path != path else None
-    return FlightTracks(label, path, trajectories, record, _sizes_m(trajectories, record))
+    trajectories, record = read_tracks(path, recording=recording), _record_beside(path)
+    return _flight_tracks(label, path, trajectories, record)
 
 
-def _sizes_m(trajectories: Trajectories, record: RunRecord | None) -> Float[np.ndarray, "drones 3"]:
-    """Sizes of the drones as the record has them, by the drones' names; the usual size for all others."""
-    learned = {} if record is None or isinstance(record.drones, int) else record.drones
-    size_m = {f"{drone.drone}": drone.size_m for drone in learned}
-    return np.array([size_m.get(name, USUAL_SIZE_M) for name in trajectories.drones], np.float64).reshape(
-        -1, 3
-    )
+def _flight_tracks(
+    label: str, path: Path, trajectories: Trajectories, record: RunRecord | None
+) -> FlightTracks:
+    learned = () if record is None or isinstance(record.drones, int) else record.drones
+    sizes_m = {f"{drone.drone}": drone.size_m for drone in learned}
+    size_m = np.array([sizes_m.get(name, USUAL_SIZE_M) for name in trajectories.drones]).reshape(-1, 3)
+    colours = tuple(drone_colour(drone) for drone in range(trajectories.num_drones))
+    return FlightTracks(label, path, trajectories, record, size_m, colours)
+
+
+def _is_recording(path: Path) -> bool:
+    names = (RECORDING_FILE, CALIBRATION)
+    return path.suffix.lower() == ".toml" or any((path / name).exists() for name in names)
+
+
+def _record_beside(tracks: Path) -> RunRecord | None:
+    path = tracks.with_suffix(".json")
+    return read_run_record(path) if path.is_file() and path != tracks else None
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:

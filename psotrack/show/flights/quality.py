@@ -1,20 +1,75 @@
-"""Tables of the quality of tracks: one row per drone, and one row per camera."""
+"""Quality of tracks: quantities over time, and tables with one row per drone or per camera."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from psotrack.recordings import Recording
-from psotrack.show.flights.ellipsoids import ellipsoids_90
-from psotrack.show.flights.flight import FlightTracks
-from psotrack.show.flights.image_views import boxes_in_images, shown_frames
+from psotrack.show.flights.appearance import ellipsoids_90
+from psotrack.show.flights.flight import FlightTracks, TrackedFlight
+from psotrack.show.flights.image_views import view_in_images
+from psotrack.support import drone_colour
 from psotrack.trajectories import Status
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+
+#: Quantities over time: their names with units, and what they mean.
+QUANTITIES = {
+    "error_mm": ("error (mm)", "Distance of each drone of the reference from its track."),
+    "score": ("score", "How well the images fit the position of each drone, from 0 to 1."),
+    "deviation_mm": ("std (mm)", "Standard deviation of each position in space, as the run states it."),
+    "cameras": ("cameras", "Number of cameras that see each drone."),
+}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity over time, with a line per drone.
+
+    Attributes:
+        key: one of `QUANTITIES`.
+        frame, time_s: (rows,), numbers and times of the instants, seconds.
+        values: (rows, lines), NaN where it is not known.
+        names: name of each drone: of the tracks, or of the reference for errors.
+        colours: colour of each line, as #rrggbb.
+    """
+
+    key: str
+    frame: Int[np.ndarray, "rows"]
+    time_s: Float[np.ndarray, "rows"]
+    values: Float[np.ndarray, "rows lines"]
+    names: tuple[str, ...]
+    colours: tuple[str, ...]
+
+
+def quantities(flight: TrackedFlight, tracks: FlightTracks) -> Iterator[Quantity]:
+    """The quantities over time that are known of tracks, in the order of `QUANTITIES`."""
+    errors, flown = flight.errors(tracks), tracks.trajectories
+    if errors is not None:
+        table = errors.pivot(index=["frame", "time_s"], columns="drone", values="error_m").sort_index()
+        frame, time_s = (table.index.get_level_values(level).to_numpy() for level in ("frame", "time_s"))
+        names = tuple(f"{name}" for name in table.columns)
+        # Drones of the reference are others than those of the tracks.
+        colours = tuple(
+            tracks.colours[0] if tracks.group else drone_colour(index) for index in range(len(names))
+        )
+        yield Quantity("error_mm", frame, time_s, 1e3 * table.to_numpy(float), names, colours)
+    deviation_mm = None
+    if flown.covariance_m2 is not None:
+        variance_m2 = np.trace(flown.covariance_m2, axis1=-2, axis2=-1)
+        deviation_mm = 1e3 * np.sqrt(np.maximum(variance_m2, 0.0))
+    found = {"score": flown.fitness, "deviation_mm": deviation_mm, "cameras": flown.num_cameras}
+    for key, values in found.items():
+        if values is not None:
+            shown = np.where(flown.seen, values, np.nan).astype(np.float64)
+            yield Quantity(key, flown.frame, flown.time_s, shown, flown.drones, tracks.colours)
 
 
 def drone_quality(tracks: FlightTracks) -> DataFrame:
@@ -29,28 +84,31 @@ def drone_quality(tracks: FlightTracks) -> DataFrame:
     """
     import pandas as pd
 
-    trajectories, seen = tracks.trajectories, tracks.trajectories.seen
-    rows: list[dict[str, Any]] = []
-    for drone, name in enumerate(trajectories.drones):
-        there = seen[:, drone]
-        times_s = trajectories.time_s[there]
-        rows.append(
-            {
-                "drone": name,
-                "seen": there.mean(),
-                "coasting": np.nan
-                if trajectories.status is None
-                else (there & (trajectories.status[:, drone] == Status.COASTING)).mean(),
-                "first_s": times_s[0] if len(times_s) else np.nan,
-                "last_s": times_s[-1] if len(times_s) else np.nan,
-                "fitness": _mean(trajectories.fitness, there, drone),
-                "num_cameras": _mean(trajectories.num_cameras, there, drone),
-                "radius_90_m": _median_radius_m(trajectories.covariance_m2, there, drone),
-                "speed_m_s": _mean_speed_m_s(trajectories.velocity_m_s, there, drone),
-                **dict(zip(("size_x_m", "size_y_m", "size_z_m"), tracks.size_m[drone], strict=True)),
-            }
-        )
-    return pd.DataFrame(rows)
+    flown, seen = tracks.trajectories, tracks.trajectories.seen
+
+    def of_seen(values: np.ndarray | None) -> DataFrame:
+        """A column per drone, with the values of the frames in which it is seen."""
+        return pd.DataFrame(np.where(seen, np.nan if values is None else values, np.nan))
+
+    times_s = of_seen(flown.time_s[:, None])
+    covariance_m2, velocity_m_s = flown.covariance_m2, flown.velocity_m_s
+    longest_m = None if covariance_m2 is None else ellipsoids_90(covariance_m2).half_axes_m[..., 2]
+    speed_m_s = None if velocity_m_s is None else np.linalg.norm(velocity_m_s, axis=-1)
+    coasting = None if flown.status is None else seen & (flown.status == Status.COASTING)
+    return pd.DataFrame(
+        {
+            "drone": list(flown.drones),
+            "seen": seen.mean(axis=0),
+            "coasting": np.nan if coasting is None else coasting.mean(axis=0),
+            "first_s": times_s.min(),
+            "last_s": times_s.max(),
+            "fitness": of_seen(flown.fitness).mean(),
+            "num_cameras": of_seen(flown.num_cameras).mean(),
+            "radius_90_m": of_seen(longest_m).median(),
+            "speed_m_s": of_seen(speed_m_s).mean(),
+            **{f"size_{axis}_m": lengths_m for axis, lengths_m in zip("xyz", tracks.size_m.T, strict=True)},
+        }
+    )
 
 
 def camera_quality(tracks: FlightTracks, recording: Recording) -> DataFrame:
@@ -64,46 +122,21 @@ def camera_quality(tracks: FlightTracks, recording: Recording) -> DataFrame:
     """
     import pandas as pd
 
-    boxes_px = boxes_in_images(recording, tracks.trajectories, tracks.size_m)
-    in_view = np.isfinite(boxes_px).all(axis=-1)
-    num_seen = max(int(tracks.trajectories.seen.sum()), 1)
-    shown = shown_frames(recording, tracks.trajectories)
-    record = tracks.record
+    views = view_in_images(recording, tracks.trajectories, tracks.size_m)
+    names, record = recording.rig.names, tracks.record
+    widths_px = pd.DataFrame((views.boxes_px[..., 2] - views.boxes_px[..., 0]).reshape(-1, len(names)))
     errors = {} if record is None else record.camera_errors.get("cameras", {})
-    rows = []
-    for camera, name in enumerate(recording.rig.names):
-        widths_px = np.ptp(boxes_px[..., camera, [0, 2]][in_view[..., camera]], axis=-1)
-        noise_px = [part for part in errors.get(name, {}).get("noise_px") or () if part is not None]
-        intervals = [] if record is None else record.left_out.get(name, [])
-        rows.append(
-            {
-                "camera": name,
-                "frames": shown.is_there[:, camera].mean(),
-                "in_view": in_view[..., camera].sum() / num_seen,
-                "width_px": np.median(widths_px) if len(widths_px) else np.nan,
-                "noise_px": np.sqrt(np.mean(np.square(noise_px))) if noise_px else np.nan,
-                "left_out": sum(stop - first for first, stop in intervals),
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def _mean(values: np.ndarray | None, there: np.ndarray, drone: int) -> float:
-    if values is None or not there.any():
-        return np.nan
-    return float(np.mean(values[there, drone]))
-
-
-def _mean_speed_m_s(velocity_m_s: np.ndarray | None, there: np.ndarray, drone: int) -> float:
-    if velocity_m_s is None or not there.any():
-        return np.nan
-    return float(np.linalg.norm(velocity_m_s[there, drone], axis=-1).mean())
-
-
-def _median_radius_m(
-    covariance_m2: Float[np.ndarray, "frames drones 3 3"] | None, there: np.ndarray, drone: int
-) -> float:
-    if covariance_m2 is None or not there.any():
-        return np.nan
-    longest_m = ellipsoids_90(covariance_m2[there, drone]).half_axes_m[:, 2]
-    return float(np.nanmedian(longest_m)) if np.isfinite(longest_m).any() else np.nan
+    noise_px = pd.DataFrame(
+        [errors.get(name, {}).get("noise_px") or (np.nan, np.nan) for name in names], dtype=float
+    )
+    left_out = {} if record is None else record.left_out
+    return pd.DataFrame(
+        {
+            "camera": names,
+            "frames": (views.frame >= 0).mean(axis=0),
+            "in_view": widths_px.count() / max(int(tracks.trajectories.seen.sum()), 1),
+            "width_px": widths_px.median(),
+            "noise_px": np.sqrt(noise_px.pow(2).mean(axis=1)),
+            "left_out": [sum(stop - first for first, stop in left_out.get(name, ())) for name in names],
+        }
+    )

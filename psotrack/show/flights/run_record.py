@@ -17,22 +17,18 @@ class LearnedDrone(msgspec.Struct, frozen=True):
     Attributes:
         drone: number of the drone.
         size_m: full lengths along the world's axes, metres.
-        size_std_m: standard errors of the lengths, metres; None where they are not known.
     """
 
     drone: int
     size_m: tuple[float, float, float]
-    size_std_m: tuple[float | None, float | None, float | None] = (None, None, None)
 
 
 class MeetingRecord(msgspec.Struct, frozen=True):
     """Two drones that met: see `identity.Encounter`."""
 
     drones: tuple[int, int]
-    first_frame: int
     closest_frame: int
     distance_m: float
-    last_frame: int
     outcome: str
 
 
@@ -41,6 +37,7 @@ class RunRecord(msgspec.Struct, frozen=True):
 
     Attributes:
         sequence: name of the recording; empty if unknown.
+        recording: path of the recording, relative to the record's folder or absolute; empty if unknown.
         rate_hz: instants per second.
         drones: what was learned of each drone; their number alone, where nothing was learned.
         encounters: drones that met.
@@ -49,12 +46,12 @@ class RunRecord(msgspec.Struct, frozen=True):
         settings: settings of the run.
         versions: versions of the packages.
         device: the device that computed.
-        seconds: seconds per stage.
         real_time_factor: seconds of video per second of wall clock.
         whole: the whole record, as plain data.
     """
 
     sequence: str = ""
+    recording: str = ""
     rate_hz: float | None = None
     drones: int | tuple[LearnedDrone, ...] = ()
     encounters: tuple[MeetingRecord, ...] = ()
@@ -63,9 +60,22 @@ class RunRecord(msgspec.Struct, frozen=True):
     settings: dict[str, Any] = {}
     versions: dict[str, str] = {}
     device: dict[str, str] = {}
-    seconds: dict[str, float] = {}
     real_time_factor: float | None = None
     whole: dict[str, Any] = {}
+
+
+def recording_beside(recording: Path | str, tracks: Path | str) -> str:
+    """Path of a recording as the record of its tracks holds it, under the key `recording`.
+
+    It is relative where the recording lies in the folder of the tracks, so that both can be moved together, and else
+    absolute.
+
+    Args:
+        recording: the recording, as a user names it for `open_recording`.
+        tracks: file of the tracks, beside which the record is.
+    """
+    path, folder = Path(recording).absolute(), Path(tracks).absolute().parent
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
 def read_run_record(path: Path | str) -> RunRecord | None:
@@ -76,10 +86,21 @@ def read_run_record(path: Path | str) -> RunRecord | None:
     """
     path = Path(path)
     content = read_json(path, "the record of a run, as `psotrack track` writes it")
-    if "format" in content:
-        return None
+    return None if "format" in content else as_run_record(content, path)
+
+
+def as_run_record(content: dict[str, Any], where: object) -> RunRecord:
+    """The record of a run of plain data.
+
+    Args:
+        content: the data.
+        where: where they come from, for messages.
+
+    Raises:
+        InputError: a part is wrong.
+    """
 
     def wrong(field: str, expected: str, found: str, remedy: str) -> InputError:
-        return InputError(f"{path}, {field}", expected=expected, found=found, remedy=remedy)
+        return InputError(f"{where}, {field}", expected=expected, found=found, remedy=remedy)
 
     return convert({**content, "whole": content}, RunRecord, wrong)

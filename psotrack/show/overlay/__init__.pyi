@@ -1,4 +1,16 @@
-from .codecs import Codec, find_codec
-from .folder import OverlayOptions, WrittenOverlays, write_overlays
+from .drawing import DrawnTracks, ImagePlaces, draw_drones, drawn_tracks, places_in
+from .folder import Codec, OverlayOptions, WrittenOverlays, find_codec, save_picture, write_overlays
 
-__all__ = ["Codec", "OverlayOptions", "WrittenOverlays", "find_codec", "write_overlays"]
+__all__ = [
+    "Codec",
+    "DrawnTracks",
+    "ImagePlaces",
+    "OverlayOptions",
+    "WrittenOverlays",
+    "draw_drones",
+    "drawn_tracks",
+    "find_codec",
+    "places_in",
+    "save_picture",
+    "write_overlays",
+]

@@ -1,52 +1,64 @@
-"""The folder of overlay videos: which videos are wanted, which are finished, and of which inputs they are."""
+"""The folder of overlay videos: which videos are wanted, which are finished, and of what they are made."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError, OutputError, check_positive
-from psotrack.recordings import FrameTimes, Recording, nearest_frames
-from psotrack.show.flights import (
-    FlightTracks,
-    ImageEllipses,
-    TrackedFlight,
-    boxes_in_images,
-    colour_rgb,
-    ellipses_in_images,
-    statuses,
-)
-from psotrack.show.overlay.codecs import Codec, find_codec
-from psotrack.show.overlay.drawing import ImageTracks
-from psotrack.show.overlay.map_view import MapTracks, make_map
-from psotrack.show.overlay.videos import CameraOverlay, CameraVideoTask, MosaicTask, write_video
+from psotrack.recordings import Recording, encoded_video, read_frames_at
+from psotrack.show.flights import ImageViews, TrackedFlight, rows_at, view_in_images
+from psotrack.show.overlay.drawing import DrawnTracks, drawn_tracks, places_in
+from psotrack.show.overlay.map_view import make_map
+from psotrack.show.overlay.videos import DrawnCamera, DrawnVideo, write_video
 from psotrack.support import (
     Report,
     atomic_write,
     check_file_name,
-    digest_record,
+    digest_file,
     map_in_processes,
     no_progress,
     read_text,
     refuse_to_overwrite,
 )
-from psotrack.trajectories import Trajectories
 
-#: File beside the videos that says of which inputs they are.
+#: File beside the videos that says of what they are made.
 INPUTS_FILE = "overlay.json"
 #: Raise it when the same inputs give other videos than before.
-_DRAWING = 1
-#: How much white is mixed into the colours, which stand before images.
-_LIGHTER = 0.2
-#: Width of the mosaic, pixels.
-_MOSAIC_WIDTH_PX = 1920
+_DRAWING = 2
+#: Width of the mosaic as a video and as a picture, pixels.
+_VIDEO_WIDTH_PX, _PICTURE_WIDTH_PX = 1920, 1440
+#: Size of the video with which a codec is tried, pixels.
+_TRIED_WH = (320, 240)
+
+
+@dataclass(frozen=True)
+class Codec:
+    """A codec of MP4 files.
+
+    Attributes:
+        name: name for people.
+        fourcc: the four characters by which OpenCV knows the codec.
+    """
+
+    name: str
+    fourcc: str
+
+
+#: Codecs from the best one on. Browsers and phones play H.264; OpenCV's wheels encode it on few machines.
+_CODECS = (Codec("H.264", "avc1"), Codec("MPEG-4", "mp4v"))
 
 
 @dataclass(frozen=True)
@@ -69,14 +81,20 @@ class WrittenOverlays:
     """What was written.
 
     Attributes:
+        folder: folder of the videos.
         codec: codec of the videos.
         written: videos that were made.
         kept: videos that were there already.
     """
 
+    folder: Path
     codec: Codec
     written: tuple[Path, ...]
     kept: tuple[Path, ...]
+
+    def __str__(self) -> str:
+        kept = f", {len(self.kept)} were there already" if self.kept else ""
+        return f"{self.folder}: {len(self.written)} videos in {self.codec.name}{kept}"
 
 
 def write_overlays(
@@ -89,7 +107,7 @@ def write_overlays(
 ) -> WrittenOverlays:
     """Draw the tracks of a flight into the videos of its cameras.
 
-    Videos of the same inputs that are finished are kept; after an interruption, the next call makes the others.
+    Videos of the same content that are finished are kept; after an interruption, the next call makes the others.
 
     Args:
         folder: folder of the videos; is made.
@@ -101,51 +119,95 @@ def write_overlays(
     Raises:
         InputError: the recording has no video, or a video cannot be read.
         SettingsError: the scale is not above 0.
-        OutputError: the folder has videos of other inputs and `force` is not set, or a video cannot be written.
+        OutputError: the folder has videos of another content and `force` is not set, or a video cannot be written.
     """
     check_positive("scale", options.scale)
-    recording = flight.recording
-    cameras = [] if recording is None else [name for name in recording.rig.names if name in recording.videos]
-    if recording is None or not cameras:
-        where = "overlay" if recording is None else recording.folder
-        raise InputError(where, expected="a recording with videos", found="none")
+    recording, cameras = _filmed(flight)
     for name in cameras:
         check_file_name(name, recording.folder)
-    codec = find_codec()
-    videos = {
-        f"{name}.mp4": _digest(flight, recording, codec, options, cameras if name == "mosaic" else [name])
-        for name in (["mosaic"] if options.mosaic else cameras)
-    }
-    kept = _begin(folder, flight, videos, options.force)
-    wanted = [name for name in videos if name not in kept]
-    if wanted:
-        tasks = _tasks(folder, flight, recording, codec, options, wanted)
-        with report("overlay", sum(len(task.time_s) for task in tasks)) as advance:
+    codec, scene = find_codec(), _Scene(flight, recording)
+    if options.mosaic:
+        videos = {"mosaic.mp4": scene.mosaic(cameras, codec, _VIDEO_WIDTH_PX)}
+    else:
+        videos = {f"{name}.mp4": scene.of_camera(name, codec, options.scale) for name in cameras}
+    kept = _begin(folder, flight, {name: _digest(video) for name, video in videos.items()}, options.force)
+    tasks = [(folder / name, video) for name, video in videos.items() if name not in kept]
+    if tasks:
+        with report("overlay", sum(len(video.time_s) for _, video in tasks)) as advance:
             map_in_processes(write_video, tasks, jobs=jobs or os.cpu_count() or 1, advance=advance)
-    return WrittenOverlays(
-        codec, tuple(folder / name for name in wanted), tuple(folder / name for name in kept)
+    written = tuple(path for path, _ in tasks)
+    return WrittenOverlays(folder, codec, written, tuple(folder / name for name in kept))
+
+
+def save_picture(path: Path, flight: TrackedFlight, *, most_cameras: int = 5, force: bool = False) -> None:
+    """Save the middle moment of a flight as a picture: its first cameras, and the map from above.
+
+    Args:
+        path: path of the PNG file.
+        flight: tracks and a recording.
+        most_cameras: largest number of cameras.
+        force: replace an existing file.
+
+    Raises:
+        InputError: the recording has no video, or a video cannot be read.
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    refuse_to_overwrite(path, force)
+    recording, cameras = _filmed(flight)
+    video = _Scene(flight, recording).mosaic(cameras[:most_cameras], _CODECS[0], _PICTURE_WIDTH_PX)
+    instant = len(video.time_s) // 2
+    frames = [
+        next(read_frames_at(camera.video, [number]))[1]
+        if (number := int(video.frame[instant, index])) >= 0
+        else None
+        for index, camera in enumerate(video.cameras)
+    ]
+    _, coded = cv2.imencode(".png", video.image(instant, frames))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(coded.tobytes())
+
+
+def find_codec(codecs: Sequence[Codec] = _CODECS) -> Codec:
+    """The first of some codecs with which a video can be written and read back.
+
+    Raises:
+        OutputError: there is none.
+    """
+    for codec in codecs:
+        with tempfile.TemporaryDirectory(prefix="psotrack-") as folder, contextlib.suppress(OutputError):
+            with encoded_video(Path(folder) / "tried.mp4", codec.fourcc, 25.0, _TRIED_WH) as encoder:
+                for level in (0, 255):
+                    encoder.write(np.full((*_TRIED_WH[::-1], 3), level, np.uint8))
+            return codec
+    raise OutputError(
+        "overlay",
+        expected=f"one of the codecs {', '.join(codec.name for codec in codecs)}",
+        found="none",
+        remedy=f"is the disk of {tempfile.gettempdir()} full? videos were tried there",
     )
 
 
+# Which videos are finished
+
+
 def _begin(folder: Path, flight: TrackedFlight, videos: dict[str, str], force: bool) -> list[str]:
-    """Write down of which inputs the videos will be; returns the videos that are finished.
+    """Write down of what the videos will be made; returns the names of those that are finished.
 
     Args:
         folder: the folder.
         flight: the flight.
-        videos: digest of the inputs of each wanted video by its file's name.
+        videos: digest of each wanted video by its file's name.
         force: whether existing videos are made again.
 
     Raises:
-        InputError: the list of inputs cannot be read.
-        OutputError: a video of other inputs exists.
+        InputError: the list cannot be read.
+        OutputError: a video of another content exists.
     """
     before = _digests(folder / INPUTS_FILE)
     there = [name for name in videos if (folder / name).exists()]
     kept = [name for name in there if not force and before.get(name) == videos[name]]
-    for name in there:
-        if name in kept:
-            continue
+    others = [name for name in there if name not in kept]
+    for name in others:
         if not force and name in before:
             raise OutputError(
                 folder / name,
@@ -154,10 +216,9 @@ def _begin(folder: Path, flight: TrackedFlight, videos: dict[str, str], force: b
                 remedy="pass --force to replace it",
             )
         refuse_to_overwrite(folder / name, force)
-    for name in there:
-        # An old video must not count as one of the new inputs, if this run is interrupted.
-        if name not in kept:
-            (folder / name).unlink()
+    for name in others:
+        # An old video must not count as one of the new content, if this run is interrupted.
+        (folder / name).unlink()
     if len(kept) < len(videos):
         content = {
             "recording": flight.name,
@@ -170,7 +231,7 @@ def _begin(folder: Path, flight: TrackedFlight, videos: dict[str, str], force: b
 
 
 def _digests(path: Path) -> dict[str, str]:
-    """Digests of the inputs of a folder's videos by their names."""
+    """Digests of a folder's videos by their names."""
     if not path.exists():
         return {}
     try:
@@ -182,145 +243,85 @@ def _digests(path: Path) -> dict[str, str]:
         ) from None
 
 
-def _digest(
-    flight: TrackedFlight,
-    recording: Recording,
-    codec: Codec,
-    options: OverlayOptions,
-    cameras: Sequence[str],
-) -> str:
-    """Digest of what a video of some cameras is made of."""
-    index = [recording.rig.names.index(name) for name in cameras]
-    rig = recording.rig.cameras
-    infos = [recording.videos[name] for name in cameras]
-    return digest_record(
-        {
-            "drawing": _DRAWING,
-            "codec": codec.fourcc,
-            "scale": options.scale,
-            "instants": recording.num_frames,
-            "cameras": list(cameras),
-            "rig": [np.asarray(value)[index].tolist() for value in (rig.K, rig.dist, rig.T_cam_world)],
-            "videos": [[str(info.path), info.num_frames, info.fps] for info in infos],
-            "tracks": [
-                [each.label, _digest_tracks(each.trajectories), each.size_m.tolist()]
-                for each in flight.tracks
-            ],
-        }
-    )
+def _digest(video: DrawnVideo) -> str:
+    """Digest of all that is drawn and of the videos into which it is drawn: of everything that changes the result."""
 
+    def plain(value: Any) -> Any:
+        if isinstance(value, Path):
+            return digest_file(value) if value.is_file() else None
+        if isinstance(value, np.generic):
+            return value.item()
+        return [value.shape, hashlib.blake2b(value.tobytes()).hexdigest()]
 
-def _digest_tracks(trajectories: Trajectories) -> list[str]:
-    """Digests of what is drawn of tracks; the files of some formats are folders."""
-    arrays = (
-        trajectories.time_s,
-        trajectories.position_m,
-        statuses(trajectories),
-        np.zeros(0) if trajectories.covariance_m2 is None else trajectories.covariance_m2,
-    )
-    digests = [hashlib.blake2b(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays]
-    return [*trajectories.drones, *digests]
+    text = msgspec.json.encode([_DRAWING, video], enc_hook=plain, order="deterministic")
+    return hashlib.blake2b(text, digest_size=20).hexdigest()
 
 
 # What is drawn
 
 
-def _tasks(
-    folder: Path,
-    flight: TrackedFlight,
-    recording: Recording,
-    codec: Codec,
-    options: OverlayOptions,
-    wanted: Sequence[str],
-) -> list[CameraVideoTask | MosaicTask]:
-    boxes_px = [boxes_in_images(recording, each.trajectories, each.size_m) for each in flight.tracks]
-    ellipses = [ellipses_in_images(recording, each.trajectories) for each in flight.tracks]
-    names = [_names(flight, number) for number in range(len(flight.tracks))]
-    rgb = [
-        tuple(colour_rgb(colour, _LIGHTER) for colour in flight.colours(number))
-        for number in range(len(flight.tracks))
-    ]
+def _filmed(flight: TrackedFlight) -> tuple[Recording, list[str]]:
+    """The recording of a flight, and its cameras that have a video."""
+    recording = flight.recording
+    cameras = [] if recording is None else [name for name in recording.rig.names if name in recording.videos]
+    if recording is None or not cameras:
+        where = "overlay" if recording is None else recording.folder
+        raise InputError(where, expected="a recording with videos", found="none")
+    return recording, cameras
 
-    def overlay_of(camera: str, size_wh: tuple[int, int] | None) -> CameraOverlay:
-        video, index = recording.videos[camera], recording.rig.names.index(camera)
-        scaled = size_wh or _even(np.array(video.image_size_wh) * options.scale)
-        tracks = [
-            ImageTracks(
-                names[number],
-                rgb[number],
-                statuses(each.trajectories),
-                boxes_px[number][:, :, index],
-                _of_camera(ellipses[number], "middle_px", each, index),
-                _of_camera(ellipses[number], "shape_px2", each, index),
-            )
-            for number, each in enumerate(flight.tracks)
-        ]
-        return CameraOverlay(camera, video, scaled, scaled[0] / video.image_size_wh[0], tuple(tracks))
 
-    if not options.mosaic:
-        return [
-            _camera_task(folder / name, codec, flight, recording, overlay_of(name.removesuffix(".mp4"), None))
-            for name in wanted
+class _Scene:
+    """The tracks of a flight in its cameras."""
+
+    def __init__(self, flight: TrackedFlight, recording: Recording) -> None:
+        self._flight, self._recording = flight, recording
+        self._tracks: tuple[DrawnTracks, ...] = tuple(drawn_tracks(each) for each in flight.tracks)
+        self._views: list[ImageViews] = [
+            view_in_images(recording, each.trajectories, each.size_m) for each in flight.tracks
         ]
-    cameras = [name for name in recording.rig.names if name in recording.videos]
-    columns = int(np.ceil(np.sqrt(len(cameras) + 1)))
-    width, height = recording.videos[cameras[0]].image_size_wh
-    tile_wh = _even(_MOSAIC_WIDTH_PX / columns * np.array([1.0, height / width]))
-    overlays = tuple(overlay_of(camera, tile_wh) for camera in cameras)
-    timeline = recording.timeline()
-    tracks = zip(names, rgb, flight.tracks, strict=True)
-    return [
-        MosaicTask(
-            folder / "mosaic.mp4",
-            codec,
-            overlays,
-            timeline.frame[:, [timeline.cameras.index(camera) for camera in cameras]],
-            _rows_at(flight, timeline.time_s),
-            timeline.time_s,
-            timeline.rate_hz,
-            make_map(flight, tile_wh),
-            tuple(
-                MapTracks(own, colours, statuses(each.trajectories), each.trajectories.position_m)
-                for own, colours, each in tracks
-            ),
+
+    def of_camera(self, name: str, codec: Codec, scale: float) -> DrawnVideo:
+        """The video of one camera, at the times of its frames."""
+        video = self._recording.videos[name]
+        size_wh = _even(np.array(video.image_size_wh) * scale)
+        time_s = self._recording.exposed[name].time_s[: video.num_frames]
+        frame = np.arange(len(time_s))[:, None]
+        cameras = (self._camera(name, size_wh),)
+        return DrawnVideo(
+            codec.fourcc, video.fps, size_wh, cameras, self._tracks, frame, self._rows_at(time_s), time_s
         )
-    ]
 
+    def mosaic(self, names: Sequence[str], codec: Codec, width_px: int) -> DrawnVideo:
+        """The video of some cameras at the recording's instants, with the map; images keep their aspect ratios."""
+        columns = int(np.ceil(np.sqrt(len(names) + 1)))
+        width, height = self._recording.videos[names[0]].image_size_wh
+        tile_wh = _even(width_px / columns * np.array([1.0, height / width]))
+        timeline = self._recording.timeline()
+        cameras = []
+        for name in names:
+            own_wh = np.array(self._recording.videos[name].image_size_wh)
+            cameras.append(self._camera(name, _even(own_wh * (np.array(tile_wh) / own_wh).min())))
+        return DrawnVideo(
+            codec.fourcc,
+            timeline.rate_hz,
+            tile_wh,
+            tuple(cameras),
+            self._tracks,
+            timeline.frame[:, [timeline.cameras.index(name) for name in names]],
+            self._rows_at(timeline.time_s),
+            timeline.time_s,
+            make_map(self._recording.rig, self._tracks, tile_wh),
+        )
 
-def _camera_task(
-    path: Path, codec: Codec, flight: TrackedFlight, recording: Recording, overlay: CameraOverlay
-) -> CameraVideoTask:
-    time_s = recording.exposed[overlay.name].time_s[: overlay.video.num_frames]
-    return CameraVideoTask(path, codec, overlay, _rows_at(flight, time_s), time_s)
+    def _camera(self, name: str, size_wh: tuple[int, int]) -> DrawnCamera:
+        index = self._recording.rig.names.index(name)
+        places = tuple(places_in(views, index) for views in self._views)
+        return DrawnCamera(name, self._recording.videos[name], size_wh, places)
 
-
-def _rows_at(flight: TrackedFlight, time_s: Float[np.ndarray, " times"]) -> Int[np.ndarray, "times files"]:
-    """The row of each file's tracks that is nearest to each time; -1 where none is near."""
-    rows = np.full((len(time_s), len(flight.tracks)), -1)
-    for number, tracks in enumerate(flight.tracks):
-        own_s = tracks.trajectories.time_s
-        if len(own_s) > 1:
-            rows[:, number], _ = nearest_frames(FrameTimes.listed(own_s, tracks.path), time_s)
-        else:
-            rows[:, number] = np.where(np.isclose(time_s, own_s[0]), 0, -1)
-    return rows
-
-
-def _of_camera(
-    ellipses: ImageEllipses | None, field: str, tracks: FlightTracks, index: int
-) -> Float[np.ndarray, "..."]:
-    """A field of ellipses in one camera; NaN of its shape for tracks without covariances."""
-    if ellipses is not None:
-        return getattr(ellipses, field)[:, :, index]
-    sides = (2, 2) if field == "shape_px2" else (2,)
-    return np.full((tracks.trajectories.num_frames, tracks.trajectories.num_drones, *sides), np.nan)
-
-
-def _names(flight: TrackedFlight, number: int) -> tuple[str, ...]:
-    tracks = flight.tracks[number]
-    if len(flight.tracks) == 1:
-        return tracks.trajectories.drones
-    return tuple(f"{tracks.label} {drone}" for drone in tracks.trajectories.drones)
+    def _rows_at(self, time_s: Float[np.ndarray, " times"]) -> Int[np.ndarray, "times files"]:
+        """The row of each file's tracks at each time; -1 for none."""
+        rows = [rows_at(tracks.trajectories, time_s) for tracks in self._flight.tracks]
+        return np.stack(rows, axis=1) if rows else np.zeros((len(time_s), 0), int)
 
 
 def _even(size_wh: Float[np.ndarray, "2"]) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -12,18 +12,38 @@ from psotrack.errors import InputError, PsotrackError
 from psotrack.geometry.rig_files import read_rig
 from psotrack.show.reports.page import check_page_path, render, write_page
 from psotrack.show.reports.scene import Scene3D
-from psotrack.show.reports.tables import PageCell, PageTable, number, percent
+from psotrack.show.reports.tables import PageColumn, make_table, percent
 from psotrack.support import convert, read_json
 
-#: Largest number of views, corners and pixels along a side.
-_MOST = 10**9
+Count = Annotated[int, msgspec.Meta(ge=0, le=10**9)]
+Side = Annotated[int, msgspec.Meta(ge=1, le=10**9)]
+
+_CAMERAS = (
+    PageColumn("camera", "camera"),
+    PageColumn("lens", "lens"),
+    PageColumn("views", "views", 0),
+    PageColumn("corners", "corners", 0),
+    PageColumn("rms (px)", "rms_px", 2),
+    PageColumn("median (px)", "median_px", 2),
+    PageColumn("within views (px)", "own_median_px", 2),
+    percent("covered", "covered", 0),
+    PageColumn("f (px)", "focal", 1),
+    PageColumn("std f (px)", "focal_std", 1),
+    PageColumn("centre (m)", "centre"),
+    PageColumn("std (mm)", "centre_std", 1, 1e3),
+    PageColumn("shares most views with", "partner"),
+)
+_NOTE = (
+    "rms: of the corners that count. Within views: errors of the corners and of the lens alone. Covered: share of the "
+    "image in which corners were found."
+)
 
 
 class CalibratedCamera(msgspec.Struct, frozen=True):
     """Figures of one camera, as `calibrate rig --json` writes them."""
 
-    views: int
-    corners: int
+    views: Count
+    corners: Count
     rms_px: float
     median_px: float
     own_median_px: float
@@ -34,9 +54,9 @@ class CalibratedCamera(msgspec.Struct, frozen=True):
     focal_std_px: tuple[float | None, float | None] = (None, None)
     lens: str = ""
     best_partner: str = ""
-    shared: int = 0
-    coverage: tuple[tuple[int, ...], ...] = ()
-    image_size_wh: tuple[int, int] = (4, 3)
+    shared: Count = 0
+    coverage: tuple[tuple[Count, ...], ...] = ()
+    image_size_wh: tuple[Side, Side] = (4, 3)
 
 
 class WorstView(msgspec.Struct, frozen=True):
@@ -82,25 +102,25 @@ def write_calibration_report(path: Path | str, record_path: Path | str, *, force
     check_page_path(path, force)
     record_path = Path(record_path)
     record = _read(record_path)
-    rig_path = _rig_path(record_path, record.rig)
-    rig = read_rig(rig_path)
-    rms_px = [camera.rms_px for camera in record.cameras.values()]
+    # The rig as named, or beside the record where both were moved.
+    places = (record_path.parent / Path(record.rig).name, Path(record.rig))
+    rig_path = next((place for place in places if place.is_file()), None)
+    if rig_path is None:
+        raise InputError(record_path, expected=f"the rig {record.rig}, or {places[0]}", found="neither")
+    cameras = record.cameras.values()
+    rms_px = [camera.rms_px for camera in cameras]
     text = render(
         "calibration.html",
-        scenes={"scene": Scene3D(np.zeros(1), rig=rig)},
+        scenes={"scene": Scene3D(np.zeros(1), rig=read_rig(rig_path))},
         title=f"Calibration {rig_path.name}",
-        name=f"Calibration {rig_path.name}",
         figures=(
-            (f"{len(record.cameras)}", "cameras"),
+            (f"{len(cameras)}", "cameras"),
             (f"{np.median(rms_px):.2f} px", "median rms"),
             (f"{max(rms_px):.2f} px", "largest rms"),
-            (f"{100 * min(camera.covered for camera in record.cameras.values()):.0f} %", "least coverage"),
+            (f"{100 * min(camera.covered for camera in cameras):.0f} %", "least coverage"),
         ),
-        table=_table(record),
-        coverage=[_grid(name, camera) for name, camera in record.cameras.items()],
-        sentences=[*record.print, *record.advice],
-        worst=record.worst_views,
-        world=record.world,
+        table=make_table(_CAMERAS, [_row(*item) for item in record.cameras.items()], _NOTE),
+        record=record,
     )
     write_page(path, text, force=force)
 
@@ -113,85 +133,17 @@ def _read(path: Path) -> CalibrationRecord:
 
     if not content.get("cameras"):
         raise InputError(path, expected="the record of a calibration by a board", found="no cameras")
-    record = convert(content, CalibrationRecord, wrong)
-    for name, camera in record.cameras.items():
-        if len({len(line) for line in camera.coverage}) > 1:
-            raise wrong(f"cameras.{name}.coverage", "lines of equal length", "different ones", "")
-        cells = [count for line in camera.coverage for count in line]
-        if wrong_cells := [count for count in cells if not 0 <= count <= _MOST]:
-            expected = f"numbers from 0 to {_MOST}"
-            raise wrong(f"cameras.{name}.coverage", expected, f"{wrong_cells[0]}", "")
-        for field in ("views", "corners", "shared"):
-            if not 0 <= (count := getattr(camera, field)) <= _MOST:
-                raise wrong(f"cameras.{name}.{field}", f"a number from 0 to {_MOST}", f"{count}", "")
-        if not all(1 <= side <= _MOST for side in camera.image_size_wh):
-            raise wrong(f"cameras.{name}.image_size_wh", "a width and height", f"{camera.image_size_wh}", "")
-    return record
+    return convert(content, CalibrationRecord, wrong)
 
 
-def _rig_path(record_path: Path, rig: str) -> Path:
-    """The rig that a record names: as named, or beside the record where both were moved."""
-    named, beside = Path(rig), record_path.parent / Path(rig).name
-    found = next((place for place in (beside, named) if place.is_file()), None)
-    if found is None:
-        raise InputError(record_path, expected=f"the rig {rig}, or {beside}", found="neither")
-    return found
-
-
-def _table(record: CalibrationRecord) -> PageTable:
-    rows = tuple(
-        (
-            PageCell(name),
-            PageCell(camera.lens),
-            number(camera.views),
-            number(camera.corners),
-            number(camera.rms_px, 2),
-            number(camera.median_px, 2),
-            number(camera.own_median_px, 2),
-            percent(camera.covered, 0),
-            number(camera.focal_px[0], 1),
-            number(camera.focal_std_px[0], 1),
-            PageCell(" ".join(f"{part:.3f}" for part in camera.centre_m)),
-            number(_length(camera.centre_std_m), 1, factor=1e3),
-            PageCell(f"{camera.best_partner} ({camera.shared})" if camera.best_partner else "–"),  # noqa: RUF001
-        )
-        for name, camera in record.cameras.items()
-    )
-    headings = (
-        *("camera", "lens", "views", "corners", "rms (px)", "median (px)", "within views (px)", "covered"),
-        *("f (px)", "std f (px)", "centre (m)", "std (mm)", "shares most views with"),
-    )
-    note = (
-        "rms: of the corners that count. Within views: errors of the corners and of the lens alone. Covered: share of "
-        "the image in which corners were found."
-    )
-    return PageTable(headings, rows, note)
-
-
-def _length(parts: tuple[float | None, ...]) -> float | None:
-    known = [part for part in parts if part is not None]
-    return float(np.linalg.norm(known)) if len(known) == len(parts) else None
-
-
-def _grid(name: str, camera: CalibratedCamera) -> dict[str, Any]:
-    """Coverage of one camera: cells with their shade from 0 (no corner) to 1 (most corners)."""
-    counts = np.array(camera.coverage, float)
-    most = counts.max() if counts.size else 0
-    cells = [
-        {
-            "x": column,
-            "y": row,
-            "shade": round(0.15 + 0.85 * float(np.sqrt(count / most)), 3) if count else 0,
-            "count": int(count),
-        }
-        for row, line in enumerate(camera.coverage)
-        for column, count in enumerate(line)
-    ]
-    rows, columns = counts.shape if counts.size else (0, 0)
+def _row(name: str, camera: CalibratedCamera) -> dict[str, Any]:
+    """Figures of a camera as its row shows them."""
     return {
-        "name": name,
-        "cells": cells,
-        "rows": rows,
-        "columns": columns,
-        "aspect": camera.image_size_wh[0] / camera.image_size_wh[1],
+        **msgspec.structs.asdict(camera),
+        "camera": name,
+        "focal": camera.focal_px[0],
+        "focal_std": camera.focal_std_px[0],
+        "centre": " ".join(f"{part:.3f}" for part in camera.centre_m),
+        "centre_std": float(np.linalg.norm(np.array(camera.centre_std_m, float))),
+        "partner": f"{camera.best_partner} ({camera.shared})" if camera.best_partner else "",
     }

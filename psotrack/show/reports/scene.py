@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import Rig, undistort
-from psotrack.show.flights import USUAL_SIZE_M, TrackedFlight, ellipsoids_90
-from psotrack.support import drone_colour, short_repr
+from psotrack.pipeline import TrackedRecording
+from psotrack.recordings import Recording
+from psotrack.show.flights import FlightTracks, TrackedFlight, ellipsoids_90, flight_of, rows_at, statuses
+from psotrack.support import short_repr
 from psotrack.trajectories import Status, Trajectories
 
 #: Largest number of rows of a view. 5,000 rows of ten drones take 2 MB, and a slider has fewer pixels.
@@ -28,25 +30,6 @@ _PYRAMID = 0.06
 _FAR_M = 1000.0
 #: Shares of the image at which the rays of a pyramid are looked for: the corners of a wide lens may show nothing.
 _CORNER_SHARES = (1.0, 0.9, 0.75, 0.5, 0.25)
-
-
-@dataclass(frozen=True, repr=False)
-class SceneDrones:
-    """Drones of a scene.
-
-    Attributes:
-        trajectories: their positions, status and covariances.
-        size_m: (drones, 3), full lengths along the world's axes, metres.
-        colours: a colour per drone, as #rrggbb.
-        names: the shown name of each drone.
-    """
-
-    trajectories: Trajectories
-    size_m: Float[np.ndarray, "drones 3"]
-    colours: tuple[str, ...]
-    names: tuple[str, ...]
-
-    __repr__ = short_repr
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,7 +65,7 @@ class Scene3D:
     """
 
     time_s: Float[np.ndarray, "rows"]
-    drones: tuple[SceneDrones, ...] = ()
+    drones: tuple[FlightTracks, ...] = ()
     truth: Trajectories | None = None
     rig: Rig | None = None
     clouds: tuple[PointCloud, ...] = ()
@@ -108,29 +91,21 @@ class Scene3D:
 
     def data(self) -> dict[str, Any]:
         """The scene as plain data, fit for JSON, with every n-th row where there are more than `MOST_ROWS`."""
-        step = row_step(len(self.time_s))
-        rows = np.arange(0, len(self.time_s), step)
+        rows = slice(None, None, row_step(len(self.time_s)))
         time_s = np.asarray(self.time_s, np.float64)[rows]
         low_m, high_m = self._bounds_m()
         origin_m = np.round((low_m + high_m) / 2) if np.abs([low_m, high_m]).max() > _FAR_M else np.zeros(3)
         extent_m = float((high_m - low_m).max())
+        truth, rig = self.truth, self.rig
+        true_m = None if truth is None else _at_times(truth, time_s, truth.position_m) - origin_m
         return {
             "time_s": _packed(time_s),
             "step_name": self.step_name,
             "origin_m": origin_m.tolist(),
             "bounds_m": [(low_m - origin_m).tolist(), (high_m - origin_m).tolist()],
             "drones": [drone for each in self.drones for drone in _drones(each, time_s, origin_m)],
-            "truth": []
-            if self.truth is None
-            else [
-                {"name": name, "position_m": _packed(positions)}
-                for name, positions in zip(
-                    self.truth.drones,
-                    np.swapaxes(_at_times(self.truth, time_s, self.truth.position_m) - origin_m, 0, 1),
-                    strict=True,
-                )
-            ],
-            "cameras": [] if self.rig is None else _cameras(self.rig, origin_m, _PYRAMID * extent_m),
+            "truth": [] if true_m is None else [_packed(own_m) for own_m in np.swapaxes(true_m, 0, 1)],
+            "cameras": [] if rig is None else _cameras(rig, origin_m, _PYRAMID * extent_m),
             "clouds": [
                 {
                     "name": cloud.name,
@@ -150,10 +125,9 @@ class Scene3D:
             parts.append(self.truth.position_m.reshape(-1, 3))
         if self.rig is not None:
             parts.append(np.asarray(self.rig.cameras.centre_world))
-        points_m = np.concatenate([np.asarray(part, np.float64) for part in parts] or [np.zeros((1, 3))])
+        points_m = np.concatenate([np.zeros((0, 3)), *(np.asarray(part, np.float64) for part in parts)])
         points_m = points_m[np.isfinite(points_m).all(axis=-1)]
-        if not len(points_m):
-            points_m = np.zeros((1, 3))
+        points_m = points_m if len(points_m) else np.zeros((1, 3))
         low_m, high_m = points_m.min(axis=0), points_m.max(axis=0)
         extent_m = max(float((high_m - low_m).max()), 0.1)
         middle_m = (low_m + high_m) / 2
@@ -164,49 +138,23 @@ class Scene3D:
 
 
 def scene_of_flight(flight: TrackedFlight) -> Scene3D:
-    """The scene of a flight: its tracks at the times of the first tracks, its truth and its cameras.
-
-    Raises:
-        SettingsError: the flight has neither tracks nor a truth.
-    """
-    several = len(flight.tracks) > 1
-    drones = tuple(
-        SceneDrones(
-            each.trajectories,
-            each.size_m,
-            tuple(flight.colours(number)),
-            tuple(f"{each.label} {name}" if several else name for name in each.trajectories.drones),
-        )
-        for number, each in enumerate(flight.tracks)
-    )
-    first = flight.tracks[0].trajectories if flight.tracks else flight.truth
-    if first is None:
-        raise SettingsError("scene", expected="tracks, or a recording with a reference", found="neither")
-    return Scene3D(
-        first.time_s, drones, flight.truth, None if flight.recording is None else flight.recording.rig
-    )
+    """The scene of a flight: its tracks at the times of the first tracks, its truth and its cameras."""
+    recording = flight.recording
+    shown = flight.tracks[0].trajectories if flight.tracks else flight.truth
+    if shown is None:
+        assert recording is not None
+        return Scene3D(recording.timeline().time_s, rig=recording.rig)
+    return Scene3D(shown.time_s, flight.tracks, flight.truth, None if recording is None else recording.rig)
 
 
-def scene_of_tracks(
-    trajectories: Trajectories,
-    *,
-    truth: Trajectories | None = None,
-    rig: Rig | None = None,
-    size_m: Float[np.ndarray, "drones 3"] | None = None,
-) -> Scene3D:
-    """The scene of tracks that are in memory.
+def view_3d(tracks: TrackedRecording | Trajectories, recording: Recording | None = None) -> Scene3D:
+    """A view of tracks that turns and plays, for a notebook; a saved notebook keeps the view.
 
     Args:
-        trajectories: the tracks.
-        truth: a reference to show beside; None for none.
-        rig: cameras to show; None for none.
-        size_m: (drones, 3), full lengths of the drones, metres; None: `USUAL_SIZE_M`.
+        tracks: the result of `track`, or trajectories.
+        recording: the recording, whose cameras and reference are shown; None shows the tracks alone.
     """
-    count = trajectories.num_drones
-    sizes = np.tile(np.array(USUAL_SIZE_M), (count, 1)) if size_m is None else np.asarray(size_m, np.float64)
-    colours = tuple(drone_colour(drone) for drone in range(count))
-    drones = SceneDrones(trajectories, sizes, colours, trajectories.drones)
-    return Scene3D(trajectories.time_s, (drones,), truth, rig)
+    return scene_of_flight(flight_of(tracks, recording))
 
 
 def row_step(num_rows: int) -> int:
@@ -215,55 +163,39 @@ def row_step(num_rows: int) -> int:
 
 
 def _drones(
-    each: SceneDrones, time_s: Float[np.ndarray, "rows"], origin_m: np.ndarray
+    tracks: FlightTracks, time_s: Float[np.ndarray, "rows"], origin_m: Float[np.ndarray, "3"]
 ) -> list[dict[str, Any]]:
-    trajectories = each.trajectories
-    position_m = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
-    status = np.where(trajectories.seen, 0.0, float(Status.LOST))
-    if trajectories.status is not None:
-        status = np.where(trajectories.seen, trajectories.status, Status.LOST).astype(float)
+    flown = tracks.trajectories
+    position_m = np.where(flown.seen[..., None], flown.position_m, np.nan)
+    status = np.where(flown.seen, statuses(flown), Status.LOST)
     of_rows = {
-        "position_m": _at_times(trajectories, time_s, position_m) - origin_m,
-        "status": np.nan_to_num(_at_times(trajectories, time_s, status), nan=float(Status.LOST)),
+        "position_m": _at_times(flown, time_s, position_m) - origin_m,
+        "status": np.nan_to_num(_at_times(flown, time_s, status), nan=float(Status.LOST)),
     }
-    if trajectories.covariance_m2 is not None:
-        ellipsoids = ellipsoids_90(_at_times(trajectories, time_s, trajectories.covariance_m2))
+    if flown.covariance_m2 is not None:
+        ellipsoids = ellipsoids_90(_at_times(flown, time_s, flown.covariance_m2))
         of_rows["half_axes_m"] = ellipsoids.half_axes_m
         turns = Rotation.from_matrix(ellipsoids.rotation.reshape(-1, 3, 3)).as_quat()
         of_rows["rotation_xyzw"] = turns.reshape(*ellipsoids.rotation.shape[:2], 4)
     return [
         {
             "name": name,
-            "colour": each.colours[drone],
-            "size_m": each.size_m[drone].tolist(),
+            "colour": tracks.colours[drone],
+            "size_m": tracks.size_m[drone].tolist(),
             **{key: _packed(values[:, drone]) for key, values in of_rows.items()},
         }
-        for drone, name in enumerate(each.names)
+        for drone, name in enumerate(tracks.names)
     ]
 
 
 def _at_times(
-    trajectories: Trajectories, time_s: Float[np.ndarray, "rows"], values: Float[np.ndarray, "frames *rest"]
+    trajectories: Trajectories, time_s: Float[np.ndarray, "rows"], values: np.ndarray
 ) -> Float[np.ndarray, "rows *rest"]:
     """Values in the rows of a scene: those of the nearest frame, NaN where no frame is near."""
-    own_s = np.asarray(trajectories.time_s, np.float64)
-    nearest = _nearest(own_s, time_s)
-    interval_s = max(
-        np.median(np.diff(own_s)) if len(own_s) > 1 else 0.0,
-        np.median(np.diff(time_s)) if len(time_s) > 1 else 0.0,
-    )
-    there = np.abs(own_s[nearest] - time_s) <= 0.6 * interval_s + 1e-9
-    found = np.asarray(values, np.float64)[nearest]
-    found[~there] = np.nan
+    rows = rows_at(trajectories, time_s)
+    found = np.asarray(values, np.float64)[rows]
+    found[rows < 0] = np.nan
     return found
-
-
-def _nearest(
-    own_s: Float[np.ndarray, "frames"], time_s: Float[np.ndarray, "rows"]
-) -> Int[np.ndarray, "rows"]:
-    after = np.clip(np.searchsorted(own_s, time_s), min(1, len(own_s) - 1), len(own_s) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(own_s[before] - time_s) <= np.abs(own_s[after] - time_s), before, after)
 
 
 def _cameras(rig: Rig, origin_m: Float[np.ndarray, "3"], length_m: float) -> list[dict[str, Any]]:

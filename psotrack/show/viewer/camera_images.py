@@ -1,25 +1,22 @@
 """Images of cameras as small JPEG files, with the silhouettes, blobs and markers that are drawn above them.
 
 Rerun shows JPEG images in every viewer; videos need FFmpeg on the user's computer, and a video codec takes longer than
-JPEG. Workers write the images of a camera one after the other into one file, so that an hour does not fill the memory.
+JPEG. Images are made one after the other, so that an hour does not fill the memory.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt32
 
-from psotrack.errors import OutputError
 from psotrack.foreground.silhouettes import find_blobs
 from psotrack.recordings import VideoInfo, read_frames
-from psotrack.support import Advance, short_repr
 
 #: Quality of JPEG with which the size of images is planned, and its limits while images are written.
 _QUALITY, _LEAST_QUALITY, _BEST_QUALITY = 75, 20, 90
@@ -67,13 +64,12 @@ class ImagePlan:
     num_images: int
 
 
-@dataclass(frozen=True)
-class EncodingTask:
-    """Task of encoding the images of one video.
+@dataclass(frozen=True, eq=False)
+class ImageSource:
+    """Where the images of one camera come from, and how they are encoded.
 
     Attributes:
         video: the video.
-        path: file that the images are written to, one after the other.
         step, reduction: see `ImagePlan`.
         bytes_per_image: size that the images shall have on average, with their silhouettes.
         silhouettes: one of the `arrays` of `Silhouettes`, by frames; None where there are no silhouettes.
@@ -82,7 +78,6 @@ class EncodingTask:
     """
 
     video: VideoInfo
-    path: Path
     step: int
     reduction: int
     bytes_per_image: float
@@ -91,26 +86,25 @@ class EncodingTask:
     dictionary: str | None = None
 
 
-@dataclass(frozen=True, repr=False)
-class EncodedImages:
-    """Encoded images of one camera.
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """An encoded frame of a camera, and what was found in it.
 
     Attributes:
-        path: file of all images, one after the other: of each frame the JPEG image, then the PNG image of the
-            silhouette.
-        frame: (images,), numbers of the video's frames.
-        sizes: (images, 2), bytes of the JPEG image and of the PNG image; 0 where there is no silhouette.
-        blobs_px: boxes of each image's blobs, (blobs, 4), as in `geometry.boxes`.
-        markers: ids of each image's markers, and their corners, (markers, 4, 2), pixel centres at whole numbers.
+        frame: number of the frame.
+        jpeg: the image.
+        silhouette: PNG image of the silhouette; empty where there is none.
+        blobs_px: boxes of the blobs, as in `geometry.boxes`.
+        marker_ids: ids of the markers.
+        marker_corners_px: their corners, pixel centres at whole numbers.
     """
 
-    path: Path
-    frame: Int[np.ndarray, " images"]
-    sizes: Int[np.ndarray, "images 2"]
-    blobs_px: tuple[Float[np.ndarray, "blobs 4"], ...]
-    markers: tuple[tuple[Int[np.ndarray, " markers"], Float[np.ndarray, "markers 4 2"]], ...]
-
-    __repr__ = short_repr
+    frame: int
+    jpeg: bytes
+    silhouette: bytes
+    blobs_px: Float[np.ndarray, "blobs 4"]
+    marker_ids: Int[np.ndarray, " markers"]
+    marker_corners_px: Float[np.ndarray, "markers 4 2"]
 
 
 def plan_images(videos: Mapping[CameraKey, VideoInfo], max_bytes: float) -> ImagePlan:
@@ -137,58 +131,33 @@ def plan_images(videos: Mapping[CameraKey, VideoInfo], max_bytes: float) -> Imag
     return ImagePlan(step, reduction, sum(len(range(0, each.num_frames, step)) for each in videos.values()))
 
 
-def encode_images(task: EncodingTask, advance: Advance) -> EncodedImages:
+def encode_images(source: ImageSource) -> Iterator[EncodedImage]:
     """Encode the images of one video; the quality follows the size of the images so far.
 
     Raises:
         InputError: the video ends early.
-        OutputError: the disk is full.
     """
     detector = None
-    if task.dictionary is not None:
+    if source.dictionary is not None:
         from psotrack.inside_out.detection import MarkerDetector
 
-        detector = MarkerDetector(task.dictionary)
-    frames, sizes, blobs, markers = range(0, task.video.num_frames, task.step), [], [], []
-    coverages = _read_coverages(task.silhouettes, frames)
+        detector = MarkerDetector(source.dictionary)
+    coverages = _read_coverages(source.silhouettes, range(0, source.video.num_frames, source.step))
     quality, written = _QUALITY, 0
-    try:
-        with task.path.open("wb") as file:
-            for number, image in enumerate(read_frames(task.video, task.step, into_one=True), 1):
-                jpeg, mask = _jpeg(_reduced(image, task.reduction), quality), b""
-                if task.silhouettes is not None:
-                    coverage = next(coverages)
-                    mask = _silhouette_png(coverage)
-                    blobs.append(_blob_boxes_px(coverage, task.cell_px))
-                if detector is not None:
-                    found = detector.detect(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
-                    markers.append((found.ids, found.corners_px))
-                file.write(jpeg + mask)
-                sizes.append((len(jpeg), len(mask)))
-                written += len(jpeg) + len(mask)
-                planned = number * task.bytes_per_image
-                change = _QUALITY_STEP * ((written < 0.98 * planned) - (written > planned))
-                quality = int(np.clip(quality + change, _LEAST_QUALITY, _BEST_QUALITY))
-                advance(1)
-    except OSError as error:
-        raise OutputError(
-            task.path, expected="a file that can be written", found=error.strerror or f"{error}"
-        ) from error
-    return EncodedImages(
-        task.path, np.array(frames), np.array(sizes).reshape(-1, 2), tuple(blobs), tuple(markers)
-    )
-
-
-def split_images(images: EncodedImages, chosen: Sequence[int]) -> list[tuple[bytes, bytes]]:
-    """The JPEG and the PNG image of some of a camera's images."""
-    ends = np.cumsum(images.sizes.sum(axis=1))
-    found = []
-    with images.path.open("rb") as file:
-        for index in chosen:
-            jpeg, mask = images.sizes[index].tolist()
-            file.seek(int(ends[index]) - jpeg - mask)
-            found.append((file.read(jpeg), file.read(mask)))
-    return found
+    for number, image in enumerate(read_frames(source.video, source.step, into_one=True)):
+        jpeg, silhouette, blobs_px = _jpeg(_reduced(image, source.reduction), quality), b"", np.zeros((0, 4))
+        if source.silhouettes is not None:
+            coverage = next(coverages)
+            silhouette, blobs_px = _silhouette_png(coverage), _blob_boxes_px(coverage, source.cell_px)
+        ids, corners_px = np.zeros(0, int), np.zeros((0, 4, 2))
+        if detector is not None:
+            found = detector.detect(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8))
+            ids, corners_px = found.ids, found.corners_px
+        yield EncodedImage(number * source.step, jpeg, silhouette, blobs_px, ids, corners_px)
+        written += len(jpeg) + len(silhouette)
+        planned = (number + 1) * source.bytes_per_image
+        change = _QUALITY_STEP * ((written < 0.98 * planned) - (written > planned))
+        quality = int(np.clip(quality + change, _LEAST_QUALITY, _BEST_QUALITY))
 
 
 def _reduced(

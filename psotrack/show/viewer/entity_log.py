@@ -13,22 +13,48 @@ Rerun has no lens distortion: marks are drawn in the pixels of the raw images, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 from jaxtyping import Bool, Float, Int, UInt8
 
-from psotrack.show.flights import FlightTracks, TrackedFlight, colour_rgb
+from psotrack.show.flights import FlightTracks, status_rgb, statuses
 from psotrack.show.viewer.camera_images import CameraKey
 
 #: Timelines: seconds of the recording, and numbers of instants.
 TIME, FRAME = "time", "frame"
 #: Rows that are sent together: Rerun keeps what is sent together in one piece.
 _ROWS = 2000
-#: How much white is mixed into the colours, because the viewer is dark.
-_LIGHTER = 0.25
+#: Grey that is mixed into the colours of predicted drones: it can be read on the dark and on the light theme.
+_PALE = 140
+
+
+class Instants(NamedTuple):
+    """Instants at which values are logged.
+
+    Attributes:
+        frame: (rows,), numbers of the instants.
+        time_s: (rows,), times of the instants, seconds.
+    """
+
+    frame: Int[np.ndarray, " rows"]
+    time_s: Float[np.ndarray, " rows"]
+
+
+class Marks(NamedTuple):
+    """How marks in images look.
+
+    Attributes:
+        counts: (rows,), number of marks of each row.
+        rgb: colours of all marks of all rows, or one colour.
+        labels: names of all marks of all rows; None: no names.
+    """
+
+    counts: Int[np.ndarray, " rows"]
+    rgb: UInt8[np.ndarray, "marks 3"] | tuple[int, int, int]
+    labels: list[str] | None = None
 
 
 class EntityLog:
@@ -40,129 +66,87 @@ class EntityLog:
 
     def __init__(self, stream: rr.RecordingStream) -> None:
         self._stream = stream
+        self._logged: set[tuple[str, str]] = set()
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
 
     def static(self, path: str, values: Any) -> None:
-        """Log values that hold at all times."""
-        self._stream.log(path, values, static=True, strict=True)
+        """Log values that hold at all times; the first ones of a kind count."""
+        key = (path, type(values).__name__)
+        if key not in self._logged:
+            self._logged.add(key)
+            self._stream.log(path, values, static=True, strict=True)
 
     def rows(
         self,
         path: str,
-        frame: Int[np.ndarray, " rows"],
-        time_s: Float[np.ndarray, " rows"],
+        at: Instants,
         columns: Callable[[slice], Any],
+        counts: Int[np.ndarray, " rows"] | None = None,
     ) -> None:
         """Log values over time, in pieces.
 
         Args:
             path: path of the entity.
-            frame: (rows,), numbers of the instants.
-            time_s: (rows,), times of the instants, seconds.
-            columns: makes the columns of some of the rows.
+            at: the instants of the rows.
+            columns: makes the columns of some of the values.
+            counts: (rows,), number of values of each row; a row without values hides those of the row before. None:
+                one value per row.
         """
-        for first in range(0, len(frame), _ROWS):
+        ends = np.arange(len(at.frame) + 1) if counts is None else np.concatenate([[0], np.cumsum(counts)])
+        for first in range(0, len(at.frame), _ROWS):
             rows = slice(first, first + _ROWS)
+            own = ends[first : first + _ROWS + 1]
+            found = columns(slice(int(own[0]), int(own[-1])))
             times = [
-                rr.TimeColumn(TIME, duration=np.asarray(time_s[rows], np.float64)),
-                rr.TimeColumn(FRAME, sequence=np.asarray(frame[rows], np.int64)),
+                rr.TimeColumn(TIME, duration=np.asarray(at.time_s[rows], np.float64)),
+                rr.TimeColumn(FRAME, sequence=np.asarray(at.frame[rows], np.int64)),
             ]
-            rr.send_columns(path, times, columns(rows), recording=self._stream, strict=True)
+            found = found if counts is None else found.partition(np.diff(own))
+            rr.send_columns(path, times, found, recording=self._stream, strict=True)
 
     def rows_where(
         self,
         path: str,
-        frame: Int[np.ndarray, " rows"],
-        time_s: Float[np.ndarray, " rows"],
+        at: Instants,
         there: Bool[np.ndarray, " rows"],
         columns: Callable[[Int[np.ndarray, " some"]], Any],
     ) -> None:
-        """Log one value per row that has a value; at the first row without, the value before goes away.
+        """Log one value in each row that has a value.
 
         Args:
             path: path of the entity.
-            frame, time_s: see `rows`.
+            at: the instants of the rows.
             there: (rows,), whether a row has a value.
             columns: makes the columns of rows with these numbers, all of which have a value.
         """
-        ends = np.diff(there.astype(int), prepend=0) < 0
-        logged, values = np.flatnonzero(there | ends), np.flatnonzero(there)
-        counts = there[logged].astype(int)
-        self.rows(
-            path,
-            frame[logged],
-            time_s[logged],
-            lambda rows: columns(values[_part(counts, rows)]).partition(counts[rows]),
-        )
+        numbers = np.flatnonzero(there)
+        self.rows(path, at, lambda values: columns(numbers[values]), there.astype(int))
 
-    def boxes(
-        self,
-        path: str,
-        frame: Int[np.ndarray, " rows"],
-        time_s: Float[np.ndarray, " rows"],
-        boxes_px: Sequence[Float[np.ndarray, "_ 4"]],
-        rgb: UInt8[np.ndarray, "boxes 3"] | tuple[int, int, int],
-        labels: Sequence[str] | None = None,
-    ) -> None:
-        """Log boxes in images over time.
-
-        Args:
-            path: path of the entity.
-            frame, time_s: see `rows`.
-            boxes_px: the boxes of each row; where a row has none, the boxes of the row before go away.
-            rgb: colours of all boxes, or of each box of all rows.
-            labels: names of all boxes of all rows; None: no names, and thin lines.
-        """
-        counts = np.array([len(each) for each in boxes_px], int)
-        xyxy = np.concatenate([np.zeros((0, 4)), *boxes_px])
-        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(xyxy), 3))
-
-        def columns(rows: slice) -> Any:
-            part = _part(counts, rows)
-            found = rr.Boxes2D.columns(
-                half_sizes=(xyxy[part, 2:] - xyxy[part, :2]) / 2,
-                centers=(xyxy[part, 2:] + xyxy[part, :2]) / 2,
-                colors=colours[part],
-                labels=None if labels is None else list(labels[part]),
-            )
-            return found.partition(counts[rows])
-
-        radius = -0.75 if labels is None else -1.5  # negative: in pixels of the screen
-        self.static(path, rr.Boxes2D.from_fields(radii=[radius], show_labels=labels is not None))
-        self.rows(path, frame, time_s, columns)
+    def boxes(self, path: str, at: Instants, marks: Marks, boxes_px: Float[np.ndarray, "boxes 4"]) -> None:
+        """Log boxes in images over time; without names, they have thin lines."""
+        radius = -0.75 if marks.labels is None else -1.5  # negative: in pixels of the screen
+        centre_px, half_px = (boxes_px[:, 2:] + boxes_px[:, :2]) / 2, (boxes_px[:, 2:] - boxes_px[:, :2]) / 2
+        self._marks(path, at, marks, rr.Boxes2D, radius, centers=centre_px, half_sizes=half_px)
 
     def lines(
-        self,
-        path: str,
-        frame: Int[np.ndarray, " rows"],
-        time_s: Float[np.ndarray, " rows"],
-        lines_px: Sequence[Float[np.ndarray, "_ points 2"]],
-        rgb: UInt8[np.ndarray, "lines 3"] | tuple[int, int, int],
-        labels: Sequence[str] | None = None,
+        self, path: str, at: Instants, marks: Marks, lines_px: Float[np.ndarray, "lines points 2"]
     ) -> None:
-        """Log lines in images over time; the arguments are those of `boxes`."""
-        counts = np.array([len(each) for each in lines_px], int)
-        lines = [line for each in lines_px for line in each]
-        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(lines), 3))
+        """Log lines in images over time."""
+        self._marks(path, at, marks, rr.LineStrips2D, -1.0, strips=lines_px)
 
-        def columns(rows: slice) -> Any:
-            part = _part(counts, rows)
-            found = rr.LineStrips2D.columns(
-                strips=lines[part],
-                colors=colours[part],
-                labels=None if labels is None else list(labels[part]),
-            )
-            return found.partition(counts[rows])
+    def _marks(
+        self, path: str, at: Instants, marks: Marks, kind: Any, radius: float, **places: np.ndarray
+    ) -> None:
+        labels = marks.labels
+        self.static(path, kind.from_fields(radii=[radius], show_labels=labels is not None))
+        rgb = np.broadcast_to(np.array(marks.rgb, np.uint8), (int(marks.counts.sum()), 3))
 
-        self.static(path, rr.LineStrips2D.from_fields(radii=[-1.0], show_labels=labels is not None))
-        self.rows(path, frame, time_s, columns)
+        def columns(part: slice) -> Any:
+            own = {key: list(values[part]) for key, values in places.items()}
+            return kind.columns(**own, colors=rgb[part], labels=None if labels is None else labels[part])
 
-
-def _part(counts: Int[np.ndarray, " rows"], rows: slice) -> slice:
-    """The values of some rows, where each row has a number of values."""
-    first = int(counts[: rows.start].sum())
-    return slice(first, first + int(counts[rows].sum()))
+        self.rows(path, at, columns, marks.counts)
 
 
 def part(name: str) -> str:
@@ -175,21 +159,21 @@ def camera_path(camera: CameraKey) -> str:
     return f"world/{'onboard' if camera.on_drone else 'cameras'}/{part(camera.name)}"
 
 
-def tracks_path(root: str, flight: TrackedFlight, tracks: FlightTracks) -> str:
+def tracks_path(root: str, tracks: FlightTracks) -> str:
     """Path of what belongs to the tracks of one file."""
-    return root if len(flight.tracks) == 1 else f"{root}/{part(tracks.label)}"
+    return f"{root}/{part(tracks.group)}" if tracks.group else root
 
 
-def drone_path(root: str, flight: TrackedFlight, tracks: FlightTracks, drone: str) -> str:
+def drone_path(root: str, tracks: FlightTracks, drone: str) -> str:
     """Path of what belongs to a drone of the tracks of one file."""
-    return f"{tracks_path(root, flight, tracks)}/{part(drone)}"
+    return f"{tracks_path(root, tracks)}/{part(drone)}"
 
 
-def drone_label(flight: TrackedFlight, tracks: FlightTracks, drone: str) -> str:
-    """Name of a drone, with the name of the tracks where there are several."""
-    return drone if len(flight.tracks) == 1 else f"{tracks.label} {drone}"
+def instants(tracks: FlightTracks) -> Instants:
+    """The instants of tracks."""
+    return Instants(tracks.trajectories.frame, tracks.trajectories.time_s)
 
 
-def shown_rgb(colour: str) -> tuple[int, int, int]:
-    """A colour #rrggbb as the viewer shows it on its dark background."""
-    return colour_rgb(colour, _LIGHTER)
+def shown_rgb(tracks: FlightTracks) -> UInt8[np.ndarray, "frames drones 3"]:
+    """Colours of drones by their status, which can be read on the dark and on the light theme."""
+    return status_rgb(statuses(tracks.trajectories), tracks.colours, pale=_PALE)

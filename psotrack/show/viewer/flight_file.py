@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import threading
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,21 +13,20 @@ import rerun as rr
 
 from psotrack.errors import OutputError
 from psotrack.foreground.silhouettes import Silhouettes
-from psotrack.recordings import VideoInfo
+from psotrack.recordings import Recording, VideoInfo
 from psotrack.show.flights import TrackedFlight
 from psotrack.show.viewer.camera_images import (
     CameraKey,
-    EncodingTask,
     ImagePlan,
-    encode_images,
+    ImageSource,
     plan_images,
 )
 from psotrack.show.viewer.entity_log import EntityLog
 from psotrack.show.viewer.image_marks import log_images, log_marks
 from psotrack.show.viewer.layout import blueprint_of
 from psotrack.show.viewer.plots import log_plots
-from psotrack.show.viewer.space import log_drones, log_world
-from psotrack.support import Report, atomic_write, map_in_processes, no_progress
+from psotrack.show.viewer.space import log_flight, log_world
+from psotrack.support import Report, atomic_write, no_progress
 
 #: Largest size by default: this number of bytes per second of the recording, up to the second number.
 _BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
@@ -43,12 +43,29 @@ class WrittenFlight:
     """What was written.
 
     Attributes:
+        path: the file.
         num_bytes: size of the file.
         plan: how the images were reduced.
+        has_silhouettes: whether silhouettes are shown.
     """
 
+    path: Path
     num_bytes: int
     plan: ImagePlan
+    has_silhouettes: bool
+
+    def __str__(self) -> str:
+        parts = [f"{self.path}: {self.num_bytes / 1e6:.1f} MB"]
+        if self.plan.num_images:
+            smallest = max(self.plan.reduction.values())
+            frames = "every frame" if self.plan.step == 1 else f"1 frame in {self.plan.step}"
+            size = "full size" if smallest == 1 else f"1/{smallest} of the width and height"
+            parts.append(f"{self.plan.num_images} images ({frames}, {size})")
+            if not self.has_silhouettes:
+                parts.append("no silhouettes are stored; --silhouettes computes them")
+        else:
+            parts.append("without images; the recording with its videos shows the cameras, too")
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -94,19 +111,15 @@ def write_flight(
     with atomic_write(path) as temporary:
         try:
             plan = _write(temporary, flight, content, jobs or os.cpu_count() or 1, report)
-            _check_end(temporary)
-        except _FileError as error:
+        except RuntimeError as error:
             expected, found = "to write the whole file", "that Rerun could not"
             raise OutputError(path, expected=expected, found=found, remedy="is the disk full?") from error
         num_bytes = temporary.stat().st_size
-    return WrittenFlight(num_bytes, plan)
-
-
-class _FileError(Exception):
-    """Rerun could not write the file."""
+    return WrittenFlight(path, num_bytes, plan, content.silhouettes is not None)
 
 
 def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, report: Report) -> ImagePlan:
+    """Write the file; raises `RuntimeError` where Rerun cannot."""
     stream = rr.RecordingStream(APPLICATION, recording_id=flight.name, send_properties=False)
     stream.save(path)
     try:
@@ -115,39 +128,23 @@ def _write(path: Path, flight: TrackedFlight, content: ViewContent, jobs: int, r
         log = EntityLog(stream)
         stream.send_blueprint(blueprint_of(flight, has_images=bool(videos), has_onboard=content.onboard))
         log_world(log, flight)
-        log_drones(log, flight)
+        log_flight(log, flight)
         log_plots(log, flight)
-        _flush(stream)
+        stream.flush()
         most = _max_bytes(flight, content)
         plan = plan_images(videos, _left_bytes(path, most))
         log_marks(log, flight, plan.step)
-        _flush(stream)
-        with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
-            tasks = _tasks(content, videos, plan, Path(folder), _left_bytes(path, most))
-            with report("images", plan.num_images) as advance:
-                encoded = map_in_processes(encode_images, list(tasks.values()), jobs=jobs, advance=advance)
-            for camera, images in zip(tasks, encoded, strict=True):
-                task = tasks[camera]
-                log_images(log, flight, camera, images, (task.reduction, task.cell_px))
+        stream.flush()
+        sources = _sources(content, videos, plan, _left_bytes(path, most))
+        if flight.recording is not None:
+            _log_all_images(log, flight.recording, sources, plan.num_images, jobs, report)
     finally:
         stream.disconnect()
-    return plan
-
-
-def _check_end(path: Path) -> None:
-    """Raise `_FileError` for a file without its end."""
     with path.open("rb") as file:
         file.seek(-min(len(_END), path.stat().st_size), os.SEEK_END)
         if file.read() != _END:
-            raise _FileError
-
-
-def _flush(stream: rr.RecordingStream) -> None:
-    """Wait until the file has everything that was logged."""
-    try:
-        stream.flush()
-    except RuntimeError as error:
-        raise _FileError from error
+            raise RuntimeError("the end is missing")
+    return plan
 
 
 def _left_bytes(path: Path, max_bytes: float) -> float:
@@ -158,7 +155,6 @@ def _left_bytes(path: Path, max_bytes: float) -> float:
 def _max_bytes(flight: TrackedFlight, content: ViewContent) -> float:
     if content.max_bytes is not None:
         return content.max_bytes
-    assert flight.recording is not None or not content.onboard
     if flight.recording is None or not flight.recording.num_frames:
         return _MOST_BYTES
     return min(_MOST_BYTES, _BYTES_PER_S * max(1.0, flight.recording.num_frames / flight.recording.fps))
@@ -169,26 +165,21 @@ def _videos(flight: TrackedFlight, with_onboard: bool) -> dict[CameraKey, VideoI
     recording = flight.recording
     if recording is None:
         return {}
-    names = [name for name in recording.rig.names if name in recording.videos]
-    videos = {CameraKey(name): recording.videos[name] for name in names}
-    for name, camera in (recording.onboard or {}).items() if with_onboard else ():
-        videos[CameraKey(name, on_drone=True)] = camera.video
-    return videos
+    videos = {
+        CameraKey(name): recording.videos[name] for name in recording.rig.names if name in recording.videos
+    }
+    onboard = (recording.onboard or {}) if with_onboard else {}
+    return videos | {CameraKey(name, on_drone=True): camera.video for name, camera in onboard.items()}
 
 
-def _tasks(
-    content: ViewContent,
-    videos: Mapping[CameraKey, VideoInfo],
-    plan: ImagePlan,
-    folder: Path,
-    max_bytes: float,
-) -> dict[CameraKey, EncodingTask]:
+def _sources(
+    content: ViewContent, videos: Mapping[CameraKey, VideoInfo], plan: ImagePlan, max_bytes: float
+) -> dict[CameraKey, ImageSource]:
     silhouettes = content.silhouettes
     arrays = {} if silhouettes is None else dict(zip(silhouettes.cameras, silhouettes.arrays, strict=True))
     return {
-        camera: EncodingTask(
+        camera: ImageSource(
             video=video,
-            path=folder / f"{number}.images",
             step=plan.step,
             reduction=plan.reduction[camera],
             bytes_per_image=max_bytes / max(plan.num_images, 1),
@@ -196,5 +187,33 @@ def _tasks(
             cell_px=1 if silhouettes is None else silhouettes.reduction,
             dictionary=content.dictionary if camera.on_drone else None,
         )
-        for number, (camera, video) in enumerate(videos.items())
+        for camera, video in videos.items()
     }
+
+
+def _log_all_images(
+    log: EntityLog,
+    recording: Recording,
+    sources: Mapping[CameraKey, ImageSource],
+    num_images: int,
+    jobs: int,
+    report: Report,
+) -> None:
+    """Log the images of all cameras, several cameras at the same time: OpenCV decodes and encodes in threads."""
+    stop = threading.Event()
+    with report("images", num_images) as advance, ThreadPoolExecutor(jobs) as threads:
+
+        def log_one(camera: CameraKey) -> None:
+            def goes_on(steps: int) -> None:
+                if stop.is_set():
+                    raise InterruptedError
+                advance(steps)
+
+            log_images(log, recording, camera, sources[camera], goes_on)
+
+        try:
+            list(threads.map(log_one, sources))
+        except BaseException:
+            # The other threads end with their next image.
+            stop.set()
+            raise

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from psotrack.geometry.rotations import rotation_matrices
-from psotrack.recordings import OnboardVideo, read_detections
-from psotrack.show.flights import (
-    FlightTracks,
-    TrackedFlight,
-    boxes_in_images,
-    ellipse_outlines_px,
-    ellipses_in_images,
-    shown_frames,
-    status_colours,
-    statuses,
+from psotrack.recordings import OnboardVideo, Recording, read_detections
+from psotrack.show.flights import FlightTracks, TrackedFlight, ellipse_outlines_px, view_in_images
+from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSource, encode_images
+from psotrack.show.viewer.entity_log import (
+    EntityLog,
+    Instants,
+    Marks,
+    camera_path,
+    instants,
+    shown_rgb,
+    tracks_path,
 )
-from psotrack.show.viewer.camera_images import CameraKey, EncodedImages, split_images
-from psotrack.show.viewer.entity_log import EntityLog, camera_path, drone_label, shown_rgb, tracks_path
 from psotrack.show.viewer.space import MARKER_RGB, pinhole
+from psotrack.support import Advance
 
 _DETECTION_RGB = (255, 214, 10)
 _BLOB_RGB = (120, 255, 190)
@@ -40,85 +42,110 @@ def log_marks(log: EntityLog, flight: TrackedFlight, step: int) -> None:
         flight: the flight.
         step: each frame whose number is a multiple of it is shown.
     """
-    for number, tracks in enumerate(flight.tracks):
-        colours = [shown_rgb(colour) for colour in flight.colours(number)]
-        _log_boxes(log, flight, tracks, colours, step)
     recording = flight.recording
-    if recording is None or recording.detections is None:
+    if recording is None:
         return
+    for tracks in flight.tracks:
+        _log_tracks(log, recording, tracks, step)
     timeline = recording.timeline()
     for index, name in enumerate(recording.rig.names):
-        if name in recording.detections:
+        if name in (recording.detections or {}):
+            assert recording.detections is not None
             detections = read_detections(recording.detections[name])
             rows = _rows_shown(timeline.frame[:, index], step)
-            of_rows = [detections.in_frame(int(frame)).xyxy for frame in timeline.frame[rows, index]]
+            boxes_px = [detections.in_frame(int(frame)).xyxy for frame in timeline.frame[rows, index]]
             path = f"{camera_path(CameraKey(name))}/detections"
-            log.boxes(path, rows, timeline.time_s[rows], of_rows, _DETECTION_RGB)
+            _log_boxes(log, path, Instants(rows, timeline.time_s[rows]), boxes_px, _DETECTION_RGB)
 
 
 def log_images(
-    log: EntityLog,
-    flight: TrackedFlight,
-    camera: CameraKey,
-    images: EncodedImages,
-    pixels: tuple[int, int],
+    log: EntityLog, recording: Recording, camera: CameraKey, source: ImageSource, advance: Advance
 ) -> None:
     """Log the images of a camera: of the rig with silhouettes and blobs, on a drone with its path and markers.
 
     Args:
         log: receives the values.
-        flight: the flight.
+        recording: the recording.
         camera: the camera.
-        images: its images.
-        pixels: pixels of the video per pixel of the images, and per pixel of the silhouettes, along each side.
+        source: its images.
+        advance: receives the number of images.
+
+    Raises:
+        InputError: the video ends early.
     """
-    assert flight.recording is not None
-    path = camera_path(camera)
-    for kind, reduction in zip(("image", "silhouettes"), pixels, strict=True):
-        if kind == "image" or images.blobs_px:
-            log.static(f"{path}/{kind}", rr.Transform3D(scale=[reduction, reduction, 1]))
+    path, instant, shown = camera_path(camera), _shown_at(recording, camera, source.step), []
+    kinds = [("image", source.reduction), ("silhouettes", source.cell_px)]
+    for kind, reduction in kinds if source.silhouettes is not None else kinds[:1]:
+        log.static(f"{path}/{kind}", rr.Transform3D(scale=[reduction, reduction, 1]))
     if camera.on_drone:
-        assert flight.recording.onboard is not None
-        video = flight.recording.onboard[camera.name]
-        _log_path(log, path, video)
-        chosen = np.arange(len(images.frame))
-        frame, time_s = images.frame, images.frame / video.video.fps
-    else:
-        timeline = flight.recording.timeline()
-        shown = timeline.frame[:, timeline.cameras.index(camera.name)]
-        frame = np.flatnonzero(_is_new(shown) & np.isin(shown, images.frame))
-        chosen, time_s = np.searchsorted(images.frame, shown[frame]), timeline.time_s[frame]
-    for first in range(0, len(chosen), _TOGETHER):
-        rows = slice(first, first + _TOGETHER)
-        jpegs, pngs = zip(*split_images(images, chosen[rows].tolist()), strict=True)
-        _log_encoded(log, f"{path}/image", frame[rows], time_s[rows], jpegs)
-        if images.blobs_px:
-            _log_encoded(log, f"{path}/silhouettes", frame[rows], time_s[rows], pngs)
-    if images.blobs_px:
-        log.boxes(f"{path}/blobs", frame, time_s, [images.blobs_px[index] for index in chosen], _BLOB_RGB)
-    if images.markers:
+        assert recording.onboard is not None
+        _log_path(log, path, recording.onboard[camera.name])
+    together: list[EncodedImage] = []
+    for image in encode_images(source):
+        if image.frame in instant:
+            together.append(image)
+            shown.append(replace(image, jpeg=b"", silhouette=b""))
+        if len(together) == _TOGETHER:
+            _log_encoded(log, path, together, instant)
+            together = []
+        advance(1)
+    _log_encoded(log, path, together, instant)
+    at = _instants(shown, instant)
+    if source.silhouettes is not None:
+        _log_boxes(log, f"{path}/blobs", at, [image.blobs_px for image in shown], _BLOB_RGB)
+    if source.dictionary is not None:
+        counts = np.array([len(image.marker_ids) for image in shown], int)
+        corners_px = np.concatenate([np.zeros((0, 4, 2)), *(image.marker_corners_px for image in shown)])
+        labels = [f"{marker}" for image in shown for marker in image.marker_ids.tolist()]
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
-        outlines_px = [corners_px[:, [0, 1, 2, 3, 0]] + 0.5 for _, corners_px in images.markers]
-        labels = [f"{marker}" for ids, _ in images.markers for marker in ids.tolist()]
-        log.lines(f"{path}/markers", frame, time_s, outlines_px, MARKER_RGB, labels)
+        outlines_px = corners_px[:, [0, 1, 2, 3, 0]] + 0.5
+        log.lines(f"{path}/markers", at, Marks(counts, MARKER_RGB, labels), outlines_px)
+
+
+def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, tuple[int, float]]:
+    """Number and time of the instant at which each frame of a camera is shown first."""
+    if camera.on_drone:
+        assert recording.onboard is not None
+        video = recording.onboard[camera.name].video
+        return {frame: (frame, frame / video.fps) for frame in range(0, video.num_frames, step)}
+    timeline = recording.timeline()
+    frame = timeline.frame[:, timeline.cameras.index(camera.name)]
+    rows = _rows_shown(frame, step)
+    return dict(
+        zip(
+            frame[rows].tolist(), zip(rows.tolist(), timeline.time_s[rows].tolist(), strict=True), strict=True
+        )
+    )
+
+
+def _instants(images: Sequence[EncodedImage], instant: Mapping[int, tuple[int, float]]) -> Instants:
+    at = np.array([instant[image.frame] for image in images], float).reshape(-1, 2)
+    return Instants(at[:, 0].astype(int), at[:, 1])
 
 
 def _log_encoded(
-    log: EntityLog,
-    path: str,
-    frame: Int[np.ndarray, " rows"],
-    time_s: Float[np.ndarray, " rows"],
-    blobs: Sequence[bytes],
+    log: EntityLog, path: str, images: Sequence[EncodedImage], instant: Mapping[int, tuple[int, float]]
 ) -> None:
-    kinds = ["image/png" if blob.startswith(b"\x89PNG") else "image/jpeg" for blob in blobs]
-    # PNG images are silhouettes, in front of the JPEG images.
-    orders = [float(kind == "image/png") for kind in kinds]
-    log.rows(
-        path,
-        frame,
-        time_s,
-        lambda _: rr.EncodedImage.columns(blob=list(blobs), media_type=kinds, draw_order=orders),
-    )
+    """Log some images together, and their silhouettes, which are in front."""
+
+    def encoded(blobs: list[bytes], kind: str, order: float) -> Callable[[slice], Any]:
+        count = len(blobs)
+        found = rr.EncodedImage.columns(blob=blobs, media_type=[kind] * count, draw_order=[order] * count)
+        return lambda _: found
+
+    at = _instants(images, instant)
+    if images:
+        log.rows(f"{path}/image", at, encoded([each.jpeg for each in images], "image/jpeg", 0.0))
+    if images and images[0].silhouette:
+        log.rows(f"{path}/silhouettes", at, encoded([each.silhouette for each in images], "image/png", 1.0))
+
+
+def _log_boxes(
+    log: EntityLog, path: str, at: Instants, boxes_px: Sequence[np.ndarray], rgb: tuple[int, int, int]
+) -> None:
+    """Log the boxes of each row, without names."""
+    counts = np.array([len(each) for each in boxes_px], int)
+    log.boxes(path, at, Marks(counts, rgb), np.concatenate([np.zeros((0, 4)), *boxes_px]))
 
 
 def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
@@ -130,56 +157,34 @@ def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
     rotation = rotation_matrices(orientation_wxyz[known])
     log.rows(
         path,
-        frame,
-        frame / onboard.video.fps,
+        Instants(frame, frame / onboard.video.fps),
         lambda rows: rr.Transform3D.columns(translation=position_m[rows], mat3x3=rotation[rows]),
     )
     if onboard.K is not None:
         log.static(path, pinhole(onboard.K, np.array(onboard.video.image_size_wh), _ONBOARD_DISTANCE_M))
 
 
-def _log_boxes(
-    log: EntityLog,
-    flight: TrackedFlight,
-    tracks: FlightTracks,
-    colours: Sequence[tuple[int, int, int]],
-    step: int,
-) -> None:
-    recording, trajectories = flight.recording, tracks.trajectories
-    if recording is None:
-        return
-    shown = shown_frames(recording, trajectories)
-    boxes_px = boxes_in_images(recording, trajectories, tracks.size_m)
-    ellipses = ellipses_in_images(recording, trajectories)
-    status = statuses(trajectories)
-    rgb = np.stack([status_colours(status[:, drone], colour) for drone, colour in enumerate(colours)], axis=1)
-    labels = [drone_label(flight, tracks, name) for name in trajectories.drones]
+def _log_tracks(log: EntityLog, recording: Recording, tracks: FlightTracks, step: int) -> None:
+    """Log the boxes and ellipses of the drones of one file."""
+    views = view_in_images(recording, tracks.trajectories, tracks.size_m)
+    rgb = shown_rgb(tracks)
     for index, name in enumerate(recording.rig.names):
-        rows = _rows_shown(shown.frame[:, index], step)
-        at = (trajectories.frame[rows], trajectories.time_s[rows])
+        rows = _rows_shown(views.frame[:, index], step)
+        at = Instants(*(part[rows] for part in instants(tracks)))
         path = camera_path(CameraKey(name))
-        there = np.isfinite(boxes_px[rows, :, index]).all(axis=-1)
-        log.boxes(
-            tracks_path(f"{path}/boxes", flight, tracks),
-            *at,
-            [boxes[seen] for boxes, seen in zip(boxes_px[rows, :, index], there, strict=True)],
-            rgb[rows][there],
-            [labels[drone] for drone in np.nonzero(there)[1]],
-        )
-        if ellipses is None:
+        boxes_px = views.boxes_px[rows, :, index]
+        there = np.isfinite(boxes_px).all(axis=-1)
+        labels = [tracks.names[drone] for drone in np.nonzero(there)[1]]
+        marks = Marks(there.sum(axis=1), rgb[rows][there], labels)
+        log.boxes(tracks_path(f"{path}/boxes", tracks), at, marks, boxes_px[there])
+        if tracks.trajectories.covariance_m2 is None:
             continue
-        middle_px, shape_px2 = ellipses.middle_px[rows, :, index], ellipses.shape_px2[rows, :, index]
+        middle_px, shape_px2 = views.middle_px[rows, :, index], views.shape_px2[rows, :, index]
         there = np.isfinite(middle_px).all(axis=-1) & np.isfinite(shape_px2).all(axis=(-2, -1))
-        log.lines(
-            tracks_path(f"{path}/ellipses", flight, tracks),
-            *at,
-            # Pixel centres are at whole numbers, in Rerun half a pixel further.
-            [
-                ellipse_outlines_px(middle[seen] + 0.5, shape[seen])
-                for middle, shape, seen in zip(middle_px, shape_px2, there, strict=True)
-            ],
-            rgb[rows][there],
-        )
+        # Pixel centres are at whole numbers, in Rerun half a pixel further.
+        outlines_px = ellipse_outlines_px(middle_px[there] + 0.5, shape_px2[there])
+        marks = Marks(there.sum(axis=1), rgb[rows][there])
+        log.lines(tracks_path(f"{path}/ellipses", tracks), at, marks, outlines_px)
 
 
 def _is_new(frame: Int[np.ndarray, " instants"]) -> np.ndarray:

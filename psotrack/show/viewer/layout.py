@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from psotrack.show.flights import TrackedFlight
+from psotrack.recordings import Recording
+from psotrack.show.flights import QUANTITIES, TrackedFlight
 from psotrack.show.viewer.camera_images import CameraKey
 from psotrack.show.viewer.entity_log import FRAME, TIME, camera_path, drone_path
 
 #: Time for which a drone's trail is shown, seconds.
 _TRAIL_S = 3.0
-#: Background of the view of space, also where the browser's page is light: colours of drones are made for it.
-_BACKGROUND = (18, 20, 24)
-#: Quantities that are plotted, and the names of their plots.
-_PLOTS = {
-    "error_mm": "error against the reference (mm)",
-    "score": "score",
-    "deviation_mm": "standard deviation (mm)",
-    "cameras": "cameras that see the drone",
-}
+_STATES = rrb.StateTimelineView(origin="/status", name="status")
 
 
 def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool = False) -> rrb.Blueprint:
@@ -34,43 +28,36 @@ def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool =
         has_onboard: whether the cameras on drones are shown.
     """
     left: list[rrb.View | rrb.Container] = [_space_view(flight)]
-    if flight.tracks:
-        left.append(rrb.Horizontal(_plots(flight), _states(), column_shares=[3, 2]))
     right: list[rrb.View | rrb.Container] = []
     if flight.recording is not None and (has_images or flight.tracks):
-        right.append(_cameras(flight, has_onboard))
+        right.append(_cameras(flight.recording, has_onboard))
     if flight.tracks:
-        right.append(_events())
-    columns: list[rrb.View | rrb.Container] = [rrb.Vertical(*left, row_shares=[5, 2][: len(left)])]
-    if right:
-        columns.append(rrb.Vertical(*right, row_shares=[5, 1.4][: len(right)]))
-    return rrb.Blueprint(
-        rrb.Horizontal(*columns, column_shares=[5, 4][: len(columns)]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIME, loop_mode="all"),
-        collapse_panels=False,
-        auto_layout=False,
-        auto_views=False,
-    )
+        plots = [_plot(key) for key in QUANTITIES if flight.truth is not None or key != "error_mm"]
+        left.append(rrb.Horizontal(rrb.Tabs(*plots, active_tab=0), _STATES, column_shares=[3, 2]))
+        columns = rrb.TextLogColumns(timeline_columns=[TIME, FRAME], text_log_columns=["loglevel", "body"])
+        name = "events: a click on a time jumps there"
+        right.append(rrb.TextLogView(origin="/events", name=name, columns=columns))
+    halves = [rrb.Vertical(*views, row_shares=[5, 2][: len(views)]) for views in (left, right) if views]
+    return _arranged(halves, [5.0, 4.0], loop_mode="all")
 
 
 def live_blueprint() -> rrb.Blueprint:
     """The arrangement for tracks that come while cameras film."""
+    delay = rrb.TimeSeriesView(origin="/plots/delay_ms", name="delay (ms)")
+    plots = [_plot(key) for key in QUANTITIES if key != "error_mm"]
+    space = rrb.Spatial3DView(origin="/world", name="space")
+    return _arranged([space, rrb.Vertical(*plots, delay, _STATES)], [2.0, 1.0], play_state="following")
+
+
+def _arranged(
+    columns: Sequence[rrb.View | rrb.Container], shares: list[float], **playing: Any
+) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial3DView(origin="/world", name="space", background=_BACKGROUND),
-            rrb.Vertical(
-                rrb.TimeSeriesView(origin="/plots/height_m", name="height (m)"),
-                rrb.TimeSeriesView(origin="/plots/deviation_mm", name="standard deviation (mm)"),
-                rrb.TimeSeriesView(origin="/plots/delay_ms", name="delay (ms)"),
-                _states(),
-            ),
-            column_shares=[2, 1],
-        ),
+        rrb.Horizontal(*columns, column_shares=shares[: len(columns)]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIME, play_state="following"),
+        rrb.TimePanel(state="collapsed", timeline=TIME, **playing),
+        collapse_panels=False,
         auto_layout=False,
         auto_views=False,
     )
@@ -83,25 +70,18 @@ def _space_view(flight: TrackedFlight) -> rrb.Spatial3DView:
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
     trails: dict[Any, Any] = {
-        f"{drone_path('world/drones', flight, tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
+        f"{drone_path('world/drones', tracks, drone)}/trail": rrb.VisibleTimeRanges([last])
         for tracks in flight.tracks
         for drone in tracks.trajectories.drones
     }
+    # Marks in the images would hide the drones in space.
+    marks = ("boxes", "ellipses", "blobs", "detections", "silhouettes")
     return rrb.Spatial3DView(
         origin="/world",
-        # Marks in the images would hide the drones in space.
-        contents=[
-            "$origin/**",
-            "- $origin/cameras/*/boxes/**",
-            "- $origin/cameras/*/ellipses/**",
-            "- $origin/cameras/*/blobs/**",
-            "- $origin/cameras/*/detections/**",
-            "- $origin/cameras/*/silhouettes/**",
-        ],
+        contents=["$origin/**", *(f"- $origin/cameras/*/{mark}/**" for mark in marks)],
         name="space",
         overrides=trails,
         eye_controls=_eye(flight),
-        background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0),
     )
 
@@ -116,60 +96,31 @@ def _eye(flight: TrackedFlight) -> rrb.EyeControls3D | None:
     if not len(points_m):
         return None
     low, high = points_m.min(axis=0), points_m.max(axis=0)
-    middle_m, reach_m = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.0)
-    middle_m[2] = low[2] + 0.3 * (high[2] - low[2])
-    position_m = middle_m + reach_m * np.array([-0.33, -0.52, 0.4])
+    reach_m = max(float(np.linalg.norm(high - low)), 1.0)
+    target_m = low + (high - low) * [0.5, 0.5, 0.3]
+    position_m = target_m + reach_m * np.array([-0.33, -0.52, 0.4])
     return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital, position=position_m, look_target=middle_m, eye_up=(0, 0, 1)
+        kind=rrb.Eye3DKind.Orbital, position=position_m, look_target=target_m, eye_up=(0, 0, 1)
     )
 
 
-def _plots(flight: TrackedFlight) -> rrb.Tabs:
-    has_truth = flight.truth is not None
-    return rrb.Tabs(
-        *(
-            rrb.TimeSeriesView(
-                origin=f"/plots/{quantity}",
-                name=name,
-                axis_y=rrb.ScalarAxis(range=(0.0, 1.0)) if quantity == "score" else None,
-                plot_legend=rrb.PlotLegend(visible=True),
-            )
-            for quantity, name in _PLOTS.items()
-            if has_truth or quantity != "error_mm"
-        ),
-        active_tab=0,
+def _plot(quantity: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=f"/plots/{quantity}",
+        name=QUANTITIES[quantity][0],
+        axis_y=rrb.ScalarAxis(range=(0.0, 1.0)) if quantity == "score" else None,
+        plot_legend=rrb.PlotLegend(visible=True),
     )
 
 
-def _states() -> rrb.StateTimelineView:
-    return rrb.StateTimelineView(origin="/status", name="status")
+def _cameras(recording: Recording, has_onboard: bool) -> rrb.Container:
+    def grid(names: Iterable[str], on_drone: bool, title: str) -> rrb.Container:
+        keys = [CameraKey(name, on_drone) for name in names]
+        views = [rrb.Spatial2DView(origin=f"/{camera_path(key)}", name=key.name) for key in keys]
+        columns = 2 if len(keys) <= 8 else int(np.ceil(np.sqrt(len(keys))))
+        return rrb.Grid(*views, grid_columns=columns, name=title)
 
-
-def _events() -> rrb.TextLogView:
-    return rrb.TextLogView(
-        origin="/events",
-        name="events: a click on a time jumps there",
-        columns=rrb.TextLogColumns(timeline_columns=[TIME, FRAME], text_log_columns=["loglevel", "body"]),
-    )
-
-
-def _cameras(flight: TrackedFlight, has_onboard: bool) -> rrb.Container:
-    assert flight.recording is not None
-    onboard = (flight.recording.onboard or {}) if has_onboard else {}
-    names = flight.recording.rig.names
-    grid = rrb.Grid(
-        *(rrb.Spatial2DView(origin=f"/{camera_path(CameraKey(name))}", name=name) for name in names),
-        grid_columns=2 if len(names) <= 8 else int(np.ceil(np.sqrt(len(names)))),
-        name="cameras",
-    )
-    if not onboard:
-        return grid
-    on_drones = rrb.Grid(
-        *(
-            rrb.Spatial2DView(origin=f"/{camera_path(CameraKey(name, on_drone=True))}", name=name)
-            for name in onboard
-        ),
-        grid_columns=2,
-        name="cameras on drones",
-    )
-    return rrb.Tabs(grid, on_drones, active_tab=0)
+    of_rig = grid(recording.rig.names, False, "cameras")
+    if not has_onboard:
+        return of_rig
+    return rrb.Tabs(of_rig, grid(recording.onboard or {}, True, "cameras on drones"), active_tab=0)

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
+from dataclasses import replace
+from functools import partial
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import rerun as rr
 from jaxtyping import Float
 
 from psotrack.recordings import Recording
-from psotrack.show.flights import USUAL_SIZE_M, TrackedFlight, ellipsoids_90, status_rgb
-from psotrack.show.viewer.entity_log import FRAME, TIME, EntityLog, part, shown_rgb
+from psotrack.show.flights import TrackedFlight, flight_of, statuses
+from psotrack.show.viewer.entity_log import EntityLog, Instants, instants, part, shown_rgb
 from psotrack.show.viewer.flight_file import APPLICATION
 from psotrack.show.viewer.layout import live_blueprint
-from psotrack.show.viewer.plots import log_status_words
+from psotrack.show.viewer.plots import log_quantities, log_status
 from psotrack.show.viewer.programs import viewer_program
-from psotrack.show.viewer.space import ELLIPSOID_FILL, log_world, quaternions_xyzw, status_label
-from psotrack.support import COLOURS, whole_number
-from psotrack.trajectories import Status, Trajectories
+from psotrack.show.viewer.space import log_drones, log_world
+from psotrack.support import drone_colour, whole_number
+from psotrack.trajectories import Trajectories
 
 #: Number of positions in a drone's trail: three seconds at 25 per second.
 _TRAIL_ROWS = 75
@@ -45,8 +48,9 @@ class LiveView:
         self._recording, self._web = recording, web
         self._trails: dict[str, deque[Float[np.ndarray, "3"]]] = {}
         self._status: dict[str, int] = {}
-        self._colours: dict[str, tuple[int, int, int]] = {}
+        self._colours: dict[str, str] = {}
         self._ends = contextlib.ExitStack()
+        self._now = Instants(np.zeros(1, int), np.zeros(1))
         self.page = ""
 
     def __enter__(self) -> LiveView:
@@ -57,72 +61,44 @@ class LiveView:
             self._stream.connect_grpc(program.address)
             stack.callback(self._close)
             self._stream.send_blueprint(live_blueprint())
-            self._entities = EntityLog(self._stream)
-            log_world(self._entities, TrackedFlight(self._recording.name, (), self._recording))
+            self._log = EntityLog(self._stream)
+            log_world(self._log, TrackedFlight(self._recording.name, (), self._recording))
             self._ends = stack.pop_all()
         return self
 
     def write(self, rows: Trajectories) -> None:
         """Show the rows of an instant."""
-        self._stream.set_time(TIME, duration=float(rows.time_s[0]))
-        self._stream.set_time(FRAME, sequence=int(rows.frame[0]))
-        for name in self._trails.keys() - set(rows.drones):
-            self._log(f"world/drones/{part(name)}", rr.Clear(recursive=True))
+        (tracks,) = flight_of(rows).tracks
+        for name in rows.drones:
+            number = whole_number(name)
+            number = len(self._colours) if number is None else number
+            self._colours.setdefault(name, drone_colour(number))
+        tracks = replace(tracks, colours=tuple(self._colours[name] for name in rows.drones))
+        self._now = instants(tracks)
+        log_drones(self._log, tracks)
+        log_quantities(self._log, TrackedFlight("", (), None), tracks)
+        log_status(self._log, tracks, self._status)
+        self._status |= dict(zip(rows.drones, statuses(rows)[0].tolist(), strict=True))
+        self._show_trails(rows, shown_rgb(tracks)[0].tolist())
+
+    def _show_trails(self, rows: Trajectories, rgb: list[list[int]]) -> None:
+        known = dict(zip(rows.drones, np.isfinite(rows.position_m[0]).all(axis=-1).tolist(), strict=True))
+        for name in [name for name in self._trails if not known.get(name)]:
+            path = f"world/drones/{part(name)}"
+            self._log.rows(path, self._now, partial(_only, rr.Clear.columns(is_recursive=[True])))
             del self._trails[name]
         for index, name in enumerate(rows.drones):
-            status = int(rows.status[0, index]) if rows.status is not None else int(Status.TRACKED)
-            if name not in self._colours:
-                self._begin(name)
-            if status != self._status.get(name):
-                self._log(f"status/{part(name)}", rr.StateChange(state=Status(status).label))
-                self._status[name] = status
-            position_m = rows.position_m[0, index].astype(np.float64)
-            path = f"world/drones/{part(name)}"
-            if not np.isfinite(position_m).all():
-                self._log(path, rr.Clear(recursive=True))
-                continue
-            trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
-            trail.append(position_m)
-            rgb = [status_rgb(status, self._colours[name])]
-            label = status_label(name, status)
-            half_m = np.array(USUAL_SIZE_M) / 2
-            self._log(
-                f"{path}/body",
-                rr.Boxes3D(centers=[position_m], half_sizes=[half_m], colors=rgb, labels=[label]),
-            )
-            self._log(f"{path}/trail", rr.LineStrips3D([np.stack(trail)], colors=rgb))
-            self._log(f"plots/height_m/{part(name)}", rr.Scalars(position_m[2]))
-            if status == Status.LOST:
-                self._log(f"{path}/ellipsoid", rr.Clear(recursive=False))
-            elif rows.covariance_m2 is not None and np.isfinite(rows.covariance_m2[0, index]).all():
-                covariance_m2 = rows.covariance_m2[0, index].astype(np.float64)
-                ellipsoid = ellipsoids_90(covariance_m2)
-                self._log(
-                    f"{path}/ellipsoid",
-                    rr.Ellipsoids3D(
-                        centers=[position_m],
-                        half_sizes=[ellipsoid.half_axes_m],
-                        quaternions=quaternions_xyzw(ellipsoid.rotation[None]),
-                        colors=rgb,
-                        fill_mode=ELLIPSOID_FILL,
-                    ),
-                )
-                deviation_mm = 1e3 * float(np.sqrt(np.trace(covariance_m2)))
-                self._log(f"plots/deviation_mm/{part(name)}", rr.Scalars(deviation_mm))
-
-    def _begin(self, name: str) -> None:
-        """Choose the colour of a drone that is seen for the first time, and log how its status and its lines look."""
-        number = whole_number(name)
-        number = len(self._colours) if number is None else number
-        self._colours[name] = shown_rgb(COLOURS[number % len(COLOURS)])
-        log_status_words(self._entities, f"status/{part(name)}")
-        for quantity in ("height_m", "deviation_mm"):
-            line = rr.SeriesLines(colors=[self._colours[name]], names=[name], widths=[1.5])
-            self._entities.static(f"plots/{quantity}/{part(name)}", line)
+            if known[name]:
+                trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
+                trail.append(rows.position_m[0, index].astype(np.float64))
+                line = rr.LineStrips3D.columns(strips=[np.stack(trail)], colors=[rgb[index]])
+                self._log.rows(f"world/drones/{part(name)}/trail", self._now, partial(_only, line))
 
     def show_delay(self, delay_s: float) -> None:
         """Show the delay of the instant whose rows were written last, seconds."""
-        self._log("plots/delay_ms", rr.Scalars(1e3 * delay_s))
+        self._log.rows(
+            "plots/delay_ms", self._now, partial(_only, rr.Scalars.columns(scalars=[1e3 * delay_s]))
+        )
 
     def __exit__(
         self,
@@ -132,11 +108,13 @@ class LiveView:
     ) -> None:
         self._ends.close()
 
-    def _log(self, path: str, values: rr.AsComponents) -> None:
-        self._stream.log(path, values)
-
     def _close(self) -> None:
         # The viewer may have been closed.
         with contextlib.suppress(Exception):
             self._stream.flush(timeout_sec=_LAST_ROWS_S)
         self._stream.disconnect()
+
+
+def _only(columns: Any, _: slice) -> Any:
+    """Columns of a single row, for `EntityLog.rows`."""
+    return columns

@@ -155,7 +155,7 @@ function psotrackScene(host, data) {
   }
 
   for (const each of data.truth) {
-    const position = decode(each.position_m);
+    const position = decode(each);
     const material = wide({ linewidth: 1, transparent: true, opacity: 0.7, dashed: true, dashSize: extent / 90, gapSize: extent / 130 });
     inked.push(material);
     groupOf("truth").add(segments(pairs(position, 0, count - 1), material));
