@@ -26,9 +26,6 @@ __all__ = ["cli", "main"]
 #: Commands by name: the module that defines the command, and the first sentence of its help. A test holds the sentences
 #: equal to the commands' own.
 COMMANDS = {
-    "as-real": LazyCommand(
-        "psotrack.cli.as_real", "Write the simulated sequence SEQ in the form of the dataset's real half."
-    ),
     "cache": LazyCommand(
         "psotrack.cli.cache", "List, check, prune and empty the cache of silhouettes and compiled programs."
     ),
