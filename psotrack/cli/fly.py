@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import FORCE, QUIET, Numbers
-from psotrack.errors import errors_name
+from psotrack.errors import SettingsError, errors_name
 from psotrack.support import refuse_to_overwrite
 from psotrack.support.interrupts import unhurried_end
 
@@ -85,6 +85,8 @@ def fly(
     from psotrack.simulation.flights import devices, piloting
 
     sticks_path = out.with_suffix(".sticks.csv")
+    if out.suffix != ".csv":
+        raise SettingsError("--out", expected="a file that ends in .csv", found=out.name)
     refuse_to_overwrite(out, force)
     refuse_to_overwrite(sticks_path, force)
     space = flight_space(hall)
