@@ -100,7 +100,6 @@ def test_a_person_is_as_tall_as_stated_and_walks_in_and_out():
         assert not one.layers(0.0), "nobody is in the image at the beginning"
         tall, middles = [], []
         for time_s in np.arange(0, 6, 0.1):
-            # The soft shadow covers at most half of the light.
             rows, columns = np.nonzero(covered(one.layers(time_s)) > 0.6)
             if len(rows) and 4 < columns.mean() < SHAPE[1] - 5:
                 tall.append(np.ptp(rows) + 1)

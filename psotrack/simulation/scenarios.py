@@ -516,9 +516,10 @@ def preset_text(name: str) -> str:
 
 
 def scenario_error(
-    recipe: Scenario, field: str, *, expected: str, found: str, remedy: str = ""
+    recipe: Scenario, field: str, expected: str, found: object, remedy: str = ""
 ) -> SettingsError:
     """Error about a field of a scenario whose value has the right type but is not possible."""
+    found = f"{list(found) if isinstance(found, tuple) else found}"
     return SettingsError(f"scenario {recipe.name}: {field}", expected=expected, found=found, remedy=remedy)
 
 
