@@ -35,7 +35,6 @@ from psotrack.recordings.datasets.dpjait import (
 )
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
-from psotrack.simulation.labels.mocap import mocap_markers_m
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
@@ -215,7 +214,7 @@ def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
         write_rig(folder / _RIG, scene.rig)
         _write_recording_file(scene, folder)
     position_m, orientation_wxyz = scene.positions_m(num_frames), scene.orientations_wxyz(num_frames)
-    markers_m = mocap_markers_m(scene, num_frames)
+    markers_m = scene.mocap_markers_m(num_frames)
     for drone in range(len(scene.flights)):
         number = drone + 1
         write_poses(folder / pose_file(number, fps), position_m[:, drone], orientation_wxyz[:, drone])

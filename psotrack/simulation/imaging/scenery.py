@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -102,7 +101,7 @@ class Scenery:
             return np.random.default_rng([seed, stream, purpose, sensor.FOR_SCENERY])
 
         self._settings, self._blur_px = settings, lens_blur_px
-        self._things: list[_Thing] = []
+        self._things: list[_Screen | _Foliage | _Person] = []
         if settings.screen:
             self._things.append(_Screen(rng(_FOR_SCREEN), settings.screen, shape))
         if settings.foliage:
@@ -130,13 +129,6 @@ class Scenery:
             layer.seen, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(0, 0, 0, 1)
         )
         return Layer(layer.x - margin, layer.y - margin, lens_blur(wider, self._blur_px))
-
-
-class _Thing(Protocol):
-    """Something that changes behind the drones."""
-
-    def at(self, time_s: float) -> Layer | None:
-        """What it looks like at a time; None if it is not in the image."""
 
 
 def _dark_half(rng: np.random.Generator, drop: float, shape: tuple[int, int]) -> Image:
