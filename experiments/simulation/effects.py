@@ -2,9 +2,9 @@
 
     python experiments/simulation/effects.py --out experiments/pictures
 
-Writes effect_NAME.png for the effects of `scenarios.Imaging` and `scenarios.Surroundings` that one frame shows. Where an effect is mild by
-default it is exaggerated; the titles say by how much. The record of all pictures is results/effects.json beside this
-file; --only writes none.
+Writes effect_NAME.png for the effects of `scenarios.Imaging` and `scenarios.Surroundings` that one frame shows. Where
+an effect is mild by default it is exaggerated; the titles say by how much. The record of all pictures is
+results/effects.json beside this file; --only writes none.
 """
 
 from __future__ import annotations
