@@ -1,30 +1,19 @@
 """A simulated sequence, written in the form of the real half: file layout, lens distortion, markers and their clock."""
 
-import json
-import shutil
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from real_form import SERIALS, write_as_real
 from scipy.spatial.transform import Rotation
 
-from psotrack.cli.simulate.as_real import as_real
-from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import project
-from psotrack.recordings import read_frames
 from psotrack.recordings.datasets.dpjait import read_detections, read_mocap_markers, read_poses, read_sequence
 from psotrack.recordings.mocap import body_trajectories, read_c3d
 from psotrack.simulation import (
-    RealFormSettings,
     SimulationSettings,
     change_scenario,
     scenario,
     simulate,
-    write_as_real,
 )
-from psotrack.simulation.real_form import SERIALS
 from psotrack.trajectories import Status
 
 pytestmark = pytest.mark.slow
@@ -47,32 +36,7 @@ def simulated_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def real_folder(simulated_folder, tmp_path_factory):
-    return write_as_real(
-        simulated_folder, tmp_path_factory.mktemp("real"), RealFormSettings(offset_s=OFFSET_S, seed=3)
-    )
-
-
-def opencv_camera(camera):
-    """Return the parameters of a camera in OpenCV's form: rotation vector, translation, K, distortion."""
-    rvec, _ = cv2.Rodrigues(camera.T_cam_world[:3, :3])
-    return rvec, camera.T_cam_world[:3, 3], camera.K, camera.dist
-
-
-def test_the_files_have_the_layout_of_the_real_half(real_folder):
-    assert real_folder.parts[-2:] == ("Real_Data", "R02_D4")
-    videos, detections = {f"{serial}.avi" for serial in SERIALS}, {f"{serial}.csv" for serial in SERIALS}
-    assert {path.name for path in real_folder.iterdir()} == {
-        "cameras_calibration.csv",
-        "R02_D4.c3d",
-        "dl_data",
-        *videos,
-    }
-    assert {path.name for path in (real_folder / "dl_data").iterdir()} == detections
-    header = (real_folder / "cameras_calibration.csv").read_text().splitlines()[0]
-    assert header == (
-        "cam_name;cam_x[mm];cam_y[mm];cam_z[mm];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy;"
-        "coeff_1;coeff_2;coeff_3;coeff_4"
-    )
+    return write_as_real(simulated_folder, tmp_path_factory.mktemp("real"), offset_s=OFFSET_S, seed=3)
 
 
 def test_the_folder_is_read_as_a_real_sequence(real_folder, simulated_folder):
@@ -92,55 +56,6 @@ def test_the_folder_is_read_as_a_real_sequence(real_folder, simulated_folder):
     )
     assert recording.truth.drones == ("dron1", "dron2", "dron3", "dron4")
     assert set(recording.detections) == set(SERIALS)
-
-
-def test_frames_are_distorted_by_the_lens(real_folder, simulated_folder):
-    """Undistorting a frame by OpenCV gives the simulated frame; only the inner part is compared."""
-    recording, simulated_recording = read_sequence(real_folder), read_sequence(simulated_folder)
-    for serial, name in zip(SERIALS, simulated_recording.rig.names, strict=True):
-        cam, flat = (
-            source.rig.cameras[source.rig.names.index(key)]
-            for source, key in ((recording, serial), (simulated_recording, name))
-        )
-        maps = cv2.initUndistortRectifyMap(cam.K, cam.dist, np.eye(3), flat.K, (480, 270), cv2.CV_32FC1)
-        frame = next(read_frames(recording.videos[serial]))
-        expected = next(read_frames(simulated_recording.videos[name])).astype(float)
-        undistorted = cv2.remap(frame, *maps, cv2.INTER_CUBIC).astype(float)
-        inner = np.s_[20:-20, 30:-30]
-        # Encoding and resampling twice: measured 3.2 grey levels at most; without undistortion at least 6.7.
-        assert np.abs(undistorted - expected)[inner].mean() < 4
-        assert np.abs(frame - expected)[inner].mean() > 5
-
-
-def test_boxes_are_distorted_like_the_frames(real_folder, simulated_folder):
-    """OpenCV distorts the outline of a simulated box; the written box bounds the distorted outline."""
-    recording, simulated_recording = read_sequence(real_folder), read_sequence(simulated_folder)
-    for serial, name in zip(SERIALS, simulated_recording.rig.names, strict=True):
-        found, simulated_boxes = (
-            read_detections(source.detections[key])
-            for source, key in ((recording, serial), (simulated_recording, name))
-        )
-        assert found.frame.tolist() == simulated_boxes.frame.tolist()
-        assert found.confidence.tolist() == simulated_boxes.confidence.tolist()
-        cam, flat = (
-            recording.rig.cameras[SERIALS.index(serial)],
-            simulated_recording.rig.cameras[simulated_recording.rig.names.index(name)],
-        )
-        for box, simulated_box in zip(found.xyxy, simulated_boxes.xyxy, strict=True):
-            share = np.linspace(0, 1, 41)
-            low, high = simulated_box[:2], simulated_box[2:]
-            sides = [
-                np.stack([low[0] + share * (high - low)[0], np.full(41, y)], -1) for y in (low[1], high[1])
-            ]
-            sides += [
-                np.stack([np.full(41, x), low[1] + share * (high - low)[1]], -1) for x in (low[0], high[0])
-            ]
-            rays = (np.concatenate(sides) - flat.K[:2, 2]) / flat.K[0, 0]
-            rays = np.column_stack([rays, np.ones(len(rays))])
-            outline = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), cam.K, cam.dist)[0][:, 0]
-            expected = np.hstack([outline.min(axis=0), outline.max(axis=0)])
-            # Between the 41 points of a side, the curved side deviates by less than a hundredth of a pixel.
-            np.testing.assert_allclose(box, expected, rtol=0, atol=0.02)
 
 
 def test_drones_project_into_their_boxes(real_folder, simulated_folder):
@@ -193,24 +108,9 @@ def test_the_reference_follows_the_drones_with_its_clock_offset(real_folder, sim
     assert np.nanmedian(off_m) > 0.05
 
 
-def test_markers_are_missing_and_labels_are_swapped_sometimes(real_folder):
-    """The written markers have the gaps and swapped labels of a real mocap recording.
-
-    The test of the reference shows that reading repairs them.
-    """
-    markers_m = read_c3d(real_folder / "R02_D4.c3d").position_m[:, :-1]
-    assert 0.001 < np.isnan(markers_m).all(axis=-1).mean() < 0.05
-    by_drone = markers_m.reshape(len(markers_m), 4, 4, 3)
-    arms_m = np.linalg.norm(by_drone[:, :, 1:] - by_drone[:, :, :-1], axis=-1)
-    wrong = (np.abs(arms_m - np.nanmedian(arms_m, axis=0)) > 0.005).any(axis=-1)
-    # Two labels of each drone are swapped for 20 frames, or fewer at the end of the recording.
-    assert (wrong.sum(axis=0) <= 20).all()
-    assert (wrong.sum(axis=0) >= 10).sum() >= 2
-
-
 @pytest.mark.parametrize("offset_s", [-0.5, 0.0, 1.0])
 def test_the_mocap_recording_begins_at_the_offset(simulated_folder, tmp_path, offset_s):
-    folder = write_as_real(simulated_folder, tmp_path, RealFormSettings(offset_s=offset_s, rate_hz=120.0))
+    folder = write_as_real(simulated_folder, tmp_path, offset_s=offset_s, rate_hz=120.0)
     mocap = read_c3d(folder / "R02_D4.c3d")
     # The last frame of the videos is at 0.96 s.
     assert len(mocap.position_m) == round((0.96 + offset_s) * 120 - 0.25) + 1
@@ -221,67 +121,9 @@ def test_the_mocap_recording_begins_at_the_offset(simulated_folder, tmp_path, of
 
 
 def test_one_video_can_be_left_out(simulated_folder, tmp_path):
-    folder = write_as_real(simulated_folder, tmp_path, RealFormSettings(three_videos=True))
+    folder = write_as_real(simulated_folder, tmp_path, three_videos=True)
     recording = read_sequence(folder)
     assert recording.rig.names == SERIALS
     assert tuple(recording.videos) == tuple(recording.detections) == SERIALS[:3]
     assert recording.usable().rig.names == SERIALS[:3]
     assert recording.usable(SERIALS[:3]).num_frames == NUM_FRAMES
-
-
-def test_the_mocap_noise_depends_on_the_seed(simulated_folder, real_folder, tmp_path):
-    same_seed = write_as_real(simulated_folder, tmp_path / "one", RealFormSettings(offset_s=OFFSET_S, seed=3))
-    other_seed = write_as_real(
-        simulated_folder, tmp_path / "other", RealFormSettings(offset_s=OFFSET_S, seed=4)
-    )
-    assert (same_seed / "R02_D4.c3d").read_bytes() == (real_folder / "R02_D4.c3d").read_bytes()
-    assert (other_seed / "R02_D4.c3d").read_bytes() != (real_folder / "R02_D4.c3d").read_bytes()
-
-
-def test_invalid_input_is_refused(simulated_folder, real_folder, tmp_path):
-    with pytest.raises(
-        OutputError,
-        match=r"R02_D4: expected a path that does not exist yet, found an existing folder; pass --force",
-    ):
-        write_as_real(simulated_folder, real_folder.parents[1])
-    with pytest.raises(SettingsError, match=r"offset_s: expected more than -0\.96 s, .* found -1"):
-        write_as_real(simulated_folder, tmp_path, RealFormSettings(offset_s=-1.0))
-    with pytest.raises(SettingsError, match="rate_hz: expected a number above 0, found 0"):
-        write_as_real(simulated_folder, tmp_path, RealFormSettings(rate_hz=0.0))
-    short = Path(shutil.copytree(simulated_folder, tmp_path / "S77"))
-    (short / "cam4i_s.avi").unlink()
-    with pytest.raises(InputError, match="S77: expected videos of 4 cameras, found 3"):
-        write_as_real(short, tmp_path)
-    (tmp_path / "S78").mkdir()
-    unmarked = Path(shutil.copytree(simulated_folder, tmp_path / "S78", dirs_exist_ok=True))
-    for path in unmarked.glob("dron*_markers_*"):
-        path.unlink()
-    with pytest.raises(InputError, match=r"S78: expected markers of its drones, dron1_markers_25\.csv"):
-        write_as_real(unmarked, tmp_path)
-    assert not (tmp_path / "Real_Data").exists()
-
-
-def test_command(simulated_folder, tmp_path):
-    arguments = [
-        simulated_folder,
-        "--out",
-        tmp_path,
-        "--offset",
-        "0.2",
-        "--rate",
-        "120",
-        "--three-videos",
-        "--json",
-        "-",
-    ]
-    result = CliRunner().invoke(as_real, [*map(str, arguments)], catch_exceptions=False)
-    folder = tmp_path / "Real_Data" / "R02_D4"
-    assert (result.exit_code, json.loads(result.stdout)) == (0, {"sequence": str(folder)})
-    own = write_as_real(
-        simulated_folder, tmp_path / "own", RealFormSettings(offset_s=0.2, rate_hz=120.0, three_videos=True)
-    )
-    for path in own.iterdir():
-        if path.is_file():
-            assert (folder / path.name).read_bytes() == path.read_bytes(), path.name
-    with pytest.raises(OutputError, match="R02_D4"):
-        CliRunner().invoke(as_real, [*map(str, arguments)], catch_exceptions=False)

@@ -5,17 +5,15 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from real_form import SERIALS, write_as_real
 
 from psotrack.cli import cli
 from psotrack.simulation import (
-    RealFormSettings,
     SimulationSettings,
     change_scenario,
     scenario,
     simulate,
-    write_as_real,
 )
-from psotrack.simulation.real_form import SERIALS
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +30,7 @@ def sequence(tmp_path_factory):
     simulated = simulate(
         recipe, root, SimulationSettings(num_frames=150, scale=0.35, masks=False, onboard=False)
     )
-    return write_as_real(simulated, root, RealFormSettings(offset_s=OFFSET_S))
+    return write_as_real(simulated, root, offset_s=OFFSET_S)
 
 
 @pytest.fixture(scope="module")

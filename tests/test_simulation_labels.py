@@ -35,7 +35,6 @@ from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging.raster import RasterView, pinhole
 from psotrack.simulation.labels.detector import detect, iou
 from psotrack.simulation.labels.masks import Silhouette, silhouettes
-from psotrack.simulation.labels.mocap import mocap_markers_m
 from psotrack.simulation.scenarios import Mesh
 from psotrack.simulation.world import drones
 
@@ -625,7 +624,7 @@ def test_iou_agrees_with_counted_pixels(corners):
 
 
 def test_markers_are_fixed_to_the_body_and_differ_between_drones(scene, tmp_path):
-    markers = mocap_markers_m(scene, 40)
+    markers = scene.mocap_markers_m(40)
     assert markers.shape == (40, 4, 4, 3)
     position, orientation = scene.positions_m(40), scene.orientations_wxyz(40)
     distances = []

@@ -114,7 +114,7 @@ def test_the_folder_of_a_laboratory(tmp_path):
     rig = read_rig(folder / "truth" / "rig.toml")
     assert rig.names == tuple(camera.name for camera in OWN_CAMERAS)
     record = json.loads((folder / "simulation.json").read_text())
-    assert record["board"]["squares"] == [4, 5]
+    assert record["board"]["squares_wh"] == [4, 5]
     # The board's corner on the floor is the origin of the world in which rig and reference are written.
     flight = read_tum(folder, fps=100.0)
     assert flight.drones == ("dron1", "dron2")

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError, SettingsError
 from psotrack.simulation import flight_space
 from psotrack.simulation.flights import devices
-from psotrack.simulation.flights.devices import GamepadDevice, KeyboardDevice, ScriptedDevice, open_device
+from psotrack.simulation.flights.devices import Gamepad, Pilot, Script, key_sticks, open_device
 from psotrack.simulation.flights.dynamics import DYNAMICS, Space, Sticks
 from psotrack.simulation.flights.motion import Heading
+from psotrack.simulation.flights.panel import Panel
 from psotrack.simulation.flights.piloting import Sample, fly, read_sticks, until, write_sticks
 from psotrack.simulation.flights.recordings import read_recorded_flight, recorded_flight
 from psotrack.simulation.scenarios import FlightFromFile
@@ -27,6 +28,12 @@ LABORATORY = flight_space("laboratory")
 UNBOUNDED_SPACE = Space(np.full(3, -1e6), np.full(3, 1e6))
 START_M = np.array([0.0, 0.0, 1.0])
 STEP_HZ = 250.0
+#: Upper bound of the acceleration of every flight: full tilt at full thrust, plus the drag at full speed.
+MOST_M_S2 = np.hypot(
+    np.tan(np.radians(DYNAMICS.max_tilt_deg)) * (9.81 + DYNAMICS.max_climb_m_s2)
+    + DYNAMICS.drag_per_s * DYNAMICS.max_speed_m_s,
+    DYNAMICS.max_climb_m_s2 + DYNAMICS.drag_per_s * DYNAMICS.max_climb_m_s,
+)
 
 
 def record_flight(*rows, space=LABORATORY, start_m=START_M, **settings):
@@ -136,7 +143,7 @@ def test_limits_hold_for_any_sticks_and_the_drone_stays_in_the_hall(stick_positi
     slack = 1e-6  # rounding of the differences: 1e-15 m times the rate squared, with a margin
     assert np.hypot(velocity_m_s[:, 0], velocity_m_s[:, 1]).max() <= DYNAMICS.max_speed_m_s + slack
     assert np.abs(velocity_m_s[:, 2]).max() <= DYNAMICS.max_climb_m_s + slack
-    assert np.linalg.norm(acceleration_m_s2, axis=1).max() <= DYNAMICS.max_acceleration_m_s2 + slack
+    assert np.linalg.norm(acceleration_m_s2, axis=1).max() <= MOST_M_S2 + slack
     assert (
         np.degrees(np.arccos(body_rotations(recorded)[:, 2, 2].clip(-1, 1)).max())
         <= DYNAMICS.max_tilt_deg + slack
@@ -154,7 +161,7 @@ def test_walls_floor_and_ceiling_stop_the_drone_gently(sticks, axis, end_m):
     # The drone stops where braking balances the sticks, at most 0.1 m from the wall.
     assert abs(recorded.position_m[-1, axis] - end_m) < 0.1
     assert np.abs(velocity_m_s[-1]).max() < 1e-3
-    assert np.abs(acceleration_m_s2).max() < DYNAMICS.max_acceleration_m_s2
+    assert np.abs(acceleration_m_s2).max() < MOST_M_S2
 
 
 def test_braking_at_a_wall_takes_precedence_over_the_sticks():
@@ -169,7 +176,7 @@ def test_braking_at_a_wall_takes_precedence_over_the_sticks():
     recorded = record_flight(*((0.655 * k, *sticks) for k, sticks in enumerate(pilot)), (6,), rate_hz=STEP_HZ)
     assert recorded.position_m[:, 1].max() > 3.4, "the flight must come near the wall"
     acceleration_m_s2 = velocity_and_acceleration(recorded)[1]
-    assert np.linalg.norm(acceleration_m_s2, axis=1).max() < DYNAMICS.max_acceleration_m_s2
+    assert np.linalg.norm(acceleration_m_s2, axis=1).max() < MOST_M_S2
 
 
 def test_a_wall_stops_even_a_drone_that_does_not_brake():
@@ -237,7 +244,7 @@ def test_a_flight_that_cannot_start_is_refused(change, message):
 def test_stick_times_must_increase_and_a_flight_needs_six_samples():
     with pytest.raises(SettingsError, match=r"^sticks: expected a time after 1 s, found 1 s$"):
         record_flight((0, 1), (1, 0), (1, 1))
-    with pytest.raises(SettingsError, match=r"^recording: expected at least 6 samples, found 4$"):
+    with pytest.raises(SettingsError, match=r"^flight: expected at least 6 samples, found 4$"):
         record_flight((0, 1), (0.13,))
 
 
@@ -281,7 +288,8 @@ SCRIPT = (Sample(0.0, Sticks(1.0, -0.5, 0.1, 0.0)), Sample(1 / 3, Sticks(turn=-1
 def test_written_sticks_are_read_back_exactly(tmp_path):
     write_sticks(tmp_path / "s.csv", SCRIPT)
     assert read_sticks(tmp_path / "s.csv") == SCRIPT
-    assert list(open_device(str(tmp_path / "s.csv"), LABORATORY).samples()) == list(SCRIPT)
+    with open_device(str(tmp_path / "s.csv"), LABORATORY) as device:
+        assert list(device.samples()) == list(SCRIPT)
 
 
 @pytest.mark.parametrize(
@@ -308,7 +316,7 @@ def test_broken_sticks_are_named_by_file_line_and_column(tmp_path, old, new, mes
 
 
 @dataclass
-class FakePanel:
+class FakePanel(Panel):
     """Fake of the pilot's window.
 
     Attributes:
@@ -353,7 +361,7 @@ class FakeController:
     """Fake of `pyglet.input.Controller` with the methods that the devices use; y is up in its events."""
 
     def __init__(self):
-        self.handlers, self.open_now = {}, True
+        self.handlers = {}
 
     def push_handlers(self, **handlers):
         self.handlers |= handlers
@@ -363,9 +371,6 @@ class FakeController:
 
     def press(self, button):
         self.handlers["on_button_press"](self, button)
-
-    def close(self):
-        self.open_now = False
 
 
 @pytest.mark.parametrize(
@@ -380,12 +385,12 @@ class FakeController:
     ],
 )
 def test_keys_act_as_full_sticks_and_opposite_keys_cancel(keys, sticks):
-    assert KeyboardDevice(FakePanel(), lambda name: name in keys.split()).sticks() == sticks
+    assert key_sticks(lambda name: name in keys.split()) == sticks
 
 
 def test_a_controller_uses_mode_2():
     pad = FakeController()
-    device = GamepadDevice(FakePanel(), pad)
+    device = Gamepad(pad)
     pad.move("leftstick", 1.0, 0.0)
     assert device.sticks() == Sticks(turn=-1.0)
     pad.move("leftstick", 0.0, -1.0)
@@ -399,7 +404,7 @@ def test_a_controller_uses_mode_2():
 )
 def test_sticks_rest_within_the_dead_zone_and_reach_their_ends(raw, live):
     pad = FakeController()
-    device = GamepadDevice(FakePanel(), pad)
+    device = Gamepad(pad)
     pad.move("rightstick", 0.0, raw)
     assert device.sticks().forward == pytest.approx(live, abs=1e-12)
 
@@ -416,9 +421,11 @@ def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
             pad.press("start")
 
     panel.on_pump = pilot
-    with GamepadDevice(panel, pad, **panel.timing()) as device:
+    gamepad = Gamepad(pad)
+    device = Pilot(panel, gamepad.sticks, **panel.timing())
+    gamepad.on_end = device.stop
+    with device.flying():
         live = fly(device.samples(), START_M, LABORATORY, watch=device.watch)
-    assert not pad.open_now
     assert panel.gone
     times_s = np.array([sample.time_s for sample in live.samples])
     assert len(times_s) == 241
@@ -427,7 +434,7 @@ def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
     assert live.recorded.time_s[-1] == 4.0
     assert [time_s for time_s, _ in panel.shown] == list(times_s)
     np.testing.assert_allclose(panel.shown[-1][1], live.recorded.position_m[-1], atol=0.05)
-    again = fly(ScriptedDevice(live.samples).samples(), START_M, LABORATORY)
+    again = fly(Script(live.samples).samples(), START_M, LABORATORY)
     np.testing.assert_array_equal(again.recorded.position_m, live.recorded.position_m)
     assert np.linalg.norm(live.recorded.position_m[-1] - START_M) > 1.0
 
@@ -435,7 +442,7 @@ def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
 def test_a_slow_machine_samples_less_often_but_keeps_the_time():
     panel = FakePanel(lasts=20)
     panel.on_pump = lambda: panel.sleep(0.1)
-    device = KeyboardDevice(panel, lambda name: name == "W", **panel.timing())
+    device = Pilot(panel, lambda: Sticks(forward=1.0), **panel.timing())
     samples = list(device.samples())
     assert len(samples) == 20
     assert samples[-1].time_s == pytest.approx(2.0, rel=0.2)
@@ -445,7 +452,7 @@ def test_a_slow_machine_samples_less_often_but_keeps_the_time():
 def test_samples_missed_in_a_stall_are_not_repeated():
     panel = FakePanel(lasts=60)
     panel.on_pump = lambda: panel.sleep(1.0 if panel.lasts == 50 else 1e-4)
-    device = KeyboardDevice(panel, lambda name: name == "W", **panel.timing())
+    device = Pilot(panel, lambda: Sticks(forward=1.0), **panel.timing())
     gaps_s = np.diff([sample.time_s for sample in device.samples()])
     assert gaps_s.max() > 0.99
     # About sixty samples were missed; at most two samples come early to return to the schedule.
@@ -456,7 +463,7 @@ def test_ctrl_c_ends_a_flight_keeps_it_and_is_restored_afterwards():
     panel = FakePanel()
     panel.on_pump = lambda: panel.lasts == 10**9 - 60 and signal.raise_signal(signal.SIGINT)
     before = signal.getsignal(signal.SIGINT)
-    with KeyboardDevice(panel, lambda name: name == "UP", **panel.timing()) as device:
+    with Pilot(panel, lambda: Sticks(up=1.0), **panel.timing()).flying() as device:
         live = fly(device.samples(), START_M, LABORATORY)
     assert len(live.samples) in (60, 61)
     assert live.recorded.position_m[-1, 2] > 1.3
@@ -490,7 +497,7 @@ def test_without_pyglet_the_error_says_how_to_install_it(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyglet", None)
     sentence = f"device {name}: expected the package pyglet, found it is not installed; pip install 'psotrack[control]'"
     with pytest.raises(SettingsError, match=f"^{re.escape(sentence)}$"):
-        open_device(name, LABORATORY)
+        open_device(name, LABORATORY).__enter__()
 
 
 @pytest.mark.parametrize(
@@ -501,7 +508,7 @@ def test_a_missing_controller_is_an_error(code, pyglet):
     with pytest.raises(
         SettingsError, match=r"^device gamepad: expected a game controller, found none; plug one in"
     ):
-        open_device("gamepad", LABORATORY)
+        open_device("gamepad", LABORATORY).__enter__()
 
 
 def test_a_missing_display_is_an_error_of_one_line(pyglet):
@@ -510,14 +517,14 @@ def test_a_missing_display_is_an_error_of_one_line(pyglet):
         "device keyboard: expected a display with OpenGL for the pilot's window, found Cannot connect to"
     )
     with pytest.raises(SettingsError, match=f"^{re.escape(sentence)}"):
-        open_device("keyboard", LABORATORY)
+        open_device("keyboard", LABORATORY).__enter__()
 
 
 def test_an_unknown_device_is_refused():
     with pytest.raises(
         SettingsError, match=r"^device: expected gamepad, keyboard, or a file .*, found joystick$"
     ):
-        open_device("joystick", LABORATORY)
+        open_device("joystick", LABORATORY).__enter__()
 
 
 FAKE_WINDOW = """
@@ -635,6 +642,7 @@ def test_the_command_writes_a_flight_and_sticks_that_reproduce_it(run_fly, tmp_p
         (("--device", "script.csv", "--hall", "barn"), "hall: expected one of laboratory"),
         (("--device", "script.csv", "--start", "9,0,1"), "start: expected a point from"),
         (("--device", "joystick"), "device: expected gamepad, keyboard, or a file"),
+        (("--device", "script.csv", "--out", "loop"), "--out: expected a file that ends in .csv, found loop"),
     ],
 )
 def test_wrong_input_is_an_error_of_one_line_and_writes_nothing(run_fly, tmp_path, arguments, message):

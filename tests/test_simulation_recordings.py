@@ -1,7 +1,6 @@
 """Recorded flights: file formats, error messages, and resampling compared with the formula that was sampled."""
 
 import re
-import shutil
 
 import msgspec
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings.datasets.dpjait import pose_file, write_poses
 from psotrack.simulation import Scenario, write_recorded_flight
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading
@@ -56,16 +54,12 @@ def angle_deg(a, b):
     return np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
 
 
-def csv_lines(*rows, separator=","):
-    return "".join(f"{separator.join(map(str, row))}\n" for row in rows)
-
-
-def csv_table(separator=",", header=("time_s", "x_m", "y_m", "z_m"), count=8):
-    return csv_lines(
-        header,
-        *((k / 10, k, 2 * k, 3 * k, 1, 0, 0, 0)[: len(header)] for k in range(count)),
-        separator=separator,
-    )
+def write_tracks(path, num_drones=1, count=8, orientation_wxyz=None):
+    """Tracks of some drones, one of which is at k, 2 k and 3 k metres after k / 10 seconds."""
+    k = np.arange(count)
+    position_m = np.repeat(np.stack([k, 2.0 * k, 3.0 * k], axis=-1)[:, None], num_drones, axis=1)
+    names = ("a", "b", "c")[:num_drones]
+    write_trajectories(path, Trajectories(k, k / 10, names, position_m, orientation_wxyz=orientation_wxyz))
 
 
 # --- resampling
@@ -238,7 +232,7 @@ def test_a_scenario_with_more_frames_than_its_recording_is_refused_when_it_is_pl
 
 def test_a_start_after_the_end_is_refused(tmp_path):
     path = tmp_path / "loop.csv"
-    path.write_text(csv_table())
+    write_tracks(path)
     with pytest.raises(
         SettingsError, match=r"^start_s of .*loop\.csv: expected less than its duration, 0\.7 s, found 0\.7$"
     ):
@@ -261,132 +255,64 @@ def test_a_written_recording_is_read_back_exactly(tmp_path, oriented):
         np.testing.assert_allclose(again.orientation_wxyz, recorded.orientation_wxyz, atol=1e-15)
     else:
         assert again.orientation_wxyz is None
-        assert path.read_text().startswith("time_s,x_m,y_m,z_m\n")
 
 
-def test_semicolons_and_other_columns_are_read_too(tmp_path):
-    path = tmp_path / "loop.csv"
-    header = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-    path.write_text(csv_table(";", header))
-    recorded = read_recorded_flight(path)
-    np.testing.assert_array_equal(recorded.position_m[:, 1], 2.0 * np.arange(8))
-    np.testing.assert_array_equal(recorded.orientation_wxyz, np.tile([1.0, 0, 0, 0], (8, 1)))
-
-
-def test_a_pose_file_of_the_dataset_is_read_without_its_placeholder(tmp_path):
-    path = tmp_path / "dron3_pos_25.csv"
-    time_s = np.arange(50) / 25
-    write_poses(path, FORMULA.position_m(time_s), FORMULA.orientation_wxyz(time_s))
-    recorded = read_recorded_flight(path)
-    np.testing.assert_array_equal(recorded.time_s, time_s[1:])
-    np.testing.assert_array_equal(recorded.position_m, FORMULA.position_m(time_s)[1:])
-    # The file holds all digits of the quaternions; reading normalises them, which may change the last digits.
-    np.testing.assert_allclose(recorded.orientation_wxyz, FORMULA.orientation_wxyz(time_s)[1:], atol=1e-12)
-
-
-def test_the_rate_of_a_pose_file_is_in_its_name(tmp_path):
-    time_s = np.arange(50) / 100
-    write_poses(tmp_path / "dron1_pos_100.csv", FORMULA.position_m(time_s), FORMULA.orientation_wxyz(time_s))
-    np.testing.assert_array_equal(read_recorded_flight(tmp_path / "dron1_pos_100.csv").time_s, time_s[1:])
-    shutil.copy(tmp_path / "dron1_pos_100.csv", tmp_path / pose_file(1, 29.97))
-    again = read_recorded_flight(tmp_path / pose_file(1, 29.97))
-    np.testing.assert_array_equal(again.time_s, np.arange(1, 50) / 29.97)
-    (tmp_path / "dron1_pos_100.csv").rename(tmp_path / "dron1.csv")
-    with pytest.raises(InputError, match=r"dron1\.csv: expected a pose file named like dron1_pos_25\.csv"):
-        read_recorded_flight(tmp_path / "dron1.csv")
-
-
-def test_a_trajectory_of_one_drone_is_a_recording(tmp_path):
+def test_a_tum_file_is_read_with_and_without_orientations(tmp_path):
     time_s = np.arange(40) / 25
-    position_m = np.stack([FORMULA.position_m(time_s), FORMULA.position_m(time_s + 1)], axis=1)
-    for drones in (1, 2):
-        names = ("a", "b")[:drones]
-        tracks = Trajectories(np.arange(40), time_s, names, position_m[:, :drones])
-        write_trajectories(tmp_path / f"{drones}.csv", tracks)
-    np.testing.assert_array_equal(read_recorded_flight(tmp_path / "1.csv").position_m, position_m[:, 0])
-    with pytest.raises(
-        InputError, match=r"2\.csv, line 3, column drone: expected one drone, a as above, found b"
-    ):
-        read_recorded_flight(tmp_path / "2.csv")
+    quaternion = FORMULA.orientation_wxyz(time_s)[:, [1, 2, 3, 0]]
+    for name, xyzw in (("turned.tum", quaternion), ("level.txt", np.tile([0.0, 0, 0, 1], (40, 1)))):
+        np.savetxt(tmp_path / name, np.column_stack([time_s, FORMULA.position_m(time_s), xyzw]), fmt="%.17g")
+    turned, level = (read_recorded_flight(tmp_path / name) for name in ("turned.tum", "level.txt"))
+    np.testing.assert_allclose(turned.time_s, time_s, atol=1e-12)
+    np.testing.assert_array_equal(turned.position_m, FORMULA.position_m(time_s))
+    np.testing.assert_allclose(turned.orientation_wxyz, FORMULA.orientation_wxyz(time_s), atol=1e-12)
+    # The identity in every row says that no orientation is known: the attitude follows the acceleration.
+    assert level.orientation_wxyz is None
 
 
-QUATERNIONS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-BROKEN = {
-    "stuck": (
-        csv_table().replace("0.3,", "0.2,"),
-        "line 5, column time_s: expected a time above 0.2, the time in line 4, found 0.2",
-    ),
-    "backwards": (
-        csv_table().replace("0.3,", "0.1,"),
-        "line 5, column time_s: expected a time above 0.2, the time in line 4",
-    ),
-    "short": (csv_table(count=5), "loop.csv: expected at least 6 samples, found 5"),
-    "nan": (
-        csv_table().replace("0.3,3,6", "0.3,3,nan"),
-        "line 5, column y_m: expected a finite number, found 'nan'",
-    ),
-    "empty": (
-        csv_table().replace("0.3,3,6", "0.3,3,"),
-        "line 5, column y_m: expected a value, found nothing",
-    ),
-    "word": (
-        csv_table().replace("0.3,3,6", "0.3,3,six"),
-        "line 5, column y_m: expected a number, found 'six'",
-    ),
-    "time": (
-        csv_table().replace("0.3,3", "noon,3"),
-        "line 5, column time_s: expected a number, found 'noon'",
-    ),
-    "no height": (
-        csv_table(header=("time_s", "x_m", "y_m", "h")),
-        "expected a column z_m, found only time_s, x_m, y_m, h",
-    ),
-    "no time": (csv_table(header=("t", "x_m", "y_m", "z_m")), "expected a column time_s"),
-    "half a quaternion": (csv_table(header=QUATERNIONS[:6]), "expected a column qy, found only"),
-    "long quaternion": (
-        csv_table(header=QUATERNIONS).replace("0.3,3,6,9,1", "0.3,3,6,9,1.1"),
-        "line 5, column qw: expected a quaternion of length 1, found length 1.1",
-    ),
-    "nothing": ("", "line 1: expected columns separated by ',', found an empty file"),
-    "no rows": (csv_table(count=0), "expected rows below the header, found none"),
-    "ragged": (csv_table() + "0.9,1,2\n", "line 10: expected 4 values as in the header, found 3"),
-}
+def test_rows_without_a_position_are_left_out(tmp_path):
+    path = tmp_path / "loop.csv"
+    write_tracks(path)
+    lines = path.read_text().splitlines()
+    lines[4] = lines[4].replace(",3.0,6.0,9.0,", ",,,,")
+    path.write_text("\n".join(lines))
+    np.testing.assert_allclose(read_recorded_flight(path).time_s, [0, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7])
 
 
-@pytest.mark.parametrize("name", BROKEN)
-def test_errors_in_a_file_are_named_by_file_line_and_column(tmp_path, name):
-    text, message = BROKEN[name]
-    (tmp_path / "loop.csv").write_text(text)
-    with pytest.raises(InputError) as error:
-        read_recorded_flight(tmp_path / "loop.csv")
-    assert "loop.csv" in str(error.value)
-    assert message in str(error.value)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"none\.csv: expected a file to read, found no such file"):
-        read_recorded_flight(tmp_path / "none.csv")
+def half_turned(count=8):
+    orientation_wxyz = np.tile([1.0, 0, 0, 0], (count, 1, 1))
+    orientation_wxyz[5] = np.nan
+    return orientation_wxyz
 
 
 @pytest.mark.parametrize(
-    ("time_s", "index", "value", "message"),
+    ("tracks", "message"),
     [
-        (np.arange(5.0), None, 0.0, "at least 6 samples, found 5"),
-        (np.array([0.0, 1, 2, 2, 4, 5]), None, 0.0, "times that increase, found 2 s at sample 3"),
-        (np.arange(6.0), 4, np.nan, "finite numbers, found NaN or infinity at sample 4"),
-        (np.arange(6.0), 2, np.inf, "finite numbers, found NaN or infinity at sample 2"),
+        ({"num_drones": 2}, "loop.csv: expected the flight of one drone, found a, b; keep one drone's rows"),
+        ({"count": 5}, "loop.csv: expected at least 6 positions, found 5"),
+        (
+            {"orientation_wxyz": half_turned()},
+            "loop.csv: expected an orientation with each position, or no orientations, found none at 0.5 s",
+        ),
     ],
 )
-def test_invalid_recordings_are_not_written(tmp_path, time_s, index, value, message):
-    position_m = np.zeros((len(time_s), 3))
-    if index is not None:
-        position_m[index, 1] = value
-    with pytest.raises(SettingsError, match=message):
-        write_recorded_flight(tmp_path / "loop.csv", time_s, position_m, None)
-    assert not list(tmp_path.iterdir())
+def test_tracks_that_cannot_be_flown_are_refused(tmp_path, tracks, message):
+    write_tracks(tmp_path / "loop.csv", **tracks)
+    with pytest.raises(InputError, match=re.escape(message)):
+        read_recorded_flight(tmp_path / "loop.csv")
+
+
+def test_errors_of_a_file_name_it_and_the_line(tmp_path):
+    path = tmp_path / "loop.csv"
+    write_tracks(path)
+    path.write_text(path.read_text().replace("3.0,6.0", "3.0,six"))
+    with pytest.raises(InputError, match=r"loop\.csv, line 5: expected a number in y_m, found 'six'"):
+        read_recorded_flight(path)
+    with pytest.raises(InputError, match=r"none\.csv: expected a file or folder of tracks, found no such"):
+        read_recorded_flight(tmp_path / "none.csv")
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="expected a path that can be written"):
+    with pytest.raises(OutputError, match="expected a path"):
         write_recorded_flight(tmp_path / "file" / "loop.csv", EVEN_S, FORMULA.position_m(EVEN_S), None)

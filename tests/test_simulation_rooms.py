@@ -267,6 +267,16 @@ def test_tables_are_closed_from_below(hall_name):
         assert any(surface.normal[2] == -1 for surface in match)
 
 
+def test_a_pixel_without_a_surface_is_not_taken_for_the_last_surface():
+    """A sky takes the place of what is beyond the floor, whatever surface is the last of the room."""
+    lit = rooms.room("laboratory", False, 0.1)
+    open_room = rooms.Room(lit.surfaces[:1], (False,), lit.panels, {})
+    cam = raster.pinhole(make_hall_camera(RIGS["laboratory"][0], 0.1))
+    seen = backdrop.render(open_room, cam, Imaging())
+    np.testing.assert_array_equal(seen.shell, ~seen.floor)
+    assert 0.1 < seen.floor.mean() < 0.9
+
+
 def test_rooms_are_deterministic():
     first = rooms.room("laboratory", True, 0.2)
     rooms.room.cache_clear()

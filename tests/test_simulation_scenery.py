@@ -1,6 +1,5 @@
 """What changes around the drones, `scenarios.Surroundings`: places, sizes, times, and what stays as it is."""
 
-import json
 from dataclasses import replace
 
 import cv2
@@ -101,7 +100,6 @@ def test_a_person_is_as_tall_as_stated_and_walks_in_and_out():
         assert not one.layers(0.0), "nobody is in the image at the beginning"
         tall, middles = [], []
         for time_s in np.arange(0, 6, 0.1):
-            # The soft shadow covers at most half of the light.
             rows, columns = np.nonzero(covered(one.layers(time_s)) > 0.6)
             if len(rows) and 4 < columns.mean() < SHAPE[1] - 5:
                 tall.append(np.ptp(rows) + 1)
@@ -312,19 +310,6 @@ def test_sequences_have_the_same_masks_truth_and_rig(tmp_path):
     for name in names:
         same = (calm / name).read_bytes() == (restless / name).read_bytes()
         assert same == (name.suffix != ".avi" and name.name != "simulation.json"), name
-
-
-def test_without_surroundings_the_record_is_that_of_older_versions(tmp_path):
-    """A sequence that an earlier call began is continued only if its record is the same."""
-    settings = SimulationSettings(num_frames=1, scale=0.04, masks=False, onboard=False)
-    folder = simulate(S02, tmp_path / "calm", settings, jobs=1)
-    recipe = json.loads((folder / "simulation.json").read_text())["scenario"]
-    assert "surroundings" not in recipe
-    assert not {"exposure", "exposure_period_s"} & set(recipe["imaging"])
-    restless = change_scenario(S02, RESTLESS)
-    folder = simulate(restless, tmp_path / "restless", settings, jobs=1)
-    recipe = json.loads((folder / "simulation.json").read_text())["scenario"]
-    assert msgspec.convert(recipe, type(S02)) == restless
 
 
 def test_frames_do_not_depend_on_the_order_of_rendering(still_scene):

@@ -106,8 +106,6 @@ def inputs(tmp_path_factory, root):
         tracked = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
         assert tracked.returncode == 0, tracked.stderr
         sequence = root / "Simulated_Data" / "S01_D2_A"
-        simulated = psotrack(root, *CORNERS.split(), "--out", folder / "corners")
-        assert simulated.returncode == 0, simulated.stderr
         packed = psotrack(
             root, "archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack"
         )
@@ -135,11 +133,6 @@ TRACK = (
     "track {root}/Simulated_Data/S01_D2_A --particles 8 --iterations 2 --swarm joint --score hard --init truth "
     "--drone-size 0.5,0.5,0.2 --reduction 2 --jobs 1 --force --quiet"
 )
-#: A sequence that has all that `as-real` uses.
-CORNERS = (
-    "simulate S02_D4_A --set cameras=laboratory_corners --set markers=false --frames 12 --scale 0.1 --jobs 1 "
-    "--no-masks --no-onboard --quiet"
-)
 #: Outputs, which belong together -> words of the command that writes them.
 COMMANDS = {
     ("tracks.csv", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.csv",
@@ -164,7 +157,6 @@ COMMANDS = {
     "--out lens.toml --force --quiet",
     ("better.csv",): "calibrate adjust {inputs}/boxes --tracks {inputs}/boxes/tracks.csv --out better.csv "
     "--force --quiet",
-    ("Real_Data/R02_D4",): "simulate as-real {inputs}/corners/Simulated_Data/S02_D4_A --out . --quiet",
     (
         "camera.csv",
     ): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "

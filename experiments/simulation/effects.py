@@ -2,9 +2,9 @@
 
     python experiments/simulation/effects.py --out experiments/pictures
 
-Writes effect_NAME.png for each effect of `scenarios.Imaging` and `scenarios.Surroundings`. Where an effect is mild by
-default it is exaggerated; the titles say by how much. The record of all pictures is results/effects.json beside this
-file; --only writes none.
+Writes effect_NAME.png for the effects of `scenarios.Imaging` and `scenarios.Surroundings` that one frame shows. Where
+an effect is mild by default it is exaggerated; the titles say by how much. The record of all pictures is
+results/effects.json beside this file; --only writes none.
 """
 
 from __future__ import annotations
@@ -19,13 +19,10 @@ import cv2
 import matplotlib
 import msgspec
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from psotrack.geometry import project
-from psotrack.simulation import RESTLESS, CameraRenderer, Scenario, build, scenario
-from psotrack.simulation.imaging.sensor import Sensor, flicker_gain
+from psotrack.simulation import CameraRenderer, Scenario, build, scenario
 from psotrack.simulation.scenarios import (
     CameraPlace,
     Drone,
@@ -36,7 +33,6 @@ from psotrack.simulation.scenarios import (
     Surroundings,
     Variation,
 )
-from psotrack.support import COLOURS
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -249,74 +245,6 @@ def save_small(page: Image.Image, path: Path) -> None:
     page.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def curves(rows: int) -> tuple[Figure, list[Any]]:
-    figure = Figure(figsize=(7.6, 2.1 * rows), dpi=100, layout="constrained")
-    axes = [figure.add_subplot(rows, 1, index + 1) for index in range(rows)]
-    for ax in axes:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.axhline(1.0, color="#9aa3ad", linewidth=0.8)
-        ax.set_ylabel("light, relative")
-    return figure, axes
-
-
-def drift() -> Figure:
-    """Draw two minutes of slow changes of three cameras: the defaults, and the automatic exposure of --restless."""
-    default = Imaging()
-    figure, (exposure, white, automatic) = curves(3)
-    time_s = np.linspace(0, 120, 600)
-    for camera, colour in zip(range(3), COLOURS, strict=False):
-        alone = msgspec.structs.replace(OFF, exposure_drift=default.exposure_drift)
-        sensor = Sensor(alone, 0, camera, (8, 8))
-        exposure.plot(
-            time_s, [sensor.gains(t)[1] for t in time_s], color=colour, label=f"camera {camera + 1}"
-        )
-    alone = msgspec.structs.replace(OFF, white_balance_drift=default.white_balance_drift)
-    sensor = Sensor(alone, 0, 0, (8, 8))
-    gains = np.array([sensor.gains(t) for t in time_s])
-    for channel, (name, colour) in enumerate(
-        (("blue", COLOURS[0]), ("green", COLOURS[2]), ("red", COLOURS[1]))
-    ):
-        white.plot(time_s, gains[:, channel], color=colour, label=name)
-    exposure.set_title(f"exposure_drift = {default.exposure_drift}", fontsize=10)
-    white.set_title(f"white_balance_drift = {default.white_balance_drift}, camera 1", fontsize=10)
-    limits = {key.removeprefix("imaging."): value for key, value in RESTLESS.items() if "exposure" in key}
-    swings = msgspec.structs.replace(OFF, **limits)
-    for camera, colour in zip(range(3), COLOURS, strict=False):
-        sensor = Sensor(swings, 1, camera, (8, 8))
-        gains = [sensor.gains(t)[1] for t in time_s]
-        automatic.plot(time_s, gains, color=colour, label=f"camera {camera + 1}")
-    stated = ", ".join(f"{name} = {value}" for name, value in limits.items())
-    automatic.set_title(stated, fontsize=10)
-    automatic.set_xlabel("time in s")
-    for ax in (exposure, white, automatic):
-        ax.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
-        ax.margins(y=0.25)
-    return figure
-
-
-def flicker() -> Figure:
-    """Draw the light of the lamps, and the brightness of frames with three shutter times."""
-    figure, (lamps, frames) = curves(2)
-    shown = Imaging(flicker=0.3, shutter_s=0)
-    time_s = np.linspace(0, 0.08, 800)
-    lamps.plot(1000 * time_s, [flicker_gain(shown, 0.0, t) for t in time_s], color=COLOURS[0])
-    for frame in range(3):
-        middle_ms = 40 * frame
-        lamps.axvspan(max(middle_ms - 4, 0), min(middle_ms + 4, 80), color="#dde1e6", linewidth=0)
-    lamps.set_title("lamps at 2 x 50.02 Hz, flicker = 0.3; grey: exposures of 1/125 s at 25 fps", fontsize=10)
-    lamps.set_xlabel("time in ms")
-    frame_s = np.arange(1500) / 25
-    for shutter, colour in ((500, COLOURS[1]), (125, COLOURS[0]), (100, COLOURS[2])):
-        setting = msgspec.structs.replace(shown, shutter_s=1 / shutter)
-        gains = [flicker_gain(setting, 0.0, t) for t in frame_s]
-        frames.plot(frame_s, gains, color=colour, label=f"1/{shutter} s")
-    frames.set_title("brightness of frames: a slow beat, none at all at 1/100 s", fontsize=10)
-    frames.set_xlabel("time in s")
-    frames.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
-    frames.margins(y=0.25)
-    return figure
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
@@ -325,8 +253,7 @@ def main() -> None:
     parser.add_argument(
         "--results", type=Path, default=Path(__file__).parent / "results", help="folder of the record"
     )
-    curves_of = {"drift": drift, "flicker": flicker}
-    names = [*(pair.name for pair in PAIRS), *curves_of]
+    names = [pair.name for pair in PAIRS]
     parser.add_argument(
         "--only", nargs="*", choices=names, metavar="NAME", help=f"some of {', '.join(names)}"
     )
@@ -341,14 +268,6 @@ def main() -> None:
                 picture(pair).save(path, optimize=True)
             else:
                 save_small(picture(pair), path)
-    for name, draw in curves_of.items():
-        if not options.only or name in options.only:
-            canvas = FigureCanvasAgg(draw())
-            canvas.draw()
-            save_small(
-                Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"),
-                options.out / f"effect_{name}.png",
-            )
     if not options.only:
         run.save(options.results, files=[options.out / f"effect_{name}.png" for name in names])
 

@@ -115,7 +115,6 @@ COMMANDS = {
 }
 #: Commands that there were once, and what replaces them.
 RENAMED = {
-    "as-real": "simulate as-real",
     "detect-markers": "onboard detect",
     "fly": "simulate fly",
     "fuse": "onboard fuse",

@@ -5,7 +5,6 @@ from .imaging.renderer import CameraRenderer
 from .listing import catalogue, render
 from .own_cameras import OWN_CAMERAS, simulate_own_cameras
 from .preview import save_preview
-from .real_form import RealFormSettings, write_as_real
 from .scenarios import RESTLESS, Scenario, change_scenario, load, preset_names, preset_text, scenario
 from .scene import Scene, build
 
@@ -13,7 +12,6 @@ __all__ = [
     "OWN_CAMERAS",
     "RESTLESS",
     "CameraRenderer",
-    "RealFormSettings",
     "Scenario",
     "Scene",
     "SimulationSettings",
@@ -29,6 +27,5 @@ __all__ = [
     "scenario",
     "simulate",
     "simulate_own_cameras",
-    "write_as_real",
     "write_recorded_flight",
 ]

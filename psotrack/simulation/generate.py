@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
 
 from psotrack import __version__
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import SettingsError
 from psotrack.geometry import make_rig
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import RECORDING_FILE
@@ -36,16 +35,23 @@ from psotrack.recordings.datasets.dpjait import (
 )
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
-from psotrack.simulation.labels.mocap import mocap_markers_m
-from psotrack.simulation.scenarios import FlightFromFile, Imaging, Mesh, Scenario, Surroundings
+from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
-from psotrack.simulation.unfinished import Unfinished, is_made, unfinished
-from psotrack.support import Report, map_in_processes, no_progress
+from psotrack.simulation.unfinished import unfinished
+from psotrack.support import (
+    Report,
+    atomic_write,
+    digest_file,
+    map_in_processes,
+    no_progress,
+    refuse_to_overwrite,
+)
 
-#: Pieces of work per process. Few, because each piece first draws a camera's backdrop; more than one, so that all
-#: processes end at about the same time.
-_PIECES_PER_JOB = 4
+#: File that says how the sequence was made.
+RECORD = "simulation.json"
+#: Segments of a piece of work. Several, because each piece first draws a camera's backdrop.
+_PIECE = 2
 #: Rig file of a sequence whose lenses the dataset's calibration cannot hold.
 _RIG = "rig.toml"
 #: File of the lenses of on-board cameras with distortion, by the drones' names: for `localise --camera`.
@@ -89,9 +95,8 @@ def simulate(
     focal lengths, skew) are written in `rig.toml`, and the folder gets a `recording.toml` instead of the calibration.
 
     On one machine, the same scenario and settings give the same files for every number of jobs. A simulation of fewer
-    frames shows the beginning of the same flight. The sequence is made in a hidden folder beside its final place and
-    moved there when it is complete. If a call is interrupted or killed, the next call with the same scenario and
-    settings keeps the finished parts.
+    frames shows the beginning of the same flight. The sequence appears at its place when it is complete. If a call is
+    interrupted or killed, the next call with the same scenario and settings keeps the parts that are drawn.
 
     Args:
         scenario: the scenario, or the name of a scenario of the package, such as "S02_D4_A".
@@ -123,15 +128,26 @@ def simulate(
         # On-board images have their own size. Check here, not after hours of drawing, that the scale fits it.
         intrinsics(scene)
     record = _record(scene, settings)
-    if keep and is_made(folder, record):
+    if keep and (folder / RECORD).is_file() and (folder / RECORD).read_bytes() == record:
         return folder
-    with unfinished(folder, record, force) as growing:
-        if not growing.complete:
-            _write_streams(scene, growing, frames, settings, jobs or os.cpu_count() or 1, report)
-            _write_tables(scene, growing.folder, frames)
+    refuse_to_overwrite(folder, force)
+    streams, every = _streams(scene, settings.onboard), segments(frames)
+    with unfinished(folder, record) as parts:
+        works = _missing(scene, streams, every, settings.masks, parts)
+        _draw(works, len(streams) * frames, jobs or os.cpu_count() or 1, report)
+        with atomic_write(folder) as growing:
+            growing.mkdir()
+            for stream in streams:
+                join(stream, [segment_folder(parts / stream.name, some) for some in every], growing)
+            if settings.masks:
+                static = [stream for stream in streams if not stream.onboard]
+                join_masks(
+                    [segment_folder(parts / one.name, some) for one in static for some in every], growing
+                )
+            _write_tables(scene, growing, frames)
             if settings.onboard:
-                _write_onboard_tables(scene, growing.folder, frames)
-        growing.finish()
+                _write_onboard_tables(scene, growing, frames)
+            (growing / RECORD).write_bytes(record)
     return folder
 
 
@@ -146,31 +162,16 @@ def _record(scene: Scene, settings: SimulationSettings) -> bytes:
         "masks": settings.masks,
         "onboard": settings.onboard,
         "sha256": _digests(scene.scenario),
-        "scenario": _stated(scene.scenario),
+        "scenario": scene.scenario,
     }
     return msgspec.json.format(msgspec.json.encode(record), indent=1)
-
-
-def _stated(recipe: Scenario) -> dict[str, Any]:
-    """The scenario as plain values, without newer fields that are off, so that older records stay the same."""
-    data: dict[str, Any] = msgspec.to_builtins(recipe)
-    if recipe.surroundings == Surroundings():
-        del data["surroundings"]
-    for field in ("exposure", "exposure_period_s"):
-        if getattr(recipe.imaging, field) == getattr(Imaging(), field):
-            del data["imaging"][field]
-    return data
 
 
 def _digests(recipe: Scenario) -> dict[str, str]:
     """SHA-256 digests of the files that a scenario names, by path."""
     parts = itertools.chain.from_iterable((drone.model, drone.flight) for drone in recipe.drones)
     files = sorted({part.file for part in parts if isinstance(part, Mesh | FlightFromFile)})
-    try:
-        return {file: hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files}
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(error.filename, expected="a file to read", found=found) from error
+    return {file: digest_file(file, algorithm="sha256") for file in files}
 
 
 def _streams(scene: Scene, onboard: bool) -> list[Stream]:
@@ -181,51 +182,27 @@ def _streams(scene: Scene, onboard: bool) -> list[Stream]:
     return static + [Stream(f"dron{drone + 1}_cam", drone, onboard=True) for drone in drones]
 
 
-def _write_streams(
-    scene: Scene,
-    growing: Unfinished,
-    num_frames: int,
-    settings: SimulationSettings,
-    jobs: int,
-    report: Report,
-) -> None:
-    """Draw all missing segments, and join the segments of each stream."""
-    streams, every = _streams(scene, settings.onboard), segments(num_frames)
-    parts = {
-        stream: [segment_folder(growing.segments / stream.name, frames) for frames in every]
-        for stream in streams
-    }
-    missing = {
-        stream: [frames for frames, part in zip(every, parts[stream], strict=True) if not part.exists()]
-        for stream in streams
-    }
-    pieces = -(-_PIECES_PER_JOB * jobs // len(streams))
-    works = [
-        Work(scene, stream, settings.masks, growing.segments / stream.name, piece)
-        for stream in streams
-        for piece in _cut(missing[stream], pieces)
-    ]
+def _missing(
+    scene: Scene, streams: Sequence[Stream], every: Sequence[range], masks: bool, parts: Path
+) -> list[Work]:
+    """Pieces of work for the segments that are not drawn yet."""
+    works = []
+    for stream in streams:
+        folder = parts / stream.name
+        missing = [frames for frames in every if not segment_folder(folder, frames).exists()]
+        for start in range(0, len(missing), _PIECE):
+            works.append(Work(scene, stream, masks, folder, tuple(missing[start : start + _PIECE])))
+    return works
+
+
+def _draw(works: Sequence[Work], total: int, jobs: int, report: Report) -> None:
+    """Draw what is missing of `total` frames of all streams."""
     waiting = sum(len(frames) for work in works for frames in work.segments)
-    total = len(streams) * num_frames
     if waiting < total:
-        _logger.info(
-            "%s: %d of %d frames were drawn by an earlier call", growing.target, total - waiting, total
-        )
+        _logger.info("%d of %d frames were drawn by an earlier call", total - waiting, total)
     with report("simulate", total) as advance:
         advance(total - waiting)
         map_in_processes(draw, works, jobs=jobs, advance=advance)
-    if settings.masks:
-        join_masks(
-            [part for stream in streams if not stream.onboard for part in parts[stream]], growing.folder
-        )
-    for stream in streams:
-        join(stream, parts[stream], growing.folder)
-
-
-def _cut(frames: list[range], pieces: int) -> list[tuple[range, ...]]:
-    """Divide consecutive segments into at most `pieces` pieces of about equal size."""
-    size = -(-len(frames) // pieces) or 1
-    return [tuple(frames[start : start + size]) for start in range(0, len(frames), size)]
 
 
 def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
@@ -237,7 +214,7 @@ def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
         write_rig(folder / _RIG, scene.rig)
         _write_recording_file(scene, folder)
     position_m, orientation_wxyz = scene.positions_m(num_frames), scene.orientations_wxyz(num_frames)
-    markers_m = mocap_markers_m(scene, num_frames)
+    markers_m = scene.mocap_markers_m(num_frames)
     for drone in range(len(scene.flights)):
         number = drone + 1
         write_poses(folder / pose_file(number, fps), position_m[:, drone], orientation_wxyz[:, drone])

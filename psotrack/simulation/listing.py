@@ -44,17 +44,12 @@ def render(rows: list[dict[str, Any]]) -> Table:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("name", "drones", "cameras", "frames", "hall", "m/s", "flights"):
+    headings = ("name", "drones", "cameras", "frames", "hall", "m/s", "flights")
+    for heading in headings:
         numeric = heading in {"drones", "cameras", "frames", "m/s"}
         table.add_column(heading, justify="right" if numeric else "left", no_wrap=heading != "flights")
     for row in rows:
-        table.add_row(
-            row["name"],
-            f"{row['drones']}",
-            f"{row['cameras']}",
-            f"{row['frames']}",
-            row["hall"].removesuffix("_hall").replace("_", " "),
-            f"{row['mean_speed_m_s']:.1f}",
-            row["description"],
-        )
+        hall = row["hall"].removesuffix("_hall").replace("_", " ")
+        told = row | {"hall": hall, "m/s": f"{row['mean_speed_m_s']:.1f}", "flights": row["description"]}
+        table.add_row(*(f"{told[heading]}" for heading in headings))
     return table

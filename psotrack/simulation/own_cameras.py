@@ -8,15 +8,13 @@ rate; then the drones fly. What a laboratory would not know is written to the fo
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from psotrack import __version__
 from psotrack.errors import SettingsError
@@ -139,24 +137,20 @@ def simulate_own_cameras(
     num_frames = scenarios.count_frames(recipe, settings.num_frames)
     scene = build(recipe, scale=settings.scale, seed=settings.seed)
     if recipe.hall != _HALL:
-        raise scenarios.scenario_error(recipe, "hall", expected=_HALL, found=recipe.hall)
+        raise scenarios.scenario_error(recipe, "hall", _HALL, recipe.hall)
     rig = own_rig(settings.scale)
     duration_s = num_frames / recipe.fps
     places = board_poses(rig, BOARD_PLACES, settings.seed)
     frames = [int((duration_s - one.start_s) * one.fps) for one in OWN_CAMERAS]
     if min(frames) < 1:
-        raise SettingsError(
-            "frames", expected="a flight longer than the clocks differ", found=f"{num_frames}"
-        )
+        expected = "a flight longer than the clocks differ"
+        raise SettingsError("frames", expected=expected, found=f"{num_frames}")
     with (
         atomic_write(folder) as growing,
         report("simulate", sum(frames) + len(frames) * len(places)) as advance,
     ):
-        growing.mkdir()
-        (growing / "board").mkdir()
-        works = [
-            _Work(scene, rig, index, number, places, growing) for index, number in enumerate(frames)
-        ]  # fmt: skip
+        (growing / "board").mkdir(parents=True)
+        works = [_Work(scene, rig, index, number, places, growing) for index, number in enumerate(frames)]
         map_in_processes(_draw, works, jobs=jobs or os.cpu_count() or 1, advance=advance)
         _write_tables(growing, scene, rig, places[0], duration_s)
         _write_record(growing, scene, num_frames)
@@ -192,41 +186,21 @@ class _Work:
     folder: Path
 
 
-class _OwnRenderer:
-    """Draws the images of one camera."""
-
-    def __init__(self, work: _Work) -> None:
-        one, lens = OWN_CAMERAS[work.index], work.rig.cameras[work.index]
-        scenario = msgspec.structs.replace(work.scene.scenario, fps=one.fps)
-        own = make_rig({one.name: lens})
-        self.scene = replace(work.scene, scenario=scenario, rig=own, start_s=one.start_s)
-        self.renderer = CameraRenderer(self.scene, 0, stream=work.index)
-        width, height = (int(side) for side in lens.image_size_wh)
-        self.size_wh = (width, height)
-        imaging, seed, shape = scenario.imaging, work.scene.seed, (height, width)
-        self.board_sensor = Sensor(imaging, seed, _BOARD_STREAM + work.index, shape)
-
-    def flight(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
-        """Image of a frame of the flight."""
-        return self.renderer.frame(frame)
-
-    def board(self, number: int, board: PosedBoard) -> UInt8[np.ndarray, "height width 3"]:
-        """Image of the room with the board in one place."""
-        views = [draw_board(view.empty_room(), view.cam, board) for view in self.renderer.views]
-        image = self.renderer.assemble(views)
-        return self.board_sensor.expose(image, number, number / BOARD_FPS)
-
-
 def _draw(work: _Work, advance: Advance) -> None:
-    one = OWN_CAMERAS[work.index]
-    artist = _OwnRenderer(work)
-    with VideoWriter(work.folder / "board" / f"{one.name}.avi", BOARD_FPS, artist.size_wh) as video:
+    one, lens = OWN_CAMERAS[work.index], work.rig.cameras[work.index]
+    scenario = msgspec.structs.replace(work.scene.scenario, fps=one.fps)
+    scene = replace(work.scene, scenario=scenario, rig=make_rig({one.name: lens}), start_s=one.start_s)
+    renderer = CameraRenderer(scene, 0, stream=work.index)
+    width, height = renderer.cam.width, renderer.cam.height
+    sensor = Sensor(scenario.imaging, scene.seed, _BOARD_STREAM + work.index, (height, width))
+    with VideoWriter(work.folder / "board" / f"{one.name}.avi", BOARD_FPS, (width, height)) as video:
         for number, board in enumerate(work.places):
-            video.write(artist.board(number, board))
+            views = [draw_board(view.empty_room(), view.cam, board) for view in renderer.views]
+            video.write(sensor.expose(renderer.assemble(views), number, number / BOARD_FPS))
             advance(1)
-    with VideoWriter(work.folder / one.flight, one.fps, artist.size_wh) as video:
+    with VideoWriter(work.folder / one.flight, one.fps, (width, height)) as video:
         for frame in range(work.num_frames):
-            video.write(artist.flight(frame))
+            video.write(renderer.frame(frame))
             advance(1)
 
 
@@ -255,22 +229,13 @@ def moved(rig: Rig, origin_m: Float[np.ndarray, "3"]) -> Rig:
 
 
 def _write_record(folder: Path, scene: Scene, num_frames: int) -> None:
-    board = own_board()
-    record: Mapping[str, Any] = {
+    record = {
         "version": __version__,
         "scenario": scene.scenario.name,
         "frames": num_frames,
         "scale": scene.scale,
         "seed": scene.seed,
-        "board": {
-            "squares": list(board.squares_wh),
-            "square_m": board.square_m,
-            "marker_m": board.marker_m,
-            "dictionary": board.dictionary,
-            "fps": BOARD_FPS,
-            "floor": 0,
-        },
+        "board": {**asdict(own_board()), "fps": BOARD_FPS, "floor": 0},
         "opencv": cv2.__version__,
     }
-    with atomic_write(folder / "simulation.json") as temporary:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=1))
+    (folder / "simulation.json").write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=1))

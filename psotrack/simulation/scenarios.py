@@ -164,10 +164,11 @@ class Waypoints(_Record, frozen=True, kw_only=True, tag_field="kind", tag="waypo
 
 
 class FlightFromFile(_Record, frozen=True, kw_only=True, tag_field="kind", tag="recording"):
-    """A recorded flight: a CSV file of positions and optional orientations, at any rate.
+    """A recorded flight: tracks of one drone, at any rate.
 
     Attributes:
-        file: path of the CSV file; a relative path starts at the folder of the scenario's file.
+        file: path of the tracks in any format that psotrack reads (.csv, .parquet, .json, .tum, .mcap); a relative path
+            starts at the folder of the scenario's file.
         start_s: time in the recorded flight that becomes the first frame.
         offset_m: vector that is added to the positions.
     """
@@ -515,9 +516,10 @@ def preset_text(name: str) -> str:
 
 
 def scenario_error(
-    recipe: Scenario, field: str, *, expected: str, found: str, remedy: str = ""
+    recipe: Scenario, field: str, expected: str, found: object, remedy: str = ""
 ) -> SettingsError:
     """Error about a field of a scenario whose value has the right type but is not possible."""
+    found = f"{list(found) if isinstance(found, tuple) else found}"
     return SettingsError(f"scenario {recipe.name}: {field}", expected=expected, found=found, remedy=remedy)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -14,7 +13,7 @@ from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import CameraPlace, Scenario
 from psotrack.simulation.validation import camera_places, check, check_flights
-from psotrack.simulation.world.drones import DroneModel, model
+from psotrack.simulation.world.drones import DroneModel, marker_cross, model
 from psotrack.simulation.world.rooms import Room, room
 
 #: Smallest and largest side of an image, pixels. Smaller images show nothing; larger images cannot be written, because
@@ -65,6 +64,16 @@ class Scene:
         time_s = frame_times_s(self.scenario, num_frames)
         return np.stack([flight.orientation_wxyz(time_s) for flight in self.flights], axis=1)
 
+    def mocap_markers_m(self, num_frames: int) -> Float[np.ndarray, "frames drones 4 3"]:
+        """(frames, drones, 4, 3), ground truth: mocap markers A, B, C and D of each drone, world, metres."""
+        time_s = frame_times_s(self.scenario, num_frames)
+        markers = [
+            marker_cross(shape, number) @ flight.rotation(time_s).swapaxes(-1, -2)
+            + flight.position_m(time_s)[:, None]
+            for number, (shape, flight) in enumerate(zip(self.models, self.flights, strict=True), start=1)
+        ]
+        return np.stack(markers, axis=1)
+
 
 def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
     """Build the scene of a scenario.
@@ -97,23 +106,21 @@ def _rig(scenario: Scenario, scale: float, seed: int) -> Rig:
     normal = np.random.default_rng([seed, _FOR_CAMERAS]).standard_normal((len(places), 3))
     # Without the tails of the distribution, which would give implausible lenses.
     draws = np.clip(normal, -2.5, 2.5) * [spread.focal_length, *2 * [spread.principal_point_px]]
-    return make_rig(
-        {
-            f"cam{index}": _camera(_change_lens(place, draw), scenario, scale)
-            for index, (place, draw) in enumerate(zip(places, draws, strict=True), start=1)
-        }
-    )
+    cameras = (_camera(place, draw, scenario, scale) for place, draw in zip(places, draws, strict=True))
+    return make_rig({f"cam{number}": camera for number, camera in enumerate(cameras, start=1)})
 
 
-def _change_lens(place: CameraPlace, draw: Float[np.ndarray, "3"]) -> CameraPlace:
-    """Camera with a changed lens: relative focal length, and principal point right and down in pixels."""
-    longer, right_px, down_px = draw.tolist()
-    cx, cy = place.principal_point_px
-    return msgspec.structs.replace(
-        place,
-        focal_length_px=place.focal_length_px * (1 + longer),
-        principal_point_px=(cx + right_px, cy + down_px),
-    )
+def _camera(place: CameraPlace, draw: Float[np.ndarray, "3"], scenario: Scenario, scale: float) -> Camera:
+    """Camera with changes of its lens: relative focal length, and principal point right and down in pixels."""
+    R, t_m = look_at(place.position_m, place.target_m)
+    longer, *moved_px = draw.tolist()
+    focal = place.focal_length_px * (1 + longer) * scale
+    # Pixel centres have integer coordinates, so the image's corner, which the scale does not move, is at -0.5.
+    centre_px = zip(place.principal_point_px, moved_px, strict=True)
+    cx, cy = ((at + by + 0.5) * scale - 0.5 for at, by in centre_px)
+    K = np.array([[focal, place.skew_px * scale, cx], [0.0, focal * place.aspect, cy], [0.0, 0.0, 1.0]])
+    size_wh = image_size_wh(scenario, scale)
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=size_wh, dist=place.distortion, fisheye=place.fisheye)
 
 
 def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:
@@ -124,30 +131,10 @@ def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:
     """
     sides = [side * scale for side in scenario.image_size_wh]
     if max(sides) > _MAX_SIDE_PX:
-        raise SettingsError(
-            "scale",
-            expected=f"images of at most {_MAX_SIDE_PX} pixels a side",
-            found=" x ".join(f"{side:.7g}" for side in sides),
-        )
+        found = " x ".join(f"{side:.7g}" for side in sides)
+        raise SettingsError("scale", expected=f"images of at most {_MAX_SIDE_PX} pixels a side", found=found)
     width, height = (2 * round(side / 2) for side in sides)
     if min(width, height) < _MIN_SIDE_PX:
-        raise SettingsError(
-            "scale", expected=f"images of at least {_MIN_SIDE_PX} pixels a side", found=f"{width} x {height}"
-        )
+        found = f"{width} x {height}"
+        raise SettingsError("scale", expected=f"images of at least {_MIN_SIDE_PX} pixels a side", found=found)
     return width, height
-
-
-def _camera(place: CameraPlace, scenario: Scenario, scale: float) -> Camera:
-    R, t_m = look_at(place.position_m, place.target_m)
-    focal = place.focal_length_px * scale
-    # Pixel centres have integer coordinates, so the image's corner, which the scale does not move, is at -0.5.
-    cx, cy = ((centre + 0.5) * scale - 0.5 for centre in place.principal_point_px)
-    K = np.array([[focal, place.skew_px * scale, cx], [0.0, focal * place.aspect, cy], [0.0, 0.0, 1.0]])
-    return make_camera(
-        R=R,
-        t_m=t_m,
-        K=K,
-        image_size_wh=image_size_wh(scenario, scale),
-        dist=place.distortion,
-        fisheye=place.fisheye,
-    )

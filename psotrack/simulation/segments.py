@@ -93,7 +93,7 @@ def draw(work: Work, advance: Advance) -> None:
 
 
 def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
-    """Join the segments' videos, and the detections of a static camera, and delete the segments' videos.
+    """Join the segments' videos, and the detections of a static camera.
 
     Args:
         stream: the stream to write.
@@ -101,16 +101,12 @@ def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
         folder: folder of the sequence.
 
     Raises:
-        OutputError: a file cannot be written; the segments' videos are kept in this case.
+        OutputError: a file cannot be written.
     """
     if not stream.onboard:
         with atomic_write(folder / DETECTIONS / f"{stream.name}_s.csv") as temporary:
             temporary.write_bytes(b"".join((part / _BOXES).read_bytes() for part in parts))
-    video = folder / stream.video_file
-    if not video.exists():
-        join_videos(video, [part / _VIDEO for part in parts])
-    for part in parts:
-        (part / _VIDEO).unlink(missing_ok=True)
+    join_videos(folder / stream.video_file, [part / _VIDEO for part in parts])
 
 
 def join_masks(parts: Sequence[Path], folder: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -24,16 +26,19 @@ def check(scenario: Scenario) -> None:
             furniture, or has no viewing direction; the limits are outside the hall; an exposure is longer than the time
             between two frames; or the on-board camera cannot be a pinhole camera. The message names the field.
     """
-    _check_named(scenario)
+    if scenario.hall not in HALLS:
+        raise scenario_error(scenario, "hall", f"one of {', '.join(HALLS)}", scenario.hall)
+    for index, drone in enumerate(scenario.drones):
+        if isinstance(drone.model, str) and drone.model not in MODELS:
+            expected = f"one of {', '.join(MODELS)}, or a mesh"
+            raise scenario_error(scenario, f"drones[{index}].model", expected, drone.model)
     hall = HALLS[scenario.hall]
     for index, place in enumerate(camera_places(scenario)):
         _check_camera(scenario, index, place, hall)
     _check_bounds(scenario, hall)
-    _check_shutter(scenario, "imaging.shutter_s", scenario.imaging.shutter_s)
-    _check_exposure(scenario, "imaging.exposure", scenario.imaging.exposure)
+    _check_exposure(scenario, "imaging", scenario.imaging.shutter_s, scenario.imaging.exposure)
     if scenario.onboard:
-        _check_shutter(scenario, "onboard.shutter_s", scenario.onboard.shutter_s)
-        _check_exposure(scenario, "onboard.exposure", scenario.onboard.exposure)
+        _check_exposure(scenario, "onboard", scenario.onboard.shutter_s, scenario.onboard.exposure)
         _check_onboard(scenario, scenario.onboard)
 
 
@@ -50,12 +55,8 @@ def check_flights(scenario: Scenario, flights: tuple[Flight, ...]) -> None:
         if hit.any():
             at = int(np.argmax(hit))
             x, y, z = position_m[at]
-            raise scenario_error(
-                scenario,
-                f"drones[{index}].flight",
-                expected="a way around the furniture",
-                found=f"[{x:.3f}, {y:.3f}, {z:.3f}] at {time_s[at]:.2f} s, inside of it",
-            )
+            found = f"[{x:.3f}, {y:.3f}, {z:.3f}] at {time_s[at]:.2f} s, inside of it"
+            raise scenario_error(scenario, f"drones[{index}].flight", "a way around the furniture", found)
 
 
 def camera_places(scenario: Scenario) -> tuple[CameraPlace, ...]:
@@ -67,107 +68,68 @@ def camera_places(scenario: Scenario) -> tuple[CameraPlace, ...]:
     if not isinstance(scenario.cameras, str):
         return scenario.cameras
     if scenario.cameras not in RIGS:
-        raise scenario_error(
-            scenario, "cameras", expected=f"one of {', '.join(RIGS)}, or a list", found=scenario.cameras
-        )
+        raise scenario_error(scenario, "cameras", f"one of {', '.join(RIGS)}, or a list", scenario.cameras)
     return RIGS[scenario.cameras]
 
 
-def _check_named(scenario: Scenario) -> None:
-    if scenario.hall not in HALLS:
-        raise scenario_error(scenario, "hall", expected=f"one of {', '.join(HALLS)}", found=scenario.hall)
-    for index, drone in enumerate(scenario.drones):
-        if isinstance(drone.model, str) and drone.model not in MODELS:
-            expected = f"one of {', '.join(MODELS)}, or a mesh"
-            raise scenario_error(scenario, f"drones[{index}].model", expected=expected, found=drone.model)
-
-
 def _check_camera(scenario: Scenario, index: int, place: CameraPlace, hall: Hall) -> None:
-    of_rig = isinstance(scenario.cameras, str)
-    field = "cameras" if of_rig else f"cameras[{index}].position_m"
-    found = f"{list(place.position_m)}" + (f" of camera {index + 1} of {scenario.cameras}" if of_rig else "")
+    refusal = partial(scenario_error, scenario)
+    field, found = f"cameras[{index}].position_m", f"{list(place.position_m)}"
+    if isinstance(scenario.cameras, str):
+        field, found = "cameras", f"{found} of camera {index + 1} of {scenario.cameras}"
     if not _inside(place.position_m, hall):
-        raise scenario_error(scenario, field, expected=f"a place in the hall, {_extent(hall)}", found=found)
+        raise refusal(field, f"a place in the hall, {_extent(hall)}", found)
     if _in_furniture(np.array([place.position_m]), hall).any():
-        raise scenario_error(scenario, field, expected="a place outside of the furniture", found=found)
-    allowed = (0, FISHEYE_COEFFICIENTS) if place.fisheye else PINHOLE_COEFFICIENTS
-    if len(place.distortion) not in allowed:
-        raise scenario_error(
-            scenario,
-            f"cameras[{index}].distortion",
-            expected=f"{', '.join(map(str, allowed))} coefficients{' of a fisheye' if place.fisheye else ''}",
-            found=f"{len(place.distortion)}",
-        )
+        raise refusal(field, "a place outside of the furniture", found)
+    counts, of_lens = (
+        ((0, FISHEYE_COEFFICIENTS), " of a fisheye") if place.fisheye else (PINHOLE_COEFFICIENTS, "")
+    )
+    if len(place.distortion) not in counts:
+        expected = f"{', '.join(map(str, counts))} coefficients{of_lens}"
+        raise refusal(f"cameras[{index}].distortion", expected, len(place.distortion))
     away = np.subtract(place.target_m, place.position_m)
     if np.hypot(away[0], away[1]) < 1e-6:
-        raise scenario_error(
-            scenario,
-            f"cameras[{index}].target_m",
-            expected="a point that is not straight above or below the camera, nor at its place",
-            found=f"{list(place.target_m)}",
-        )
+        expected = "a point that is not straight above or below the camera, nor at its place"
+        raise refusal(f"cameras[{index}].target_m", expected, place.target_m)
 
 
 def _check_bounds(scenario: Scenario, hall: Hall) -> None:
-    limits = scenario.limits
-    for name in ("lower_m", "upper_m"):
-        corner = getattr(limits, name)
-        if not _inside(corner, hall):
+    lower_m, upper_m = scenario.limits.lower_m, scenario.limits.upper_m
+    for name, corner_m in (("lower_m", lower_m), ("upper_m", upper_m)):
+        if not _inside(corner_m, hall):
             raise scenario_error(
-                scenario,
-                f"limits.{name}",
-                expected=f"a point in the hall, {_extent(hall)}",
-                found=f"{list(corner)}",
+                scenario, f"limits.{name}", f"a point in the hall, {_extent(hall)}", corner_m
             )
-    if not np.all(np.less(limits.lower_m, limits.upper_m)):
-        raise scenario_error(
-            scenario,
-            "limits.lower_m",
-            expected=f"less than limits.upper_m, {list(limits.upper_m)}, along each axis",
-            found=f"{list(limits.lower_m)}",
-        )
+    if not np.all(np.less(lower_m, upper_m)):
+        expected = f"less than limits.upper_m, {list(upper_m)}, along each axis"
+        raise scenario_error(scenario, "limits.lower_m", expected, lower_m)
 
 
-def _check_exposure(scenario: Scenario, field: str, exposure: tuple[float, float]) -> None:
-    if exposure[0] > exposure[1]:
-        raise scenario_error(scenario, field, expected="the smaller factor first", found=f"{list(exposure)}")
-
-
-def _check_shutter(scenario: Scenario, field: str, shutter_s: float) -> None:
+def _check_exposure(scenario: Scenario, part: str, shutter_s: float, exposure: tuple[float, float]) -> None:
     if shutter_s > 1 / scenario.fps:
         expected = f"at most {1 / scenario.fps:g} s, the time between two frames"
-        raise scenario_error(scenario, field, expected=expected, found=f"{shutter_s:g}")
+        raise scenario_error(scenario, f"{part}.shutter_s", expected, f"{shutter_s:g}")
+    if exposure[0] > exposure[1]:
+        raise scenario_error(scenario, f"{part}.exposure", "the smaller factor first", exposure)
 
 
 def _check_onboard(scenario: Scenario, camera: OnboardCamera) -> None:
-    readout_s, frame_s = camera.line_time_s * camera.image_size_wh[1], 1 / scenario.fps
-    if readout_s > frame_s:
-        raise scenario_error(
-            scenario,
-            "onboard.line_time_s",
-            expected=f"at most {frame_s / camera.image_size_wh[1]:.3g} s: {camera.image_size_wh[1]} rows in"
-            f" {frame_s:g} s, the time between two frames",
-            found=f"{camera.line_time_s:g}",
-        )
+    refusal = partial(scenario_error, scenario)
+    (width, height), frame_s = camera.image_size_wh, 1 / scenario.fps
+    if camera.line_time_s * height > frame_s:
+        most_s = f"at most {frame_s / height:.3g} s"
+        expected = f"{most_s}: {height} rows in {frame_s:g} s, the time between two frames"
+        raise refusal("onboard.line_time_s", expected, f"{camera.line_time_s:g}")
     if len(camera.distortion) not in PINHOLE_COEFFICIENTS:
         expected = f"{', '.join(map(str, PINHOLE_COEFFICIENTS))} coefficients"
-        raise scenario_error(
-            scenario, "onboard.distortion", expected=expected, found=f"{len(camera.distortion)}"
-        )
+        raise refusal("onboard.distortion", expected, len(camera.distortion))
     if max(camera.fov_deg) >= 180:
-        raise scenario_error(
-            scenario, "onboard.fov_deg", expected="angles below 180 degrees", found=f"{list(camera.fov_deg)}"
-        )
+        raise refusal("onboard.fov_deg", "angles below 180 degrees", camera.fov_deg)
     half_width, half_height = np.tan(np.radians(camera.fov_deg) / 2)
-    width, height = camera.image_size_wh
     if abs(half_width * height / (half_height * width) - 1) > _SQUARE:
         fits = np.degrees(2 * np.arctan(half_width * height / width))
-        raise scenario_error(
-            scenario,
-            "onboard.fov_deg",
-            expected=f"angles that fit {width} x {height} square pixels, {camera.fov_deg[0]:g} and {fits:.4g}",
-            found=f"{list(camera.fov_deg)}",
-        )
+        pixels = f"angles that fit {width} x {height} square pixels"
+        raise refusal("onboard.fov_deg", f"{pixels}, {camera.fov_deg[0]:g} and {fits:.4g}", camera.fov_deg)
 
 
 def _inside(point_m: Vector, hall: Hall) -> bool:

@@ -594,7 +594,9 @@ def _frames_of_silhouettes(path: Path) -> object:
     return compute(recording, cache=flight / "none").read(0, recording.num_frames)
 
 
-_FLIGHT = "time_s,x_m,y_m,z_m\n" + "".join(f"{i / 25},{i / 50},0.5,1.25\n" for i in range(12))
+_FLIGHT = "frame,time_s,drone,x_m,y_m,z_m\n" + "".join(
+    f"{i},{i / 25},a,{i / 50},0.5,1.25\n" for i in range(12)
+)
 _STICKS = "time_s,forward,left,up,turn\n0,0,0,0,0\n0.2,0.5,0,0.25,-0.5\n0.4,-1,1,0,0\n0.6,0,0,0,0\n"
 _OTHERS = {
     "scenario": Format(

@@ -10,10 +10,6 @@ COMMANDS = {
         "psotrack.cli.simulate.sequence:sequence",
         "Simulate a sequence: videos, calibration, ground truth, masks and detections.",
     ),
-    "as-real": LazyCommand(
-        "psotrack.cli.simulate.as_real:as_real",
-        "Write the simulated sequence SEQ in the form of the dataset's real half.",
-    ),
     "fly": LazyCommand(
         "psotrack.cli.simulate.fly:fly",
         "Fly a simulated drone by hand and record the flight for a scenario.",

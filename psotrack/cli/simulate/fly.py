@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from psotrack.cli.options import FORCE, QUIET, out_option
-from psotrack.cli.output import Output, pass_output
+from psotrack.cli.output import Output, check_suffix, pass_output
 from psotrack.cli.records import HelpfulCommand
 from psotrack.cli.types import Numbers
 from psotrack.errors import errors_name
@@ -83,6 +83,7 @@ def fly(
     from psotrack.simulation.flights import devices, piloting
 
     sticks_path = out.with_suffix(".sticks.csv")
+    check_suffix("--out", out, ".csv")
     output.refuse(out, sticks_path)
     space = flight_space(hall)
     start = np.array(start_m)

@@ -43,24 +43,16 @@ def flying_order(scenario: Scenario) -> tuple[int, ...]:
 
 def _chain(scenario: Scenario, index: int) -> list[int]:
     """Index of a drone, then of the drone that its flight is relative to, and so on along the chain."""
-    chain = [index]
+    chain, count = [index], len(scenario.drones)
     while relation := followed(scenario.drones[chain[-1]].flight):
         name, number = relation
         field = f"drones[{chain[-1]}].flight.{name}"
-        if number > len(scenario.drones):
-            count = len(scenario.drones)
-            raise scenario_error(
-                scenario, field, expected=f"a drone's number, 1 to {count}", found=f"{number}"
-            )
+        if number > count:
+            raise scenario_error(scenario, field, f"a drone's number, 1 to {count}", number)
         chain.append(number - 1)
         if chain[-1] in chain[:-1]:
             loop = " -> ".join(f"{link + 1}" for link in chain)
-            raise scenario_error(
-                scenario,
-                field,
-                expected="relative flights without a cycle",
-                found=f"drones {loop}",
-            )
+            raise scenario_error(scenario, field, "relative flights without a cycle", f"drones {loop}")
     return chain
 
 
@@ -81,37 +73,23 @@ def check_records(scenario: Scenario) -> None:
 def _check_near_pass(scenario: Scenario, field: str, record: NearPass) -> None:
     for name, vector in (("side", record.side), ("swing_m", record.swing_m)):
         if not np.any(vector):
-            raise scenario_error(scenario, f"{field}.{name}", expected="a direction", found="[0, 0, 0]")
+            raise scenario_error(scenario, f"{field}.{name}", "a direction", "[0, 0, 0]")
     side, swing = (np.array(vector) / np.linalg.norm(vector) for vector in (record.side, record.swing_m))
     cosine = float(side @ swing)
     if abs(cosine) > _PERPENDICULAR:
-        raise scenario_error(
-            scenario,
-            f"{field}.side",
-            expected="a direction perpendicular to swing_m",
-            found=f"one at {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.4g} degrees to it",
-            remedy="otherwise distance_m is not the smallest distance",
-        )
+        found = f"one at {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.4g} degrees to it"
+        remedy = "otherwise distance_m is not the smallest distance"
+        raise scenario_error(scenario, f"{field}.side", "a direction perpendicular to swing_m", found, remedy)
 
 
 def _check_waypoints(scenario: Scenario, field: str, record: Waypoints) -> None:
     # A fast drone could reach the next waypoint between two frames, where the limits are not checked.
-    if record.speed_m_s > scenario.limits.max_speed_m_s:
-        raise scenario_error(
-            scenario,
-            f"{field}.speed_m_s",
-            expected=f"at most {scenario.limits.max_speed_m_s:g} m/s (limits.max_speed_m_s)",
-            found=f"{record.speed_m_s:g}",
-        )
-    for point, (here, there) in enumerate(
-        zip(record.points_m, record.points_m[1:] + record.points_m[:1], strict=True)
-    ):
-        if here == there:
-            following = (point + 1) % len(record.points_m)
-            raise scenario_error(
-                scenario,
-                f"{field}.points_m[{following}]",
-                expected="a point that differs from the previous one (the first point follows the last)",
-                found=f"{list(there)} again",
-                remedy="to stand still at a point, set hover_s",
-            )
+    most_m_s = scenario.limits.max_speed_m_s
+    if record.speed_m_s > most_m_s:
+        expected = f"at most {most_m_s:g} m/s (limits.max_speed_m_s)"
+        raise scenario_error(scenario, f"{field}.speed_m_s", expected, f"{record.speed_m_s:g}")
+    for index, point_m in enumerate(record.points_m):
+        if point_m == record.points_m[index - 1]:
+            expected = "a point that differs from the previous one (the first point follows the last)"
+            found, remedy = f"{list(point_m)} again", "to stand still at a point, set hover_s"
+            raise scenario_error(scenario, f"{field}.points_m[{index}]", expected, found, remedy)

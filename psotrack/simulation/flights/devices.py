@@ -7,19 +7,18 @@ imported at the first use.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import signal
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from psotrack.errors import SettingsError
 from psotrack.simulation.flights.dynamics import FlightState, Space, Sticks
-from psotrack.simulation.flights.panel import PygletPanel, pyglet_module
+from psotrack.simulation.flights.panel import Panel, pyglet_module
 from psotrack.simulation.flights.piloting import Sample, read_sticks
 
 #: Half width of the range around the middle that counts as 0, because springs do not return sticks exactly to 0.
@@ -50,53 +49,9 @@ KEYS: Mapping[str, Sticks] = {
 }
 
 
-class Device(ABC):
-    """Source of stick samples; closed at the end of a `with` block."""
-
-    @abstractmethod
-    def samples(self) -> Iterator[Sample]:
-        """Yield samples of the sticks with times that increase from 0, until the flight ends."""
-
-    @abstractmethod
-    def watch(self, time_s: float, state: FlightState) -> None:
-        """Show the drone's state to the pilot."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Release the controller and the window."""
-
-    def __enter__(self) -> Device:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-def open_device(name: str, space: Space) -> Device:
-    """Open the device `gamepad` or `keyboard`, or a file in the format of `read_sticks`.
-
-    Args:
-        name: name of the device, or path of the file.
-        space: space of the flight, which the pilot's window shows.
-
-    Raises:
-        SettingsError: pyglet is not installed, no controller is connected, or there is no display.
-        InputError: the file cannot be used.
-    """
-    if name == "gamepad":
-        return _open_gamepad(space)
-    if name == "keyboard":
-        return _open_keyboard(space)
-    if not Path(name).suffix:
-        raise SettingsError("device", expected="gamepad, keyboard, or a file of sticks (.csv)", found=name)
-    return ScriptedDevice(read_sticks(Path(name)))
-
-
 @dataclass(frozen=True)
-class ScriptedDevice(Device):
-    """Stick samples from a file; the flight ends at the time of the last sample."""
+class Script:
+    """Stick samples from a file; the flight ends at the time of the last sample, and nothing is shown."""
 
     script: tuple[Sample, ...]
 
@@ -107,63 +62,40 @@ class ScriptedDevice(Device):
     def watch(self, time_s: float, state: FlightState) -> None:
         """Do nothing: there is no window."""
 
-    def close(self) -> None:
-        """Do nothing: there is no controller and no window."""
 
+class Pilot:
+    """A person with a window, who moves sticks that are read at 60 Hz of the wall clock.
 
-# --- live devices
-
-
-@runtime_checkable
-class Panel(Protocol):
-    """The pilot's window."""
-
-    @property
-    def closed(self) -> bool:
-        """Whether the pilot pressed Esc or closed the window."""
-
-    def pump(self) -> None:
-        """Process events of keys, sticks and the window."""
-
-    def draw(self, time_s: float, state: FlightState) -> None:
-        """Draw the drone's state."""
-
-    def close(self) -> None:
-        """Close the window."""
-
-
-class LiveDevice(Device):
-    """A device that a person operates, read at 60 Hz of the wall clock."""
+    Args:
+        panel: the pilot's window.
+        sticks: gives the current positions of the sticks.
+        clock: gives the time in seconds.
+        sleep: waits for a number of seconds.
+    """
 
     def __init__(
         self,
         panel: Panel,
+        sticks: Callable[[], Sticks],
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._panel = panel
-        self._clock = clock
-        self._sleep = sleep
+        self._panel, self._sticks, self._clock, self._sleep = panel, sticks, clock, sleep
         self._stopped = False
-
-    @abstractmethod
-    def sticks(self) -> Sticks:
-        """Current positions of the sticks."""
 
     def stop(self, *signal_and_frame: object) -> None:
         """End the flight with the next sample; also the handler of SIGINT."""
         self._stopped = True
 
-    def __enter__(self) -> Device:
-        # Ctrl-C ends the flight between two samples, as Esc does, so that the flight up to then is kept.
-        self._handler = signal.signal(signal.SIGINT, self.stop)
-        return super().__enter__()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        signal.signal(signal.SIGINT, self._handler)
-        super().__exit__(kind, error, trace)
+    @contextlib.contextmanager
+    def flying(self) -> Iterator[Pilot]:
+        """Let Ctrl-C end the flight between two samples, as Esc does, so that it is kept; close the window at last."""
+        with contextlib.closing(self._panel):
+            handler = signal.signal(signal.SIGINT, self.stop)
+            try:
+                yield self
+            finally:
+                signal.signal(signal.SIGINT, handler)
 
     def samples(self) -> Iterator[Sample]:
         """Yield stick samples at 60 Hz, or as fast as the machine can; the last sample ends the flight."""
@@ -171,7 +103,7 @@ class LiveDevice(Device):
         polls = 0
         while True:
             self._panel.pump()
-            yield Sample(self._clock() - begin_s, self.sticks())
+            yield Sample(self._clock() - begin_s, self._sticks())
             if self._stopped or self._panel.closed:
                 return
             # Time is counted from the beginning of the flight, so that the time of drawing does not accumulate.
@@ -182,53 +114,71 @@ class LiveDevice(Device):
         """Show the drone's state to the pilot."""
         self._panel.draw(time_s, state)
 
-    def close(self) -> None:
-        """Close the window."""
-        self._panel.close()
+
+@contextlib.contextmanager
+def open_device(name: str, space: Space) -> Iterator[Script | Pilot]:
+    """Open the device `gamepad` or `keyboard`, or a file in the format of `read_sticks`, for a `with` block.
+
+    Args:
+        name: name of the device, or path of the file.
+        space: space of the flight, which the pilot's window shows.
+
+    Raises:
+        SettingsError: pyglet is not installed, no controller is connected, or there is no display.
+        InputError: the file cannot be used.
+    """
+    if name == "gamepad":
+        controller = _controller()
+        controller.open()
+        with contextlib.closing(controller):
+            gamepad = Gamepad(controller)
+            pilot = Pilot(Panel(name, space, GAMEPAD_HELP), gamepad.sticks)
+            gamepad.on_end = pilot.stop
+            with pilot.flying():
+                yield pilot
+    elif name == "keyboard":
+        panel = Panel(name, space, KEYBOARD_HELP)
+        with Pilot(panel, lambda: key_sticks(panel.is_down)).flying() as pilot:
+            yield pilot
+    elif Path(name).suffix:
+        yield Script(read_sticks(Path(name)))
+    else:
+        raise SettingsError("device", expected="gamepad, keyboard, or a file of sticks (.csv)", found=name)
 
 
-class KeyboardDevice(LiveDevice):
-    """The keyboard: a pressed key moves a stick to its end."""
-
-    def __init__(self, panel: Panel, is_down: Callable[[str], bool], **timing: Any) -> None:
-        super().__init__(panel, **timing)
-        self._is_down = is_down
-
-    def sticks(self) -> Sticks:
-        """Sum of the stick positions of all pressed keys."""
-        down = [meaning for name, meaning in KEYS.items() if self._is_down(name)]
-        return Sticks(*(sum(axis) for axis in zip(Sticks(), *down, strict=True)))
+def key_sticks(is_down: Callable[[str], bool]) -> Sticks:
+    """Sum of the stick positions of all pressed keys: a key moves a stick to its end."""
+    down = [meaning for name, meaning in KEYS.items() if is_down(name)]
+    return Sticks(*(sum(axis) for axis in zip(Sticks(), *down, strict=True)))
 
 
-class GamepadDevice(LiveDevice):
-    """A game controller with a layout that pyglet knows."""
+class Gamepad:
+    """Sticks of a game controller with a layout that pyglet knows.
 
-    def __init__(self, panel: Panel, controller: Any, **timing: Any) -> None:
-        super().__init__(panel, **timing)
-        self._controller = controller
-        self._sticks = Sticks()
+    Attributes:
+        on_end: called when the pilot presses start or back.
+    """
+
+    def __init__(self, controller: Any) -> None:
+        self._now = Sticks()
+        self.on_end: Callable[[], None] = lambda: None
         # Events are used, because the sign of pyglet's polled values depends on the operating system.
         controller.push_handlers(on_stick_motion=self._move, on_button_press=self._press)
+
+    def sticks(self) -> Sticks:
+        """Positions of both sticks, without their dead zones."""
+        return self._now
 
     def _move(self, controller: Any, stick: str, vector: tuple[float, float]) -> None:
         right, up = (_without_dead_zone(value) for value in vector)
         if stick == "leftstick":
-            self._sticks = self._sticks._replace(up=up, turn=0.0 - right)
+            self._now = self._now._replace(up=up, turn=0.0 - right)
         elif stick == "rightstick":
-            self._sticks = self._sticks._replace(forward=up, left=0.0 - right)
+            self._now = self._now._replace(forward=up, left=0.0 - right)
 
     def _press(self, controller: Any, button: str) -> None:
         if button in ("start", "back"):
-            self.stop()
-
-    def sticks(self) -> Sticks:
-        """Positions of both sticks, without their dead zones."""
-        return self._sticks
-
-    def close(self) -> None:
-        """Release the controller, and close the window."""
-        self._controller.close()
-        super().close()
+            self.on_end()
 
 
 def _without_dead_zone(value: float) -> float:
@@ -237,26 +187,13 @@ def _without_dead_zone(value: float) -> float:
     return math.copysign(min(beyond, 1.0), value) if beyond > 0 else 0.0
 
 
-# --- opening devices
-
-
-def _open_gamepad(space: Space) -> GamepadDevice:
-    pads = pyglet_module("input", "gamepad")
+def _controller() -> Any:
+    """The first controller that is connected."""
     try:
-        controllers = pads.get_controllers()
+        controllers = pyglet_module("input", "gamepad").get_controllers()
     except OSError:  # Linux without input devices does not even have their folder.
         controllers = []
-    if not controllers:
-        raise SettingsError(
-            "device gamepad",
-            expected="a game controller",
-            found="none",
-            remedy="plug one in, or use --device keyboard",
-        )
-    controllers[0].open()
-    return GamepadDevice(PygletPanel("gamepad", space, GAMEPAD_HELP), controllers[0])
-
-
-def _open_keyboard(space: Space) -> KeyboardDevice:
-    panel = PygletPanel("keyboard", space, KEYBOARD_HELP)
-    return KeyboardDevice(panel, panel.is_down)
+    if controllers:
+        return controllers[0]
+    remedy = "plug one in, or use --device keyboard"
+    raise SettingsError("device gamepad", expected="a game controller", found="none", remedy=remedy)

@@ -64,17 +64,6 @@ class Dynamics:
     drag_per_s: float = 0.2
     braking_per_s: float = 3.0
 
-    @property
-    def max_acceleration_m_s2(self) -> float:
-        """Upper bound of the acceleration of every flight: full tilt at full thrust, plus the drag at full speed."""
-        level = np.tan(np.radians(self.max_tilt_deg)) * (GRAVITY_M_S2 + self.max_climb_m_s2)
-        return float(
-            np.hypot(
-                level + self.drag_per_s * self.max_speed_m_s,
-                self.max_climb_m_s2 + self.drag_per_s * self.max_climb_m_s,
-            )
-        )
-
 
 #: Dynamics of a small drone in a hall.
 DYNAMICS = Dynamics()

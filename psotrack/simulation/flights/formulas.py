@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.simulation.flights.motion import Flight, Heading
-
-Times = Float[np.ndarray, "times"]
-Vectors = Float[np.ndarray, "times 3"]
+from psotrack.simulation.flights.motion import Flight, Heading, Times, Vectors
 
 
 @dataclass(frozen=True)
@@ -31,23 +28,12 @@ class HarmonicFlight(Flight):
     phase_rad: Float[np.ndarray, "harmonics 3"]
     heading: Heading
 
-    def _derivative(self, time_s: Times, order: int) -> Vectors:
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3); the n-th derivative of a sine is the sine with n quarter turns added to its angle."""
         w = self.angular_rad_s[:, None]
-        # The n-th derivative of the sine is the sine with n quarter turns added to its angle.
         angle = w * time_s[:, None, None] + self.phase_rad + order * np.pi / 2
-        return (self.amplitude_m * w**order * np.sin(angle)).sum(axis=1)
-
-    def position_m(self, time_s: Times) -> Vectors:
-        """(times, 3), world, metres."""
-        return self.centre_m + self._derivative(time_s, 0)
-
-    def velocity_m_s(self, time_s: Times) -> Vectors:
-        """(times, 3), world."""
-        return self._derivative(time_s, 1)
-
-    def acceleration_m_s2(self, time_s: Times) -> Vectors:
-        """(times, 3), world, gravity not included."""
-        return self._derivative(time_s, 2)
+        moved_m = (self.amplitude_m * w**order * np.sin(angle)).sum(axis=1)
+        return moved_m if order else self.centre_m + moved_m
 
 
 @dataclass(frozen=True)
@@ -64,17 +50,9 @@ class RelativeFlight(Flight):
     offset: Flight
     heading: Heading
 
-    def position_m(self, time_s: Times) -> Vectors:
-        """(times, 3), world, metres."""
-        return self.other.position_m(time_s) + self.offset.position_m(time_s)
-
-    def velocity_m_s(self, time_s: Times) -> Vectors:
-        """(times, 3), world."""
-        return self.other.velocity_m_s(time_s) + self.offset.velocity_m_s(time_s)
-
-    def acceleration_m_s2(self, time_s: Times) -> Vectors:
-        """(times, 3), world, gravity not included."""
-        return self.other.acceleration_m_s2(time_s) + self.offset.acceleration_m_s2(time_s)
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3), sum of both derivatives."""
+        return self.other.derivative(time_s, order) + self.offset.derivative(time_s, order)
 
 
 @dataclass(frozen=True)
@@ -91,17 +69,9 @@ class DelayedFlight(Flight):
     delay_s: float
     heading: Heading
 
-    def position_m(self, time_s: Times) -> Vectors:
-        """(times, 3), world, metres."""
-        return self.leader.position_m(time_s - self.delay_s)
-
-    def velocity_m_s(self, time_s: Times) -> Vectors:
-        """(times, 3), world."""
-        return self.leader.velocity_m_s(time_s - self.delay_s)
-
-    def acceleration_m_s2(self, time_s: Times) -> Vectors:
-        """(times, 3), world, gravity not included."""
-        return self.leader.acceleration_m_s2(time_s - self.delay_s)
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3), derivative of the leader at an earlier time."""
+        return self.leader.derivative(time_s - self.delay_s, order)
 
 
 #: Share of the distance after a share t of the time, for the motion with minimum jerk from rest to rest, and its two
@@ -125,7 +95,8 @@ class WaypointFlight(Flight):
     hover_s: float
     heading: Heading
 
-    def _derivative(self, time_s: Times, order: int) -> Vectors:
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3), derivative of the motion along the leg of each time."""
         ends_s = np.cumsum(self.moving_s + self.hover_s)
         loop_s = time_s % ends_s[-1]
         # Rounding can place the end of the loop after the last leg.
@@ -135,15 +106,3 @@ class WaypointFlight(Flight):
         leg_m = (np.roll(self.points_m, -1, axis=0) - self.points_m)[leg]
         moved = (_MINIMUM_JERK[order](share) / moving_s**order)[:, None] * leg_m
         return self.points_m[leg] + moved if order == 0 else moved
-
-    def position_m(self, time_s: Times) -> Vectors:
-        """(times, 3), world, metres."""
-        return self._derivative(time_s, 0)
-
-    def velocity_m_s(self, time_s: Times) -> Vectors:
-        """(times, 3), world."""
-        return self._derivative(time_s, 1)
-
-    def acceleration_m_s2(self, time_s: Times) -> Vectors:
-        """(times, 3), world, gravity not included."""
-        return self._derivative(time_s, 2)

@@ -15,6 +15,9 @@ from scipy.spatial.transform import Rotation
 
 GRAVITY_M_S2 = 9.81
 
+Times = Float[np.ndarray, "times"]
+Vectors = Float[np.ndarray, "times 3"]
+
 
 @dataclass(frozen=True)
 class Heading:
@@ -59,16 +62,20 @@ class Flight(ABC):
     heading: Heading
 
     @abstractmethod
-    def position_m(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3), derivative of the position: 0 is the position itself, 1 the velocity, 2 the acceleration."""
+
+    def position_m(self, time_s: Times) -> Vectors:
         """(times, 3), world, metres."""
+        return self.derivative(time_s, 0)
 
-    @abstractmethod
-    def velocity_m_s(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+    def velocity_m_s(self, time_s: Times) -> Vectors:
         """(times, 3), world."""
+        return self.derivative(time_s, 1)
 
-    @abstractmethod
-    def acceleration_m_s2(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3"]:
+    def acceleration_m_s2(self, time_s: Times) -> Vectors:
         """(times, 3), world, gravity not included."""
+        return self.derivative(time_s, 2)
 
     def rotation(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 3 3"]:
         """(times, 3, 3), body to world: z along a + g, x as near to the heading as possible."""

@@ -43,13 +43,12 @@ def pyglet_module(name: str, device: str) -> ModuleType:
         ) from error
     try:
         return importlib.import_module(f"pyglet.{name}")
-    except (
-        Exception
-    ) as error:  # The import opens a display, and the classes of its errors cannot be imported before.
-        raise no_display(device, error) from error
+    # The import opens a display, and the classes of its errors cannot be imported before.
+    except Exception as error:
+        raise _no_display(device, error) from error
 
 
-def no_display(device: str, error: Exception) -> SettingsError:
+def _no_display(device: str, error: Exception) -> SettingsError:
     """Error for a machine that cannot open a window."""
     return SettingsError(
         f"device {device}",
@@ -59,8 +58,8 @@ def no_display(device: str, error: Exception) -> SettingsError:
     )
 
 
-class PygletPanel:
-    """A window with the hall seen from above; satisfies `devices.Panel`."""
+class Panel:
+    """A window with the hall seen from above."""
 
     def __init__(self, device: str, space: Space, help_lines: tuple[str, ...]) -> None:
         self._pyglet = {name: pyglet_module(name, device) for name in ("app", "shapes", "text", "window")}
@@ -76,10 +75,9 @@ class PygletPanel:
             self._window = window.Window(
                 *(round(side) for side in size_px), caption="psotrack simulate fly", vsync=False
             )
-        except (
-            Exception
-        ) as error:  # pyglet has different classes for a missing display and for screens without OpenGL.
-            raise no_display(device, error) from error
+        # pyglet has different classes for a missing display and for screens without OpenGL.
+        except Exception as error:
+            raise _no_display(device, error) from error
         self._keys = window.key.KeyStateHandler()
         self._window.push_handlers(self._keys)
         self._pyglet["app"].platform_event_loop.start()

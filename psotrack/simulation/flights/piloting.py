@@ -17,6 +17,7 @@ from psotrack.errors import SettingsError, check_positive
 from psotrack.simulation.flights.dynamics import DYNAMICS, Dynamics, FlightState, Space, Sticks, Vector, step
 from psotrack.simulation.flights.motion import GRAVITY_M_S2, attitude
 from psotrack.simulation.flights.recordings import Recorded
+from psotrack.simulation.flights.resampling import MIN_SAMPLES
 from psotrack.support import Column, TextRow, read_table, write_rows
 
 #: Smallest number of integration steps per second: several steps in each time constant of the dynamics.
@@ -68,7 +69,7 @@ def fly(
 
     Raises:
         SettingsError: the start is outside the space, the rate is not above 0, the samples' times do not increase, or
-            the flight is too short for a `Recorded`.
+            the flight is too short to be replayed.
     """
     check(start_m, space, rate_hz)
     per_record = int(np.ceil(_MIN_STEPS_HZ / rate_hz))
@@ -115,6 +116,8 @@ def until(samples: Iterable[Sample], end_s: float) -> Iterator[Sample]:
 
 
 def _recorded(states: list[FlightState], rate_hz: float) -> Recorded:
+    if len(states) < MIN_SAMPLES:
+        raise SettingsError("flight", expected=f"at least {MIN_SAMPLES} samples", found=f"{len(states)}")
     thrust = np.array([state.push_m_s2 for state in states]) + np.array([0.0, 0.0, GRAVITY_M_S2])
     rotation = attitude(thrust, np.array([state.yaw_rad for state in states]))
     return Recorded(

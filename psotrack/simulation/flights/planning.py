@@ -58,16 +58,11 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
 def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
     """Error that names the limit that the flights violate without variation, or else the most frequent violation."""
     if nominal:
-        return scenario_error(scenario, nominal.field, expected=nominal.limit, found=nominal.found)
+        return scenario_error(scenario, nominal.field, nominal.limit, nominal.found)
     (field, limit), times = Counter((found.field, found.limit) for found in varied).most_common(1)[0]
     example = next(found for found in varied if (found.field, found.limit) == (field, limit))
-    return scenario_error(
-        scenario,
-        field,
-        expected=limit,
-        found=example.found,
-        remedy=f"{times} of {len(varied)} variations broke this limit: lower variation, or leave more room",
-    )
+    remedy = f"{times} of {len(varied)} variations broke this limit: lower variation, or leave more room"
+    return scenario_error(scenario, field, limit, example.found, remedy)
 
 
 def _recorded(scenario: Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[int, Flight]:

@@ -1,8 +1,8 @@
-"""Recorded flights, from motion capture, a simulator or `psotrack simulate fly`: reading, writing and replaying."""
+"""Recorded flights, from motion capture, a tracker or `psotrack simulate fly`: reading, writing and replaying."""
 
 from __future__ import annotations
 
-import re
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,26 +13,17 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings.datasets.dpjait import read_poses
-from psotrack.simulation.flights.motion import Flight, Heading
+from psotrack.recordings.exchange import read_tracks
+from psotrack.simulation.flights.motion import Flight, Heading, Times, Vectors
 from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
 from psotrack.simulation.scenarios import FlightFromFile
-from psotrack.support import Column, Table, TextRow, first_repeat, read_rows, read_table, write_rows
+from psotrack.trajectories import Trajectories, write_trajectories
 
 #: Largest time before the first and after the last sample that a flight is extrapolated to. It is longer than half an
 #: exposure, because the exposures of the first and last frame reach beyond the samples.
 _BEYOND_S = 0.1
 #: Tolerance for times of frames and times of samples, which come from different divisions.
 _ROUNDING_S = 1e-6
-#: Largest difference between 1 and the norm of a quaternion: the effect of rounding to two decimals.
-_NORM_TOLERANCE = 0.02
-
-_POSITION = ("x_m", "y_m", "z_m")
-_QUATERNION = ("qw", "qx", "qy", "qz")
-_POSE_FILE = re.compile(r".*_pos_(?P<rate_hz>\d+(\.\d+)?)\.csv", re.IGNORECASE)
-
-Times = Float[np.ndarray, "times"]
-Vectors = Float[np.ndarray, "times 3"]
 
 
 @dataclass(frozen=True)
@@ -40,36 +31,14 @@ class Recorded:
     """Samples of a flight.
 
     Attributes:
-        time_s: (samples,), increasing times of at least `MIN_SAMPLES` samples.
+        time_s: (samples,), increasing times.
         position_m: (samples, 3), world.
         orientation_wxyz: (samples, 4), unit quaternions that turn body into world coordinates, or None.
-
-    Raises:
-        SettingsError: too few samples, times that do not increase, or a number that is not finite.
     """
 
     time_s: Float[np.ndarray, "samples"]
     position_m: Float[np.ndarray, "samples 3"]
     orientation_wxyz: Float[np.ndarray, "samples 4"] | None
-
-    def __post_init__(self) -> None:
-        if len(self.time_s) < MIN_SAMPLES:
-            raise SettingsError(
-                "recording", expected=f"at least {MIN_SAMPLES} samples", found=f"{len(self.time_s)}"
-            )
-        if not np.all(np.diff(self.time_s) > 0):
-            index = int(np.argmin(np.diff(self.time_s) > 0)) + 1
-            raise SettingsError(
-                "recording",
-                expected="times that increase",
-                found=f"{self.time_s[index]:g} s at sample {index}",
-            )
-        for values in (self.position_m, self.orientation_wxyz):
-            if values is not None and not np.isfinite(values).all():
-                index = int(np.argmin(np.isfinite(values).all(axis=1)))
-                raise SettingsError(
-                    "recording", expected="finite numbers", found=f"NaN or infinity at sample {index}"
-                )
 
     @property
     def duration_s(self) -> float:
@@ -77,28 +46,28 @@ class Recorded:
         return float(self.time_s[-1] - self.time_s[0])
 
 
-# --- files
-
-
 def read_recorded_flight(path: str | Path) -> Recorded:
-    """Read the flight of one drone from a file of `write_recorded_flight`, a trajectory, or a pose file of DPJAIT.
-
-    Recorded flights and trajectories have the columns `time_s`, `x_m`, `y_m`, `z_m` and, optionally, `qw`, `qx`, `qy`,
-    `qz`, separated by commas or semicolons; the column `drone` of a trajectory must have the same value in all rows. A
-    pose file (`dronN_pos_25.csv`) has its rate in its name; its placeholder at frame 0 is left out.
+    """Read the flight of one drone from tracks in any format of `read_tracks`; rows without a position are left out.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, the times do not increase, there are fewer than
-            `MIN_SAMPLES` samples, a value is missing or NaN, or a quaternion does not have length 1. The message names
-            file, line and column.
+        InputError: the file cannot be read, has no drone or several, fewer than `MIN_SAMPLES` positions, or positions
+            with and without an orientation.
     """
-    header = read_rows(path, ";")[:1]
-    table = read_table(path, ";" if header and len(header[0].cells) > 1 else ",")
-    recorded = _from_poses(Path(path)) if table.find("id") and table.find("pos_x") else _from_table(table)
-    time_s, position_m, orientation_wxyz = recorded
-    if len(time_s) < MIN_SAMPLES:
-        raise InputError(path, expected=f"at least {MIN_SAMPLES} samples", found=f"{len(time_s)}")
-    return Recorded(time_s, position_m, orientation_wxyz)
+    tracks = read_tracks(path)
+    if tracks.num_drones != 1:
+        found = ", ".join(tracks.drones)
+        raise InputError(
+            path, expected="the flight of one drone", found=found, remedy="keep one drone's rows"
+        )
+    known = np.isfinite(tracks.position_m[:, 0]).all(axis=1)
+    if np.count_nonzero(known) < MIN_SAMPLES:
+        found = f"{np.count_nonzero(known)}"
+        raise InputError(path, expected=f"at least {MIN_SAMPLES} positions", found=found)
+    turned = None if tracks.orientation_wxyz is None else tracks.orientation_wxyz[known, 0]
+    if turned is not None and not np.isfinite(turned).all():
+        found = f"none at {tracks.time_s[known][~np.isfinite(turned).all(axis=1)][0]:g} s"
+        raise InputError(path, expected="an orientation with each position, or no orientations", found=found)
+    return Recorded(tracks.time_s[known], tracks.position_m[known, 0], turned)
 
 
 def write_recorded_flight(
@@ -107,74 +76,16 @@ def write_recorded_flight(
     position_m: Float[np.ndarray, "samples 3"],
     orientation_wxyz: Float[np.ndarray, "samples 4"] | None,
 ) -> None:
-    """Write `time_s,x_m,y_m,z_m[,qw,qx,qy,qz]`, all digits, so that reading gives the same numbers.
+    """Write the tracks of one drone, .csv or .parquet, with all digits, so that reading gives the same numbers.
 
     Raises:
-        SettingsError: the samples are not valid for `Recorded`.
+        InputError: the path has another suffix.
         OutputError: the file cannot be written; an existing file is unchanged.
     """
-    recorded = Recorded(time_s, position_m, orientation_wxyz)
-    columns = [recorded.time_s[:, None], recorded.position_m]
-    header = ["time_s", *_POSITION]
-    if recorded.orientation_wxyz is not None:
-        columns.append(recorded.orientation_wxyz)
-        header += _QUATERNION
-    write_rows(path, [header, *np.hstack(columns).tolist()], ",")
-
-
-_Samples = tuple[Times, Vectors, Float[np.ndarray, "times 4"] | None]
-
-
-def _from_poses(path: Path) -> _Samples:
-    match = _POSE_FILE.fullmatch(path.name)
-    rate_hz = float(match["rate_hz"]) if match else 0.0
-    if rate_hz == 0:
-        raise InputError(
-            path, expected="a pose file named like dron1_pos_25.csv, with its rate", found=path.name
-        )
-    position_m, orientation_wxyz = read_poses(path)
-    frame = np.flatnonzero(np.isfinite(position_m).all(axis=1))
-    return frame / rate_hz, position_m[frame], None if orientation_wxyz is None else orientation_wxyz[frame]
-
-
-def _from_table(table: Table) -> _Samples:
-    _check_one_drone(table)
-    time = table.column("time_s")
-    position = [table.column(name) for name in _POSITION]
-    quaternion = [table.column(name) for name in _QUATERNION] if table.find(_QUATERNION[0]) else []
-    time_s = np.array([row.number(time) for row in table.rows])
-    again = first_repeat(time_s)
-    if again is not None:
-        before, row = table.rows[again - 1 : again + 1]
-        raise row.error(
-            time, f"a time above {before.text(time)}, the time in line {before.line}", row.text(time)
-        )
-    position_m = np.array([[row.number(column) for column in position] for row in table.rows])
-    orientation_wxyz = np.array([_unit(row, quaternion) for row in table.rows]) if quaternion else None
-    return time_s, position_m, orientation_wxyz
-
-
-def _check_one_drone(table: Table) -> None:
-    column = table.find("drone")
-    if column is None:
-        return
-    name = table.rows[0].text(column)
-    for row in table.rows:
-        if row.text(column) != name:
-            raise row.error(
-                column, f"one drone, {name} as above", row.text(column), "keep the rows of one drone only"
-            )
-
-
-def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
-    quaternion = np.array([row.number(column) for column in columns])
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > _NORM_TOLERANCE:
-        raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
-    return quaternion / norm
-
-
-# --- flights
+    turned = None if orientation_wxyz is None else orientation_wxyz[:, None]
+    frame = np.arange(len(time_s))
+    tracks = Trajectories(frame, time_s, ("dron1",), position_m[:, None], orientation_wxyz=turned)
+    write_trajectories(path, tracks, force=True)
 
 
 def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
@@ -184,7 +95,7 @@ def recorded_flight(record: FlightFromFile, heading: Heading) -> RecordedFlight:
         InputError: `read_recorded_flight` cannot read the file.
         SettingsError: the recorded flight ends before `start_s`.
     """
-    recorded = read_recorded_flight(Path(record.file))
+    recorded = read_recorded_flight(record.file)
     if record.start_s >= recorded.duration_s:
         raise SettingsError(
             f"start_s of {record.file}",
@@ -257,21 +168,14 @@ class RecordedFlight(Flight):
             )
         return inside_s, (own_s - inside_s)[:, None]
 
-    def position_m(self, time_s: Times) -> Vectors:
-        """(times, 3), world, metres."""
+    def derivative(self, time_s: Times, order: int) -> Vectors:
+        """(times, 3), by a Taylor series from the nearest time within the samples."""
         own_s, beyond_s = self._own_time(time_s)
-        position, velocity, acceleration = (curve(own_s) for curve in self._splines)
-        return self.offset_m + position + velocity * beyond_s + acceleration * beyond_s**2 / 2
-
-    def velocity_m_s(self, time_s: Times) -> Vectors:
-        """(times, 3), world."""
-        own_s, beyond_s = self._own_time(time_s)
-        _, velocity, acceleration = (curve(own_s) for curve in self._splines)
-        return velocity + acceleration * beyond_s
-
-    def acceleration_m_s2(self, time_s: Times) -> Vectors:
-        """(times, 3), world, gravity not included."""
-        return self._splines[2](self._own_time(time_s)[0])
+        terms = (
+            curve(own_s) * beyond_s**power / math.factorial(power)
+            for power, curve in enumerate(self._splines[order:])
+        )
+        return sum(terms, self.offset_m * (order == 0))
 
     def rotation(self, time_s: Times) -> Float[np.ndarray, "times 3 3"]:
         """(times, 3, 3), body to world: as recorded, or from the acceleration if no orientations were recorded."""

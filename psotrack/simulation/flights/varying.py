@@ -28,7 +28,6 @@ from psotrack.simulation.scenarios import (
     FlightRecord,
     FollowingFlight,
     Formation,
-    Harmonic,
     Harmonics,
     NearPass,
     Orbit,
@@ -37,6 +36,10 @@ from psotrack.simulation.scenarios import (
     Vector,
     Waypoints,
 )
+
+#: Records of flights that are sums of harmonics.
+HarmonicRecord = Harmonics | Orbit | Crossing | Formation | NearPass
+Point = Vector | Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ def _num_harmonics(record: FlightRecord) -> int:
     if isinstance(record, FlightFromFile | FollowingFlight):
         return 0
     # A flight through waypoints uses one number: the change of its period.
-    return 1 if isinstance(record, Waypoints) else len(_as_harmonics(record).terms)
+    return 1 if isinstance(record, Waypoints) else len(_harmonics(record)[1])
 
 
 def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tuple[Flight, ...]:
@@ -132,12 +135,12 @@ def make(scenario: Scenario, drawn: Draws, recorded: Mapping[int, Flight]) -> tu
             case Formation(leader=other) | NearPass(other=other) as record:
                 # Offset and distance that the scenario gives are not varied.
                 unmoved = replace(draw, centre=np.zeros(3))
-                offset = _harmonic_flight(_as_harmonics(record), unmoved, scenario.variation, heading)
+                offset = _harmonic_flight(record, unmoved, scenario.variation, heading)
                 made[index] = RelativeFlight(made[other - 1], offset, heading)
             case Waypoints() as record:
                 made[index] = _waypoint_flight(record, draw, scenario.variation, heading)
             case record:
-                made[index] = _harmonic_flight(_as_harmonics(record), draw, scenario.variation, heading)
+                made[index] = _harmonic_flight(record, draw, scenario.variation, heading)
     return tuple(made[index] for index in range(len(scenario.drones)))
 
 
@@ -151,17 +154,19 @@ def make_heading(drone: Drone, turn: Turn, variation: Variation) -> Heading:
     )
 
 
-def _harmonic_flight(record: Harmonics, draw: Draw, variation: Variation, heading: Heading) -> HarmonicFlight:
-    amplitude = np.array([term.amplitude_m for term in record.terms], np.float64).reshape(-1, 3)
-    period_s = np.array([term.period_s for term in record.terms], np.float64)
-    phase_deg = np.array([term.phase_deg for term in record.terms], np.float64).reshape(-1, 3)
-    terms = slice(len(record.terms))
+def _harmonic_flight(
+    record: HarmonicRecord, draw: Draw, variation: Variation, heading: Heading
+) -> HarmonicFlight:
+    centre_m, terms = _harmonics(record)
+    count = len(terms)
+    amplitude_m, phase_deg = (np.array([term[i] for term in terms], float).reshape(-1, 3) for i in (0, 2))
+    period_s = np.array([term[1] for term in terms], float)
     return HarmonicFlight(
-        centre_m=np.array(record.centre_m, np.float64) + draw.centre * variation.centre_m,
-        amplitude_m=amplitude * (1 + variation.size * draw.size[terms])[:, None],
-        angular_rad_s=2 * np.pi / (period_s * (1 + variation.period * draw.period[terms])),
+        centre_m=np.array(centre_m, float) + draw.centre * variation.centre_m,
+        amplitude_m=amplitude_m * (1 + variation.size * draw.size[:count])[:, None],
+        angular_rad_s=2 * np.pi / (period_s * (1 + variation.period * draw.period[:count])),
         # All axes of a harmonic get the same change of phase, so that an orbit stays an orbit.
-        phase_rad=np.radians(phase_deg + (variation.phase_deg * draw.phase[terms])[:, None]),
+        phase_rad=np.radians(phase_deg + (variation.phase_deg * draw.phase[:count])[:, None]),
         heading=heading,
     )
 
@@ -174,42 +179,24 @@ def _waypoint_flight(record: Waypoints, draw: Draw, variation: Variation, headin
     return WaypointFlight(points_m, leg_m / record.speed_m_s * slower, record.hover_s * slower, heading)
 
 
-def _as_harmonics(record: Harmonics | Orbit | Crossing | Formation | NearPass) -> Harmonics:
-    """Flight of a record as a sum of harmonics; for a formation or near pass, the offset from the other drone."""
+def _harmonics(record: HarmonicRecord) -> tuple[Point, list[tuple[Point, float, Point]]]:
+    """Centre, and amplitude, period and phases of each term; of a formation or near pass, from the other drone."""
     match record:
         case Harmonics():
-            return record
+            return record.centre_m, [(one.amplitude_m, one.period_s, one.phase_deg) for one in record.terms]
         case Orbit():
             across = 180.0 if record.clockwise else 0.0
-            round_about = Harmonic(
-                amplitude_m=(*record.radius_m, 0.0),
-                period_s=record.period_s,
-                phase_deg=(record.phase_deg + 90.0, record.phase_deg + across, 0.0),
-            )
-            rise = Harmonic(
-                amplitude_m=(0.0, 0.0, record.rise_m),
-                period_s=record.rise_period_s,
-                phase_deg=(0.0, 0.0, record.rise_phase_deg),
-            )
-            return Harmonics(centre_m=record.centre_m, terms=(round_about, rise))
+            phases_deg = (record.phase_deg + 90.0, record.phase_deg + across, 0.0)
+            about = (*record.radius_m, 0.0), record.period_s, phases_deg
+            rise = (0.0, 0.0, record.rise_m), record.rise_period_s, (0.0, 0.0, record.rise_phase_deg)
+            return record.centre_m, [about, rise]
         case Crossing():
             start, end = np.array(record.start_m), np.array(record.end_m)
-            to_and_fro = Harmonic(
-                amplitude_m=_vector((end - start) / 2),
-                period_s=record.period_s,
-                phase_deg=(record.phase_deg - 90.0,) * 3,
-            )
-            return Harmonics(centre_m=_vector((start + end) / 2), terms=(to_and_fro,))
+            to_and_fro = (end - start) / 2, record.period_s, (record.phase_deg - 90.0,) * 3
+            return (start + end) / 2, [to_and_fro]
         case Formation():
-            return Harmonics(centre_m=record.offset_m, terms=())
+            return record.offset_m, []
         case NearPass():
             side = np.array(record.side) / np.linalg.norm(record.side)
-            swing = Harmonic(
-                amplitude_m=record.swing_m, period_s=record.period_s, phase_deg=(record.phase_deg,) * 3
-            )
-            return Harmonics(centre_m=_vector(side * record.distance_m), terms=(swing,))
-
-
-def _vector(values: Float[np.ndarray, "3"]) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
+            swing = record.swing_m, record.period_s, (record.phase_deg,) * 3
+            return side * record.distance_m, [swing]

@@ -102,14 +102,15 @@ class OnboardRenderer:
         """(rows, width, 4), light of a strip at one time, and the floor's share."""
         others = [i for i in range(len(self.scene.flights)) if i != self.drone_index]
         posed = [pose(self.scene, drone, np.array([during_s])) for drone in others]
-        parts = []
-        for index, window in self._lens_strips.views(strip, self.cam_at(during_s)):
-            view = replace(window, shift_px=shift_px)
+
+        def draw(view: RasterView) -> UInt16[np.ndarray, "_ _ 4"]:
+            view = replace(view, shift_px=shift_px)
             light = np.empty((*view.shape, 4), np.uint16)
             self._painter.paint(view, light)
             self._draw_drones(light, view, posed)
-            parts.append((index, view, light))
-        return self._lens_strips.assemble(strip, parts)
+            return light
+
+        return self._lens_strips.show(strip, self.cam_at(during_s), draw)
 
     def _row_time_s(self, time_s: float, row: float) -> float:
         """When the middle of the exposure of a row is, for a frame whose middle row is exposed at `time_s`."""
@@ -166,16 +167,15 @@ class OnboardRenderer:
         if not (self._imaging.shadows or self._imaging.contact_shadows):
             return
         lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
+
+        def draw(view: RasterView) -> UInt8[np.ndarray, "_ _"]:
+            H = np.array([[1, 0, -view.x], [0, 1, -view.y], [0, 0, 1.0]]) @ self._floor.to_image(view.cam)
+            return cv2.warpPerspective(lost, H, view.shape[::-1], flags=cv2.INTER_LINEAR)
+
         seen = np.zeros(total.shape[:2], np.uint8)
         for strip in strips(self.height, row_px, 0, 1):
-            parts = []
-            for index, view in self._lens_strips.views(
-                strip, self.cam_at(self._row_time_s(time_s, strip.middle))
-            ):
-                H = np.array([[1, 0, -view.x], [0, 1, -view.y], [0, 0, 1.0]]) @ self._floor.to_image(view.cam)
-                shadow = cv2.warpPerspective(lost, H, view.shape[::-1], flags=cv2.INTER_LINEAR)
-                parts.append((index, view, shadow))
-            seen[strip.rows] = self._lens_strips.assemble(strip, parts)
+            cam = self.cam_at(self._row_time_s(time_s, strip.middle))
+            seen[strip.rows] = self._lens_strips.show(strip, cam, draw)
         # Above the horizon, a pixel's line meets the floor behind the camera; the floor's share is 0 at these pixels.
         x, y, width, height = cv2.boundingRect(seen)
         part = total[y : y + height, x : x + width]

@@ -6,9 +6,8 @@ time depends only on (seed, stream, time), so any frame can be drawn alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -102,7 +101,7 @@ class Scenery:
             return np.random.default_rng([seed, stream, purpose, sensor.FOR_SCENERY])
 
         self._settings, self._blur_px = settings, lens_blur_px
-        self._things: list[_Thing] = []
+        self._things: list[_Screen | _Foliage | _Person] = []
         if settings.screen:
             self._things.append(_Screen(rng(_FOR_SCREEN), settings.screen, shape))
         if settings.foliage:
@@ -130,13 +129,6 @@ class Scenery:
             layer.seen, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(0, 0, 0, 1)
         )
         return Layer(layer.x - margin, layer.y - margin, lens_blur(wider, self._blur_px))
-
-
-class _Thing(Protocol):
-    """Something that changes behind the drones."""
-
-    def at(self, time_s: float) -> Layer | None:
-        """What it looks like at a time; None if it is not in the image."""
 
 
 def _dark_half(rng: np.random.Generator, drop: float, shape: tuple[int, int]) -> Image:
@@ -287,81 +279,47 @@ class _Person:
         self, rng: np.random.Generator, share: float, period_s: float, shape: tuple[int, int]
     ) -> None:
         height, width = shape
-        self._width, self._period_s = width, period_s
-        self._tall_px = share * height
+        self._width, self._period_s, self._tall_px = width, period_s, share * height
         self._from_left = bool(rng.uniform() < 0.5)
         self._reach_px = rng.uniform(*_REACH) * width
         self._foot_px = rng.uniform(max(share, 0.8), 1.02) * height
         # Nobody is in the image at time 0.
         self._phase = rng.uniform(_VISIT, 1)
         self._shirt, self._trousers = rng.uniform(0.03, 0.5, 3), rng.uniform(0.01, 0.12, 3)
-        self._wh = max(8, round(0.64 * self._tall_px)), max(8, round(1.1 * self._tall_px))
-        width_px, height_px = self._wh
-        # The point between the feet in the window, without the fraction of a pixel.
-        self._foot_xy = width_px // 2, round(0.98 * self._tall_px)
-        # Rounded bodies are darker towards their sides, and the light comes from above.
-        across = (np.arange(width_px) - self._foot_xy[0]) / self._tall_px
-        up = (self._foot_xy[1] - np.arange(height_px)) / self._tall_px
-        shade = np.clip(1.1 - 4 * across**2, 0.3, None) * (0.7 + 0.3 * np.clip(up, 0, 1))[:, None]
-        folds = 1 + 0.12 * _smooth(rng, (height_px, width_px), 12)
-        self._shade = (_BRIGHTEST / 255 * shade * folds).astype(np.float32)[..., None]
-        shadow = np.zeros(shade.shape, np.float32)
-        axes = max(1, round(0.22 * self._tall_px)), max(1, round(0.035 * self._tall_px))
-        cv2.ellipse(shadow, self._foot_xy, axes, 0, 0, 360, 0.5, -1)
-        self._lit = 1 - cv2.GaussianBlur(shadow, (0, 0), max(0.02 * self._tall_px, 0.5))
 
     def at(self, time_s: float) -> Layer | None:
         share = (time_s / self._period_s + self._phase) % 1 / _VISIT
         if share >= 1:
             return None
-        outside = 0.5 * self._wh[0]
-        x_px = -outside + (self._reach_px + outside) * np.sin(np.pi * share)
-        ahead = 1 if self._from_left == (share < 0.5) else -1
+        outside_px = 0.32 * self._tall_px
+        x_px = (self._reach_px + outside_px) * np.sin(np.pi * share) - outside_px
         x_px = float(x_px if self._from_left else self._width - 1 - x_px)
-        column, row = int(np.floor(x_px)), int(np.floor(self._foot_px))
-        body = self._body(x_px - column, self._foot_px - row, time_s, ahead)
-        seen = np.empty(body.shape, np.float32)
-        seen[..., :3] = body[..., :3] * self._shade
-        seen[..., 3] = (1 - body[..., 3] / np.float32(255)) * self._lit
-        return Layer(column - self._foot_xy[0], row - self._foot_xy[1], seen)
-
-    def _body(
-        self, right_px: float, down_px: float, time_s: float, ahead: int
-    ) -> UInt8[np.ndarray, "rows columns 4"]:
-        """The body without shade: light in units of `_BRIGHTEST` / 255, and coverage in 1/255."""
-        body = np.zeros((self._wh[1], self._wh[0], 4), np.uint8)
+        ahead = 1 if self._from_left == (share < 0.5) else -1
+        x, y = int(np.floor(x_px - outside_px)), int(np.floor(self._foot_px - 1.05 * self._tall_px))
+        body = np.zeros((max(8, round(1.1 * self._tall_px)), max(8, round(2 * outside_px)), 4), np.uint8)
         one = 1 << _FRACTION_BITS
+        for points, thick, bgr in self._parts(np.sin(2 * np.pi * _STEPS_HZ * time_s), ahead):
+            # Points are to the right of the feet and above them, in heights of the person.
+            at_px = np.array([x_px - x, self._foot_px - y]) + self._tall_px * np.array(points) * [1, -1]
+            line = [(at_px * one).round().astype(np.int32)]
+            colour = (*(255 / _BRIGHTEST * bgr).tolist(), 255.0)
+            wide_px = max(1, round(thick * self._tall_px))
+            cv2.polylines(body, line, False, colour, wide_px, cv2.LINE_AA, _FRACTION_BITS)
+        seen = body * np.float32(_BRIGHTEST / 255)
+        seen[..., 3] = 1 - body[..., 3] / np.float32(255)
+        return Layer(x, y, seen)
 
-        def at(right: float, up: float) -> tuple[int, int]:
-            x = self._foot_xy[0] + right_px + right * self._tall_px
-            y = self._foot_xy[1] + down_px - up * self._tall_px
-            return round(x * one), round(y * one)
-
-        def paint(bgr: Float[np.ndarray, "3"]) -> tuple[float, ...]:
-            return (*(255 / _BRIGHTEST * bgr).tolist(), 255.0)
-
-        def limb(points: Sequence[tuple[int, int]], wide: float, bgr: Float[np.ndarray, "3"]) -> None:
-            line = [np.array(points, np.int32)]
-            thick = max(1, round(wide * self._tall_px))
-            cv2.polylines(body, line, False, paint(bgr), thick, cv2.LINE_AA, _FRACTION_BITS)
-
-        def oval(middle: tuple[int, int], wide: float, tall: float, bgr: Float[np.ndarray, "3"]) -> None:
-            axes = round(wide * self._tall_px * one), round(tall * self._tall_px * one)
-            cv2.ellipse(body, middle, axes, 0, 0, 360, paint(bgr), -1, cv2.LINE_AA, _FRACTION_BITS)
-
-        swing = np.sin(2 * np.pi * _STEPS_HZ * time_s)
-        for side in (-1, 1):
-            step = side * swing
-            bent = 0.05 * max(0.0, step) * ahead
-            limb([at(0.0, 0.5), at(0.08 * step + bent, 0.26), at(0.17 * step, 0.03)], 0.085, self._trousers)
-            limb(
-                [at(0.0, 0.76), at(-0.09 * step, 0.62), at(-0.13 * step + 0.04 * ahead, 0.48)],
-                0.05,
-                self._shirt,
-            )
-        oval(at(0.0, 0.65), 0.085, 0.19, self._shirt)
-        oval(at(0.01 * ahead, 0.92), 0.055, 0.075, _SKIN)
-        return body
+    def _parts(
+        self, swing: float, ahead: int
+    ) -> Iterator[tuple[list[tuple[float, float]], float, Float[np.ndarray, "3"]]]:
+        """Yield legs, arms, body and head: points of a line, its thickness, and its light."""
+        for step in (-swing, swing):
+            knee = 0.08 * step + 0.05 * max(0.0, step) * ahead
+            yield [(0.0, 0.5), (knee, 0.26), (0.17 * step, 0.03)], 0.085, self._trousers
+            hand = 0.04 * ahead - 0.13 * step
+            yield [(0.0, 0.76), (-0.09 * step, 0.62), (hand, 0.48)], 0.05, self._shirt
+        yield [(0.0, 0.55), (0.0, 0.75)], 0.17, self._shirt
+        yield [(0.01 * ahead, 0.9), (0.01 * ahead, 0.94)], 0.11, _SKIN
 
 
 def _smooth(

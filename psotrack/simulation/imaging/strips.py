@@ -6,7 +6,7 @@ begin at different rows, so that the mean time of the samples of every row is th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -62,53 +62,35 @@ def strips(height: int, motion_px: float, sample: int, num_samples: int) -> Iter
 
 
 class LensStrips:
-    """The views without distortion that show the strips of a camera's image.
+    """Shows strips of a camera's image by views without distortion.
 
     Args:
         camera: intrinsics of the camera, at the origin.
     """
 
     def __init__(self, camera: Camera) -> None:
-        width, height = (int(side) for side in camera.image_size_wh)
         self._lens: LensImage | None = lens_image(camera) if camera.dist.any() else None
-        whole = Pinhole(np.eye(3), np.zeros(3), np.asarray(camera.K), width, height)
-        self._faces = (whole,) if self._lens is None else self._lens.faces
 
-    def views(self, strip: Strip, cam: Pinhole) -> list[tuple[int, RasterView]]:
-        """Numbers and windows of the faces that show a strip, for a camera whose pose is that of `cam`."""
-        if self._lens is None:
-            return [(0, replace(full_view(cam), y=strip.first, height=strip.end - strip.first))]
-        found = []
-        for index, face in enumerate(self._faces):
-            at_px = self._lens.at_px[strip.rows][self._lens.face[strip.rows] == index]
-            if not len(at_px):
-                continue
-            x, y = np.maximum(np.floor(at_px.min(axis=0)).astype(int) - _MARGIN_PX, 0).tolist()
-            right, bottom = np.ceil(at_px.max(axis=0)).astype(int) + _MARGIN_PX + 1
-            window = replace(
-                full_view(Pinhole(face.R @ cam.R, face.R @ cam.t_m, face.K, face.width, face.height)),
-                x=x,
-                y=y,
-                width=min(int(right), face.width) - x,
-                height=min(int(bottom), face.height) - y,
-            )
-            found.append((index, window))
-        return found
-
-    def assemble(
-        self, strip: Strip, images: list[tuple[int, RasterView, Shaped[np.ndarray, "..."]]]
+    def show(
+        self, strip: Strip, cam: Pinhole, draw: Callable[[RasterView], Shaped[np.ndarray, "..."]]
     ) -> Shaped[np.ndarray, "..."]:
-        """The strip from images of its views."""
+        """The strip as a camera at the pose of `cam` sees it; `draw` gives the image of a view."""
         if self._lens is None:
-            return images[0][2]
-        first = images[0][2]
-        face = self._lens.face[strip.rows]
-        whole = np.zeros((*face.shape, *first.shape[2:]), first.dtype)
-        for index, view, image in images:
-            x, y = np.ascontiguousarray(np.moveaxis(self._lens.at_px[strip.rows], -1, 0))
-            offset = np.float32(view.x), np.float32(view.y)
-            shown = cv2.remap(
-                image, x - offset[0], y - offset[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            return draw(replace(full_view(cam), y=strip.first, height=strip.end - strip.first))
+        face, at_px = self._lens.face[strip.rows], self._lens.at_px[strip.rows]
+        images = []
+        for index, one in enumerate(self._lens.faces):
+            seen = face == index
+            if not seen.any():
+                continue
+            x, y = np.maximum(np.floor(at_px[seen].min(axis=0)).astype(int) - _MARGIN_PX, 0).tolist()
+            right, bottom = (np.ceil(at_px[seen].max(axis=0)).astype(int) + _MARGIN_PX + 1).tolist()
+            whole = full_view(Pinhole(one.R @ cam.R, one.R @ cam.t_m, one.K, one.width, one.height))
+            view = replace(
+                whole, x=x, y=y, width=min(right, one.width) - x, height=min(bottom, one.height) - y
             )
-            whole[face == index] = shown[face == index]
-        return whole
+            columns, rows = (np.ascontiguousarray(at_px[..., axis]) for axis in (0, 1))
+            columns, rows = columns - np.float32(x), rows - np.float32(y)
+            image = cv2.remap(draw(view), columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            images.append(np.where(seen.reshape(seen.shape + (1,) * (image.ndim - 2)), image, 0))
+        return sum(images[1:], images[0])

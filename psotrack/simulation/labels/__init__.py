@@ -1,1 +1,1 @@
-"""Labels of the simulated videos: masks, detections and mocap markers."""
+"""Labels of the frames: masks and detections."""

@@ -76,14 +76,16 @@ def silhouettes(
     """
     time_s = scene.time_s(frame)
     drawn = [_draw_alone(scene, cam, drone, time_s) for drone in range(len(scene.flights))]
+    nearest_m, owner = backdrop_depth_m.copy(), np.zeros(backdrop_depth_m.shape, np.int32)
     in_image = [drone for drone in drawn if drone is not None]
-    seen = [drone.covered & (drone.depth_m < backdrop_depth_m[drone.window.slices]) for drone in in_image]
-    for i, drone in enumerate(in_image):
-        for j in range(i + 1, len(in_image)):
-            _occlude(drone, in_image[j], seen[i], seen[j])
+    for drone in in_image:
+        window = drone.window.slices
+        is_front = drone.covered & (drone.depth_m < nearest_m[window])
+        nearest_m[window][is_front] = drone.depth_m[is_front]
+        owner[window][is_front] = drone.number
     return [
-        Silhouette(drone.number, drone.window, mask, drone.whole_px)
-        for drone, mask in zip(in_image, seen, strict=True)
+        Silhouette(drone.number, drone.window, owner[drone.window.slices] == drone.number, drone.whole_px)
+        for drone in in_image
     ]
 
 
@@ -165,20 +167,3 @@ def _draw_alone(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn
     covered = colour[..., 0] > 0.5
     part = window.slices_in(beyond)
     return _Drawn(drone + 1, window, covered[part], depth_m[part], int(np.count_nonzero(covered)))
-
-
-def _occlude(
-    drone: _Drawn, other: _Drawn, seen: Bool[np.ndarray, "rows columns"], other_seen: Bool[np.ndarray, "r c"]
-) -> None:
-    """Remove from the visible masks of two drones the pixels where the other drone is nearer."""
-    a, b = drone.window, other.window
-    if not a.overlaps(b):
-        return
-    x, y = max(a.x, b.x), max(a.y, b.y)
-    right, bottom = min(a.x + a.width, b.x + b.width), min(a.y + a.height, b.y + b.height)
-    shared = RasterView(a.cam, x, y, right - x, bottom - y)
-    here, there = shared.slices_in(a), shared.slices_in(b)
-    both = drone.covered[here] & other.covered[there]
-    nearer = drone.depth_m[here] <= other.depth_m[there]
-    seen[here] &= ~(both & ~nearer)
-    other_seen[there] &= ~(both & nearer)

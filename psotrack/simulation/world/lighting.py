@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float
 
 #: Share of ambient light. The share is large, because walls and ceiling of a bright room reflect much light.
 AMBIENT = 0.4
-#: (8, 3), index of the bound (0 lower, 1 upper) along each axis, for the eight corners of a box.
-_CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
 
 
 @dataclass(frozen=True)
@@ -72,61 +70,30 @@ def bake(
     """Light at a regular grid of points on one face, with shadows of boxes."""
     raised = points_m + 2e-3 * normal
     normals = np.broadcast_to(normal, points_m.shape)
+    # Boxes behind the plane cast no shadow on it.
+    reach_m = np.where(normal > 0, boxes_m[:, 1], boxes_m[:, 0]) - points_m[0, 0]
+    before = boxes_m[reach_m @ normal > 1e-9]
     light = np.zeros(points_m.shape[:2])
     for panel in panels.samples_m():
         for source in panel:
-            if (source - points_m[0, 0]) @ normal <= 0:
-                continue
-            box, row, column = np.nonzero(_shadowable(points_m, normal, source, boxes_m))
-            hidden = _blocked(raised[row, column].T, source, boxes_m[box].T)
-            seen = np.ones(light.shape, bool)
-            seen[row[hidden], column[hidden]] = False
-            light += seen * panels.direct(raised, normals, source) / len(panel)
+            if (source - points_m[0, 0]) @ normal > 0:
+                seen = ~_blocked(raised, source, before).any(axis=0)
+                light += seen * panels.direct(raised, normals, source) / len(panel)
     return light + AMBIENT * (0.85 + 0.15 * normal[2])
 
 
-def _shadowable(
+def _blocked(
     points_m: Float[np.ndarray, "rows columns 3"],
-    normal: Float[np.ndarray, "3"],
     source_m: Float[np.ndarray, "3"],
     boxes_m: Float[np.ndarray, "boxes 2 3"],
 ) -> Bool[np.ndarray, "boxes rows columns"]:
-    """Cells of a grid that may lie in a box's shadow: the window around the shadows of the box's corners.
-
-    A box that reaches as high above the plane as the source has an infinite shadow; its window is the whole grid.
-    """
-    first, size = points_m[0, 0], np.array(points_m.shape[:2])
-    steps = np.stack([points_m[1, 0] - first, points_m[0, 1] - first])
-    corners = boxes_m[:, _CORNERS, np.arange(3)]
-    height = (source_m - first) @ normal
-    below_source = (source_m - corners) @ normal
-    least = 1e-3 * height
-    shadows = source_m - first + (corners - source_m) * (height / np.maximum(below_source, least))[..., None]
-    at = shadows @ (steps / (steps**2).sum(axis=-1, keepdims=True)).T
-    # One cell more on each side, because light is computed slightly above the plane.
-    low, high = at.min(axis=1) - 1, at.max(axis=1) + 1
-    endless = below_source.min(axis=1) < least
-    low[endless], high[endless] = 0, size
-    # A box behind the plane casts no shadow on the plane.
-    high[below_source.min(axis=1) > height - 1e-9] = -1
-    rows, columns = (
-        (low[:, axis, None] <= np.arange(size[axis])) & (np.arange(size[axis]) <= high[:, axis, None])
-        for axis in range(2)
-    )
-    return rows[:, :, None] & columns[:, None]
-
-
-def _blocked(
-    points_m: Float[np.ndarray, "3 pairs"],
-    source_m: Float[np.ndarray, "3"],
-    boxes_m: Float[np.ndarray, "3 2 pairs"],
-) -> Bool[np.ndarray, "pairs"]:
-    """Whether a box stands between a point and the source, for each pair (slab test, Kay and Kajiya, 1986)."""
-    enter, leave = np.full(points_m.shape[1], -np.inf), np.full(points_m.shape[1], np.inf)
-    for start, to, (lower, upper) in zip(points_m, source_m, boxes_m, strict=True):
-        ray = to - start
+    """Whether a box stands between a point and the source (slab test, Kay and Kajiya, 1986)."""
+    enter, leave = -np.inf, np.inf
+    for axis in range(3):
+        start = points_m[..., axis]
+        ray = source_m[axis] - start
         ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
-        a, b = (lower - start) / ray, (upper - start) / ray
+        a, b = ((boxes_m[:, side, axis, None, None] - start) / ray for side in range(2))
         enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
     # A point on the box itself touches the box at 0, which does not count as blocked.
     return (enter < leave) & (leave > 1e-3) & (enter < 1) & (leave > np.maximum(enter, 0) + 1e-3)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.simulation.scenarios import Mesh
@@ -35,39 +36,48 @@ def load(mesh: Mesh) -> DroneModel:
             size of a drone.
     """
     path = Path(mesh.file)
-    triangles = mesh.scale * _read(path) - np.array(mesh.origin_m)
+    refusal = functools.partial(InputError, path, remedy="export it again")
+    triangles = mesh.scale * _read(path, refusal) - np.array(mesh.origin_m)
     if not (np.abs(triangles) <= LARGEST).all():
-        found = "NaN, infinity or huge numbers"
-        raise InputError(path, expected="numbers as vertices", found=found, remedy="export it again")
-    kept = triangles[_area_m2(triangles) > _NO_AREA_M2]
+        raise refusal(expected="numbers as vertices", found="NaN, infinity or huge numbers")
+    a, b, c = triangles.swapaxes(0, 1)
+    kept = triangles[np.linalg.norm(np.cross(b - a, c - a), axis=-1) > 2 * _NO_AREA_M2]
     if not len(kept):
         found = f"{len(triangles)} without" if len(triangles) else "no faces"
-        raise InputError(
-            path, expected="faces with an area", found=found, remedy="export a surface, not points or lines"
-        )
-    _check_size(path, mesh, kept.reshape(-1, 3))
+        remedy = "export a surface, not points or lines"
+        raise refusal(expected="faces with an area", found=found, remedy=remedy)
+    extent_m = float(np.ptp(kept, axis=(0, 1)).max())
+    if not _SMALLEST_M <= extent_m <= _LARGEST_M:
+        expected = f"a drone of {_SMALLEST_M:g} to {_LARGEST_M:g} m over all"
+        remedy = "set scale to metres per unit of the file (0.001 for millimetres)"
+        raise refusal(expected=expected, found=f"{extent_m:.3g} m", remedy=remedy)
+    if np.abs(kept).max() > _LARGEST_M:
+        middle_m = (kept.min(axis=(0, 1)) + kept.max(axis=(0, 1))) / 2 + mesh.origin_m
+        found = f"the drone's middle at ({', '.join(f'{at:.3g}' for at in middle_m)}) m"
+        remedy = "set origin_m to about this point"
+        raise refusal(expected="the body origin in or near the drone", found=found, remedy=remedy)
     hubs = np.array([rotor.centre_m for rotor in mesh.rotors], float).reshape(-1, 3)
     radii = np.array([rotor.radius_m for rotor in mesh.rotors], float)
-    _check_rotors(path, np.linalg.norm(hubs, axis=-1) + radii)
+    for number, farthest_m in enumerate(np.linalg.norm(hubs, axis=-1) + radii):
+        if farthest_m > _LARGEST_M:
+            expected = f"rotors within {_LARGEST_M:g} m of the body origin"
+            found = f"rotors[{number}] that reaches {farthest_m:.3g} m"
+            remedy = "give centre_m and radius_m in metres; the scale of the mesh does not apply to them"
+            raise refusal(expected=expected, found=found, remedy=remedy)
     return DroneModel(kept, np.ones(len(kept)), hubs, radii)
 
 
-def _read(path: Path) -> Triangles:
+def _read(path: Path, refusal: Callable[..., InputError]) -> Triangles:
     """Triangles of a file, in the file's units."""
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
-        raise InputError(
-            path,
-            expected="a mesh, .obj or .ply",
-            found=path.suffix or "no suffix",
-            remedy="export the drone as one of these",
-        )
+        found, remedy = path.suffix or "no suffix", "export the drone as one of these"
+        raise refusal(expected="a mesh, .obj or .ply", found=found, remedy=remedy)
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            path, expected="a mesh file", found=error.strerror or str(error), remedy="check the drone's model"
-        ) from error
+        found = error.strerror or str(error)
+        raise refusal(expected="a mesh file", found=found, remedy="check the drone's model") from error
     # Imported here, because the import is slow and few scenarios need it.
     import trimesh
 
@@ -79,51 +89,8 @@ def _read(path: Path) -> Triangles:
         faces = np.asarray(read.faces, int).reshape(-1, 3)
     # Each parser of trimesh has different errors.
     except Exception as error:
-        raise InputError(
-            path, expected="a mesh", found=f"a file that cannot be read ({error})", remedy="export it again"
-        ) from error
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(
-            path,
-            expected=f"faces of its {len(vertices)} vertices",
-            found=f"vertex {faces.min() if faces.min() < 0 else faces.max()}",
-            remedy="export it again",
-        )
+        raise refusal(expected="a mesh", found=f"a file that cannot be read ({error})") from error
+    wrong = faces[(faces < 0) | (faces >= len(vertices))]
+    if wrong.size:
+        raise refusal(expected=f"faces of its {len(vertices)} vertices", found=f"vertex {wrong[0]}")
     return vertices[faces].reshape(-1, 3, 3)
-
-
-def _area_m2(triangles: Triangles) -> Float[np.ndarray, "faces"]:
-    a, b, c = triangles.swapaxes(0, 1)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2
-
-
-def _check_size(path: Path, mesh: Mesh, points_m: Float[np.ndarray, "points 3"]) -> None:
-    """Raise `InputError` unless points in the body frame have the size of a drone and are near the origin."""
-    extent = float(np.ptp(points_m, axis=0).max())
-    if not _SMALLEST_M <= extent <= _LARGEST_M:
-        raise InputError(
-            path,
-            expected=f"a drone of {_SMALLEST_M:g} to {_LARGEST_M:g} m over all",
-            found=f"{extent:.3g} m",
-            remedy="set scale to metres per unit of the file (0.001 for millimetres)",
-        )
-    if np.abs(points_m).max() > _LARGEST_M:
-        middle = (points_m.min(axis=0) + points_m.max(axis=0)) / 2 + mesh.origin_m
-        raise InputError(
-            path,
-            expected="the body origin in or near the drone",
-            found=f"the drone's middle at ({', '.join(f'{at:.3g}' for at in middle)}) m",
-            remedy="set origin_m to about this point",
-        )
-
-
-def _check_rotors(path: Path, reach_m: Float[np.ndarray, "rotors"]) -> None:
-    """Raise `InputError` if a rotor reaches farther from the origin than a drone can."""
-    for number, farthest_m in enumerate(reach_m):
-        if farthest_m > _LARGEST_M:
-            raise InputError(
-                path,
-                expected=f"rotors within {_LARGEST_M:g} m of the body origin",
-                found=f"rotors[{number}] that reaches {farthest_m:.3g} m",
-                remedy="give centre_m and radius_m in metres; the scale of the mesh does not apply to them",
-            )

@@ -1,4 +1,4 @@
-"""Conversion of a simulated sequence to the form of the real half of DPJAIT, which a Vicon system recorded.
+"""A simulated sequence in the form of the real half of DPJAIT, which a Vicon system recorded, for tests of its readers.
 
 The real half differs from the simulated half: four cameras of one type with lens distortion, 1924 x 1082 pixels, named
 by serial number, calibration in millimetres. The reference is one C3D file of marker crosses at 100 Hz. It begins at
@@ -8,9 +8,8 @@ middle of a cross is not the drone's body origin: evaluation finds the lever arm
 
 from __future__ import annotations
 
-import itertools
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,14 +17,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
-from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, Rig, to_pixels, undistort
-from psotrack.recordings import Recording, VideoInfo, VideoWriter, read_frames
+from psotrack.recordings import VideoInfo, VideoWriter, read_frames
 from psotrack.recordings.datasets.dpjait import (
     CALIBRATION,
     DETECTIONS,
     Detections,
-    mocap_markers_file,
     read_detections,
     read_mocap_markers,
     read_sequence,
@@ -33,7 +30,6 @@ from psotrack.recordings.datasets.dpjait import (
     write_detections,
 )
 from psotrack.recordings.mocap import Markers, write_c3d
-from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite
 
 #: Serial numbers of the dataset's cameras, without the fifth camera, which was a spare.
 SERIALS = ("55260362", "56339527", "60881257", "61016180")
@@ -52,91 +48,46 @@ _HIDDEN_PER_S, _HIDDEN_S, _SWAPPED_S = 0.1, 0.08, 0.2
 _REFLECTION_M = (1.3, -1.1, 0.02)
 
 
-@dataclass(frozen=True)
-class RealFormSettings:
-    """Properties of a recording in the real form that the simulated sequence does not decide.
+def write_as_real(
+    sequence: Path,
+    root: Path,
+    *,
+    rate_hz: float = 100.0,
+    offset_s: float = 0.37,
+    three_videos: bool = False,
+    seed: int = 0,
+) -> Path:
+    """Write a simulated sequence in the folder ROOT/Real_Data/RXX_Dn, where XX is the number in the sequence's name.
 
-    Attributes:
+    The lens shows more than the simulated image: 8 % of the pixels, at the edges, repeat its border. Marker positions
+    between the frames of the simulation are cubic splines; before frame 0 the drones stand still.
+
+    Args:
+        sequence: folder of the simulated sequence; its first four cameras are used.
+        root: root folder of the data.
         rate_hz: rate of the C3D file, hertz.
         offset_s: time in the C3D file at frame 0 of the videos, seconds; positive if the C3D file begins first.
         three_videos: whether to leave out the last camera's video, as in R17_D1_A.
         seed: seed of the markers' noise, gaps and swapped labels.
     """
-
-    rate_hz: float = 100.0
-    offset_s: float = 0.37
-    three_videos: bool = False
-    seed: int = 0
-
-
-def write_as_real(
-    sequence: str | Path,
-    root: str | Path,
-    settings: RealFormSettings | None = None,
-    *,
-    force: bool = False,
-    report: Report = no_progress,
-) -> Path:
-    """Write a simulated sequence in the folder ROOT/Real_Data/RXX_Dn, in the form of the dataset's real half.
-
-    XX is the number in the sequence's name, 99 if the name has no number; n is the number of drones.
-
-    The images are distorted by the lens and encoded again. The lens shows more than the simulated image: 8 % of
-    the pixels, at the edges, repeat the border of the simulated image. Marker positions between the frames of the
-    simulation are cubic splines; before frame 0 the drones stand still. `psotrack simulate NAME --set
-    cameras=laboratory_corners --no-masks --no-onboard` makes a sequence with all that this function uses.
-
-    Args:
-        sequence: folder of the simulated sequence; its first four cameras are used.
-        root: root folder of the data.
-        settings: properties of the C3D file and the number of videos; None: the defaults.
-        force: whether to replace an existing sequence.
-        report: shows the progress in frames of all videos.
-
-    Returns:
-        Folder of the new sequence.
-
-    Raises:
-        InputError: the sequence cannot be read, has fewer than four cameras, or has no files of markers.
-        SettingsError: the rate is not above 0, or the C3D file would begin after the end of the videos.
-        OutputError: the new sequence exists and `force` is not set, or it cannot be written.
-    """
-    settings = settings or RealFormSettings()
-    check_positive("rate_hz", settings.rate_hz)
     simulated = read_sequence(sequence)
-    if len(simulated.videos) < len(SERIALS):
-        found = f"{len(simulated.videos)}"
-        raise InputError(sequence, expected=f"videos of {len(SERIALS)} cameras", found=found)
-    markers_m = _simulated_markers(simulated)
-    rng = np.random.default_rng(settings.seed)
-    recording = _recording(markers_m, simulated.fps, settings, rng)
-    names = [name for name in simulated.rig.names if name in simulated.videos][: len(SERIALS)]
+    names = simulated.rig.names[: len(SERIALS)]
     rig = _real_rig(simulated.rig.select(names))
-    folder = Path(root) / "Real_Data" / f"R{_number(simulated.name):02d}_D{markers_m.shape[1]}"
-    refuse_to_overwrite(folder, force)
-    filmed = list(zip(rig.names, names, strict=True))[: len(SERIALS) - settings.three_videos]
-    with (
-        atomic_write(folder) as growing,
-        report("lens", sum(simulated.videos[name].num_frames for _, name in filmed)) as advance,
-    ):
-        write_calibration(growing / CALIBRATION, rig, unit="mm")
-        write_c3d(growing / f"{folder.name}.c3d", recording)
-        for serial, name in filmed:
-            before, lens = (
-                any_rig.cameras[any_rig.names.index(key)]
-                for any_rig, key in ((simulated.rig, name), (rig, serial))
-            )
-            _write_video(growing / f"{serial}.avi", simulated.videos[name], before, lens, advance)
-            if simulated.detections and name in simulated.detections:
-                boxes = _distort_boxes(read_detections(simulated.detections[name]), before, lens)
-                write_detections(growing / DETECTIONS / f"{serial}.csv", boxes)
+    paths = sorted(Path(sequence).glob("dron*_markers_*.csv"))
+    markers_m = np.stack([read_mocap_markers(path) for path in paths], axis=1)
+    number = re.match(r"[A-Za-z]*(\d+)", simulated.name)[1]
+    folder = Path(root) / "Real_Data" / f"R{int(number):02d}_D{len(paths)}"
+    folder.mkdir(parents=True)
+    write_calibration(folder / CALIBRATION, rig, unit="mm")
+    rng = np.random.default_rng(seed)
+    write_c3d(folder / f"{folder.name}.c3d", _recording(markers_m, simulated.fps, rate_hz, offset_s, rng))
+    for index in range(len(SERIALS) - three_videos):
+        name, serial = names[index], SERIALS[index]
+        before, lens = simulated.rig.cameras[simulated.rig.names.index(name)], rig.cameras[index]
+        _write_video(folder / f"{serial}.avi", simulated.videos[name], before, lens)
+        boxes = _distort_boxes(read_detections(simulated.detections[name]), before, lens)
+        write_detections(folder / DETECTIONS / f"{serial}.csv", boxes)
     return folder
-
-
-def _number(name: str) -> int:
-    """Number in the name of the simulated sequence; 99 if the name has no number."""
-    match = re.match(r"[A-Za-z]*(\d+)", name)
-    return int(match[1]) if match else 99
 
 
 # --- cameras, videos and boxes
@@ -162,14 +113,13 @@ def _real_rig(rig: Rig) -> Rig:
     )
 
 
-def _write_video(path: Path, video: VideoInfo, before: Camera, lens: Camera, advance: Advance) -> None:
+def _write_video(path: Path, video: VideoInfo, before: Camera, lens: Camera) -> None:
     width, height = (int(side) for side in lens.image_size_wh)
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     xs, ys = np.moveaxis(_convert_pixels(lens, before, pixels).astype(np.float32), -1, 0)
     with VideoWriter(path, video.fps, (width, height)) as writer:
         for frame in read_frames(video):
             writer.write(cv2.remap(frame, xs, ys, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
-            advance(1)
 
 
 def _distort_boxes(detections: Detections, before: Camera, lens: Camera) -> Detections:
@@ -192,29 +142,16 @@ def _convert_pixels(
 # --- the C3D file
 
 
-def _simulated_markers(simulated: Recording) -> Float[np.ndarray, "frames drones markers 3"]:
-    """(frames, drones, markers, 3), positions of the markers at the frames of the videos, world, metres."""
-    paths = (simulated.folder / mocap_markers_file(number, simulated.fps) for number in itertools.count(1))
-    drones = [read_mocap_markers(path) for path in itertools.takewhile(Path.exists, paths)]
-    if not drones:
-        expected = f"markers of its drones, {mocap_markers_file(1, simulated.fps)} ..."
-        raise InputError(simulated.folder, expected=expected, found="none", remedy="simulate it again")
-    return np.stack(drones, axis=1)
-
-
 def _recording(
     markers_m: Float[np.ndarray, "frames drones markers 3"],
     fps: float,
-    settings: RealFormSettings,
+    rate_hz: float,
+    offset_s: float,
     rng: np.random.Generator,
 ) -> Markers:
     """Markers as a mocap system would record them, until the end of the videos."""
-    rate_hz, offset_s = settings.rate_hz, settings.offset_s
     num_frames, num_drones, per_drone, _ = markers_m.shape
     last_s = (num_frames - 1) / fps
-    if not -last_s < offset_s < np.inf:
-        expected = f"more than {-last_s:g} s, because the videos have ended by then"
-        raise SettingsError("offset_s", expected=expected, found=f"{offset_s:g}")
     time_s = np.arange(int((last_s + offset_s) * rate_hz + 1e-6) + 1) / rate_hz - offset_s
     spline = CubicSpline(np.arange(num_frames) / fps, markers_m.reshape(num_frames, -1))
     shown_m = spline(np.maximum(time_s, 0.0)).reshape(len(time_s), -1, 3)
