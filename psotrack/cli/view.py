@@ -86,7 +86,8 @@ def view(
 ) -> None:
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
 
-    Several files of TRACKS are compared: each has a colour. Rerun is an extra: pip install 'psotrack[view]'.
+    Several files of TRACKS are compared: each has a colour. Rerun is an extra, pip install '.[view]' in the checkout
+    of psotrack.
 
     \b
     Examples:
