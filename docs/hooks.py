@@ -152,13 +152,8 @@ def notebook(path: Path) -> dict[str, str | bytes]:
     body = re.sub(r"<style scoped>.*?</style>\n?", "", body, flags=re.DOTALL)
     # Tables of pandas look like the other tables of the pages.
     body = body.replace('<table border="1" class="dataframe">', "<table>")
-    body = re.sub(r"\]\(((?:\.\./)+)(experiments|README)([^)]*)\)", _repository_link, body)
     files: dict[str, str | bytes] = {f"{path.stem}.md": f"{body}\n"}
     return files | resources["outputs"]
-
-
-def _repository_link(match: re.Match[str]) -> str:
-    return f"](https://github.com/psotrack/psotrack/blob/main/{match[2]}{match[3]})"
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
