@@ -10,22 +10,25 @@ import inspect
 import json
 import sys
 import tomllib
-from functools import cache
+from collections.abc import Iterator
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import click
 import msgspec
 import pandas as pd
 from griffe import Docstring, DocstringSectionKind
 from jinja2 import Environment, StrictUndefined
 
+#: Functions of the pages that are statistics of a column, and the names of these in pandas.
+STATISTICS = {"mean": "mean", "total": "sum", "least": "min", "most": "max"}
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import _results  # noqa: E402
-from cli_reference import reference as cli_reference  # noqa: E402
 from griffe_examples import split_shared_items  # noqa: E402
 
 from psotrack.settings import TrackSettings  # noqa: E402
@@ -81,24 +84,9 @@ def column(name: str, value: str, /, **where: Any) -> pd.Series:
     return table[value]
 
 
-def mean(name: str, value: str, /, **where: Any) -> float:
-    """Mean of a column over the rows of a result."""
-    return float(column(name, value, **where).mean())
-
-
-def least(name: str, value: str, /, **where: Any) -> float:
-    """Smallest value of a column over the rows of a result."""
-    return float(column(name, value, **where).min())
-
-
-def most(name: str, value: str, /, **where: Any) -> float:
-    """Largest value of a column over the rows of a result."""
-    return float(column(name, value, **where).max())
-
-
-def total(name: str, value: str, /, **where: Any) -> float:
-    """Sum of a column over the rows of a result."""
-    return float(column(name, value, **where).sum())
+def statistic(how: str, name: str, value: str, /, **where: Any) -> float:
+    """Mean, sum, smallest or largest value of a column over the rows of a result."""
+    return float(getattr(column(name, value, **where), how)())
 
 
 def figure(name: str, path: str) -> Any:
@@ -205,6 +193,22 @@ def records() -> str:
     return markdown(pd.DataFrame(lines))
 
 
+def cli_reference() -> str:
+    """The help of every command."""
+    from psotrack.cli import cli
+
+    return "\n\n".join(_help(cli, click.Context(cli, info_name="psotrack", terminal_width=100), 2))
+
+
+def _help(command: click.Command, context: click.Context, level: int) -> Iterator[str]:
+    path = context.command_path
+    yield f"{'#' * level} {path} {{ #{path.replace(' ', '-')} }}\n\n```text\n{command.get_help(context)}\n```"
+    if isinstance(command, click.Group):
+        for name in command.list_commands(context):
+            inner = command.commands[name]
+            yield from _help(inner, click.Context(inner, parent=context, info_name=name), min(level + 1, 3))
+
+
 def struct_tables(path: str) -> str:
     """Markdown tables of the fields of a msgspec Struct and of its inner Structs.
 
@@ -298,23 +302,16 @@ def number(value: float, decimals: int = 1) -> str:
 
 ENVIRONMENT = Environment(undefined=StrictUndefined, autoescape=False, keep_trailing_newline=True)
 ENVIRONMENT.filters.update(mm=millimetres, percent=percent, number=number)
+ENVIRONMENT.globals.update({name: partial(statistic, how) for name, how in STATISTICS.items()})
 ENVIRONMENT.globals.update(
-    mean=mean,
-    least=least,
-    most=most,
-    total=total,
-    figure=figure,
-    pivot=pivot,
-    result_table=result_table,
-    part=part,
-    accuracy_table=accuracy_table,
-    cli_reference=cli_reference,
-    published=published,
-    provenance=provenance,
-    records=records,
-    struct_tables=struct_tables,
-    rows=rows,
-)
+    {
+        function.__name__: function
+        for function in (
+            figure, pivot, result_table, part, accuracy_table, cli_reference, published, provenance, records,
+            struct_tables, rows,
+        )
+    }
+)  # fmt: skip
 
 
 def render(text: str) -> str:

@@ -34,11 +34,13 @@ SHOWN_CAMERAS = 4
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demonstration shows: tables for the terminal, and where the picture is."""
+    """What the demonstration shows: tables for the terminal, and where the files are."""
 
     errors: Table
     stages: Table
     picture: Path
+    tracks: Path
+    sequence: Path
 
 
 def run(
@@ -83,7 +85,9 @@ def run(
         "evaluate, draw": time.perf_counter() - ended,
         "all": time.perf_counter() - began,
     }
-    return Demo(tables.render(evaluation, title=recording.name), _stage_table(stages), picture)
+    return Demo(
+        tables.render(evaluation, title=recording.name), _stage_table(stages), picture, tracks, folder
+    )
 
 
 def save_picture(

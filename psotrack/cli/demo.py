@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
 from pathlib import Path
 
 import click
@@ -41,3 +44,7 @@ def demo(out: Path, seed: int, jobs: int | None, force: bool, quiet: bool) -> No
         console.print(result.errors)
         console.print(result.stages)
         console.print(f"picture: {result.picture}", soft_wrap=True)
+        # A command of an environment that is not activated is typed with its path.
+        program = "psotrack" if shutil.which("psotrack") else os.path.relpath(sys.argv[0])
+        flight = f"{result.tracks} --sequence {result.sequence}"
+        console.print(f"next: {program} view {flight}", soft_wrap=True, markup=False, highlight=False)
