@@ -139,7 +139,7 @@ class Shell:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         settings = {
-            "PSOTRACK_CACHE": str(folder / "cache"),
+            "PSOTRACK_CACHE": str(folder / "users_cache"),
             "PYTHONPATH": str(ROOT),
             "PSOTRACK_PROGRESS": "none",
         }
