@@ -14,6 +14,8 @@ oracles = 'trackeval>=1.3' 'evo>=1.38'
 oracle = if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python --no-deps $(oracles); \
 	else $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(oracles); fi
 
+failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not be installed into $(VENV) (see above); remove $(VENV) to start anew" >&2
+
 # One worker per processor; a worker that has finished takes tests of another. Bytecode is kept between runs, because
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
@@ -23,17 +25,25 @@ pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist w
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-$(VENV)/.installed: pyproject.toml
+$(VENV)/.package: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	  || { echo "psotrack: set-up failed: '$(PYTHON)' is not Python 3.11 or newer; name one, e.g. make PYTHON=python3.12" >&2; exit 1; }
+	@echo "psotrack: making a Python environment in $(VENV)"
 	@{ if command -v uv >/dev/null 2>&1; then \
 	    test -d $(VENV) || uv venv --quiet --python $(PYTHON) $(VENV); \
 	  else \
 	    test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV); \
-	  fi && $(call install,test$(comma)lint) && $(oracle); } || { echo "psotrack: set-up failed: the packages of pyproject.toml could not be installed into $(VENV) (see above); remove $(VENV) to start anew" >&2; exit 1; }
+	  fi \
+	  && echo "psotrack: installing psotrack, its libraries (JAX, OpenCV, SciPy, pandas and more) and its viewer: 1.7 GB on the disk, some minutes" \
+	  && $(call install,view); } || { $(failed); exit 1; }
 	@touch $@
 
-demo: $(VENV)/.installed  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
+$(VENV)/.installed: $(VENV)/.package
+	@echo "psotrack: installing what tests and lint need (Hypothesis, Jupyter, Playwright, ruff, mypy and more): 0.6 GB more, a minute or two"
+	@{ $(call install,test$(comma)lint) && $(oracle); } || { $(failed); exit 1; }
+	@touch $@
+
+demo: $(VENV)/.package  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
 	@$(BIN)/psotrack demo --out demo --force
 
 test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/test_video.py ..." for some files

@@ -1,6 +1,6 @@
 """Figures that the pages and the README show, taken from the result files of the experiments.
 
-Pages call these functions in Jinja expressions, for instance `{{ mean("measure", "mean_error_m") | mm }}`.
+Pages call these functions in Jinja expressions, for instance `{{ mean("ablation", "mean_error_m") | mm }}`.
 A result, a column or a row that is missing raises `MissingFigureError`, which stops the build.
 """
 
@@ -10,23 +10,28 @@ import inspect
 import json
 import sys
 import tomllib
-from functools import cache
+from collections.abc import Iterator
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+import click
 import msgspec
 import pandas as pd
 from griffe import Docstring, DocstringSectionKind
 from jinja2 import Environment, StrictUndefined
 
+#: Functions of the pages that are statistics of a column, and the names of these in pandas.
+STATISTICS = {"mean": "mean", "total": "sum", "least": "min", "most": "max"}
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT / "experiments"))
+sys.path[:0] = [str(ROOT), str(ROOT / "experiments")]
 
 import _results  # noqa: E402
-from cli_reference import reference as cli_reference  # noqa: E402
 from griffe_examples import split_shared_items  # noqa: E402
+
+from psotrack.settings import TrackSettings  # noqa: E402
 
 
 class MissingFigureError(Exception):
@@ -79,24 +84,9 @@ def column(name: str, value: str, /, **where: Any) -> pd.Series:
     return table[value]
 
 
-def mean(name: str, value: str, /, **where: Any) -> float:
-    """Mean of a column over the rows of a result."""
-    return float(column(name, value, **where).mean())
-
-
-def least(name: str, value: str, /, **where: Any) -> float:
-    """Smallest value of a column over the rows of a result."""
-    return float(column(name, value, **where).min())
-
-
-def most(name: str, value: str, /, **where: Any) -> float:
-    """Largest value of a column over the rows of a result."""
-    return float(column(name, value, **where).max())
-
-
-def total(name: str, value: str, /, **where: Any) -> float:
-    """Sum of a column over the rows of a result."""
-    return float(column(name, value, **where).sum())
+def statistic(how: str, name: str, value: str, /, **where: Any) -> float:
+    """Mean, sum, smallest or largest value of a column over the rows of a result."""
+    return float(getattr(column(name, value, **where), how)())
 
 
 def figure(name: str, path: str) -> Any:
@@ -149,40 +139,38 @@ def part(name: str, file: str, title: str) -> str:
 
 
 def accuracy_table() -> str:
-    """The accuracy table of the README: mean error, and the error without constant offsets in brackets, metres."""
+    """The accuracy table of the README: mean error, and the error without constant offsets in brackets, millimetres."""
     sequences = {
         "S01_D2_A": "two drones that pass at 0.3 m",
         "S02_D4_A": "four drones",
         "S04_D10": "ten drones, passes at 0.4 m",
     }
     methods = {
-        "joint swarm": ["joint 50 x 50", "joint 100 x 70"],
-        "one swarm per drone": ["per drone 30 x 20", "per drone 50 x 30", "per drone 30 x 30 (the defaults)"],
-        "joint swarm with the paper's hard score": [
-            "joint 50 x 50, the paper's hard one-box score",
-            "joint 100 x 70, the paper's hard one-box score",
-        ],
-        "projection lines, from detections": ["projection lines"],
-        "swarm and projection lines, fused": ["fused"],
+        "swarm": "swarm, the default",
+        "lines on blobs": "projection lines, from the foreground",
+        "lines on detections": "projection lines, from detections",
+        "fused": "both, fused",
     }
-    table = all_rows("measure")
+    table = all_rows("reference")
     lines = [["", *(f"{name}: {words}" for name, words in sequences.items())]]
-    for title, names in methods.items():
-        line = [title]
-        for sequence in sequences:
-            chosen = table[(table["sequence"] == sequence) & table["method"].isin(names)]
-            raw, centred = chosen["mean_error_m"].mean(), chosen["offset_removed_mean_error_m"].mean()
-            line.append("" if chosen.empty else f"{raw:.3f} m ({centred:.4f} m)")
-        lines.append(line)
+    for method, title in methods.items():
+        chosen = table[table["method"] == method]
+        means = [
+            chosen.loc[chosen["flight"].str.startswith(name), ["mean_mm", "centred_mm"]].mean()
+            for name in sequences
+        ]
+        lines.append([title, *(f"{raw:.0f} mm ({centred:.1f} mm)" for raw, centred in means)])
     lines.append(["the paper, on its own videos", *(published(name) for name in sequences)])
-    return markdown(pd.DataFrame(lines[1:], columns=lines[0]))
+    background = TrackSettings().silhouettes.background
+    made = f"Background model: `{background}`, the default. Made by {provenance('reference')}."
+    return f"{markdown(pd.DataFrame(lines[1:], columns=lines[0]))}\n\n{made}"
 
 
 def published(name: str) -> str:
     """Range of the mean errors that the paper states for a sequence."""
     path = ROOT / "experiments" / "table5" / "published.toml"
     low, high = tomllib.loads(path.read_text(encoding="utf-8"))[name]
-    return f"{low:.3f} to {high:.3f} m" if high > low else f"{low:.3f} m"
+    return f"{1000 * low:.0f} to {1000 * high:.0f} mm" if high > low else f"{1000 * low:.0f} mm"
 
 
 def provenance(name: str) -> str:
@@ -203,6 +191,22 @@ def records() -> str:
         made = provenance(name) if result.record.exists() else "not made yet"
         lines.append({"result": f"`{name}`", "shows": result.says, "made by": made})
     return markdown(pd.DataFrame(lines))
+
+
+def cli_reference() -> str:
+    """The help of every command."""
+    from psotrack.cli import cli
+
+    return "\n\n".join(_help(cli, click.Context(cli, info_name="psotrack", terminal_width=100), 2))
+
+
+def _help(command: click.Command, context: click.Context, level: int) -> Iterator[str]:
+    path = context.command_path
+    yield f"{'#' * level} {path} {{ #{path.replace(' ', '-')} }}\n\n```text\n{command.get_help(context)}\n```"
+    if isinstance(command, click.Group):
+        for name in command.list_commands(context):
+            inner = command.commands[name]
+            yield from _help(inner, click.Context(inner, parent=context, info_name=name), min(level + 1, 3))
 
 
 def struct_tables(path: str) -> str:
@@ -298,23 +302,16 @@ def number(value: float, decimals: int = 1) -> str:
 
 ENVIRONMENT = Environment(undefined=StrictUndefined, autoescape=False, keep_trailing_newline=True)
 ENVIRONMENT.filters.update(mm=millimetres, percent=percent, number=number)
+ENVIRONMENT.globals.update({name: partial(statistic, how) for name, how in STATISTICS.items()})
 ENVIRONMENT.globals.update(
-    mean=mean,
-    least=least,
-    most=most,
-    total=total,
-    figure=figure,
-    pivot=pivot,
-    result_table=result_table,
-    part=part,
-    accuracy_table=accuracy_table,
-    cli_reference=cli_reference,
-    published=published,
-    provenance=provenance,
-    records=records,
-    struct_tables=struct_tables,
-    rows=rows,
-)
+    {
+        function.__name__: function
+        for function in (
+            figure, pivot, result_table, part, accuracy_table, cli_reference, published, provenance, records,
+            struct_tables, rows,
+        )
+    }
+)  # fmt: skip
 
 
 def render(text: str) -> str:

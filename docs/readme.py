@@ -8,7 +8,6 @@ The marker `<!-- figures: NAME -->` begins a part that the function NAME of `fig
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 from pathlib import Path
@@ -19,26 +18,16 @@ README = Path(__file__).resolve().parents[1] / "README.md"
 PART = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def rewritten(text: str) -> str:
-    """A text whose marked parts are written anew."""
-    return PART.sub(lambda match: f"{match[1]}{getattr(figures, match[2])()}\n{match[3]}", text)
-
-
 def main() -> None:
     """Read the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--check", action="store_true", help="write nothing")
-    options = parser.parse_args()
     text = README.read_text(encoding="utf-8")
-    if not PART.search(text):
+    new, count = PART.subn(lambda match: f"{match[1]}{getattr(figures, match[2])()}\n{match[3]}", text)
+    if count == 0:
         sys.exit("README.md: expected a part `<!-- figures: NAME -->` ... `<!-- end -->`, found none")
-    new = rewritten(text)
-    if options.check and new != text:
-        sys.exit("README.md: its figures differ from the result files; run `python docs/readme.py`")
-    if not options.check:
+    if "--check" not in sys.argv:
         README.write_text(new, encoding="utf-8")
+    elif new != text:
+        sys.exit("README.md: its figures differ from the result files; run `python docs/readme.py`")
 
 
 if __name__ == "__main__":

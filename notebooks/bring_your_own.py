@@ -17,7 +17,7 @@
 # and Ostermeier 2001) and differential evolution (Storn and Price 1997). A small sweep compares them with the package's
 # particle swarm at equal numbers of evaluations of the score.
 #
-# evosax comes with `pip install 'psotrack[notebooks]'`.
+# evosax comes with `pip install '.[notebooks]'`.
 
 # %%
 import os

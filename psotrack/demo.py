@@ -29,11 +29,13 @@ SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demonstration shows: tables for the terminal, and where the picture is."""
+    """What the demonstration shows: tables for the terminal, and where the files are."""
 
     errors: Table
     stages: Table
     picture: Path
+    tracks: Path
+    sequence: Path
 
 
 def run(
@@ -77,7 +79,9 @@ def run(
         "evaluate, draw": time.perf_counter() - ended,
         "all": time.perf_counter() - began,
     }
-    return Demo(tables.render(evaluation, title=recording.name), _stage_table(stages), picture)
+    return Demo(
+        tables.render(evaluation, title=recording.name), _stage_table(stages), picture, tracks, folder
+    )
 
 
 def _stage_table(seconds: dict[str, float]) -> Table:

@@ -16,6 +16,11 @@ LONGEST_MESSAGE = 290
 _SHORTEST = 150
 
 
+def install_command(extra: str) -> str:
+    """What to type to install an extra of the package, such as `view`."""
+    return f"pip install '.[{extra}]' in the checkout of psotrack"
+
+
 class PsotrackError(Exception):
     """Base class of all exceptions that psotrack raises on purpose.
 

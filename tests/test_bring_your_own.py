@@ -17,7 +17,6 @@ from helpers import make_once
 from sweeps import COMPILER
 
 import psotrack as pt
-from psotrack.cli import cli
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import ForegroundSettings, find_background
 from psotrack.geometry import project_boxes
@@ -591,12 +590,3 @@ def test_a_detector_that_no_package_adds_is_one_line(site, root, tmp_path):
     ]:
         ran = run_psotrack(site, "detect", sequence, "--detector", name, "--out", tmp_path / "boxes")
         assert (ran.returncode, ran.stderr) == (2, f"psotrack: {message}\n")
-
-
-def test_the_page_on_completion_shows_the_lines_of_the_help():
-    page = (ROOT / "docs" / "pages" / "how-to" / "completion.md").read_text().replace("\\|", "|")
-    lines = [line.strip() for line in cli.help.splitlines() if "_PSOTRACK_COMPLETE" in line]
-    assert len(lines) == 3
-    for line in lines:
-        file, command = line.split(maxsplit=1)
-        assert f"`{file}` | `{command}` |" in page

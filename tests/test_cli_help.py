@@ -189,8 +189,8 @@ def test_an_unknown_shell_is_one_line() -> None:
     assert "bash_source, zsh_source or fish_source" in result.stderr
 
 
-def test_hints_about_pip_need_no_checkout() -> None:
-    """`pip install .` works only in a checkout, so messages and help name the package."""
+def test_hints_about_pip_are_those_of_a_checkout() -> None:
+    """The package is on no index, so messages and help say `pip install '.[EXTRA]'`."""
     hints = [
         line
         for path in Path(cli.__file__).parents[1].rglob("*.py")
@@ -198,4 +198,4 @@ def test_hints_about_pip_need_no_checkout() -> None:
         if "pip install" in line
     ]
     assert len(hints) >= 4
-    assert not [line for line in hints if not re.search(r"pip install 'psotrack\[\w+\]'", line)]
+    assert not [line for line in hints if not re.search(r"pip install '\.\[[\w{}]+\]'", line)]

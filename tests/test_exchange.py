@@ -636,9 +636,9 @@ def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     export_tracks(small_tracks(), "mcap", tmp_path / "tracks.mcap")
     for name in ("mcap.reader", "mcap_ros2.writer"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(SettingsError, match=r"pip install 'psotrack\[ros\]'"):
+    with pytest.raises(SettingsError, match=r"pip install '\.\[ros\]'"):
         export_tracks(small_tracks(), "mcap", tmp_path / "again.mcap")
-    with pytest.raises(SettingsError, match=r"pip install 'psotrack\[ros\]'"):
+    with pytest.raises(SettingsError, match=r"pip install '\.\[ros\]'"):
         read_tracks(tmp_path / "tracks.mcap")
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, install_command
 from psotrack.simulation import flight_space
 from psotrack.simulation.flights import devices
 from psotrack.simulation.flights.devices import Gamepad, Pilot, Script, key_sticks, open_device
@@ -495,7 +495,8 @@ def pyglet(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ["gamepad", "keyboard"])
 def test_without_pyglet_the_error_says_how_to_install_it(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyglet", None)
-    sentence = f"device {name}: expected the package pyglet, found it is not installed; pip install 'psotrack[control]'"
+    what = f"device {name}: expected the package pyglet, found it is not installed"
+    sentence = f"{what}; {install_command('control')}"
     with pytest.raises(SettingsError, match=f"^{re.escape(sentence)}$"):
         open_device(name, LABORATORY).__enter__()
 

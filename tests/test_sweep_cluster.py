@@ -59,9 +59,7 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
 
 def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(
-        SettingsError, match=r"expected Dask, found .*; install it with `pip install 'psotrack\[dask\]'`"
-    ):
+    with pytest.raises(SettingsError, match=r"expected Dask, found .*; pip install '\.\[dask\]'"):
         run_on_cluster(read_grid(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)
 
 

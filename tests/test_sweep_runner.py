@@ -277,7 +277,7 @@ def test_a_missing_gpu_is_one_line(tmp_path: Path) -> None:
     result = psotrack(tmp_path, "sweep", grid_file(tmp_path, [3]), "--out", tmp_path, "--device", "gpu")
     assert result.returncode == 2
     assert result.stderr.count("\n") == 1
-    assert "pip install 'psotrack[cuda]'" in result.stderr
+    assert "pip install '.[cuda]'" in result.stderr
 
 
 @pytest.mark.slow

@@ -318,7 +318,7 @@ LIMITED = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "words"),
-    [(HIDDEN, ["pip install 'psotrack[view]'"]), (LIMITED, ["x.rrd", "the whole file", "disk"])],
+    [(HIDDEN, ["pip install '.[view]'"]), (LIMITED, ["x.rrd", "the whole file", "disk"])],
     ids=["without Rerun", "on a full disk"],
 )
 def test_what_the_machine_lacks_is_one_line(folder, tmp_path, code, words):

@@ -183,5 +183,5 @@ def test_a_host_that_is_unknown() -> None:
 
 def test_without_the_package_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
-    with pytest.raises(SettingsError, match=r"pip install 'psotrack\[live\]'"):
+    with pytest.raises(SettingsError, match=r"pip install '\.\[live\]'"):
         WebSocketLines("9000")

@@ -1,6 +1,6 @@
 """Detections without labels: psotrack's defaults beside Stone Soup's GNN and JPDA, each at its best of a grid.
 
-    pip install 'psotrack[bench]'
+    pip install '.[bench]'
     python experiments/accuracy/association.py --data data [--real real] [--seeds 20 21] [--scenes slow 2] [--quick]
 
 Flights by a formula (`formula_flights`) and, where --real names a folder of public repositories, parts of real flights

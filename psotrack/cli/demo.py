@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
 from pathlib import Path
 
 import click
@@ -32,3 +35,6 @@ def demo(output: Output, out: Path, seed: int, jobs: int | None) -> None:
     result = run(out, seed=seed, jobs=jobs, force=output.force, report=output.report)
     output.show(result.errors, result.stages)
     output.say(f"picture: {result.picture}")
+    # A command of an environment that is not activated is typed with its path.
+    program = "psotrack" if shutil.which("psotrack") else os.path.relpath(sys.argv[0])
+    output.say(f"next: {program} view {result.tracks} {result.sequence}")

@@ -66,7 +66,8 @@ def view(
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
 
     SEQ is the recording, with its cameras, their images and its reference; the record beside TRACKS names it. Several
-    files of TRACKS are compared: each has a colour. Rerun is an extra: pip install '.[view]' in the checkout.
+    files of TRACKS are compared: each has a colour. Rerun is an extra, pip install '.[view]' in the checkout
+    of psotrack.
 
     \b
     Examples:

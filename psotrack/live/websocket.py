@@ -13,7 +13,7 @@ import re
 import threading
 from typing import TYPE_CHECKING
 
-from psotrack.errors import OutputError, SettingsError
+from psotrack.errors import OutputError, SettingsError, install_command
 from psotrack.live.messages import host_and_port, lines_of
 from psotrack.trajectories import Trajectories
 
@@ -62,7 +62,7 @@ class WebSocketLines:
         try:
             from websockets.asyncio.server import broadcast, serve
         except ModuleNotFoundError as error:
-            expected, remedy = "the package websockets", "pip install 'psotrack[live]'"
+            expected, remedy = "the package websockets", install_command("live")
             raise SettingsError(
                 "--websocket", expected=expected, found="it is not installed", remedy=remedy
             ) from error

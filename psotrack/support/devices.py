@@ -6,7 +6,7 @@ import contextlib
 import os
 from typing import Literal
 
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, install_command
 
 Device = Literal["cpu", "gpu"]
 
@@ -20,7 +20,7 @@ def use_device(device: Device) -> None:
     import jax
 
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[device])
-    remedy = "a GPU needs NVIDIA's driver and `pip install 'psotrack[cuda]'`" if device == "gpu" else ""
+    remedy = f"a GPU needs NVIDIA's driver and {install_command('cuda')}" if device == "gpu" else ""
     try:
         found = jax.default_backend()
     except (RuntimeError, AssertionError) as error:

@@ -19,7 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from psotrack.errors import InputError, PsotrackError, SettingsError
+from psotrack.errors import InputError, PsotrackError, SettingsError, install_command
 from psotrack.foreground.silhouettes import compute
 from psotrack.support import (
     Device,
@@ -168,9 +168,8 @@ def _distributed() -> Any:
     try:
         import distributed
     except ImportError as error:
-        remedy = "install it with `pip install 'psotrack[dask]'`"
         raise SettingsError(
-            "--cluster", expected="Dask", found="no package distributed", remedy=remedy
+            "--cluster", expected="Dask", found="no package distributed", remedy=install_command("dask")
         ) from error
     # At the level INFO, Dask reports every worker that starts and ends.
     logging.getLogger("distributed").setLevel(logging.WARNING)

@@ -69,7 +69,8 @@ def fly(
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in
     .sticks.csv. --device repeats a flight from such a file. The buttons start and back, the key Esc and Ctrl-C end the
-    flight; the flight until then is kept. Controllers and the keyboard need: pip install '.[control]'
+    flight; the flight until then is kept. Controllers and the keyboard are an extra,
+    pip install '.[control]' in the checkout of psotrack.
 
     \b
     Examples:

@@ -8,7 +8,7 @@
 
 Stamps are times on the recording's clock, from 0 on. A drone whose name is no ROS name, such as `0`, has the topic
 /drone_0/pose; the metadata record `psotrack` has the names. A folder is a rosbag2 bag with one MCAP file. The libraries
-mcap and mcap-ros2-support are an extra: `pip install 'psotrack[ros]'`.
+mcap and mcap-ros2-support are an extra: `pip install '.[ros]'`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, install_command
 from psotrack.recordings import read_frames
 from psotrack.recordings.exchange import ros_messages as ros
 from psotrack.recordings.exchange.camera_boxes import CameraFrames, camera_frames
@@ -358,5 +358,5 @@ def _library(name: str) -> ModuleType:
     except ImportError as error:
         raise SettingsError(
             "mcap", expected="the packages mcap and mcap-ros2-support", found=f"{error}".lower(),
-            remedy="pip install 'psotrack[ros]'",
+            remedy=install_command("ros"),
         ) from error  # fmt: skip

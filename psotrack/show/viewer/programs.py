@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from psotrack.errors import OutputError, SettingsError
+from psotrack.errors import OutputError, SettingsError, install_command
 from psotrack.support.interrupts import unhurried_end
 
 _HOST = "127.0.0.1"
@@ -64,7 +64,7 @@ def check_installed() -> None:
             "the viewer",
             expected="the package rerun-sdk",
             found="that it is not installed",
-            remedy="pip install 'psotrack[view]'",
+            remedy=install_command("view"),
         ) from error
 
 

@@ -1,7 +1,7 @@
 """Input devices for flying by hand: a game controller, the keyboard, or a file of stick positions.
 
 The sticks are in mode 2, which most pilots know: the left stick controls climb and turn, the right stick controls
-forward and sideways motion. Controllers and windows need pyglet, an extra (`pip install 'psotrack[control]'`) that is
+forward and sideways motion. Controllers and windows need pyglet, an extra (`pip install '.[control]'`) that is
 imported at the first use.
 """
 

@@ -1,6 +1,6 @@
 """The pilot's window: help for keys or sticks, the drone in the hall seen from above, its height and its speed.
 
-The window needs pyglet, an extra (`pip install 'psotrack[control]'`) that is imported when the window opens.
+The window needs pyglet, an extra (`pip install '.[control]'`) that is imported when the window opens.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from types import ModuleType
 
 import numpy as np
 
-from psotrack.errors import SettingsError
+from psotrack.errors import SettingsError, install_command
 from psotrack.simulation.flights.dynamics import FlightState, Space
 
 _PLAN_PX = 520
@@ -39,7 +39,7 @@ def pyglet_module(name: str, device: str) -> ModuleType:
             f"device {device}",
             expected="the package pyglet",
             found="it is not installed",
-            remedy="pip install 'psotrack[control]'",
+            remedy=install_command("control"),
         ) from error
     try:
         return importlib.import_module(f"pyglet.{name}")
