@@ -268,7 +268,7 @@ class TestReading:
         lab.mkdir()
         (lab / "recording.toml").write_text("version = 1", encoding="utf-8")
         with pytest.raises(
-            InputError, match=r"lab: expected a file of tracks, found a recording.*--sequence"
+            InputError, match=r"lab: expected a file of tracks, found a recording; name the recording last"
         ):
             read_flight([path, lab])
         assert split_sequence([path, lab]) == ((path,), lab)

@@ -47,7 +47,12 @@ def commands(text: str) -> Iterator[list[str]]:
 def inner_command(words: list[str]) -> tuple[click.Context, list[str]]:
     """The context of the command that some words name, and the words behind the name."""
     context, words = click.Context(cli, info_name="psotrack"), list(words)
-    while isinstance(context.command, click.Group) and words and not words[0].startswith("-"):
+    while isinstance(context.command, click.Group) and words:
+        default = getattr(context.command, "default", "")
+        if default and words[0] not in context.command.commands:
+            words.insert(0, default)
+        if words[0].startswith("-"):
+            break
         found = context.command.get_command(context, words[0])
         if found is None:
             raise click.UsageError(f"no command {words[0]}")
@@ -123,7 +128,7 @@ def test_every_example_of_a_help_is_understood() -> None:
         ("psotrack track flight --out tracks.csv --smooth | head", None),
         ("psotrack trak flight", "no command trak"),
         ("psotrack track flight --out tracks.csv --smoth", "--smoth"),
-        ("psotrack track flight", "out is missing"),
+        ("psotrack export tracks.csv", "to is missing"),
         ("psotrack export tracks.csv --to docx --out tracks.docx", "docx"),
     ],
 )
@@ -156,7 +161,7 @@ class Shell:
         ran = subprocess.run(
             program, cwd=self.folder, env=self.environment, capture_output=True, text=True, check=False
         )
-        finding = text.startswith("psotrack doctor") and ran.returncode == 2 and ran.stdout
+        finding = text.startswith("psotrack doctor") and ran.returncode == 1 and ran.stdout
         assert ran.returncode == 0 or finding, f"{text}\n{ran.stdout}{ran.stderr}"
         return ran.stdout
 

@@ -61,7 +61,7 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RowTargets:
     """Where rows go.
 
     Attributes:
@@ -83,7 +83,7 @@ class Rows:
 )
 @options_of(Replay, "replay", names={"replay": "replay"})
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after this time.")
-@options_of(Rows, "targets")
+@options_of(RowTargets, "targets")
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
@@ -120,7 +120,7 @@ def live(
     out: Path | None,
     replay: Replay,
     seconds: float | None,
-    targets: Rows,
+    targets: RowTargets,
     record: Path | None,
     viewer: str | None,
     most_drones: int,
@@ -159,7 +159,7 @@ def live(
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
-    if out is None and targets == Rows() and viewer is None:
+    if out is None and targets == RowTargets() and viewer is None:
         expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None:

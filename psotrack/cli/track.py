@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Run:
-    """A run of `track`: the recording and its path, the settings, the file of the tracks, the seconds before the work."""
+    """A run of `track`: a recording and its path, settings, the file of the tracks, the seconds before the work."""
 
     sequence: Path
     recording: Recording

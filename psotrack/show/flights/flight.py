@@ -119,7 +119,7 @@ def read_flight(
     paths = [Path(path) for path in tracks]
     for path in paths:
         if _is_recording(path):
-            remedy = f"name the recording last, TRACKS [SEQ]"
+            remedy = "name the recording last, TRACKS [SEQ]"
             raise InputError(path, expected="a file of tracks", found="a recording", remedy=remedy)
     sequence = find_recording(paths[0]) if sequence is None and paths else sequence
     recording = None if sequence is None else open_recording(sequence)
