@@ -1,4 +1,6 @@
 from .board_corners import BoardFinder
+from .board_page import save_board
+from .board_recognition import describe_board, detect_board
 from .boards import Board
 from .bundle import AdjustedRig, adjust
 from .common_errors import CommonErrors
@@ -27,7 +29,7 @@ from .rig.findings import (
     say_searched,
     worst_views,
 )
-from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
+from .rig.images import CameraImages, first_images, instants_of_numbers, open_images, open_recorded
 from .rig.lens_choice import ModelComparison, choose_lens_model, say_not_compared
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.plots import save_coverage
@@ -83,6 +85,8 @@ __all__ = [
     "choose_lens_model",
     "covariance_of_centres",
     "coverage",
+    "describe_board",
+    "detect_board",
     "distance_between",
     "figures_of",
     "find_drones_in_boxes",
@@ -92,6 +96,7 @@ __all__ = [
     "find_shifts",
     "find_views",
     "find_wrong_cameras",
+    "first_images",
     "fit_world",
     "improve",
     "in_new_world",
@@ -109,6 +114,7 @@ __all__ = [
     "read_point_views",
     "read_world",
     "reproject",
+    "save_board",
     "save_coverage",
     "say_not_compared",
     "say_print",

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from psotrack.calibration.board_corners import BoardFinder
 from psotrack.calibration.boards import Board
+from psotrack.errors import InputError
 from psotrack.foreground.detection import marker_dictionary
 
 #: Number of views after which one way of printing is certain, if it has three times as many views as any other way.
@@ -102,6 +103,84 @@ def recognise_board(board: Board, images: Iterable[UInt8[np.ndarray, "height wid
     return Recognised(best.board, best.inverted, int(views.max()))
 
 
+def detect_board(square_m: float, images: Sequence[UInt8[np.ndarray, "height width"]]) -> Board:
+    """Find out what board images show, of which only the side of a square is known: a ChArUco board or a chessboard.
+
+    Args:
+        square_m: side of a square, metres, which no image shows.
+        images: grey images, of the cameras in turn.
+
+    Raises:
+        InputError: the images show neither, or a board whose squares cannot be counted.
+    """
+    counted = [
+        (len(ids), name, turned, ids) for name, turned, ids in _markers_of_all_dictionaries(_small(images))
+    ]
+    most, family, inverted, _ = max(counted, key=lambda one: one[0], default=(0, "", False, np.zeros(0)))
+    if most < _LEAST_MARKERS:
+        return Board(_size_of_chessboard(images), square_m, None, kind="chessboard")
+    largest = f"{family}_1000" if _FAMILIES[family] else family
+    seen = _seen_markers(largest, [255 - grey if inverted else grey for grey in images])
+    # Those first that show most of the board.
+    order = sorted(range(len(images)), key=lambda index: -len(seen[index]))
+    clearest = [images[index] for index in order]
+    size = _size_by_markers(Board((3, 3), square_m, square_m / 2, largest), clearest, inverted)
+    if size is None:
+        ids = [marker for of_image in seen for marker in of_image]
+        raise InputError(
+            "board",
+            expected="a ChArUco board or a chessboard",
+            found=f"markers {min(ids)} to {max(ids)} of the dictionary {_smallest(family, max(ids))} in another order",
+            remedy="say with --board, --squares, --marker and --dictionary what the board is",
+        )
+    dictionary = _smallest(family, size[0] * size[1] // 2 - 1)
+    board = Board(size, square_m, square_m / 2, dictionary)
+    share = measure_marker_share(Recognised(board, inverted, 0), clearest) or 0.75
+    return replace(board, marker_m=round(share, 2) * square_m)
+
+
+def describe_board(board: Board) -> str:
+    """What a board is, in words: the kind, the squares, the markers."""
+    columns, rows = board.squares_wh
+    squares = f"{columns} x {rows} squares of {1e3 * board.square_m:g} mm"
+    if board.marker_m is None:
+        return f"a chessboard of {squares}"
+    return f"a ChArUco board of {squares} with markers of {1e3 * board.marker_m:g} mm, dictionary {board.dictionary}"
+
+
+def _small(images: Sequence[UInt8[np.ndarray, "height width"]]) -> list[UInt8[np.ndarray, "height width"]]:
+    """Images in which markers are found quickly."""
+    return [
+        cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
+        for grey in images
+        for scale in [max(1, round(max(grey.shape) / _FIRST_SIDE_PX))]
+    ]
+
+
+def _size_of_chessboard(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[int, int]:
+    """Columns and rows of the squares of the chessboard that most images show.
+
+    Raises:
+        InputError: fewer than two images show one.
+    """
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    shapes = Counter[tuple[int, int]]()
+    for grey in _small(images):
+        found, _, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+        if found:
+            rows, columns = np.shape(meta)[:2]
+            shapes[(max(rows, columns) + 1, min(rows, columns) + 1)] += 1
+    ((size, count), *_) = [*shapes.most_common(1), ((0, 0), 0)]
+    if count < 2:
+        raise InputError(
+            "board",
+            expected="a ChArUco board or a chessboard",
+            found=f"neither in {len(images)} images",
+            remedy="is the board large and sharp, with a white border? --squares states another kind",
+        )
+    return size
+
+
 def measure_marker_share(
     recognised: Recognised, images: Iterable[UInt8[np.ndarray, "height width"]]
 ) -> float | None:
@@ -153,11 +232,7 @@ def explain_markers_on_chessboard(
     Returns:
         what was found, and what to do; both are parts of a message.
     """
-    small = [
-        cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
-        for grey in images
-        for scale in [max(1, round(max(grey.shape) / _FIRST_SIDE_PX))]
-    ]
+    small = _small(images)
     finder = BoardFinder(board)
     corners: dict[int, Float[np.ndarray, "corners 2"]] = {}
     for family in _FAMILIES:

@@ -32,6 +32,14 @@ COMMANDS = {
         "Simulate four drones, track them in eight videos, print the errors and save a picture.",
         START,
     ),
+    "run": LazyCommand(
+        "psotrack.cli.run:run",
+        "Calibrate, check, track and show the videos of a rig in FOLDER, from board to report.",
+        START,
+    ),
+    "board": LazyCommand(
+        "psotrack.cli.board:board", "Draw a ChArUco board to print, in its true size.", START
+    ),
     "init": LazyCommand(
         "psotrack.cli.init:init",
         "Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.",
@@ -145,10 +153,11 @@ def cli(verbose: bool) -> None:
 
     \b
     Try it:          psotrack demo
-    Own cameras:     psotrack calibrate rig my_lab/board --square 0.04 --out my_lab/rig.toml
+    Own cameras:     psotrack run my_lab --square 0.035
+    Step by step:    psotrack calibrate rig my_lab/board --square 0.035 --out my_lab/rig.toml
                      psotrack init my_lab
                      psotrack track my_lab
-    Look at it:      psotrack report my_lab/results/tracks.csv
+                     psotrack view my_lab/results/tracks.csv
 
     \b
     Completion with the Tab key needs one line in the start-up file of your shell:

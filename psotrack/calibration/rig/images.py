@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import cv2
@@ -228,3 +229,9 @@ def _open(name: str, path: Path) -> CameraImages:
     return CameraImages(
         name, path, (first.shape[1], first.shape[0]), np.array(list(ordered)), None, tuple(ordered.values())
     )
+
+
+def first_images(cameras: Sequence[CameraImages], count: int = 10) -> list[UInt8[np.ndarray, "height width"]]:
+    """About `count` grey images of each camera, evenly spread over the recording, of the cameras in turn."""
+    readers = [camera.read(camera.spread(count)) for camera in cameras]
+    return [grey for round_ in zip_longest(*readers) for one in round_ if one is not None for grey in one[1:]]

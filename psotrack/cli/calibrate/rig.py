@@ -25,7 +25,7 @@ from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import SettingsError, errors_name
 
 if TYPE_CHECKING:
-    from psotrack.calibration import Board, CalibratedRig, CameraFigures, LensChoice
+    from psotrack.calibration import CalibratedRig, CameraFigures, LensChoice
 
 
 @dataclass(frozen=True)
@@ -116,13 +116,16 @@ def rig(
 ) -> None:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
-    Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'. Frames of equal
-    number are one instant. A single recording.toml, or its folder, says by itself when each frame was exposed. The
-    board must be seen by two cameras at a time, and the pairs must join all cameras.
-    With --points, VIDEO is a recording with detections, or a CSV file; with --pairs there is none.
+    Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'; a folder of videos
+    stands for all of them. Frames of equal number are one instant. A single recording.toml, or its folder, says by
+    itself when each frame was exposed. The board must be seen by two cameras at a time, and the pairs must join all
+    cameras. Of the board only --square must be stated: whether it is a ChArUco board or a chessboard, its squares,
+    markers and dictionary are found in the images; --squares states them. With --points, VIDEO is a recording with
+    detections, or a CSV file; with --pairs there is none.
 
     \b
     Examples:
+      psotrack calibrate rig my_lab/board --square 0.04 --out my_lab/rig.toml
       psotrack calibrate rig cam_0.mp4 cam_1.mp4 --squares 4x5 --square 0.054 --marker 0.0405 --out rig.toml
       psotrack calibrate rig left right --squares 10x7 --square 0.025 --floor 0 --out rig.toml
       psotrack calibrate rig a b --squares 6x6 --marker 0.09 --separation 0.03 --dictionary apriltag_36h11 --out r.toml
@@ -130,6 +133,8 @@ def rig(
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
     """
+    from psotrack.recordings.datasets import videos_in
+
     output.refuse(out)
     modes = {
         "--squares": board.squares is not None,
@@ -138,15 +143,21 @@ def rig(
         "--markers": points.markers is not None,
     }
     chosen = [name for name, is_chosen in modes.items() if is_chosen]
+    if not chosen and board.square_m is not None:
+        chosen = ["--square"]
     if len(chosen) != 1:
         raise SettingsError(
-            "rig", expected=f"one of {', '.join(modes)}", found=" and ".join(chosen) if chosen else "none"
+            "rig",
+            expected=f"one of --square, {', '.join(modes)}",
+            found=" and ".join(chosen) if chosen else "none",
         )
     if (points.distance is not None or points.stick_m is not None) and not points.points:
         raise SettingsError("rig", expected="--distance and --stick with --points", found=chosen[0])
     if not sources and points.pairs is None:
         raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
-    if board.squares is None:
+    if len(sources) == 1 and len(found_videos := videos_in(sources[0])) > 1:
+        sources = tuple(found_videos)
+    if chosen[0] in ("--points", "--pairs", "--markers"):
         if floor is not None or plot is not None:
             raise SettingsError("rig", expected="--floor and --plot with --squares", found=chosen[0])
         if points.points:
@@ -165,7 +176,7 @@ def rig(
     if world is not None and floor is not None:
         raise SettingsError("rig", expected="--floor or --world", found="both")
     given = None if world is None else read_world(world)
-    calibrated, said = _by_board(output, sources, names, board.board(), lens.choice(), floor)
+    calibrated, said = _by_board(output, sources, names, board, lens.choice(), floor)
     if given is None:
         place = (
             f"the board in frame {floor}: its first corner is the origin, z points up"
@@ -194,14 +205,17 @@ def _by_board(
     output: Output,
     sources: tuple[Path, ...],
     names: str | None,
-    board: Board,
+    board: BoardOptions,
     lenses: LensChoice,
     floor: int | None,
 ) -> tuple[CalibratedRig, list[str]]:
     """Calibrate by a board; also sentences on how the board was printed, which are printed at once."""
     from psotrack.calibration import (
         calibrate_rig,
+        describe_board,
+        detect_board,
         find_views,
+        first_images,
         instants_of_numbers,
         open_images,
         open_recorded,
@@ -216,9 +230,14 @@ def _by_board(
         cameras = open_images(sources, names.split(",") if names else None)
         instants = instants_of_numbers(cameras, floor)
     report = output.report
+    if board.squares is None:
+        stated = detect_board(board.square_m or 0.0, first_images(cameras))
+        output.say(f"the board is {describe_board(stated)}")
+    else:
+        stated = board.board()
     named = f"{sources[0]} and {len(sources) - 1} more" if sources[1:] else f"{sources[0]}"
     with errors_name(named):
-        found = find_views(board, cameras, instants, report)
+        found = find_views(stated, cameras, instants, report)
     every = {camera.name: len(camera.frames) for camera in cameras}
     searched = dict(zip(found.views.names, found.searched.tolist(), strict=True))
     said = say_print(found)

@@ -20,7 +20,7 @@ Kind = Literal[
 #: Kinds of which a camera has one file.
 OF_CAMERA: tuple[Kind, ...] = ("video", "images", "ignore", "detections", "timestamps")
 
-_VIDEO_SUFFIXES = {
+VIDEO_SUFFIXES = {
     ".avi", ".mp4", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mjpeg",
 }  # fmt: skip
 #: Names of rig files, without suffix.
@@ -73,7 +73,7 @@ def kind_of(path: Path) -> Kind:
     suffix, stem = path.suffix.lower(), path.stem.lower()
     if path.is_dir():
         return "images" if image_files(path) else "other"
-    if suffix in _VIDEO_SUFFIXES:
+    if suffix in VIDEO_SUFFIXES:
         return "other" if is_onboard_video(path) else "video"
     if suffix in IMAGE_SUFFIXES:
         return "ignore" if any(word in stem for word in _IGNORE_WORDS) else "other"

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from psotrack.errors import InputError
-from psotrack.recordings import RECORDING_FILE, Recording, is_picture_folder, read_recording_file
+from psotrack.recordings import RECORDING_FILE, Recording, is_picture_folder, natural_key, read_recording_file
+from psotrack.recordings.datasets._folder_content import VIDEO_SUFFIXES
 from psotrack.recordings.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence, reference_files_in
 from psotrack.recordings.datasets.recording_files import read_recording_toml
 from psotrack.support import ARCHIVE_SUFFIX
@@ -43,6 +44,16 @@ def is_recording(path: Path | str) -> bool:
     if any((path / name).exists() for name in (RECORDING_FILE, CALIBRATION)):
         return True
     return path.is_dir() and not is_picture_folder(path)
+
+
+def videos_in(folder: Path | str) -> list[Path]:
+    """The videos of a folder, in the order of their names; none where the path is no folder."""
+    folder = Path(folder)
+    files = folder.iterdir() if folder.is_dir() else ()
+    return sorted(
+        (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES),
+        key=lambda path: natural_key(path),
+    )
 
 
 def find_marker_corners(path: Path | str) -> Path:
