@@ -15,7 +15,7 @@ from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.geometry import make_extents, project_boxes
 from psotrack.pipeline import TrackedRecording, track_recording
 from psotrack.recordings import Recording, read_frames
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import Report, atomic_write, atomic_write_all, no_progress, refuse_to_overwrite

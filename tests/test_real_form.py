@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.cli.as_real import as_real
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import project
-from psotrack.recordings import read_frames
-from psotrack.recordings.datasets.dpjait import read_detections, read_mocap_markers, read_poses, read_sequence
+from psotrack.recordings import read_detections, read_frames
+from psotrack.recordings.datasets import read_mocap_markers, read_poses, read_sequence
 from psotrack.recordings.mocap import body_trajectories, read_c3d
 from psotrack.simulation import (
     RealFormSettings,

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from psotrack.errors import InputError
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     MaskWriter,
     join_archives,
     read_masks,

@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.recordings.datasets.dpjait import pose_file, write_poses
+from psotrack.recordings.datasets import pose_file, write_poses
 from psotrack.simulation import Scenario, write_recorded_flight
 from psotrack.simulation.flights.formulas import HarmonicFlight
 from psotrack.simulation.flights.motion import Heading

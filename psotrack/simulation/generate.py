@@ -18,9 +18,9 @@ import numpy as np
 from psotrack import __version__
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import make_rig
-from psotrack.geometry.rig_files import write_rig
+from psotrack.geometry.rig_files import write_calibration, write_rig
 from psotrack.recordings import RECORDING_FILE
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     CALIBRATION,
     DETECTIONS,
     MARKER_CORNERS,
@@ -28,7 +28,6 @@ from psotrack.recordings.datasets.dpjait import (
     mocap_markers_file,
     onboard_pose_file,
     pose_file,
-    write_calibration,
     write_marker_corners,
     write_mocap_markers,
     write_onboard_calibration,

@@ -20,17 +20,22 @@ from scipy.interpolate import CubicSpline
 
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import Camera, Rig, to_pixels, undistort
-from psotrack.recordings import Recording, VideoInfo, VideoWriter, read_frames
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.geometry.rig_files import write_calibration
+from psotrack.recordings import (
+    Detections,
+    Recording,
+    VideoInfo,
+    VideoWriter,
+    read_detections,
+    read_frames,
+    write_detections,
+)
+from psotrack.recordings.datasets import (
     CALIBRATION,
     DETECTIONS,
-    Detections,
     mocap_markers_file,
-    read_detections,
     read_mocap_markers,
     read_sequence,
-    write_calibration,
-    write_detections,
 )
 from psotrack.recordings.mocap import Markers, write_c3d
 from psotrack.support import Advance, Report, atomic_write, no_progress, refuse_to_overwrite

@@ -148,7 +148,7 @@ def map_markers(
         read_marker_map,
         read_measured_corners,
     )
-    from psotrack.recordings.datasets.dpjait import write_marker_corners
+    from psotrack.recordings.datasets import write_marker_corners
 
     given = [name for name, value in {"--out": out, "--check": checked}.items() if value is not None]
     if len(given) != 1:

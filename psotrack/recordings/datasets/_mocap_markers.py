@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry.rig_files import METRES_PER_UNIT
+from psotrack.geometry.rig_files import UNITS_M
 from psotrack.recordings.datasets._frames import rows_by_frame
 from psotrack.support import read_table, write_rows
 
@@ -46,7 +46,7 @@ def read_mocap_markers(path: Path | str) -> Float[np.ndarray, "frames 4 3"]:
     table = read_table(path)
     id_column = table.column("id")
     columns = [table.column(name.lower()) for name in _COLUMNS]
-    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in columns])
+    metres = np.array([table.factor(column, UNITS_M) for column in columns])
     rows = rows_by_frame(table, id_column)
     markers_m = np.full((max(rows) + 1, len(_COLUMNS)), np.nan)
     for frame, row in rows.items():

@@ -17,7 +17,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.geometry.rig_files import METRES_PER_UNIT
+from psotrack.geometry import LENGTH_TOLERANCE
+from psotrack.geometry.rig_files import UNITS_M
 from psotrack.recordings.datasets._frames import rows_by_frame
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
@@ -25,8 +26,6 @@ Positions = Float[np.ndarray, "frames 3"]
 Orientations = Float[np.ndarray, "frames 4"]
 
 _QUATERNION = re.compile(r"(?P<stem>[a-z_ .]*q[a-z_ .]*?)[_ .]?(?P<axis>[wxyz])")
-#: Largest deviation of a quaternion's norm from 1: the effect of rounding to two decimals.
-_NORM_TOLERANCE = 0.02
 
 
 def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
@@ -41,7 +40,7 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
     table = read_table(path)
     id_column = table.column("id")
     position = [table.column(f"pos_{axis}") for axis in "xyz"]
-    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in position])
+    metres = np.array([table.factor(column, UNITS_M) for column in position])
     quaternion = _quaternion_columns(table)
     rows = rows_by_frame(table, id_column)
     position_m = np.full((max(rows) + 1, 3), np.nan)
@@ -52,7 +51,7 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
             continue
         position_m[frame] = here_m
         if quaternion:
-            orientation_wxyz[frame] = _unit_quaternion(row, quaternion)
+            orientation_wxyz[frame] = unit_quaternion(row, quaternion)
     return position_m, orientation_wxyz if quaternion else None
 
 
@@ -109,9 +108,10 @@ def _quaternion_columns(table: Table) -> list[Column]:
     return [complete[0][axis] for axis in "wxyz"] if complete else []
 
 
-def _unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, " 4"]:
+def unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
+    """The quaternion in four columns of a row, with length 1; raise `InputError` for another length."""
     quaternion = np.array([row.number(column) for column in columns])
     norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > _NORM_TOLERANCE:
+    if abs(norm - 1) > LENGTH_TOLERANCE:
         raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
     return quaternion / norm

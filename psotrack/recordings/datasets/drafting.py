@@ -15,7 +15,7 @@ from typing import Literal, overload
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
-from psotrack.geometry.rig_files import UNITS_M, read_entries
+from psotrack.geometry.rig_files import read_cameras
 from psotrack.recordings import (
     RECORDING_FILE,
     CameraTable,
@@ -28,8 +28,6 @@ from psotrack.recordings import (
 from psotrack.recordings.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
 from psotrack.recordings.datasets.recording_files import recording_of
 
-#: Size that stands for one that a rig file does not state.
-_UNKNOWN_WH = (1, 1)
 _WORDS: Mapping[Kind, str] = {
     "video": "video",
     "images": "folder of images",
@@ -194,12 +192,7 @@ def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tupl
                 "--units", expected="a rig file, in the folder or by --calibration", found="none"
             )
         return {}
-    sizes: dict[str, tuple[int, int] | None] = {}
-    metres_per_unit = None if unit is None else UNITS_M[unit]
-    for name, entry in read_entries(calibration, _UNKNOWN_WH, metres_per_unit=metres_per_unit).items():
-        size = None if entry.camera is None else tuple(int(side) for side in entry.camera.image_size_wh)
-        sizes[name] = None if size is None or size == _UNKNOWN_WH else (size[0], size[1])
-    return sizes
+    return {name: fields.size_wh for name, fields in read_cameras(calibration).items()}
 
 
 def _names_of_files(folder: Path, found: Sequence[Found], options: DraftOptions) -> list[str]:

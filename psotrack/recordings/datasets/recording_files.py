@@ -11,11 +11,18 @@ from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, Rig, chosen_camera, make_rig
-from psotrack.geometry.rig_files import UNITS_M, Entry, camera_of_table, read_entries
+from psotrack.geometry.rig_files import (
+    KEYS,
+    UNITS_M,
+    Entry,
+    camera_values,
+    entries_of,
+    fields_of_table,
+    read_cameras,
+)
 from psotrack.recordings import (
     MOST_INSTANTS,
     RECORDING_FILE,
@@ -40,15 +47,12 @@ from psotrack.recordings import (
 from psotrack.recordings.datasets._reference import read_reference, reference_at
 
 _logger = logging.getLogger(__name__)
-#: Size of the images of a rig file that does not state it; no camera has this size.
-_UNKNOWN_WH = (1, 1)
 #: Rate of pictures until their timestamps are read.
 _UNKNOWN_HZ = 1.0
 #: Largest deviation of a rate from a thousandth of another one at which the unit of time was mistaken, not the rate.
 _SLIP_SHARE = 0.05
 #: How addresses of streams begin that OpenCV reads, with FFmpeg or with GStreamer.
 _SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtp", "udp", "tcp", "srt", "gstreamer")
-_LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "R", "tvec")
 
 
 def read_recording_toml(path: Path | str, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
@@ -86,7 +90,7 @@ def recording_of(path: Path, content: RecordingFile) -> Recording:
     _check_videos(path, opened)
     for name, table in content.cameras.items():
         _check_shutter(path, name, table, opened[name])
-    calibrated = _calibrated(path, content)
+    calibrated = _calibrated(path, content, opened)
     cameras = {
         name: _camera(path, name, content.cameras[name], opened[name], calibrated.get(name))
         for name in opened
@@ -325,19 +329,20 @@ def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
         )
 
 
-def _calibrated(path: Path, content: RecordingFile) -> dict[str, Entry]:
-    """The cameras of the rig file, by their names in the recording."""
+def _calibrated(path: Path, content: RecordingFile, opened: Mapping[str, _Opened]) -> dict[str, Entry]:
+    """The cameras of the rig file whose image size is known, by their names in the recording."""
     if content.calibration is None:
         return {}
-    unit = content.calibration_unit
-    entries = read_entries(
-        _existing(path.parent, content.calibration, path, "calibration"),
-        _UNKNOWN_WH,
-        metres_per_unit=None if unit is None else UNITS_M[unit],
-    )
-    known = {name: chosen_camera(name, tuple(entries)) for name in content.cameras}
+    stated = read_cameras(_existing(path.parent, content.calibration, path, "calibration"))
+    known = {name: chosen_camera(name, tuple(stated)) for name in content.cameras}
     _check_one_each(path, known)
-    return {name: entries[entry] for name, entry in known.items() if entry is not None}
+    sizes = {own: opened[name].size_wh or stated[own].size_wh for name, own in known.items() if own}
+    entries = entries_of(
+        {own: stated[own] for own, size_wh in sizes.items() if size_wh},
+        {own: size_wh for own, size_wh in sizes.items() if size_wh},
+        metres_per_unit=UNITS_M[content.calibration_unit] if content.calibration_unit else None,
+    )
+    return {name: entries[own] for name, own in known.items() if own in entries}
 
 
 def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
@@ -355,40 +360,22 @@ def _camera(
     path: Path, name: str, table: CameraTable, opened: _Opened, calibrated: Entry | None
 ) -> Camera | None:
     """A camera from its own keys and, where it has none, from the rig file; None where its place is not known."""
-    known = {} if calibrated is None else _keys(calibrated)
+    known: dict[str, Any] = {}
+    if calibrated is not None and calibrated.camera is not None:
+        known = camera_values(calibrated.camera, placed=calibrated.placed)
     # A size of the rig file that differs from the video's is an error of `Recording.usable`.
     size_wh = known.get("size") or opened.size_wh
     if size_wh is None and not opened.stream:
         expected = "width and height of the images, because the camera has no video"
         raise _error(path, f"cameras.{name}.size", expected, "none")
     own = msgspec.json.decode(msgspec.json.encode(table))
-    keys = known | {key: own[key] for key in (*known, *_LENS_AND_PLACE) if own.get(key) is not None}
-    if "R" in own and own["R"] is not None:
+    keys = known | {key: own[key] for key in KEYS if own.get(key) is not None}
+    if own.get("R") is not None:
         keys.pop("rvec", None)
     if size_wh is None or not keys.keys() - {"size"}:
         return None
-    entry = camera_of_table(path, name, {**keys, "size": list(size_wh)})
+    entry = fields_of_table(path, name, {**keys, "size": list(size_wh)}).entry(None, 1.0)
     return entry.camera if entry.placed else None
-
-
-def _keys(entry: Entry) -> dict[str, Any]:
-    """The keys of a `recording.toml` that say what a rig file says of a camera."""
-    camera = entry.camera
-    if camera is None:
-        return {}
-    fisheye = camera.fisheye is not None and bool(camera.fisheye)
-    keys: dict[str, Any] = {
-        "K": camera.K.tolist(),
-        "distortion": camera.dist.tolist(),
-        "model": "fisheye" if fisheye else "opencv",
-    }
-    size_wh = tuple(int(side) for side in camera.image_size_wh)
-    if size_wh != _UNKNOWN_WH:
-        keys["size"] = size_wh
-    if entry.placed:
-        T = np.asarray(camera.T_cam_world)
-        keys |= {"rvec": Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist(), "tvec": T[:3, 3].tolist()}
-    return keys
 
 
 def _no_rig() -> Rig:

@@ -13,19 +13,17 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings.datasets.dpjait import read_poses
+from psotrack.recordings.datasets import read_poses, unit_quaternion
 from psotrack.simulation.flights.motion import Flight, Heading
 from psotrack.simulation.flights.resampling import MIN_SAMPLES, spline
 from psotrack.simulation.scenarios import FlightFromFile
-from psotrack.support import Column, Table, TextRow, first_repeat, read_rows, read_table, write_rows
+from psotrack.support import Table, first_repeat, read_rows, read_table, write_rows
 
 #: Largest time before the first and after the last sample that a flight is extrapolated to. It is longer than half an
 #: exposure, because the exposures of the first and last frame reach beyond the samples.
 _BEYOND_S = 0.1
 #: Tolerance for times of frames and times of samples, which come from different divisions.
 _ROUNDING_S = 1e-6
-#: Largest difference between 1 and the norm of a quaternion: the effect of rounding to two decimals.
-_NORM_TOLERANCE = 0.02
 
 _POSITION = ("x_m", "y_m", "z_m")
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -150,7 +148,9 @@ def _from_table(table: Table) -> _Samples:
             time, f"a time above {before.text(time)}, the time in line {before.line}", row.text(time)
         )
     position_m = np.array([[row.number(column) for column in position] for row in table.rows])
-    orientation_wxyz = np.array([_unit(row, quaternion) for row in table.rows]) if quaternion else None
+    orientation_wxyz = (
+        np.array([unit_quaternion(row, quaternion) for row in table.rows]) if quaternion else None
+    )
     return time_s, position_m, orientation_wxyz
 
 
@@ -164,14 +164,6 @@ def _check_one_drone(table: Table) -> None:
             raise row.error(
                 column, f"one drone, {name} as above", row.text(column), "keep the rows of one drone only"
             )
-
-
-def _unit(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
-    quaternion = np.array([row.number(column) for column in columns])
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > _NORM_TOLERANCE:
-        raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
-    return quaternion / norm
 
 
 # --- flights
