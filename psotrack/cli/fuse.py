@@ -66,7 +66,7 @@ def fuse(
     """
     from psotrack.inside_out import fuse as fuse_paths
     from psotrack.inside_out import read_camera_path, write_fused
-    from psotrack.trajectories import read_trajectories
+    from psotrack.recordings.exchange import read_tracks
 
     check_outputs(out, json_path, force)
     if max_offset_s is not None:
@@ -77,7 +77,7 @@ def fuse(
         if name in paths:
             raise InputError(file, expected="the path of another drone", found=f"a second path of {name}")
         paths[name] = path
-    tracks = read_trajectories(outside)
+    tracks = read_tracks(outside)
     if not any(path.seen.any() for path in paths.values()):
         where = ", ".join(map(str, inside))
         raise InputError(where, expected="a pose in at least one frame", found="none")

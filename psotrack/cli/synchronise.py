@@ -54,11 +54,11 @@ def synchronise(
     """
     from psotrack.calibration.clocks import find_offset, own_reference, save_curve
     from psotrack.recordings.datasets import open_recording
-    from psotrack.trajectories import read_trajectories
+    from psotrack.recordings.exchange import read_tracks
 
     recording = open_recording(sequence, bodies=bodies)
     reference = own_reference(recording)
-    estimate = read_trajectories(tracks, fps=recording.fps)
+    estimate = read_tracks(tracks, recording=recording)
     with errors_name(f"{tracks} and {sequence}"):
         offset = find_offset(
             estimate,
