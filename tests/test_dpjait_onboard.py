@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.geometry.rig_files import write_calibration
-from psotrack.recordings import VideoWriter, describe_recording, inventory_table
+from psotrack.recordings import VideoWriter, inventory_table
 from psotrack.recordings.datasets import (
     CALIBRATION,
     ONBOARD_CALIBRATION,
@@ -116,7 +116,7 @@ def test_a_sequence_without_onboard_videos(folder):
     assert read_onboard(folder) == {}
     recording = read_sequence(folder)
     assert recording.onboard is None
-    assert describe_recording(recording)["onboard"] is None
+    assert recording.to_dict()["onboard"] is None
 
 
 @pytest.mark.parametrize("missing", ["dron1_cam_25.csv", ONBOARD_CALIBRATION])
@@ -214,7 +214,7 @@ def test_intrinsics_that_the_table_cannot_hold(tmp_path, intrinsics):
 
 
 def test_the_inventory_has_a_row_per_onboard_camera(folder):
-    content = describe_recording(read_sequence(folder))
+    content = read_sequence(folder).to_dict()
     assert content["onboard"]["dron2"] == {
         "video": str(folder / "dron2_cam_s.avi"),
         "frames": FRAMES,

@@ -26,7 +26,7 @@ def info(sequence: Path, bodies: dict[str, tuple[str, ...]], force: bool, json_p
       psotrack info flight/recording.toml
       psotrack info flight --body cf1=M1,M2,M3,M4
     """
-    from psotrack.recordings import check_end, describe_recording, inventory_table
+    from psotrack.recordings import check_end, inventory_table
     from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(sequence, bodies=bodies)
@@ -37,7 +37,7 @@ def info(sequence: Path, bodies: dict[str, tuple[str, ...]], force: bool, json_p
         from psotrack.inside_out import read_marker_table
 
         read_marker_table(recording.marker_corners)
-    content = describe_recording(recording)
+    content = recording.to_dict()
     output_json(json_path, content, force)
     if json_path != Path("-"):
         print_inventory(inventory_table(content))

@@ -88,7 +88,6 @@ def init(
     from psotrack.errors import check_positive
     from psotrack.recordings import (
         RECORDING_FILE,
-        describe_recording,
         inventory_table,
         recording_file_text,
         write_recording_file,
@@ -106,7 +105,7 @@ def init(
         calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh, bodies
     )
     draft = draft_recording(folder, path, options)
-    content = describe_recording(draft.recording)
+    content = draft.recording.to_dict()
     kept = _keep_older(path, recording_file_text(draft.content))
     write_recording_file(path, draft.content)
     output_json(json_path, _content(path, draft, content), force)

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import os
-import tempfile
 import threading
 from contextlib import AbstractContextManager
 
 import cv2
-import numpy as np
-from jaxtyping import Shaped, UInt8
-
-logger = logging.getLogger(__name__)
 
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
-#: stderr is the process's: images are decoded one after the other, so that each has its own messages.
-_decoding = threading.Lock()
 
 
 class _Silence:
@@ -53,48 +45,8 @@ _silence = _Silence()
 def silence_opencv() -> AbstractContextManager[None]:
     """Suppress the messages of OpenCV and FFmpeg about a file that is opened, decoded or written in this block.
 
-    Errors replace them. Libraries that write to the terminal themselves, such as libpng, are not silenced: see
-    `decode_image`.
+    Errors replace them. Libraries that write to the terminal themselves, such as libjpeg, are not silenced.
     FFmpeg reads its log level from the environment whenever a file is opened. A log level that the user has set is
     kept.
     """
     return _silence
-
-
-def decode_image(
-    coded: UInt8[np.ndarray, " bytes"], flags: int, where: object
-) -> Shaped[np.ndarray, "..."] | None:
-    """Decode an image; None if OpenCV cannot.
-
-    libjpeg and libpng write about damaged images straight to stderr. What they write becomes a warning with the name of
-    the image.
-
-    Args:
-        coded: content of an image file.
-        flags: flags of `cv2.imdecode`.
-        where: the file, for the warning.
-    """
-    if not len(coded):
-        return None
-    with _decoding, silence_opencv(), tempfile.TemporaryFile() as taken:
-        stderr = os.dup(2)
-        try:
-            os.dup2(taken.fileno(), 2)
-            image = cv2.imdecode(coded, flags)
-        except cv2.error:
-            image = None
-        finally:
-            os.dup2(stderr, 2)
-            taken.seek(0)
-            written = taken.read()
-            # A progress bar of another thread, which moves the cursor, is no message about the image.
-            if b"\x1b" in written:
-                os.write(stderr, written)
-                written = b""
-            os.close(stderr)
-    if image is None:
-        return None
-    if written:
-        said = written.decode(errors="replace").splitlines()[0].strip()
-        logger.warning("%s is damaged (%s)", where, said)
-    return np.asarray(image)
