@@ -1,4 +1,3 @@
-from ._archives import join_archives
 from ._marker_corners import (
     MarkerRow,
     read_marker_centres,
@@ -7,7 +6,7 @@ from ._marker_corners import (
     split_label,
     write_marker_corners,
 )
-from ._masks import MASKS, Masks, MaskWriter, read_masks
+from ._masks import MASKS, Masks, MaskWriter, join_archives, read_masks
 from ._mocap_markers import mocap_markers_file, read_mocap_markers, write_mocap_markers
 from ._onboard import (
     ONBOARD_CALIBRATION,

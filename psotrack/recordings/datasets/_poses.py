@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import LENGTH_TOLERANCE
-from psotrack.geometry.rig_files import UNITS_M
-from psotrack.recordings.datasets._frames import rows_by_frame
+from psotrack.recordings.datasets._rows import lengths_of, rows_by_frame
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 Positions = Float[np.ndarray, "frames 3"]
@@ -38,15 +37,13 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
             number. The message names line and column.
     """
     table = read_table(path)
-    id_column = table.column("id")
-    position = [table.column(f"pos_{axis}") for axis in "xyz"]
-    metres = np.array([table.factor(column, UNITS_M) for column in position])
+    lengths_m = lengths_of(table, ["pos_x", "pos_y", "pos_z"])
     quaternion = _quaternion_columns(table)
-    rows = rows_by_frame(table, id_column)
+    rows = rows_by_frame(table)
     position_m = np.full((max(rows) + 1, 3), np.nan)
     orientation_wxyz = np.full((max(rows) + 1, 4), np.nan)
     for frame, row in rows.items():
-        here_m = np.array([row.number(column) for column in position]) * metres
+        here_m = lengths_m(row)
         if frame == 0 and not here_m.any():
             continue
         position_m[frame] = here_m
