@@ -52,6 +52,19 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
     return position_m, orientation_wxyz if quaternion else None
 
 
+def poses_of_frames(path: Path, num_frames: int) -> tuple[Positions, Orientations]:
+    """Positions and orientations at the first frames of a video; NaN where the file says nothing.
+
+    Arguments and errors: see `read_poses`.
+    """
+    position_m, orientation_wxyz = np.full((num_frames, 3), np.nan), np.full((num_frames, 4), np.nan)
+    position, orientation = read_poses(path)
+    position_m[: len(position)] = position[:num_frames]
+    if orientation is not None:
+        orientation_wxyz[: len(position)] = orientation[:num_frames]
+    return position_m, orientation_wxyz
+
+
 def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orientations) -> None:
     """Write the poses of one drone at all video frames; the pose of frame 0 is replaced by the layout's placeholder.
 

@@ -21,7 +21,7 @@ from psotrack.geometry import Rig, files_by_camera
 from psotrack.geometry.rig_files import read_cameras, read_rig
 from psotrack.recordings import FrameTimes, OnboardVideo, Recording, VideoInfo, probe
 from psotrack.recordings.datasets._onboard import check_rate, is_onboard_video, numbered_files, read_onboard
-from psotrack.recordings.datasets._poses import read_poses
+from psotrack.recordings.datasets._poses import poses_of_frames
 from psotrack.recordings.mocap import NoDronesError, body_trajectories, read_c3d
 from psotrack.trajectories import Trajectories
 
@@ -238,14 +238,8 @@ def _pose_files(files: Sequence[Path], video: VideoInfo) -> dict[int, Path]:
 
 
 def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:
-    position_m = np.full((num_frames, len(poses), 3), np.nan)
-    orientation_wxyz = np.full((num_frames, len(poses), 4), np.nan)
-    for index, path in enumerate(poses.values()):
-        position, orientation = read_poses(path)
-        shared = min(num_frames, len(position))
-        position_m[:shared, index] = position[:shared]
-        if orientation is not None:
-            orientation_wxyz[:shared, index] = orientation[:shared]
+    read = [poses_of_frames(path, num_frames) for path in poses.values()]
+    position_m, orientation_wxyz = (np.stack(each, axis=1) for each in zip(*read, strict=True))
     frame = np.arange(num_frames)
     return Trajectories(
         frame,
