@@ -188,6 +188,16 @@ def test_what_others_write_while_an_image_is_decoded_stays_theirs(tmp_path, monk
     assert not caplog.records
 
 
+def test_a_photograph_with_damaged_data_is_named(tmp_path, capfd, caplog):
+    """libjpeg's own line, which does not name the file, is not shown."""
+    path, data = tmp_path / "a.jpg", bytearray(encoded(".jpg"))
+    data[-len(data) // 4 : -len(data) // 4 + 2] = b"\xff\xd5"
+    path.write_bytes(data)
+    assert read_image(path).shape == PICTURE.shape
+    assert capfd.readouterr().err == ""
+    assert f"{path} is damaged (Corrupt JPEG data" in caplog.text
+
+
 @pytest.mark.parametrize("kept", [0.3, 0.9])
 def test_a_photograph_that_is_cut_short(kept, tmp_path, capfd):
     path, data = tmp_path / "a.jpg", encoded(".jpg")

@@ -14,7 +14,7 @@ from jaxtyping import Shaped, UInt8
 
 from psotrack.errors import InputError
 from psotrack.recordings.image_headers import PNG, claimed_size_wh
-from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.opencv_messages import decode_image
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -141,14 +141,10 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
         found = "a file that is no PNG, JPEG, BMP, TIFF, WebP or PNM"
         raise InputError(where, expected="an image", found=found)
     check_pixels(where, *size_wh)
-    try:
-        with silence_opencv():
-            image = cv2.imdecode(coded, flags)
-    except cv2.error:
-        image = None
+    image = decode_image(coded, flags, where)
     if image is None:
         raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
-    return np.asarray(image)
+    return image
 
 
 def check_pixels(where: object, width: int, height: int) -> None:

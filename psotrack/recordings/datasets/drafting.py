@@ -11,7 +11,9 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, overload
+from typing import Literal
+
+import msgspec
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
@@ -289,47 +291,34 @@ def _table(
 ) -> CameraTable:
     """Table of one camera."""
     files = matching.files[name]
-    video, images = files.get("video"), files.get("images")
-    fps = None
-    if video is None and "timestamps" not in files:
+    fps = size = None
+    if "video" not in files and "timestamps" not in files:
         fps = options.fps
         if fps is None:
             expected = f"frames per second of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
-    size = None
-    if images is None and (video is None or isinstance(video, str)):
+    if "images" not in files and not isinstance(files.get("video"), Path):
         size = size_wh or options.size_wh
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
-    return CameraTable(
-        video=_written(video, base),
-        images=None if images is None else _pattern(matching.folder, Path(images), base),
-        ignore=_written(files.get("ignore"), base),
-        detections=_written(files.get("detections"), base),
-        size=size,
-        fps=fps,
-        timestamps=_written(files.get("timestamps"), base),
-    )
+    written = {kind: _written(file, base) for kind, file in files.items()}
+    if "images" in files:
+        written["images"] += _pattern(matching.folder, Path(files["images"]))
+    return msgspec.convert({**written, "size": size, "fps": fps}, CameraTable)
 
 
-def _pattern(folder: Path, images: Path, base: Path) -> str:
-    """Pattern of the images of a folder, such as `left/*.png`."""
+def _pattern(folder: Path, images: Path) -> str:
+    """Pattern of the images in a folder, such as `/*.png`."""
     suffixes = sorted({path.suffix for path in image_files(images)})
     if len(suffixes) > 1:
         raise _unclear(folder, images, "images of one kind", " and ".join(suffixes), match=False)
-    return f"{_written(images, base)}/*{suffixes[0]}"
+    return f"/*{suffixes[0]}"
 
 
-@overload
-def _written(file: Path | str, base: Path) -> str: ...
-@overload
-def _written(file: None, base: Path) -> None: ...
-@overload
-def _written(file: Path | str | None, base: Path) -> str | None: ...
-def _written(file: Path | str | None, base: Path) -> str | None:
+def _written(file: Path | str, base: Path) -> str:
     """A path as it is written: relative to the folder of the draft, with slashes."""
-    if file is None or isinstance(file, str):
+    if isinstance(file, str):
         return file
     try:
         return Path(os.path.relpath(file, base)).as_posix()
@@ -349,14 +338,12 @@ def _video_of_no_camera(
 
 
 def _unclear(folder: Path, file: Path | str, expected: str, found: str, *, match: bool = True) -> InputError:
-    name = shlex.quote(_short(file) if isinstance(file, str) else os.path.relpath(file, folder))
+    name = shlex.quote(file if isinstance(file, str) else os.path.relpath(file, folder))
     remedy = f"leave it out with --leave-out {name}"
-    return InputError(
-        file if isinstance(file, Path) else folder,
-        expected=expected,
-        found=found,
-        remedy=f"say whose it is with --match CAMERA={name}, or {remedy}" if match else remedy,
-    )
+    if match:
+        remedy = f"say whose it is with --match CAMERA={name}, or {remedy}"
+    where = file if isinstance(file, Path) else folder
+    return InputError(where, expected=expected, found=found, remedy=remedy)
 
 
 def _short(file: Path | str) -> str:
@@ -369,14 +356,9 @@ def _nothing(folder: Path, matching: _Matching, calibration: Path | None) -> Inp
         given = "" if calibration is None else f" --calibration {shlex.quote(str(calibration))}"
         remedy = f"for the videos in {below.name}: psotrack init {shlex.quote(str(below))}{given}"
     else:
-        remedy = "" if calibration is None else "say which file is whose with --match CAMERA=FILE"
-    if calibration is None:
-        return InputError(
-            folder, expected="videos, folders of images, or detections", found="none", remedy=remedy
-        )
-    return InputError(
-        folder,
-        expected=f"files named like the cameras of {calibration.name}, {', '.join(matching.cameras)}",
-        found="none",
-        remedy=remedy,
-    )
+        remedy = "say which file is whose with --match CAMERA=FILE" if calibration else ""
+    expected = "videos, folders of images, or detections"
+    if calibration is not None:
+        names = ", ".join(matching.cameras)
+        expected = f"files named like the cameras of {calibration.name}, {names}"
+    return InputError(folder, expected=expected, found="none", remedy=remedy)
