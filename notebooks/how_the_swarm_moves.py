@@ -33,7 +33,7 @@ from IPython.display import Image
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 from psotrack.foreground.silhouettes import SilhouetteSettings, compute, summed_area_table
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.show.reports import PointCloud, Scene3D
 from psotrack.simulation import SimulationSettings, simulate

@@ -28,7 +28,7 @@ from psotrack.evaluation import evaluate, plots, tables
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording
 from psotrack.recordings import read_frames
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.show.flights import flight_of
 from psotrack.show.overlay import save_picture

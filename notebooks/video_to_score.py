@@ -41,7 +41,7 @@ from psotrack.foreground.silhouettes import (
 )
 from psotrack.geometry import make_extents, project_boxes
 from psotrack.recordings import read_frames
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import DroneSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from psotrack.evaluation import evaluate, tables
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.show.flights import flight_of
 from psotrack.show.overlay import save_picture

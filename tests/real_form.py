@@ -18,16 +18,20 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
 from psotrack.geometry import Camera, Rig, to_pixels, undistort
-from psotrack.recordings import VideoInfo, VideoWriter, read_frames
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.geometry.rig_files import write_calibration
+from psotrack.recordings import (
+    Detections,
+    VideoInfo,
+    VideoWriter,
+    read_detections,
+    read_frames,
+    write_detections,
+)
+from psotrack.recordings.datasets import (
     CALIBRATION,
     DETECTIONS,
-    Detections,
-    read_detections,
     read_mocap_markers,
     read_sequence,
-    write_calibration,
-    write_detections,
 )
 from psotrack.recordings.mocap import Markers, write_c3d
 

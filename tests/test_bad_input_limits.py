@@ -22,8 +22,8 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.detection import DetectorSettings, OnnxDetector
 from psotrack.pipeline import archives
 from psotrack.recordings import read_image
-from psotrack.recordings.datasets import open_recording
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
+    open_recording,
     read_marker_corners,
     read_masks,
     read_mocap_markers,

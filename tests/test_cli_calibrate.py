@@ -15,14 +15,9 @@ from psotrack.calibration.doctor import improve_with_check
 from psotrack.cli.calibrate import calibrate
 from psotrack.errors import PsotrackError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
-from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
-from psotrack.recordings import Detections, VideoWriter
-from psotrack.recordings.datasets.dpjait import (
-    read_sequence,
-    write_calibration,
-    write_detections,
-    write_marker_corners,
-)
+from psotrack.geometry.rig_files import read_lenses, read_rig, write_calibration, write_rig
+from psotrack.recordings import Detections, VideoWriter, write_detections
+from psotrack.recordings.datasets import read_sequence, write_marker_corners
 from psotrack.trajectories import Trajectories, write_trajectories
 
 WORLD = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from psotrack import cli
 from psotrack.errors import PsotrackError
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 
 SMALL = ("--frames", "2", "--scale", "0.1", "--jobs", "1", "--no-onboard", "--quiet")
 #: Totals that the paper states for its simulated half: frames of all sequences, and frames times drones.

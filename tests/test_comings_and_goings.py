@@ -18,7 +18,7 @@ from psotrack.evaluation import evaluate
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.geometry import project
 from psotrack.pipeline import track_recording
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.simulation import Scenario, SimulationSettings, simulate, write_recorded_flight
 from psotrack.trajectories import Status, Trajectories

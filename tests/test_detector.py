@@ -13,8 +13,9 @@ from psotrack.cli.track import track
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.foreground.detection import DetectorSettings, OnnxDetector, detect_drones
 from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry.rig_files import write_calibration
 from psotrack.recordings import VideoWriter, probe, read_detections
-from psotrack.recordings.datasets import dpjait
+from psotrack.recordings.datasets import CALIBRATION
 from psotrack.trajectories import read_trajectories
 
 #: Layout of the output -> side of the network's input, pixels. "v10" needs at least 300 boxes, so 18 x 18 boxes.
@@ -157,7 +158,7 @@ def sequence(tmp_path_factory):
     folder.mkdir(parents=True)
     R, t_m = look_at((0.0, -6.0, 2.0), (0.0, 0.0, 1.5))
     one = make_camera(R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(256, 192))
-    dpjait.write_calibration(folder / dpjait.CALIBRATION, make_unnamed_rig(one, one))
+    write_calibration(folder / CALIBRATION, make_unnamed_rig(one, one))
     for name in "01":
         with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:
             for frame in range(4):
@@ -210,7 +211,7 @@ def flight_folder(tmp_path_factory):
         K = np.array([[1100.0, 0.0, 127.5], [0.0, 1100.0, 95.5], [0.0, 0.0, 1.0]])
         cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(256, 192)))
     rig = make_unnamed_rig(*cameras)
-    dpjait.write_calibration(folder / dpjait.CALIBRATION, rig)
+    write_calibration(folder / CALIBRATION, rig)
     middles, _ = project(rig.cameras, PLACES_M[:, None])
     for index, name in enumerate(rig.names):
         with VideoWriter(folder / f"{name}.avi", 25.0, (256, 192)) as writer:

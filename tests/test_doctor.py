@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration.doctor import Agreement, examine, sampled_frames
 from psotrack.cli.doctor import doctor
 from psotrack.geometry import Rig, project
-from psotrack.recordings import Detections
-from psotrack.recordings.datasets.dpjait import write_calibration, write_detections, write_poses
+from psotrack.geometry.rig_files import write_calibration
+from psotrack.recordings import Detections, write_detections
+from psotrack.recordings.datasets import write_poses
 from psotrack.tracking.matching import from_detections
 from psotrack.trajectories import Trajectories
 

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from psotrack.cli import cli
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
-from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets import dpjait
+from psotrack.recordings import VideoWriter, read_detections
+from psotrack.recordings.datasets import read_sequence
 from psotrack.recordings.mocap import Markers, write_c3d
 
 WIDTH, HEIGHT, FPS = 64, 48, 25.0
@@ -83,7 +83,7 @@ def replace_in_file(path: Path, old: str, new: str) -> None:
 
 
 def test_the_simulated_half(simulated_folder):
-    recording = dpjait.read_sequence(simulated_folder)
+    recording = read_sequence(simulated_folder)
     assert recording.name == "S99_D9"
     assert recording.rig.names == ("cam1i", "cam2i", "cam3i")
     assert [recording.videos[name].path.name for name in recording.rig.names] == [
@@ -122,20 +122,20 @@ def published_folder(simulated_folder, make_video):
 
 def test_the_simulated_half_as_published(published_folder):
     """The file `cam1i_s` belongs to the camera `cam1` of the calibration; the file `cam10i_s` does not."""
-    recording = dpjait.read_sequence(published_folder)
+    recording = read_sequence(published_folder)
     names = tuple(f"cam{i}" for i in range(1, 11))
     assert recording.rig.names == names
     assert {name: video.path.name for name, video in recording.videos.items()} == {
         name: f"{name}i_s.avi" for name in names
     }
     for i, name in enumerate(names, start=1):
-        assert dpjait.read_detections(recording.detections[name]).frame.tolist() == [i]
+        assert read_detections(recording.detections[name]).frame.tolist() == [i]
 
 
 @pytest.mark.parametrize("typed", ["cam1", "cam1i", "cam1i_s", "CAM1"])
 @pytest.mark.parametrize("half", ["simulated_folder", "published_folder"])
 def test_a_camera_is_selected_by_any_of_its_names(half, typed, request):
-    recording = dpjait.read_sequence(request.getfixturevalue(half))
+    recording = read_sequence(request.getfixturevalue(half))
     kept = recording.usable([typed, "cam3"])
     assert kept.rig.names == (recording.rig.names[0], recording.rig.names[2])
     assert list(kept.videos) == list(kept.rig.names)
@@ -152,7 +152,7 @@ def test_a_camera_is_selected_by_any_of_its_names(half, typed, request):
 )
 def test_unknown_and_repeated_camera_names(published_folder, typed, found):
     with pytest.raises(SettingsError, match=f"cameras: expected some of cam1, cam2, .*{found}"):
-        dpjait.read_sequence(published_folder).usable(typed)
+        read_sequence(published_folder).usable(typed)
 
 
 def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated_folder, make_video):
@@ -162,7 +162,7 @@ def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated_f
     (simulated_folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
     for name in ("left_back_s", "left", "left_debug"):
         shutil.copy(make_video(5), simulated_folder / f"{name}.avi")
-    videos = dpjait.read_sequence(simulated_folder).videos
+    videos = read_sequence(simulated_folder).videos
     assert {name: video.path.name for name, video in videos.items()} == {
         "left": "left.avi",
         "left_back": "left_back_s.avi",
@@ -170,7 +170,7 @@ def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated_f
 
 
 def test_the_real_half(real_folder):
-    recording = dpjait.read_sequence(real_folder)
+    recording = read_sequence(real_folder)
     assert recording.rig.names == SERIALS
     cameras = recording.rig.cameras
     np.testing.assert_allclose(cameras.T_cam_world[0, :3, 3], [-0.1, 0.2505, 6.0], rtol=0, atol=1e-12)
@@ -188,7 +188,7 @@ def test_the_real_half(real_folder):
 def test_projection_agrees_with_opencv(half, request):
     """Projection agrees with `cv2.projectPoints` and the values of the file: t is not the camera's centre."""
     folder = request.getfixturevalue(half)
-    rig = dpjait.read_sequence(folder).rig
+    rig = read_sequence(folder).rig
     line = (folder / "cameras_calibration.csv").read_text().splitlines()[2].split(";")
     t, rvec = np.array(line[1:4], float), np.array(line[4:7], float)
     f, cx, cy = (float(value) for value in line[7:10])
@@ -205,15 +205,15 @@ def test_projection_agrees_with_opencv(half, request):
 def test_forms_of_the_path_of_a_sequence(simulated_folder, monkeypatch):
     monkeypatch.chdir(simulated_folder.parent)
     for typed in ("S99_D9", "S99_D9/", "./S99_D9//", simulated_folder):
-        assert dpjait.read_sequence(typed).name == "S99_D9"
+        assert read_sequence(typed).name == "S99_D9"
     monkeypatch.chdir(simulated_folder)
-    assert dpjait.read_sequence(".").name == "S99_D9"
+    assert read_sequence(".").name == "S99_D9"
 
 
 def test_cameras_may_be_without_video(simulated_folder, caplog):
     (simulated_folder / "cam2i_s.avi").unlink()
     with caplog.at_level("INFO"):
-        recording = dpjait.read_sequence(simulated_folder)
+        recording = read_sequence(simulated_folder)
     assert list(recording.videos) == ["cam1i", "cam3i"]
     assert recording.rig.cameras.image_size_wh.tolist() == [[64, 48]] * 3
     assert "camera cam2i has no video: assuming 64 x 48 pixels like most cameras" in caplog.text
@@ -224,7 +224,7 @@ def test_cameras_may_be_without_video(simulated_folder, caplog):
 
 def test_videos_may_differ_in_length(simulated_folder, make_video):
     shutil.copy(make_video(7), simulated_folder / "cam2i_s.avi")
-    recording = dpjait.read_sequence(simulated_folder)
+    recording = read_sequence(simulated_folder)
     assert recording.num_frames == recording.truth.num_frames == 7
     assert recording.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
     assert recording.usable().timeline().frame[4:6].tolist() == [[4, 4, 4], [-1, 5, -1]]
@@ -235,21 +235,21 @@ def test_a_video_of_another_size(simulated_folder, make_video):
     with pytest.raises(
         InputError, match=r"cam1i_s\.avi: .* principal point \(32, 24\), found 96 x 64 pixels"
     ):
-        dpjait.read_sequence(simulated_folder)
+        read_sequence(simulated_folder)
     replace_in_file(simulated_folder / "cameras_calibration.csv", "1157.3;32;24", "1157.3;47;31")
-    recording = dpjait.read_sequence(simulated_folder).usable()
+    recording = read_sequence(simulated_folder).usable()
     assert recording.rig.cameras.image_size_wh.tolist() == [[96, 64], [64, 48], [64, 48]]
 
 
 def test_poses_after_the_end_of_the_videos_are_dropped(simulated_folder):
     (simulated_folder / "dron1_pos_25.csv").write_text(pose_lines(9, 0.0))
-    assert dpjait.read_sequence(simulated_folder).truth.num_frames == 5
+    assert read_sequence(simulated_folder).truth.num_frames == 5
 
 
 def test_missing_poses_are_nan(simulated_folder):
     (simulated_folder / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0))
     replace_in_file(simulated_folder / "dron2_pos_25.csv", "\n3;", "\n12;")
-    truth = dpjait.read_sequence(simulated_folder).truth
+    truth = read_sequence(simulated_folder).truth
     assert truth.seen[:, 0].tolist() == [False, True, True, False, False]
     assert truth.seen[:, 1].tolist() == [False, True, True, False, True]
 
@@ -259,7 +259,7 @@ def test_ten_drones_are_in_the_order_of_their_numbers(simulated_folder):
         (simulated_folder / f"drone{number}_pos_25.csv").write_text(
             pose_lines(5, number)
         )  # the other spelling, `drone`
-    truth = dpjait.read_sequence(simulated_folder).truth
+    truth = read_sequence(simulated_folder).truth
     assert truth.drones == tuple(f"dron{number}" for number in range(1, 11))
     assert truth.position_m[1, 9, 0] == pytest.approx(10.1)
 
@@ -267,32 +267,32 @@ def test_ten_drones_are_in_the_order_of_their_numbers(simulated_folder):
 def test_no_reference(simulated_folder):
     for path in simulated_folder.glob("dron*.csv"):
         path.unlink()
-    assert dpjait.read_sequence(simulated_folder).truth is None
+    assert read_sequence(simulated_folder).truth is None
 
 
 def test_detections_are_assigned_to_cameras(simulated_folder):
     (simulated_folder / "dl_data").mkdir()
     (simulated_folder / "dl_data" / "cam2i_s.csv").write_text("1,10,20,4,6,12,23,0.5\n")
-    detections = dpjait.read_sequence(simulated_folder).detections
+    detections = read_sequence(simulated_folder).detections
     assert list(detections) == ["cam2i"]
-    assert dpjait.read_detections(detections["cam2i"]).xyxy.tolist() == [[10, 20, 14, 26]]
+    assert read_detections(detections["cam2i"]).xyxy.tolist() == [[10, 20, 14, 26]]
 
 
 def test_other_videos_are_ignored(simulated_folder, make_video, caplog):
     shutil.copy(make_video(7), simulated_folder / "dron1_fpv.mp4")
     with caplog.at_level("INFO"):
-        assert dpjait.read_sequence(simulated_folder).truth.num_frames == 5
+        assert read_sequence(simulated_folder).truth.num_frames == 5
     assert "dron1_fpv.mp4: not used" in caplog.text
 
 
 def test_serial_numbers_with_a_prefix(real_folder):
     (real_folder / f"{SERIALS[0]}.avi").rename(real_folder / f"cam_{SERIALS[0]}.avi")
-    assert list(dpjait.read_sequence(real_folder).videos) == list(SERIALS)
+    assert list(read_sequence(real_folder).videos) == list(SERIALS)
 
 
 def assert_reading_fails(folder, message):
     with pytest.raises(InputError, match=message):
-        dpjait.read_sequence(folder)
+        read_sequence(folder)
 
 
 def test_no_such_folder(tmp_path):
@@ -343,8 +343,12 @@ def test_a_broken_video(simulated_folder):
     [
         (";", ",", ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
         ("focal_length", "focus", r": expected a column focal_length, found only cam_name, cam_x\[m\]"),
-        ("cam_x[m]", "cam_x[ft]", r": expected a column cam_x\[m\] or cam_x\[mm\], found cam_x\[ft\]"),
-        ("cam_x[m]", "cam_x", r": expected a column cam_x\[m\] or cam_x\[mm\], found cam_x"),
+        (
+            "cam_x[m]",
+            "cam_x[ft]",
+            r": expected a column cam_x\[m\] or cam_x\[cm\] or cam_x\[mm\], found cam_x\[ft\]",
+        ),
+        ("cam_x[m]", "cam_x", r": expected a column cam_x\[m\] or cam_x\[cm\] or cam_x\[mm\], found cam_x"),
         ("cam_y[m]", "cam_x[m]", ", line 1: expected each column once, found cam_x again"),
         (";cy", ";coeff_1", ": expected a column coeff_2"),
         ("cam2i;2;0.5", "cam2i;2;x", r", line 3, column cam_y\[m\]: expected a number, found 'x'"),
@@ -390,11 +394,11 @@ def test_too_many_coefficients(real_folder):
     ids=["byte order mark", "Windows", "last separator", "blank lines", "spaces", "upper case"],
 )
 def test_harmless_differences_are_accepted(simulated_folder, change_text):
-    original = dpjait.read_sequence(simulated_folder)
+    original = read_sequence(simulated_folder)
     for name in ("cameras_calibration.csv", "dron1_pos_25.csv"):
         path = simulated_folder / name
         path.write_bytes(change_text(path.read_text()).encode())
-    changed = dpjait.read_sequence(simulated_folder)
+    changed = read_sequence(simulated_folder)
     assert changed.rig.names == original.rig.names
     np.testing.assert_array_equal(changed.rig.cameras.T_cam_world, original.rig.cameras.T_cam_world)
     np.testing.assert_array_equal(changed.truth.position_m, original.truth.position_m)
@@ -464,7 +468,7 @@ def test_a_person_in_the_folder_is_no_reference(real_folder, tmp_path, caplog):
     arguments = ["evaluate", str(tmp_path / "tracks.csv"), str(real_folder), "--body", "cf1=b0,b1,b2,b3"]
     result = CliRunner().invoke(cli, [*arguments, "--json", "-"])
     assert result.exit_code == 0, result.output
-    assert dpjait.read_sequence(real_folder, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
+    assert read_sequence(real_folder, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
 
 
 def test_bodies_need_a_c3d(real_folder):
@@ -472,7 +476,7 @@ def test_bodies_need_a_c3d(real_folder):
     with pytest.raises(
         InputError, match=r"bodies cf1: expected a \.c3d file that holds their markers, found none"
     ):
-        dpjait.read_sequence(real_folder, bodies={"cf1": ["a"]})
+        read_sequence(real_folder, bodies={"cf1": ["a"]})
 
 
 @pytest.mark.parametrize(
@@ -491,7 +495,7 @@ def test_bodies_need_a_c3d(real_folder):
 def test_column_names_of_the_quaternion(simulated_folder, names, recognised):
     for path in simulated_folder.glob("dron*.csv"):
         replace_in_file(path, "q_w;q_x;q_y;q_z", names)
-    orientation_wxyz = dpjait.read_sequence(simulated_folder).truth.orientation_wxyz
+    orientation_wxyz = read_sequence(simulated_folder).truth.orientation_wxyz
     if recognised:
         assert orientation_wxyz[1, 0].tolist() == [0, 0, 0, 1]
     else:
@@ -502,4 +506,4 @@ def test_quaternion_with_the_scalar_last(simulated_folder):
     """The names of the columns decide, not their order."""
     for path in simulated_folder.glob("dron*.csv"):
         replace_in_file(path, "q_w;q_x;q_y;q_z", "q_x;q_y;q_z;q_w")
-    assert dpjait.read_sequence(simulated_folder).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]
+    assert read_sequence(simulated_folder).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]

@@ -11,8 +11,19 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, make_rig
-from psotrack.recordings import VideoWriter, describe_recording, inventory_table
-from psotrack.recordings.datasets import dpjait
+from psotrack.geometry.rig_files import write_calibration
+from psotrack.recordings import VideoWriter, inventory_table
+from psotrack.recordings.datasets import (
+    CALIBRATION,
+    ONBOARD_CALIBRATION,
+    onboard_pose_file,
+    pose_file,
+    read_onboard,
+    read_onboard_calibration,
+    read_sequence,
+    write_onboard_calibration,
+    write_poses,
+)
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 5
 K = np.array([[30.5, 0.0, 31.5], [0.0, 30.25, 23.5], [0.0, 0.0, 1.0]])
@@ -33,17 +44,17 @@ def folder(tmp_path):
     """A sequence of two wall cameras and two drones, each with an on-board camera."""
     R, t_m = look_at((4.0, 3.0, 2.5), (0.0, 0.0, 1.0))
     camera = make_camera(R=R, t_m=t_m, K=np.diag([80.0, 80.0, 1.0]), image_size_wh=(WIDTH, HEIGHT))
-    dpjait.write_calibration(tmp_path / dpjait.CALIBRATION, make_rig({"cam1i": camera, "cam2i": camera}))
+    write_calibration(tmp_path / CALIBRATION, make_rig({"cam1i": camera, "cam2i": camera}))
     for name in ("cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi"):
         write_video(tmp_path / name)
     for number in (1, 2):
         shifted_m = np.add(POSITION_M, [0.0, number, 0.0])
-        dpjait.write_poses(tmp_path / dpjait.pose_file(number), shifted_m, ORIENTATION_WXYZ)
-        dpjait.write_poses(
-            tmp_path / dpjait.onboard_pose_file(number), np.add(shifted_m, [0.1, 0.0, 0.0]), ORIENTATION_WXYZ
+        write_poses(tmp_path / pose_file(number), shifted_m, ORIENTATION_WXYZ)
+        write_poses(
+            tmp_path / onboard_pose_file(number), np.add(shifted_m, [0.1, 0.0, 0.0]), ORIENTATION_WXYZ
         )
     intrinsics = {"dron1": (K, (WIDTH, HEIGHT)), "dron2": (K + np.diag([1.0, 1.0, 0.0]), (WIDTH, HEIGHT))}
-    dpjait.write_onboard_calibration(tmp_path / dpjait.ONBOARD_CALIBRATION, intrinsics)
+    write_onboard_calibration(tmp_path / ONBOARD_CALIBRATION, intrinsics)
     return tmp_path
 
 
@@ -54,7 +65,7 @@ def replace_in_file(path, old, new):
 
 
 def test_written_onboard_files_are_read_back(folder):
-    found = dpjait.read_onboard(folder)
+    found = read_onboard(folder)
     assert list(found) == ["dron1", "dron2"]
     first, second = found.values()
     assert (first.video.path.name, first.video.num_frames) == ("dron1_cam_s.avi", FRAMES)
@@ -75,13 +86,13 @@ def test_written_onboard_files_are_read_back(folder):
     )
 )
 def test_written_intrinsics_are_read_back(tmp_path_factory, cameras):
-    path = tmp_path_factory.getbasetemp() / dpjait.ONBOARD_CALIBRATION
+    path = tmp_path_factory.getbasetemp() / ONBOARD_CALIBRATION
     intrinsics = {
         f"dron{number}": (np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (width, height))
         for number, (fx, fy, cx, cy, width, height) in enumerate(cameras, start=1)
     }
-    dpjait.write_onboard_calibration(path, intrinsics)
-    again = dpjait.read_onboard_calibration(path)
+    write_onboard_calibration(path, intrinsics)
+    again = read_onboard_calibration(path)
     assert list(again) == list(intrinsics)
     for name, (expected, size_wh) in intrinsics.items():
         np.testing.assert_array_equal(again[name][0], expected)
@@ -89,7 +100,7 @@ def test_written_intrinsics_are_read_back(tmp_path_factory, cameras):
 
 
 def test_a_recording_has_onboard_cameras_beside_its_fixed_cameras(folder):
-    recording = dpjait.read_sequence(folder)
+    recording = read_sequence(folder)
     assert list(recording.videos) == ["cam1i", "cam2i"]
     assert recording.truth.drones == ("dron1", "dron2")
     # The reference holds the poses of the drones, not of the on-board cameras 0.1 m in front.
@@ -102,17 +113,17 @@ def test_a_sequence_without_onboard_videos(folder):
     for path in folder.glob("*cam_*"):
         path.unlink()
     # Intrinsics without videos are ignored.
-    assert dpjait.read_onboard(folder) == {}
-    recording = dpjait.read_sequence(folder)
+    assert read_onboard(folder) == {}
+    recording = read_sequence(folder)
     assert recording.onboard is None
-    assert describe_recording(recording)["onboard"] is None
+    assert recording.to_dict()["onboard"] is None
 
 
-@pytest.mark.parametrize("missing", ["dron1_cam_25.csv", dpjait.ONBOARD_CALIBRATION])
+@pytest.mark.parametrize("missing", ["dron1_cam_25.csv", ONBOARD_CALIBRATION])
 def test_a_video_alone_is_enough(folder, missing):
     (folder / missing).unlink()
-    onboard = dpjait.read_onboard(folder)["dron1"]
-    assert (onboard.K is None) == (missing == dpjait.ONBOARD_CALIBRATION)
+    onboard = read_onboard(folder)["dron1"]
+    assert (onboard.K is None) == (missing == ONBOARD_CALIBRATION)
     assert np.isnan(onboard.orientation_wxyz).all() == (missing == "dron1_cam_25.csv")
     assert onboard.position_m.shape == (FRAMES, 3)
 
@@ -120,8 +131,8 @@ def test_a_video_alone_is_enough(folder, missing):
 @pytest.mark.parametrize(("rows", "num_known"), [(3, 2), (9, 4)])
 def test_poses_may_be_fewer_or_more_than_frames(folder, rows, num_known):
     turns = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1))
-    dpjait.write_poses(folder / dpjait.onboard_pose_file(1), np.ones((rows, 3)), turns)
-    onboard = dpjait.read_onboard(folder)["dron1"]
+    write_poses(folder / onboard_pose_file(1), np.ones((rows, 3)), turns)
+    onboard = read_onboard(folder)["dron1"]
     assert onboard.position_m.shape == (FRAMES, 3)
     assert np.isfinite(onboard.position_m).all(axis=1).sum() == num_known
 
@@ -129,8 +140,8 @@ def test_poses_may_be_fewer_or_more_than_frames(folder, rows, num_known):
 @pytest.mark.parametrize("file_name", ["drone1_cam.avi", "Dron_1_cam_s.AVI", "dron1_cam.mp4"])
 def test_other_spellings_of_the_file_name_are_accepted(folder, file_name):
     (folder / "dron1_cam_s.avi").rename(folder / file_name)
-    assert dpjait.read_onboard(folder)["dron1"].video.path.name == file_name
-    assert list(dpjait.read_sequence(folder).videos) == ["cam1i", "cam2i"]
+    assert read_onboard(folder)["dron1"].video.path.name == file_name
+    assert list(read_sequence(folder).videos) == ["cam1i", "cam2i"]
 
 
 # --- inconsistent files
@@ -141,25 +152,25 @@ def test_two_videos_of_one_drone(folder):
     with pytest.raises(
         InputError, match=r"drone1_cam\.avi: expected one file per drone, found dron1_cam_s\.avi"
     ):
-        dpjait.read_onboard(folder)
+        read_onboard(folder)
 
 
 def test_a_video_of_another_size_than_its_intrinsics(folder):
     write_video(folder / "dron2_cam_s.avi", (32, 32))
     with pytest.raises(InputError, match=r"dron2_cam_s\.avi: expected 64 x 48 pixels .*, found 32 x 32"):
-        dpjait.read_onboard(folder)
+        read_onboard(folder)
 
 
 def test_poses_at_another_rate(folder):
     (folder / "dron2_cam_25.csv").rename(folder / "dron2_cam_30.csv")
     with pytest.raises(InputError, match=r"dron2_cam_30\.csv: expected poses at the 25 Hz .*, found 30 Hz"):
-        dpjait.read_onboard(folder)
+        read_onboard(folder)
 
 
 def test_a_pose_that_is_not_a_number(folder):
     replace_in_file(folder / "dron1_cam_25.csv", "1.5", "one and a half")
     with pytest.raises(InputError, match=r"dron1_cam_25\.csv, line 3, column pos_z\[m\]: expected a number"):
-        dpjait.read_onboard(folder)
+        read_onboard(folder)
 
 
 @pytest.mark.parametrize(
@@ -178,16 +189,16 @@ def test_a_pose_that_is_not_a_number(folder):
     ],
 )
 def test_broken_intrinsics(folder, old, new, message):
-    replace_in_file(folder / dpjait.ONBOARD_CALIBRATION, old, new)
+    replace_in_file(folder / ONBOARD_CALIBRATION, old, new)
     with pytest.raises(InputError, match=rf"drone_cameras_calibration\.csv.*{message}"):
-        dpjait.read_onboard(folder)
+        read_onboard(folder)
 
 
 def test_a_sequence_is_read_without_broken_onboard_files(folder, caplog):
     """Tracking needs only the wall cameras."""
     replace_in_file(folder / "dron1_cam_25.csv", "1.5", "?")
     with caplog.at_level(logging.WARNING):
-        recording = dpjait.read_sequence(folder)
+        recording = read_sequence(folder)
     assert recording.onboard is None
     assert "dron1_cam_25.csv, line 3" in caplog.text
     assert recording.truth is not None
@@ -196,14 +207,14 @@ def test_a_sequence_is_read_without_broken_onboard_files(folder, caplog):
 @pytest.mark.parametrize("intrinsics", [{}, {"dron1": (K + np.eye(3, k=1), (WIDTH, HEIGHT))}])
 def test_intrinsics_that_the_table_cannot_hold(tmp_path, intrinsics):
     with pytest.raises(SettingsError, match="without skew"):
-        dpjait.write_onboard_calibration(tmp_path / "x.csv", intrinsics)
+        write_onboard_calibration(tmp_path / "x.csv", intrinsics)
 
 
 # --- the inventory
 
 
 def test_the_inventory_has_a_row_per_onboard_camera(folder):
-    content = describe_recording(dpjait.read_sequence(folder))
+    content = read_sequence(folder).to_dict()
     assert content["onboard"]["dron2"] == {
         "video": str(folder / "dron2_cam_s.avi"),
         "frames": FRAMES,

@@ -11,7 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import Rig, make_camera, make_rig, project
-from psotrack.recordings.datasets import dpjait
+from psotrack.geometry.rig_files import read_rig, write_calibration
+from psotrack.recordings.datasets import (
+    MARKER_CORNERS,
+    pose_file,
+    read_marker_corners,
+    read_poses,
+    write_marker_corners,
+    write_poses,
+)
 
 finite = st.floats(-50, 50)
 triples = st.tuples(finite, finite, finite)
@@ -40,7 +48,7 @@ def make_test_rig(poses, dist=(), focal_length_px=1156.3) -> Rig:
 
 
 def read_back(path: Path, rig: Rig) -> Rig:
-    return dpjait.read_calibration(path, dict.fromkeys(rig.names, SIZE_WH))
+    return read_rig(path, SIZE_WH)
 
 
 @given(
@@ -51,7 +59,7 @@ def read_back(path: Path, rig: Rig) -> Rig:
 def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
     path = tmp_path_factory.getbasetemp() / "cameras_calibration.csv"
     rig = make_test_rig(poses, dist)
-    dpjait.write_calibration(path, rig, unit)
+    write_calibration(path, rig, unit)
     again = read_back(path, rig)
     assert again.names == rig.names
     # Rotations are converted to vectors and back, lengths to millimetres and back, which rounds doubles up to 50.
@@ -66,7 +74,7 @@ def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
 def test_a_rig_that_is_read_back_projects_to_the_same_pixels(tmp_path_factory, poses, point):
     path = tmp_path_factory.getbasetemp() / "cameras_calibration.csv"
     rig = make_test_rig(poses, (-0.1, 0.02, 0.001, -0.002))
-    dpjait.write_calibration(path, rig, "mm")
+    write_calibration(path, rig, "mm")
     points_m = np.tile(point, (len(rig), 1))
     pixels_before, depth_m = project(rig.cameras, points_m)
     pixels_after, _ = project(read_back(path, rig).cameras, points_m)
@@ -78,12 +86,12 @@ def test_a_rig_that_is_read_back_projects_to_the_same_pixels(tmp_path_factory, p
 def test_the_header_is_the_published_one(tmp_path):
     path = tmp_path / "cameras_calibration.csv"
     poses = [(Rotation.identity(), (1.0, 2.0, 3.0))]
-    dpjait.write_calibration(path, make_test_rig(poses))
+    write_calibration(path, make_test_rig(poses))
     assert path.read_text().splitlines() == [
         "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy",
         "cam1i;1.0;2.0;3.0;0.0;0.0;0.0;1156.3;960.25;540.0",
     ]
-    dpjait.write_calibration(path, make_test_rig(poses, (0.1, 0.0, 0.0, 0.0)), "mm")
+    write_calibration(path, make_test_rig(poses, (0.1, 0.0, 0.0, 0.0)), "mm")
     assert path.read_text().splitlines() == [
         "cam_name;cam_x[mm];cam_y[mm];cam_z[mm];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
         ";coeff_1;coeff_2;coeff_3;coeff_4",
@@ -103,7 +111,7 @@ def test_rigs_that_the_file_format_cannot_hold_are_refused(tmp_path):
     plain = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
     sound = lens(plain, (0.1, 0.0, 0.0, 0.0, 0.0))
     # A fifth coefficient of zero can be left out.
-    dpjait.write_calibration(path, make_rig({"a": sound}))
+    write_calibration(path, make_rig({"a": sound}))
     for other, message in (
         (lens(plain, (0.1, 0.0, 0.0, 0.0, 0.01)), "distortion by k1, k2, p1, p2 alone, found 5 coefficients"),
         (lens(plain + np.diag([0, 1.0, 0])), "one focal length, found fx 1000 and fy 1001"),
@@ -111,23 +119,23 @@ def test_rigs_that_the_file_format_cannot_hold_are_refused(tmp_path):
         (lens(plain, fisheye=True), "OpenCV's pinhole model, found a fisheye"),
     ):
         with pytest.raises(SettingsError, match=rf"^camera GoPro 3: expected {message}; .*rig\.toml"):
-            dpjait.write_calibration(path, make_rig({"a": sound, "GoPro 3": other, "z": other}))
+            write_calibration(path, make_rig({"a": sound, "GoPro 3": other, "z": other}))
 
 
 def test_a_failed_write_leaves_the_file(tmp_path):
     path = tmp_path / "file" / "cameras_calibration.csv"
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cameras_calibration"):
-        dpjait.write_calibration(path, make_test_rig([(Rotation.identity(), (0.0, 0.0, 5.0))]))
+        write_calibration(path, make_test_rig([(Rotation.identity(), (0.0, 0.0, 5.0))]))
 
 
 @given(poses=st.lists(st.tuples(triples, rotations), min_size=2, max_size=9))
 def test_written_poses_are_read_back(tmp_path_factory, poses):
-    path = tmp_path_factory.getbasetemp() / dpjait.pose_file(1)
+    path = tmp_path_factory.getbasetemp() / pose_file(1)
     position_m = np.array([position for position, _ in poses])
     rotation = Rotation.concatenate([rotation for _, rotation in poses])
-    dpjait.write_poses(path, position_m, rotation.as_quat(scalar_first=True))
-    position_again_m, orientation_again_wxyz = dpjait.read_poses(path)
+    write_poses(path, position_m, rotation.as_quat(scalar_first=True))
+    position_again_m, orientation_again_wxyz = read_poses(path)
     assert np.isnan(position_again_m[0]).all()
     assert np.isnan(orientation_again_wxyz[0]).all()
     np.testing.assert_array_equal(position_again_m[1:], position_m[1:])
@@ -145,7 +153,7 @@ def test_written_poses_are_read_back(tmp_path_factory, poses):
 
 def test_the_first_row_is_the_placeholder(tmp_path):
     path = tmp_path / "dron1_pos_25.csv"
-    dpjait.write_poses(path, np.ones((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    write_poses(path, np.ones((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
     assert path.read_text().splitlines() == [
         "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z",
         "0;0.0;0.0;-0.0;0.0;0.0;0.0;1.0;0.0;0.0;0.0",
@@ -161,16 +169,16 @@ def test_poses_that_cannot_be_written(tmp_path):
     with pytest.raises(
         SettingsError, match="poses: expected finite numbers, found NaN or infinity at frame 2"
     ):
-        dpjait.write_poses(path, position_m, upright)
+        write_poses(path, position_m, upright)
     with pytest.raises(SettingsError, match="expected equal numbers of positions and orientations"):
-        dpjait.write_poses(path, np.ones((0, 3)), np.ones((0, 4)))
+        write_poses(path, np.ones((0, 3)), np.ones((0, 4)))
     assert not path.exists()
 
 
 def test_a_first_row_with_a_pose_is_a_pose(tmp_path):
     path = tmp_path / "dron1_pos_25.csv"
     path.write_text("id;pos_x[m];pos_y[m];pos_z[m]\n0;1;2;3\n1;1;2;3\n")
-    position_m, orientation_wxyz = dpjait.read_poses(path)
+    position_m, orientation_wxyz = read_poses(path)
     assert position_m.tolist() == [[1, 2, 3]] * 2
     assert orientation_wxyz is None
 
@@ -181,9 +189,9 @@ def test_a_first_row_with_a_pose_is_a_pose(tmp_path):
     )
 )
 def test_written_marker_corners_are_read_back(tmp_path_factory, corners):
-    path = tmp_path_factory.getbasetemp() / dpjait.MARKER_CORNERS
-    dpjait.write_marker_corners(path, corners)
-    again = dpjait.read_marker_corners(path)
+    path = tmp_path_factory.getbasetemp() / MARKER_CORNERS
+    write_marker_corners(path, corners)
+    again = read_marker_corners(path)
     assert set(again) == set(corners)
     for marker, corners_m in corners.items():
         np.testing.assert_array_equal(again[marker], corners_m)
@@ -198,8 +206,8 @@ def test_written_marker_corners_are_read_back(tmp_path_factory, corners):
     ],
 )
 def test_broken_marker_corners(tmp_path, old, new, message):
-    path = tmp_path / dpjait.MARKER_CORNERS
-    dpjait.write_marker_corners(path, {5: np.zeros((4, 3)), 7: np.full((4, 3), 0.5)})
+    path = tmp_path / MARKER_CORNERS
+    write_marker_corners(path, {5: np.zeros((4, 3)), 7: np.full((4, 3), 0.5)})
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(InputError, match=message):
-        dpjait.read_marker_corners(path)
+        read_marker_corners(path)

@@ -22,7 +22,7 @@ from psotrack.errors import (
     check_positive,
     errors_name,
 )
-from psotrack.geometry.rig_files import read_camera_names, read_lenses, read_rig, write_calibration, write_rig
+from psotrack.geometry.rig_files import read_cameras, read_lenses, read_rig, write_calibration, write_rig
 from psotrack.recordings import Detections, VideoWriter, join_videos, probe, read_detections, write_detections
 from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
 from psotrack.support import (
@@ -273,7 +273,7 @@ def test_paths_may_be_strings(tmp_path):
     assert read_rig(path("rig.toml")).names == read_lenses(path("rig.toml")).names == rig.names
     rig.cameras.K[:, 1, 1], rig.cameras.K[:, 0, 1] = rig.cameras.K[:, 0, 0], 0.0
     write_calibration(path("rig.csv"), rig)
-    assert read_camera_names(path("rig.csv")) == rig.names
+    assert tuple(read_cameras(path("rig.csv"))) == rig.names
     write_detections(path("a.csv"), Detections(np.array([0]), np.array([[0.0, 0, 2, 2]]), np.array([0.5])))
     assert len(read_detections(path("a.csv"))) == 1
     flight = Trajectories(np.arange(2), np.arange(2) / 25, ("dron1",), np.ones((2, 1, 3)))

@@ -254,6 +254,32 @@ def test_tracks_with_a_rate_of_their_own(
         assert found["missed_rate"] == expected["missed_rate"]
 
 
+@pytest.mark.parametrize("name", ["one.txt", f"{'long' * 42}.tum"])
+def test_a_file_of_tum_has_any_name(tmp_path: Path, name: str) -> None:
+    """TUM's own files end in .txt. The drone has the name of the file, however long."""
+    tracks = replace(
+        small_tracks(), position_m=np.where([[[False], [True]]], np.nan, small_tracks().position_m)
+    )
+    export_tracks(tracks, "tum", tmp_path / name)
+    read = read_tracks(tmp_path / name)
+    assert read.drones == (Path(name).stem,)
+    seen = tracks.seen[:, 0]
+    np.testing.assert_array_equal(read.position_m[:, 0], tracks.position_m[seen, 0])
+
+
+def test_all_commands_read_the_same_formats(
+    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
+) -> None:
+    """JSON as well as CSV; `test_fuse_command` has the same of `fuse`."""
+    export_tracks(small_tracks(), "json", tmp_path / "tracks.json")
+    expected, found = (
+        run_psotrack("synchronise", path, flight, "--json", "-")
+        for path in (flight / "tracks.csv", tmp_path / "tracks.json")
+    )
+    assert found.code == 0, found
+    assert found.out == expected.out
+
+
 def test_times_between_the_instants_are_interpolated_and_gaps_stay(tmp_path: Path) -> None:
     time_s = 0.0137 + np.arange(40) / 25
     keep = np.r_[0:15, 16:40]
@@ -586,7 +612,7 @@ def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch:
     ("to", "name", "words"),
     [
         ("tum", "one.tum", ("a TUM file holds one drone", "2")),
-        ("tum", "tum.csv", ("a folder, or a file that ends in .tum",)),
+        ("tum", "tum.csv", ("a folder, or a file that ends in .tum or .txt",)),
         ("kitti", "poses.txt", ("a folder",)),
         ("c3d", "tracks", ("ends in .c3d",)),
         ("mot", "mot", ("a file that ends in .txt", "name SEQ")),

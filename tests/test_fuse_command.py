@@ -12,6 +12,7 @@ from test_inside_out_fusing import recording, remove_poses, remove_positions, rm
 from psotrack.cli.onboard.fuse import fuse
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.inside_out import read_camera_path, write_camera_path
+from psotrack.recordings.exchange import export_tracks
 from psotrack.trajectories import read_trajectories, write_trajectories
 
 
@@ -39,6 +40,18 @@ def files(tmp_path_factory):
 
 def run(*words):
     return CliRunner().invoke(fuse, [str(word) for word in words])
+
+
+def test_tracks_outside_may_have_any_format(files, tmp_path) -> None:
+    folder, _ = files
+    export_tracks(read_trajectories(folder / "tracks.csv"), "json", tmp_path / "tracks.json")
+    inside = (folder / "dron1.csv", folder / "dron2.csv")
+    done = [
+        run(*inside, tracks, "--out", tmp_path / f"{number}.csv")
+        for number, tracks in enumerate((folder / "tracks.csv", tmp_path / "tracks.json"))
+    ]
+    assert [each.exit_code for each in done] == [0, 0], done[1].output
+    assert (tmp_path / "0.csv").read_bytes() == (tmp_path / "1.csv").read_bytes()
 
 
 def test_files_are_fused_into_tracks_that_other_commands_read(files, tmp_path) -> None:

@@ -171,7 +171,7 @@ translation = [0.0, 0.0, 5000.0]
 def test_a_calibration_that_leaves_its_unit_open(folder):
     path = folder("left.avi")
     (path / "calibration.toml").write_text(ANIPOSE)
-    with pytest.raises(InputError, match="anipose leaves it open; state m or cm or mm: --units of"):
+    with pytest.raises(InputError, match="the file leaves it open; state m or cm or mm: --units of"):
         draft_recording(path, path / "recording.toml")
     done = CliRunner().invoke(cli, ["init", str(path), "--units", "mm"])
     assert done.exit_code == 0, done.output

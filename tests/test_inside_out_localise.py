@@ -20,7 +20,7 @@ from psotrack.cli.onboard.localise import localise as command
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
-from psotrack.geometry.rig_files import write_rig
+from psotrack.geometry.rig_files import write_calibration, write_rig
 from psotrack.inside_out import (
     Flag,
     LocaliseSettings,
@@ -34,7 +34,7 @@ from psotrack.inside_out.frames import read_ahead
 from psotrack.inside_out.lens_files import read_lens, scale_lens
 from psotrack.inside_out.localising import localise_frames
 from psotrack.recordings import VideoWriter, natural_key
-from psotrack.recordings.datasets.dpjait import write_calibration, write_marker_corners
+from psotrack.recordings.datasets import write_marker_corners
 from psotrack.trajectories import Status
 
 SIZE_WH = (640, 480)

@@ -25,7 +25,7 @@ from psotrack.inside_out import (
 from psotrack.inside_out.mapping.scene import outward
 from psotrack.inside_out.mapping.sightings import SQUARE, FrameMarkers, collect_sightings
 from psotrack.inside_out.mapping.square_fitting import fit_square
-from psotrack.recordings.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.recordings.datasets import read_marker_corners, write_marker_corners
 from psotrack.recordings.mocap import Markers, write_c3d
 
 SIDE_M = 0.4

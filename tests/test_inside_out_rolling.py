@@ -40,7 +40,7 @@ from psotrack.inside_out.pose import ExpectedMotion, estimate_pose
 from psotrack.inside_out.pose.equations import equations, seen_markers
 from psotrack.inside_out.pose.row_motion import RowMotion, row_times_s
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets.dpjait import write_marker_corners
+from psotrack.recordings.datasets import write_marker_corners
 
 WIDTH, HEIGHT, FPS = 1280, 720, 30.0
 LENS = make_camera(

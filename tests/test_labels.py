@@ -24,8 +24,7 @@ from psotrack.foreground.detection import LabelSettings, box_corners, label_boxe
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter, read_frames
-from psotrack.recordings.datasets import open_recording
-from psotrack.recordings.datasets.dpjait import read_masks, read_sequence
+from psotrack.recordings.datasets import open_recording, read_masks, read_sequence
 from psotrack.simulation import SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Mesh
 from psotrack.trajectories import Trajectories

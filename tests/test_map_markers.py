@@ -18,7 +18,7 @@ from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import MarkerMap
 from psotrack.inside_out.lens_files import scale_lens
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets.dpjait import read_marker_corners, write_marker_corners
+from psotrack.recordings.datasets import read_marker_corners, write_marker_corners
 from psotrack.recordings.mocap import write_c3d
 
 SIZE_WH = (960, 720)

@@ -30,7 +30,7 @@ from psotrack.inside_out.localising.map_evidence import are_few, least_markers, 
 from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets.dpjait import write_marker_corners
+from psotrack.recordings.datasets import write_marker_corners
 
 SIDE_M, FPS = 0.3, 25.0
 CAMERA = make_camera(

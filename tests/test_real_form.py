@@ -6,7 +6,8 @@ from real_form import SERIALS, write_as_real
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import project
-from psotrack.recordings.datasets.dpjait import read_detections, read_mocap_markers, read_poses, read_sequence
+from psotrack.recordings import read_detections
+from psotrack.recordings.datasets import read_mocap_markers, read_poses, read_sequence
 from psotrack.recordings.mocap import body_trajectories, read_c3d
 from psotrack.simulation import (
     SimulationSettings,

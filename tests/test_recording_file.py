@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from psotrack.cli import cli
 from psotrack.errors import InputError
 from psotrack.geometry import project
-from psotrack.geometry.rig_files import read_calibration, write_calibration, write_rig
+from psotrack.geometry.rig_files import read_rig, write_calibration, write_rig
 from psotrack.recordings import (
     Detections,
     VideoWriter,
@@ -256,10 +256,25 @@ class TestCalibration:
         cameras = [camera(name, f'video = "{name}.avi"') for name in ("left", "wide")]
         rig = open_recording(write(folder, *cameras, top='calibration = "cameras.csv"')).rig
         sizes = {"left": (64, 48), "wide": (96, 48)}
-        np.testing.assert_array_equal(
-            rig.cameras.K, read_calibration(folder / "cameras.csv", sizes).cameras.K
-        )
+        np.testing.assert_array_equal(rig.cameras.K, read_rig(folder / "cameras.csv", sizes).cameras.K)
         assert rig.cameras.image_size_wh.tolist() == [[64, 48], [96, 48]]
+
+    def test_coefficients_whose_rows_count_upwards_get_the_height_of_each_video(self, folder):
+        """A file of DLT states no sizes: the row of a pixel follows from the height of the camera's own images."""
+        given = open_recording(write(folder, LEFT, camera("wide", 'video = "wide.avi"', PLACE))).rig
+        columns = []
+        for T, K, size_wh in zip(
+            given.cameras.T_cam_world, given.cameras.K, given.cameras.image_size_wh, strict=True
+        ):
+            P = np.array([[1, 0, 0], [0, -1, size_wh[1]], [0, 0, 1]]) @ K @ T[:3]
+            columns.append((P / P[2, 3]).ravel()[:11])
+        rows = [",".join(given.names), *(",".join(map(repr, row)) for row in np.array(columns).T.tolist())]
+        (folder / "calibration.csv").write_text("\n".join(rows))
+        cameras = [camera(name, f'video = "{name}.avi"') for name in given.names]
+        top = 'calibration = "calibration.csv"\ncalibration_unit = "m"'
+        rig = open_recording(write(folder, *cameras, top=top)).rig
+        np.testing.assert_allclose(rig.cameras.K, given.cameras.K, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(rig.cameras.T_cam_world, given.cameras.T_cam_world, rtol=0, atol=1e-9)
 
     def test_another_size_than_calibrated(self, folder):
         given = open_recording(write(folder, LEFT)).rig

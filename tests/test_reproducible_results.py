@@ -16,7 +16,7 @@ from psotrack.evaluation import Evaluation, evaluate
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording
 from psotrack.recordings import Recording
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import SwarmSettings, TrackSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.trajectories import Trajectories, write_trajectories

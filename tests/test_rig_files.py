@@ -7,7 +7,8 @@ from helpers import LENSES, assert_same, ring_rig
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import Rig, make_rig, project
-from psotrack.geometry.rig_files import read_lenses, read_rig, write_lenses, write_rig
+from psotrack.geometry.rig_files import KEYS, read_lenses, read_rig, write_lenses, write_rig
+from psotrack.recordings import CameraTable
 
 #: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
 ANIPOSE = """[cam_0]
@@ -86,7 +87,7 @@ def with_names(rig, *names):
 def test_a_rig_is_read_as_it_was_written(tmp_path, file, coefficients):
     # Eleven cameras, whose tables must not be sorted as text. Three names that need care: a serial number, a word of
     # YAML, and characters that must be quoted.
-    rig = with_names(ring_rig(11, coefficients=coefficients), "60881257", "true", 'a "b" \\ é: #')
+    rig = with_names(ring_rig(11, coefficients=coefficients), "60881257", "true", 'a "b" \\ é: # 🚁')
     file, file_format = ("calibration.toml", "anipose") if file == "anipose" else (file, None)
     write_rig(tmp_path / file, rig, file_format=file_format)
     back = read_rig(tmp_path / file)
@@ -113,7 +114,10 @@ def test_a_rig_in_the_datasets_layout_is_read_as_it_was_written(tmp_path):
     assert back.names == rig.names
     # Rotations are stored as Rodrigues vectors.
     assert_same(back.cameras, rig.cameras, atol=2e-15)
-    with pytest.raises(InputError, match=r"rig\.csv: expected the size of the images.*pass --size"):
+    with pytest.raises(
+        InputError,
+        match=r"rig\.csv, camera cam1i\.size .*: expected width and height.*pass --size",
+    ):
         read_rig(tmp_path / "rig.csv")
 
 
@@ -208,6 +212,15 @@ def test_lenses_are_written_without_poses(tmp_path):
         write_lenses(tmp_path / "lenses.yml", rig)
 
 
+def test_the_cameras_of_a_recording_are_a_rig(tmp_path):
+    """The keys that a recording has beside a rig's are left alone, and none counts as a misspelt one."""
+    values = {"frames": 3, "fps": 25.0, "time_offset_s": 0.1, "line_time_s": 1e-5}
+    keys = [key for key in CameraTable.__struct_fields__ if key not in KEYS]
+    lines = [f"{key} = {values.get(key, repr('a'))}\n" for key in keys]
+    (tmp_path / "recording.toml").write_text("version = 1\n" + RIG_TOML + "".join(lines))
+    assert read_rig(tmp_path / "recording.toml").names == ("left",)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -256,9 +269,9 @@ def test_a_unit_that_a_format_leaves_open_must_be_stated(tmp_path, caplog):
 
 def test_an_unknown_format_is_refused(tmp_path):
     (tmp_path / "rig.toml").write_text(RIG_TOML)
-    with pytest.raises(SettingsError, match=r"format: expected one of rig, dpjait, .*, found matlab"):
+    with pytest.raises(SettingsError, match=r"format: expected one of rig, .*, dpjait, found matlab"):
         read_rig(tmp_path / "rig.toml", file_format="matlab")
-    with pytest.raises(SettingsError, match=r"format: expected one of rig, dpjait, .*, found pose2sim"):
+    with pytest.raises(SettingsError, match=r"format: expected one of rig, .*, dpjait, found pose2sim"):
         write_rig(tmp_path / "other.toml", ring_rig(1), file_format="pose2sim")
 
 
@@ -324,7 +337,7 @@ def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
             ANIPOSE.replace("[ 0.5, 0.25,", "[ 0.5,"),
             "cam_0.rotation: expected 3 numbers or 3 x 3 numbers",
         ),
-        ("x.toml", ANIPOSE.replace('"B"', '"A"'), "cam_1.name: expected each camera once, found A again"),
+        ("x.toml", ANIPOSE.replace('"B"', '"A"'), "cam_1: expected each camera once, found A again"),
         (
             "x.toml",
             ANIPOSE.replace('"A"', '"A"\nfisheye = true').replace(

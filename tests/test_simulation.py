@@ -22,7 +22,7 @@ from psotrack import __version__
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import project
 from psotrack.recordings import VideoWriter, probe, read_detections, read_frames
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     DETECTIONS,
     MARKER_CORNERS,
     read_marker_corners,

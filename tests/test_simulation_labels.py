@@ -4,11 +4,9 @@ Masks are compared with OpenCV's projection and polygons, archives with `zipfile
 """
 
 import math
-import struct
 import zipfile
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from psotrack.errors import InputError
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     MaskWriter,
     join_archives,
     read_masks,
@@ -305,27 +303,6 @@ def test_archives_of_more_than_65535_entries_are_read(tmp_path):
         assert names == [f"{number}/{index}" for number in range(2) for index in range(counts[number])]
         for name in (names[0], names[65_535], names[65_536], names[-1]):
             assert archive.read(name) == name[2:].encode()
-    content = (tmp_path / "all.zip").read_bytes()
-    # Other readers read the two counts of entries (on this disk, in total) from the 64-bit record.
-    record = content.rfind(b"PK\x06\x06")
-    assert struct.unpack_from("<QQ", content, record + 24) == (sum(counts),) * 2
-
-
-def test_entries_beyond_4_gb_are_found(tmp_path, parts, monkeypatch):
-    """The entries follow a sparse gap of 5 GB, which takes no space on the disk."""
-    gap, open_file = 5_000_000_000, Path.open
-
-    def open_behind_gap(path, mode="r", *arguments, **options):
-        file = open_file(path, mode, *arguments, **options)
-        if mode == "wb":
-            file.seek(gap)
-        return file
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "open", open_behind_gap)
-        join_archives(tmp_path / "all.zip", parts)
-    assert (tmp_path / "all.zip").stat().st_size > gap
-    check_joined_archive(tmp_path / "all.zip")
 
 
 def test_masks_are_one_bit_png_images(tmp_path, parts):

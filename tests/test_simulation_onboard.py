@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from placed_drones import cube, straight_flight, with_drones
 from scipy.spatial.transform import Rotation
 
-from psotrack.recordings.datasets.dpjait import onboard_pose_file, read_poses, write_poses
+from psotrack.recordings.datasets import onboard_pose_file, read_poses, write_poses
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import backdrop, raster, sensor

@@ -17,8 +17,9 @@ from psotrack.calibration.clocks.synchronisation import camera_offsets
 from psotrack.cli.doctor import doctor
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera
+from psotrack.geometry.rig_files import write_calibration
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets import dpjait
+from psotrack.recordings.datasets import CALIBRATION
 from psotrack.recordings.mocap import Markers, write_c3d
 from psotrack.simulation import scenario
 from psotrack.simulation.flights.planning import plan
@@ -436,7 +437,7 @@ def make_recording(root):
     one = make_camera(
         R=R, t_m=t_m, K=np.diag([1100.0, 1100.0, 1.0]), image_size_wh=(64, 48), dist=(0.0, 0.0, 0.0, 0.0)
     )
-    dpjait.write_calibration(folder / dpjait.CALIBRATION, make_unnamed_rig(one), "mm")
+    write_calibration(folder / CALIBRATION, make_unnamed_rig(one), "mm")
     with VideoWriter(folder / "0.avi", FPS, (64, 48)) as writer:
         for _ in range(150):
             writer.write(np.zeros((48, 64, 3), np.uint8))

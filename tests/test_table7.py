@@ -15,15 +15,15 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.foreground.detection import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_calibration
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     CALIBRATION,
     MARKER_CORNERS,
     ONBOARD_CALIBRATION,
     onboard_pose_file,
     onboard_video_file,
     pose_file,
-    write_calibration,
     write_marker_corners,
     write_onboard_calibration,
     write_poses,

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.recordings import read_frames
-from psotrack.recordings.datasets import dpjait, open_recording
+from psotrack.recordings.datasets import open_recording, read_masks
 from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, simulate
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -206,7 +206,7 @@ def _simulated(root: Path, changes: Mapping[str, Any]) -> Clip:
         simulate(recipe, root, settings)
     ((name, video),) = open_recording(folder).videos.items()
     frames = list(read_frames(video))
-    with dpjait.read_masks(folder) as masks:
+    with read_masks(folder) as masks:
         drones = range(1, len(recipe.drones) + 1)
         seen = [
             np.any([masks.mask(name, drone, index) for drone in drones], axis=0)

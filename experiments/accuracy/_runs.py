@@ -16,7 +16,7 @@ from psotrack.evaluation import evaluate
 from psotrack.foreground.silhouettes import Silhouettes, compute
 from psotrack.pipeline import track_runs
 from psotrack.recordings import Recording
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.support import keep_compiled
 

@@ -26,7 +26,7 @@ from psotrack.foreground.silhouettes import SilhouetteSettings, compute
 from psotrack.geometry import project, viewpoints
 from psotrack.pipeline import track_runs
 from psotrack.recordings import Recording
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
 from psotrack.simulation import SimulationSettings, scenarios, simulate
 from psotrack.support import atomic_write

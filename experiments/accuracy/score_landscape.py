@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.foreground.silhouettes import SilhouetteSettings, compute
 from psotrack.geometry import Camera, make_extents
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import DroneSettings
 from psotrack.simulation import Scenario, SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Drone, Harmonic, Harmonics, Variation

@@ -22,7 +22,7 @@ from psotrack.geometry import Camera, look_at, make_camera, project
 from psotrack.inside_out import LocalisedVideo, MarkerMap, localise_video, open_source, read_marker_map
 from psotrack.inside_out.localising import STAGES
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets.dpjait import MARKER_CORNERS, read_onboard
+from psotrack.recordings.datasets import MARKER_CORNERS, read_onboard
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration.doctor import Diagnosis, examine
 from psotrack.geometry import Rig
 from psotrack.pipeline import detection_files_of
-from psotrack.recordings import Detections
-from psotrack.recordings.datasets.dpjait import read_detections, read_sequence
+from psotrack.recordings import Detections, read_detections
+from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import YOLO
 from psotrack.support import save_figure
 from psotrack.tracking.matching import from_detections

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.recordings import VideoWriter
-from psotrack.recordings.datasets.dpjait import MaskWriter
+from psotrack.recordings.datasets import MaskWriter
 from psotrack.simulation import CameraRenderer, Scene, build, preset_names, scenario
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.labels.detector import detect

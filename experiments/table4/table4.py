@@ -17,7 +17,7 @@ from pathlib import Path
 import pandas as pd
 
 from psotrack.errors import PsotrackError
-from psotrack.recordings.datasets.dpjait import CALIBRATION
+from psotrack.recordings.datasets import CALIBRATION
 from psotrack.support import progress_bar
 from psotrack.sweep import grid, pivot, render_table, sweep
 

@@ -18,7 +18,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Camera, make_camera
 from psotrack.inside_out import MarkerMap, read_marker_map
 from psotrack.recordings import OnboardVideo, VideoInfo
-from psotrack.recordings.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
+from psotrack.recordings.datasets import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.support import progress_bar
 from psotrack.trajectories import Trajectories
 

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from two_ways import METHODS, compare_drones, ranges
 
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

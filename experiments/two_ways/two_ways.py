@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.inside_out import CameraPath, FusedTracks, fuse, read_camera_path
-from psotrack.recordings.datasets.dpjait import read_sequence
+from psotrack.recordings.datasets import read_sequence
 from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import Trajectories, read_trajectories
 

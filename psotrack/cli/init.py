@@ -92,7 +92,7 @@ def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: 
 
 def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
     """Show a recording, and check its files."""
-    from psotrack.recordings import check_end, describe_recording, inventory_table
+    from psotrack.recordings import check_end, inventory_table
     from psotrack.recordings.datasets import open_recording
 
     recording = open_recording(sequence, bodies=bodies)
@@ -103,7 +103,7 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
         from psotrack.inside_out import read_marker_table
 
         read_marker_table(recording.marker_corners)
-    content = describe_recording(recording)
+    content = recording.to_dict()
     output.json(content)
     output.show(inventory_table(content), wide=True)
 
@@ -124,7 +124,6 @@ def _draft(
     """Write the file of a recording."""
     from psotrack.errors import check_positive
     from psotrack.recordings import (
-        describe_recording,
         inventory_table,
         recording_file_text,
         write_recording_file,
@@ -139,7 +138,7 @@ def _draft(
         calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh, bodies
     )
     draft = draft_recording(folder, path, options)
-    content = describe_recording(draft.recording)
+    content = draft.recording.to_dict()
     kept = _keep_older(path, recording_file_text(draft.content))
     write_recording_file(path, draft.content)
     output.json(_content(path, draft, content))

@@ -12,7 +12,7 @@ from psotrack.calibration import lens_of_view
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Camera, Rig, make_camera, make_rig
 from psotrack.geometry.rig_files import read_lenses
-from psotrack.recordings.datasets.dpjait import read_onboard_calibration
+from psotrack.recordings.datasets import read_onboard_calibration
 from psotrack.support import read_table
 
 #: Largest distance of the optical axis from the middle of the image, as a share of its size, for files that do not

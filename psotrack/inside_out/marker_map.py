@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
-from psotrack.recordings.datasets.dpjait import MarkerRow, read_marker_centres, read_marker_rows
+from psotrack.recordings.datasets import MarkerRow, read_marker_centres, read_marker_rows
 from psotrack.support import short_repr
 
 #: Largest deviation of a corner from its square, as a share of the side. Corners measured by motion capture are off by
@@ -128,7 +128,7 @@ def read_marker_table(path: Path | str) -> MarkerMap | MarkerCentres:
 
 
 def read_marker_map(path: Path | str) -> MarkerMap:
-    """Read a map from a table of corners; `psotrack.recordings.datasets.dpjait` describes the layouts.
+    """Read a map from a table of corners; `psotrack.recordings.datasets` describes the layouts.
 
     Raises:
         InputError: the file cannot be read, a corner or column is missing, or a marker is listed twice, is no flat

@@ -13,8 +13,8 @@ from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import views_meet
 from psotrack.pipeline.parts import Method, Parts, find_method
-from psotrack.recordings import Recording
-from psotrack.recordings.datasets.dpjait import detection_files, read_detections
+from psotrack.recordings import Recording, read_detections
+from psotrack.recordings.datasets import detection_files
 from psotrack.settings import BLOBS, YOLO, TrackSettings
 from psotrack.support import Report, digest_file, no_progress
 from psotrack.tracking.births import (

@@ -11,7 +11,7 @@ from .image_files import (
     read_image,
     read_mask,
 )
-from .inventory import describe_recording, inventory_table
+from .inventory import inventory_table
 from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
 from .recording import OnboardVideo, Recording
@@ -66,7 +66,6 @@ __all__ = [
     "WorldTable",
     "check_end",
     "check_rate",
-    "describe_recording",
     "digest_video",
     "encoded_video",
     "find_images",

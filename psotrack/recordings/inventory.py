@@ -1,14 +1,10 @@
-"""Inventory of a recording, as a JSON record and as a table: the command `psotrack init --show`."""
+"""Inventory of a recording as a table: the command `psotrack init --show`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from psotrack.recordings.detections import read_detections
-from psotrack.recordings.recording import Recording
 from psotrack.support import html_block, html_table
 
 if TYPE_CHECKING:
@@ -17,70 +13,11 @@ if TYPE_CHECKING:
 _HEADINGS = ("camera", "video", "frames", "fps", "size", "f (px)", "centre (m)", "detections")
 
 
-def describe_recording(recording: Recording) -> dict[str, Any]:
-    """Cameras, videos, detections and reference of a recording, as plain data. All detections are read.
-
-    Raises:
-        InputError: a file of detections cannot be read.
-    """
-    names = (*recording.rig.names, *recording.unplaced)
-    onboard: dict[str, dict[str, Any]] = {}
-    for name, flown in (recording.onboard or {}).items():
-        onboard[name] = {
-            "video": str(flown.video.path),
-            "frames": flown.video.num_frames,
-            "fps": flown.video.fps,
-            "image_size_wh": list(flown.video.image_size_wh),
-            "focal_length_px": None if flown.K is None else float(flown.K[0, 0]),
-            "frames_with_pose": int(np.isfinite(flown.orientation_wxyz).all(axis=1).sum()),
-        }
-    truth = recording.truth
-    timed = bool(recording.frame_times)
-    return {
-        "name": recording.name,
-        "folder": str(recording.folder),
-        "cameras": {name: _describe_camera(recording, name) for name in names},
-        "onboard": onboard or None,
-        "drones": list(truth.drones) if truth else None,
-        "frames_with_truth": int(np.count_nonzero(truth.seen.any(axis=1))) if truth else None,
-        "rate_hz": recording.fps if timed else None,
-        "instants": recording.num_frames if timed else 0,
-        "bounds_m": None if recording.bounds_m is None else list(recording.bounds_m),
-        "reference_files": [str(path) for path in recording.reference_files],
-        "marker_corners": None if recording.marker_corners is None else str(recording.marker_corners),
-    }
-
-
-def _describe_camera(recording: Recording, name: str) -> dict[str, Any]:
-    video, times = recording.videos.get(name), recording.frame_times.get(name)
-    detections = (recording.detections or {}).get(name)
-    ignore, silhouettes = recording.ignore.get(name), recording.silhouettes.get(name)
-    described: dict[str, Any] = {
-        "video": str(video.path) if video else recording.streams.get(name),
-        "silhouettes": None if silhouettes is None else str(silhouettes.path),
-        "frames": times.num_frames if times else None,
-        "fps": times.fps if times else None,
-        "begins_s": float(times.time_s[0]) if times and times.num_frames else None,
-        "image_size_wh": list(video.image_size_wh) if video else None,
-        "focal_length_px": None,
-        "centre_m": None,
-        "placed": name in recording.rig.names,
-        "detections": len(read_detections(detections)) if detections else None,
-        "ignore": None if ignore is None else str(ignore),
-    }
-    if described["placed"]:
-        cam = recording.rig.cameras[recording.rig.names.index(name)]
-        described["image_size_wh"] = [int(side) for side in cam.image_size_wh]
-        described["focal_length_px"] = float(cam.K[0, 0])
-        described["centre_m"] = [round(float(value), 4) for value in cam.centre_world]
-    return described
-
-
 def inventory_table(content: dict[str, Any]) -> Table:
     """Table with one row per camera; cameras on drones come last.
 
     Args:
-        content: record from `describe_recording`.
+        content: plain data from `Recording.to_dict`.
     """
     from rich import box
     from rich.table import Table

@@ -16,6 +16,11 @@ logger = logging.getLogger(__name__)
 
 _FFMPEG_LOG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 _FFMPEG_QUIET = "-8"
+#: How the lines begin that libjpeg writes about an image (`jerror.h`): its warnings.
+_OF_LIBJPEG = (
+    b"Corrupt JPEG data", b"Premature end of JPEG", b"Invalid SOS", b"Inconsistent progression", b"Unknown Adobe color",
+    b"Warning: unknown JFIF", b"Invalid progressive",
+)  # fmt: skip
 #: stderr is the process's: images are decoded one after the other, so that each has its own messages.
 _decoding = threading.Lock()
 
@@ -66,8 +71,8 @@ def decode_image(
 ) -> Shaped[np.ndarray, "..."] | None:
     """Decode an image; None if OpenCV cannot.
 
-    libjpeg and libpng write about damaged images straight to stderr. What they write becomes a warning with the name of
-    the image.
+    libjpeg writes about damaged images straight to stderr. Its first line becomes a warning with the name of the
+    image; what else was written meanwhile, by other threads, goes to stderr afterwards.
 
     Args:
         coded: content of an image file.
@@ -86,15 +91,12 @@ def decode_image(
         finally:
             os.dup2(stderr, 2)
             taken.seek(0)
-            written = taken.read()
-            # A progress bar of another thread, which moves the cursor, is no message about the image.
-            if b"\x1b" in written:
-                os.write(stderr, written)
-                written = b""
+            lines = taken.read().splitlines(keepends=True)
+            os.write(stderr, b"".join(line for line in lines if not line.startswith(_OF_LIBJPEG)))
             os.close(stderr)
     if image is None:
         return None
-    if written:
-        said = written.decode(errors="replace").splitlines()[0].strip()
+    said = next((line.decode().strip() for line in lines if line.startswith(_OF_LIBJPEG)), None)
+    if said is not None:
         logger.warning("%s is damaged (%s)", where, said)
     return np.asarray(image)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import gcd
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -102,9 +103,66 @@ class Recording:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the table of `psotrack init --show`."""
-        from psotrack.recordings.inventory import describe_recording, inventory_html
+        from psotrack.recordings.inventory import inventory_html
 
-        return inventory_html(describe_recording(self))
+        return inventory_html(self.to_dict())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Cameras, videos, detections and reference, as plain data: `psotrack init --show --json`. All detections are read.
+
+        Raises:
+            InputError: a file of detections cannot be read.
+        """
+        onboard = {
+            name: {
+                "video": str(flown.video.path),
+                "frames": flown.video.num_frames,
+                "fps": flown.video.fps,
+                "image_size_wh": list(flown.video.image_size_wh),
+                "focal_length_px": None if flown.K is None else float(flown.K[0, 0]),
+                "frames_with_pose": int(np.isfinite(flown.orientation_wxyz).all(axis=1).sum()),
+            }
+            for name, flown in (self.onboard or {}).items()
+        }
+        truth, timed = self.truth, bool(self.frame_times)
+        return {
+            "name": self.name,
+            "folder": str(self.folder),
+            "cameras": {name: self._described(name) for name in (*self.rig.names, *self.unplaced)},
+            "onboard": onboard or None,
+            "drones": list(truth.drones) if truth else None,
+            "frames_with_truth": int(np.count_nonzero(truth.seen.any(axis=1))) if truth else None,
+            "rate_hz": self.fps if timed else None,
+            "instants": self.num_frames if timed else 0,
+            "bounds_m": None if self.bounds_m is None else list(self.bounds_m),
+            "reference_files": [str(path) for path in self.reference_files],
+            "marker_corners": None if self.marker_corners is None else str(self.marker_corners),
+        }
+
+    def _described(self, name: str) -> dict[str, Any]:
+        """What there is of a camera, as plain data."""
+        video, times = self.videos.get(name), self.frame_times.get(name)
+        detections = (self.detections or {}).get(name)
+        ignore, silhouettes = self.ignore.get(name), self.silhouettes.get(name)
+        described: dict[str, Any] = {
+            "video": str(video.path) if video else self.streams.get(name),
+            "silhouettes": None if silhouettes is None else str(silhouettes.path),
+            "frames": times.num_frames if times else None,
+            "fps": times.fps if times else None,
+            "begins_s": float(times.time_s[0]) if times and times.num_frames else None,
+            "image_size_wh": list(video.image_size_wh) if video else None,
+            "focal_length_px": None,
+            "centre_m": None,
+            "placed": name in self.rig.names,
+            "detections": len(read_detections(detections)) if detections else None,
+            "ignore": None if ignore is None else str(ignore),
+        }
+        if described["placed"]:
+            cam = self.rig.cameras[self.rig.names.index(name)]
+            described["image_size_wh"] = [int(side) for side in cam.image_size_wh]
+            described["focal_length_px"] = float(cam.K[0, 0])
+            described["centre_m"] = [round(float(value), 4) for value in cam.centre_world]
+        return described
 
     def __post_init__(self) -> None:
         times = {name: self._frame_times_of(name, video) for name, video in self.videos.items()}

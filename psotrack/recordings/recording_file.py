@@ -15,7 +15,7 @@ import msgspec
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key
 from psotrack.recordings.timing import check_rate
-from psotrack.support import atomic_write, check_file_name, convert, read_toml, toml_key, toml_value
+from psotrack.support import atomic_write, check_file_name, convert, read_toml, toml_text
 
 #: Name of the file in a folder.
 RECORDING_FILE = "recording.toml"
@@ -256,30 +256,26 @@ def write_recording_file(path: Path | str, content: RecordingFile) -> None:
 
 def recording_file_text(content: RecordingFile) -> str:
     """Text of a `recording.toml`."""
-    lines = [f"version = {content.version}"]
-    for key in ("calibration", "calibration_unit"):
-        if getattr(content, key) is not None:
-            lines.append(f"{key} = {toml_value(getattr(content, key))}")
-    for name, camera in content.cameras.items():
-        lines += ["", f"[cameras.{toml_key(name)}]", *_assignments(camera)]
-    tables = {"world": content.world, "reference": content.reference, "markers": content.markers}
-    for name, table in tables.items():
-        assigned = [] if table is None else _assignments(table)
-        lines += ["", f"[{name}]", *assigned] if assigned else []
-    bodies = {} if content.reference is None else content.reference.bodies
-    if bodies:
-        lines += ["", "[reference.bodies]"]
-        lines += [f"{toml_key(name)} = {toml_value(labels)}" for name, labels in bodies.items()]
-    return "\n".join(lines) + "\n"
+    tables: dict[tuple[str, ...], dict[str, Any]] = {(): _values(content)}
+    tables |= {("cameras", name): _values(camera) for name, camera in content.cameras.items()}
+    for name, table in (
+        ("world", content.world),
+        ("reference", content.reference),
+        ("markers", content.markers),
+    ):
+        if table is not None and (values := _values(table)):
+            tables[(name,)] = values
+    if content.reference is not None and content.reference.bodies:
+        tables["reference", "bodies"] = dict(content.reference.bodies)
+    return toml_text(tables)
 
 
-def _assignments(table: _Table) -> list[str]:
-    """Lines `key = value` of the keys whose values are not the defaults."""
-    defaults = {field.name: field.default for field in msgspec.structs.fields(type(table))}
-    values = {name: getattr(table, name) for name in defaults}
-    return [
-        f"{name} = {toml_value(value)}"
+def _values(table: _Table) -> dict[str, Any]:
+    """The keys whose values are not the defaults; tables are left out."""
+    fields = {field.name: field.default for field in msgspec.structs.fields(type(table))}
+    values = {name: getattr(table, name) for name in fields}
+    return {
+        name: value
         for name, value in values.items()
-        # A mapping is a table of its own.
-        if value is not None and value != defaults[name] and not isinstance(value, Mapping)
-    ]
+        if value is not None and value != fields[name] and not isinstance(value, Mapping | _Table)
+    }

@@ -7,6 +7,8 @@ in half a minute.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
 import os
 import shlex
@@ -66,15 +68,11 @@ def probe(path: Path | str) -> VideoInfo:
         InputError: the file does not exist, is empty, is not a video, or has no frames.
     """
     path = Path(path)
-    capture = open_capture(path)
-    try:
+    with open_capture(path) as capture:
         num_frames = round(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         fps = capture.get(cv2.CAP_PROP_FPS)
-        width, height = (
-            round(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-        )
-    finally:
-        capture.release()
+        width = round(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
     check_pixels(path, width, height)
     is_finished = num_frames >= 1
     if not is_finished:
@@ -98,13 +96,9 @@ def check_end(video: VideoInfo) -> None:
         path = video.images[video.num_frames - 1]
         _check_size(path, video, read_image(path))
         return
-    capture = open_capture(video.path)
-    try:
-        with silence_opencv():
-            capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
-            reached = capture.grab()
-    finally:
-        capture.release()
+    with open_capture(video.path) as capture, silence_opencv():
+        capture.set(cv2.CAP_PROP_POS_FRAMES, video.num_frames - 1)
+        reached = capture.grab()
     if not reached and (count := count_packets(video.path)) < video.num_frames:
         raise TruncatedVideoError(video, count)
 
@@ -162,9 +156,8 @@ def read_frames(
             _check_size(path, video, frame)
             yield frame
         return
-    capture = open_capture(video.path)
     place: UInt8[np.ndarray, "height width 3"] | None = None
-    try:
+    with open_capture(video.path) as capture:
         for index in range(video.num_frames):
             if not capture.grab():
                 raise TruncatedVideoError(video, index)
@@ -176,8 +169,6 @@ def read_frames(
                 raise TruncatedVideoError(video, index)
             _check_size(video.path, video, frame, f" in frame {index}")
             yield frame
-    finally:
-        capture.release()
 
 
 def read_frames_at(
@@ -201,9 +192,8 @@ def read_frames_at(
             _check_size(video.images[number], video, frame)
             yield number, frame
         return
-    capture = open_capture(video.path)
     following = 0
-    try:
+    with open_capture(video.path) as capture:
         for number in numbers:
             if number - following > _WORTH_SEEKING and video.is_finished:
                 with silence_opencv():
@@ -218,8 +208,6 @@ def read_frames_at(
                 raise TruncatedVideoError(video, number)
             _check_size(video.path, video, frame, f" in frame {number}")
             yield number, frame
-    finally:
-        capture.release()
 
 
 def read_near(
@@ -245,8 +233,7 @@ def read_near(
     if not len(key_frames):
         return
     nearest = np.abs(key_frames + _SEEK_BEFORE - np.array(places)[:, None]).argmin(axis=1)
-    capture = open_capture(video.path)
-    try:
+    with open_capture(video.path) as capture:
         for key_frame in np.unique(key_frames[nearest]).tolist():
             number = min(key_frame + _SEEK_BEFORE, video.num_frames - 1)
             with silence_opencv():
@@ -254,24 +241,14 @@ def read_near(
                 decoded, frame = capture.read()
             if decoded and frame.shape[1::-1] == video.image_size_wh:
                 yield number, frame
-    finally:
-        capture.release()
 
 
 def _key_frames(video: VideoInfo) -> list[int]:
     """Numbers of the frames that can be decoded without others, found without decoding."""
-    capture = open_capture(video.path)
-    found = []
-    try:
+    with open_capture(video.path) as capture:
         capture.set(cv2.CAP_PROP_FORMAT, -1)
-        for index in range(video.num_frames):
-            if not capture.grab():
-                break
-            if capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME):
-                found.append(index)
-    finally:
-        capture.release()
-    return found
+        frames = itertools.takewhile(lambda index: capture.grab(), range(video.num_frames))
+        return [index for index in frames if capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME)]
 
 
 def _check_size(
@@ -285,8 +262,9 @@ def _check_size(
         raise InputError(path, expected=expected, found=f"{frame.shape[1]} x {frame.shape[0]}{where}")
 
 
-def open_capture(path: Path) -> cv2.VideoCapture:
-    """Open a video by FFmpeg, without FFmpeg's messages.
+@contextlib.contextmanager
+def open_capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    """A video that FFmpeg has opened, without FFmpeg's messages; it is closed at the end of the block.
 
     Raises:
         InputError: the video cannot be opened.
@@ -305,23 +283,18 @@ def open_capture(path: Path) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG, threads)
     if not capture.isOpened():
         raise InputError(path, expected="a video", found="a file that FFmpeg cannot open")
-    return capture
+    try:
+        yield capture
+    finally:
+        capture.release()
 
 
 def count_packets(path: Path) -> int:
     """Number of encoded frames in a file, counted without decoding: a few microseconds per frame."""
-    try:
-        capture = open_capture(path)
-    except InputError:
-        return 0
-    try:
+    with contextlib.suppress(InputError), open_capture(path) as capture:
         capture.set(cv2.CAP_PROP_FORMAT, -1)
-        count = 0
-        while capture.grab():
-            count += 1
-        return count
-    finally:
-        capture.release()
+        return sum(1 for _ in iter(capture.grab, False))
+    return 0
 
 
 class TruncatedVideoError(InputError):

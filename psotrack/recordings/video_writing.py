@@ -206,8 +206,7 @@ def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
     """
     # The header may count frames that are missing: count the frames themselves.
     found = count_packets(temporary) if num_frames else 0
-    has_its_end = _mp4_has_its_end if path.suffix.lower() == ".mp4" else _has_its_end
-    if found != num_frames or found == 0 or not has_its_end(temporary):
+    if found != num_frames or found == 0 or not _has_its_end(temporary):
         raise OutputError(
             path,
             expected=f"a file with {num_frames} frames" if num_frames else "at least one frame",
@@ -219,46 +218,34 @@ def check_video_written(path: Path, temporary: Path, num_frames: int) -> None:
 
 
 def _has_its_end(path: Path) -> bool:
-    """Whether an AVI file has the length that its `RIFF` chunks state; the index of frames is at their end."""
+    """Whether a file has the length that its parts state: boxes of MP4, or chunks of AVI, which are called `RIFF`.
+
+    The index of frames is at the end.
+    """
+    is_mp4 = path.suffix.lower() == ".mp4"
     size, position = path.stat().st_size, 0
     with path.open("rb") as file:
         while position < size:
             file.seek(position)
-            name, length = file.read(4), file.read(4)
-            if name != b"RIFF":
-                return False
-            position += 8 + int.from_bytes(length, "little")
-    return position == size
-
-
-def _mp4_has_its_end(path: Path) -> bool:
-    """Whether an MP4 file has the length that its boxes state."""
-    size, position = path.stat().st_size, 0
-    with path.open("rb") as file:
-        while position < size:
-            file.seek(position)
-            length = int.from_bytes(file.read(4), "big")
-            if length == 1:
+            head = file.read(16)
+            length = int.from_bytes(head[:4], "big") if is_mp4 else 8 + int.from_bytes(head[4:8], "little")
+            if is_mp4 and length == 1:
                 # A box above 4 GB states its length after its name.
-                file.seek(position + 8)
-                length = int.from_bytes(file.read(8), "big")
-            if length < 8:
+                length = int.from_bytes(head[8:], "big")
+            if length < 8 or (not is_mp4 and head[:4] != b"RIFF"):
                 return False
             position += length
     return position == size
 
 
 def _copy_packets(video: VideoInfo, encoder: VideoEncoder) -> None:
-    capture = open_capture(video.path)
-    try:
+    with open_capture(video.path) as capture:
         capture.set(cv2.CAP_PROP_FORMAT, -1)
         for index in range(video.num_frames):
             there, packet = capture.read()
             if not there:
                 raise TruncatedVideoError(video, index)
             encoder.write_encoded(packet, capture.get(cv2.CAP_PROP_LRF_HAS_KEY_FRAME))
-    finally:
-        capture.release()
 
 
 def _kind(video: VideoInfo) -> str:

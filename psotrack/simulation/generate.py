@@ -17,9 +17,9 @@ import numpy as np
 from psotrack import __version__
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_rig
-from psotrack.geometry.rig_files import write_rig
+from psotrack.geometry.rig_files import write_calibration, write_rig
 from psotrack.recordings import RECORDING_FILE
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     CALIBRATION,
     DETECTIONS,
     MARKER_CORNERS,
@@ -27,7 +27,6 @@ from psotrack.recordings.datasets.dpjait import (
     mocap_markers_file,
     onboard_pose_file,
     pose_file,
-    write_calibration,
     write_marker_corners,
     write_mocap_markers,
     write_onboard_calibration,

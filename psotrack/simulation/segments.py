@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from psotrack.recordings import Detections, VideoWriter, join_videos
-from psotrack.recordings.datasets.dpjait import DETECTIONS, MASKS, MaskWriter, join_archives, write_detections
+from psotrack.recordings import Detections, VideoWriter, join_videos, write_detections
+from psotrack.recordings.datasets import DETECTIONS, MASKS, MaskWriter, join_archives
 from psotrack.simulation.imaging.onboard import OnboardRenderer
 from psotrack.simulation.imaging.raster import Pinhole
 from psotrack.simulation.imaging.renderer import CameraRenderer

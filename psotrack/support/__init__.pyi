@@ -33,7 +33,18 @@ from .processes import map_in_processes, with_traceback, worker_processes
 from .program_seals import is_whole_program
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
 from .representation import short_repr
-from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
+from .schema import (
+    assign,
+    check_types,
+    convert,
+    nearest,
+    plain,
+    read_json,
+    read_toml,
+    toml_key,
+    toml_text,
+    toml_value,
+)
 from .standard_errors import standard_error
 from .stored_programs import load_ahead, stored_jit
 from .times import LEAST_STEP_S, first_repeat
@@ -105,6 +116,7 @@ __all__ = [
     "stored_jit",
     "terminal_bar",
     "toml_key",
+    "toml_text",
     "toml_value",
     "use_device",
     "user_cache",

@@ -12,7 +12,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -141,6 +141,20 @@ def toml_value(value: Any) -> str:
     """A text, a number or a list as value of a TOML file; numbers have all their digits."""
     # Texts and lists in JSON are valid TOML, except for the control character DEL.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def toml_text(tables: Mapping[tuple[str, ...], Mapping[str, Any]]) -> str:
+    """Text of a TOML file.
+
+    Args:
+        tables: values by key, by the place of their table such as `("cameras", "left")`; `()` is the top of the file.
+    """
+    blocks = []
+    for place, values in tables.items():
+        lines = [f"[{'.'.join(map(toml_key, place))}]"] if place else []
+        lines += [f"{toml_key(key)} = {toml_value(value)}" for key, value in values.items()]
+        blocks.append("\n".join(lines) + "\n")
+    return "\n".join(blocks)
 
 
 def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> None:

@@ -44,9 +44,8 @@ def write_tum(folder: Path | str, trajectories: Trajectories, *, force: bool = F
     for path in paths:
         refuse_to_overwrite(path, force)
     for drone, path in enumerate(paths):
-        lines = _lines(trajectories, drone)
         with atomic_write(path) as temporary:
-            temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+            temporary.write_text(tum_text(trajectories, drone), encoding="utf-8")
     return paths
 
 
@@ -111,7 +110,8 @@ def read_tum_path(path: Path | str) -> Trajectories:
     )
 
 
-def _lines(trajectories: Trajectories, drone: int) -> list[str]:
+def tum_text(trajectories: Trajectories, drone: int) -> str:
+    """The content of the file of one drone, by its index."""
     seen = trajectories.seen[:, drone]
     orientation = trajectories.orientation_wxyz
     known = orientation is not None and bool(np.isfinite(orientation[seen, drone]).all())
@@ -121,7 +121,8 @@ def _lines(trajectories: Trajectories, drone: int) -> list[str]:
     else:
         columns += list(np.tile([0, 0, 0, 1], (int(seen.sum()), 1)).T)
     words = [column.astype(str) for column in columns]
-    return [_HEADER] + [_UNKNOWN] * (not known) + [" ".join(row) for row in zip(*words, strict=True)]
+    lines = [_HEADER] + [_UNKNOWN] * (not known) + [" ".join(row) for row in zip(*words, strict=True)]
+    return "".join(f"{line}\n" for line in lines)
 
 
 def _read_file(path: Path, fps: float) -> tuple[np.ndarray, Float[np.ndarray, "rows 7"]]:

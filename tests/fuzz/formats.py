@@ -28,7 +28,7 @@ from psotrack.foreground.silhouettes import compute
 from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
 from psotrack.pipeline import archives
 from psotrack.recordings import datasets, exchange, mocap
-from psotrack.recordings.datasets.dpjait import (
+from psotrack.recordings.datasets import (
     pose_file,
     read_marker_centres,
     read_masks,

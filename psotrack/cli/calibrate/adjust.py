@@ -82,7 +82,7 @@ def adjust(
     from psotrack.geometry.rig_files import write_rig
     from psotrack.recordings import read_detections
     from psotrack.recordings.datasets import open_recording
-    from psotrack.trajectories import read_trajectories
+    from psotrack.recordings.exchange import read_tracks
 
     output.refuse(out)
     recording = open_recording(sequence)
@@ -95,7 +95,7 @@ def adjust(
         )
     recording.check_detections(recording.detections)
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
-    flown = read_trajectories(tracks, fps=recording.fps if recording.videos else None)
+    flown = read_tracks(tracks, recording=recording if recording.videos else None)
     frame_times = None
     if not _is_synchronous(recording):
         frame_times = {name: times for name, times in recording.exposed.items() if name in detections}

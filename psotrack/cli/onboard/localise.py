@@ -222,8 +222,7 @@ def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Inp
     """The input that VIDEO names: a video, a folder of images, a stream, or one drone's video in a sequence."""
     from psotrack.inside_out import open_source
     from psotrack.recordings import is_picture_folder
-    from psotrack.recordings.datasets import find_marker_corners
-    from psotrack.recordings.datasets.dpjait import read_onboard
+    from psotrack.recordings.datasets import find_marker_corners, read_onboard
 
     stream, folder = live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()

@@ -116,7 +116,7 @@ def map_markers(
         read_marker_map,
         read_measured_corners,
     )
-    from psotrack.recordings.datasets.dpjait import write_marker_corners
+    from psotrack.recordings.datasets import write_marker_corners
 
     if out is not None and checked is not None:
         raise SettingsError("onboard map", expected="--out FILE or --check MAP", found="both")

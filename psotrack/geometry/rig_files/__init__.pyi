@@ -1,28 +1,29 @@
-from .dpjait_calibration import METRES_PER_UNIT, read_calibration, read_camera_names, write_calibration
-from .entries import UNITS_M, Entry
-from .fields import lens_model
+from .dpjait_calibration import write_calibration
+from .fields import UNITS_M, CameraFields, Entry, camera_values, lens_model
 from .formats import (
     RIG_FORMATS,
     WRITTEN_RIG_FORMATS,
-    read_entries,
+    entries_of,
+    read_cameras,
     read_lenses,
     read_rig,
     write_lenses,
     write_rig,
 )
-from .rig_toml import camera_of_table
+from .rig_toml import KEYS, fields_of_table
 
 __all__ = [
-    "METRES_PER_UNIT",
+    "KEYS",
     "RIG_FORMATS",
     "UNITS_M",
     "WRITTEN_RIG_FORMATS",
+    "CameraFields",
     "Entry",
-    "camera_of_table",
+    "camera_values",
+    "entries_of",
+    "fields_of_table",
     "lens_model",
-    "read_calibration",
-    "read_camera_names",
-    "read_entries",
+    "read_cameras",
     "read_lenses",
     "read_rig",
     "write_calibration",

@@ -7,7 +7,7 @@ file may lack them. The header names the unit of lengths, millimetres or metres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +16,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Camera, Rig, camera_key, make_camera, make_rig
+from psotrack.geometry import Camera, Rig, camera_key
+from psotrack.geometry.rig_files.fields import UNITS_M, CameraFields
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
-#: Units of lengths in the headers of the dataset's tables.
-METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
 _RADIANS_PER_UNIT = {"rad": 1.0, "": 1.0, "deg": np.pi / 180}
 _MOST_COEFFICIENTS = 4
 _ADVICE = (
@@ -28,55 +27,42 @@ _ADVICE = (
 )
 
 
-def read_camera_names(path: Path | str) -> tuple[str, ...]:
-    """Read the names of the cameras from a calibration file.
+def recognises(text: str) -> bool:
+    """Whether the first line of a text names the dataset's column of cameras."""
+    return "cam_name" in text.partition("\n")[0]
 
-    Raises:
-        InputError: the file cannot be read, has no column `cam_name`, or names a camera twice.
-    """
+
+def read(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read the cameras of a calibration file; the sizes of the images are open."""
     table = read_table(path)
-    column = table.column("cam_name")
-    names: dict[str, str] = {}
-    for row in table.rows:
-        name = row.text(column)
-        if camera_key(name) in names:
-            raise row.error(column, "each camera once", f"{name} again")
-        names[camera_key(name)] = name
-    return tuple(names.values())
-
-
-def read_calibration(path: Path | str, image_sizes_wh: Mapping[str, tuple[int, int]]) -> Rig:
-    """Read the cameras of a calibration file, in metres.
-
-    Args:
-        path: path of the file.
-        image_sizes_wh: width and height of the images in pixels, by camera name; the file does not have them.
-
-    Raises:
-        InputError: the file cannot be read, a column is missing, a value is not a finite number, a camera occurs
-            twice, or a focal length is not above 0. The message names line and column.
-    """
-    names = read_camera_names(path)
-    table = read_table(path)
+    coefficients = _coefficient_columns(table)
+    name_column, focal_length = table.column("cam_name"), table.column("focal_length")
     translation = [table.column(f"cam_{axis}") for axis in "xyz"]
     rotation = [table.column(f"cam_or_{axis}") for axis in "xyz"]
-    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in translation])
-    radians = np.array([table.factor(column, _RADIANS_PER_UNIT) for column in rotation])
-    coefficients = _coefficient_columns(table)
-    cameras = {}
-    for name, row in zip(names, table.rows, strict=True):
-        cameras[name] = make_camera(
-            R=Rotation.from_rotvec(_numbers(row, rotation) * radians).as_matrix(),
-            t_m=_numbers(row, translation) * metres,
-            K=_intrinsics(table, row),
-            dist=_numbers(row, coefficients).tolist(),
-            image_size_wh=image_sizes_wh[name],
-        )
-    return make_rig(cameras)
+    middle = [table.column(name) for name in ("cx", "cy")]
+    metres = np.array([table.factor(column, UNITS_M) for column in translation])
+    radians = [table.factor(column, _RADIANS_PER_UNIT) for column in rotation]
+    names: set[str] = set()
+    for row in table.rows:
+        name, f = row.text(name_column), row.number(focal_length)
+        if camera_key(name) in names:
+            raise row.error(name_column, "each camera once", f"{name} again")
+        names.add(camera_key(name))
+        if f <= 0:
+            raise row.error(focal_length, "a focal length above 0 pixels", f"{f:g}")
+        cx, cy = _numbers(row, middle)
+        values = {
+            "K": [[f, 0, cx], [0, f, cy], [0, 0, 1]],
+            "D": _numbers(row, coefficients),
+            "rvec": _numbers(row, rotation) * radians,
+            # In units of the first column.
+            "t": _numbers(row, translation) * (metres / metres[0]),
+        }
+        yield CameraFields(path, f"camera {name}", values, name, float(metres[0]))
 
 
 def write_calibration(path: Path | str, rig: Rig, unit: Literal["m", "mm"] = "m") -> None:
-    """Write a rig to a calibration file; `read_calibration` reads the same numbers to 1e-12.
+    """Write a rig to a calibration file; `read_rig` reads the same numbers to 1e-12.
 
     Distortion columns are written if a camera has distortion, as in the real half of the dataset. The simulated half
     has no such columns.
@@ -90,8 +76,8 @@ def write_calibration(path: Path | str, rig: Rig, unit: Literal["m", "mm"] = "m"
         SettingsError: the layout cannot hold the rig: a camera has two focal lengths, skew, or coefficients beyond p2.
         OutputError: the file cannot be written.
     """
-    if unit not in METRES_PER_UNIT:
-        raise SettingsError("unit", expected=" or ".join(METRES_PER_UNIT), found=unit)
+    if unit not in UNITS_M:
+        raise SettingsError("unit", expected=" or ".join(UNITS_M), found=unit)
     _check_writable(rig)
     num_coefficients = min(rig.cameras.dist.shape[-1], _MOST_COEFFICIENTS) if rig.cameras.dist.any() else 0
     header = [
@@ -111,7 +97,7 @@ def _calibration_row(rig: Rig, index: int, unit: str, num_coefficients: int) -> 
     camera: Camera = rig.cameras[index]
     return [
         rig.names[index],
-        *(camera.T_cam_world[:3, 3] / METRES_PER_UNIT[unit]),
+        *(camera.T_cam_world[:3, 3] / UNITS_M[unit]),
         *Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_rotvec(),
         *(camera.K[0, 0], camera.K[0, 2], camera.K[1, 2]),
         *camera.dist[:num_coefficients],
@@ -134,15 +120,6 @@ def _check_writable(rig: Rig) -> None:
         else:
             continue
         raise SettingsError(f"camera {name}", expected=expected, found=found, remedy=_ADVICE)
-
-
-def _intrinsics(table: Table, row: TextRow) -> Float[np.ndarray, "3 3"]:
-    column = table.column("focal_length")
-    focal_length_px = row.number(column)
-    if focal_length_px <= 0:
-        raise row.error(column, "a focal length above 0 pixels", f"{focal_length_px:g}")
-    cx, cy = (row.number(table.column(name)) for name in ("cx", "cy"))
-    return np.array([[focal_length_px, 0, cx], [0, focal_length_px, cy], [0, 0, 1]])
 
 
 def _coefficient_columns(table: Table) -> list[Column]:

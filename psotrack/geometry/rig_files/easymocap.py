@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from psotrack.errors import InputError
-from psotrack.geometry.rig_files.entries import Entry, FileRig, Source, collect
-from psotrack.geometry.rig_files.fields import CameraFields, entry_from_fields
+from psotrack.geometry.rig_files.fields import CameraFields
 from psotrack.geometry.rig_files.opencv_storage import parse, with_partner
 
 #: Field of a camera -> the same field in this package's reader.
@@ -31,40 +31,28 @@ def recognises(text: str) -> bool:
     )
 
 
-def read(source: Source) -> FileRig:
+def read(path: Path, text: str) -> Iterator[CameraFields]:
     """Read intri.yml and extri.yml; lengths are metres."""
-    content = with_partner(source, parse(source))
-    names = _names(content)
+    content = with_partner(path, parse(path, text))
+    # Names of all cameras, of lenses and of poses, in the file's order.
+    names = dict.fromkeys(match[1] for key in content if (match := re.fullmatch(r"(?:K|Rot|R|T)_(.+)", key)))
     if not any(f"K_{name}" in content for name in names):
-        raise InputError(
-            source.path, expected="intri.yml with the lenses beside it", found="a file of poses alone"
-        )
-    return FileRig(collect(source.path, _entries(source, content, names)), metres_per_unit=1.0)
-
-
-def _names(content: Mapping[str, Any]) -> list[str]:
-    """Names of all cameras, of lenses and of poses, in the file's order."""
-    found = [match[1] for key in content if (match := re.fullmatch(r"(?:K|Rot|R|T)_(.+)", key))]
-    return list(dict.fromkeys(found))
-
-
-def _entries(
-    source: Source, content: Mapping[str, Any], names: list[str]
-) -> Iterator[tuple[str, str, Entry]]:
+        expected = "intri.yml with the lenses beside it"
+        raise InputError(path, expected=expected, found="a file of poses alone")
     for name in names:
-        values = {
-            ours: content[f"{theirs}_{name}"]
-            for theirs, ours in _FIELDS.items()
-            if content.get(f"{theirs}_{name}") is not None
-        }
-        width, height = content.get(f"W_{name}"), content.get(f"H_{name}")
-        if isinstance(width, int | float) and isinstance(height, int | float) and min(width, height) > 0:
-            values["size"] = [width, height]
-        if "rvec" in values:
-            values.pop("R", None)
-        if "K" not in values:
-            # A camera whose place is known, but not its lens.
-            yield name, f"K_{name}", Entry(None, placed=False)
-            continue
-        fields = CameraFields(source.path, f"camera {name}", values)
-        yield name, f"camera {name}", entry_from_fields(fields, source.image_size_wh)
+        yield CameraFields(path, f"camera {name}", _values(content, name), name, unit_m=1.0)
+
+
+def _values(content: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The fields of a camera; none for a camera whose place is known, but not its lens."""
+    values = {
+        ours: content[f"{theirs}_{name}"]
+        for theirs, ours in _FIELDS.items()
+        if content.get(f"{theirs}_{name}") is not None
+    }
+    width, height = content.get(f"W_{name}"), content.get(f"H_{name}")
+    if isinstance(width, int | float) and isinstance(height, int | float) and min(width, height) > 0:
+        values["size"] = [width, height]
+    if "rvec" in values:
+        values.pop("R", None)
+    return values if "K" in values else {}

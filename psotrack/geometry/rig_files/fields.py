@@ -1,4 +1,4 @@
-"""Fields of one camera in a rig file, under any of the names that calibration programs use, and their checks."""
+"""Fields of one camera in a rig file, under any of the names that calibration programs use; one conversion for all."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, Camera, make_camera
-from psotrack.geometry.rig_files.entries import Entry
 from psotrack.support import LARGEST
 
+#: Lengths of units by the names that files and options use, metres.
+UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 #: Largest element of |R Rᵀ - I| in a rotation matrix that is taken for rounded and made orthogonal: matrices written
 #: with four decimals pass.
 _ROTATION_TOLERANCE = 1e-3
@@ -28,22 +29,39 @@ _SIZE = ("size", "image_size", "imageSize", "resolution")
 
 
 @dataclass(frozen=True)
+class Entry:
+    """One camera of a rig file.
+
+    Attributes:
+        camera: the camera, in metres; None if the file has no lens for it.
+        placed: whether the file has the camera's pose; if not, the camera stands at the world's origin.
+    """
+
+    camera: Camera | None
+    placed: bool = True
+
+
+@dataclass(frozen=True)
 class CameraFields:
-    """The fields of one camera in a file.
+    """What a file says of one camera: readers of all formats yield this.
 
     Attributes:
         path: path of the file.
-        place: name of the camera's table in the file, for messages.
-        values: values by field name.
+        place: place of the camera in the file, for messages.
+        values: values by field name. `rows_upwards` is true where pixels are counted upwards from the lower edge.
+        name: name of the camera.
+        unit_m: unit of length that the format or the file states, metres; None if both leave it open.
     """
 
     path: Path
     place: str
     values: Mapping[str, Any]
+    name: str = ""
+    unit_m: float | None = None
 
     def error(self, name: str, expected: str, found: str, remedy: str = "") -> InputError:
         """Error whose message names the file and the field."""
-        place = f"{self.place}.{name}" if self.place else name
+        place = ".".join(part for part in (self.place, name) if part)
         return InputError(f"{self.path}, {place}", expected=expected, found=found, remedy=remedy)
 
     def first(self, *names: str) -> str | None:
@@ -82,46 +100,116 @@ class CameraFields:
                 return squeezed
         raise self.error(name, expected, " x ".join(map(str, array.shape)) or quoted(self.values[name]))
 
+    def entry(self, image_size_wh: tuple[int, int] | None, metres_per_unit: float) -> Entry:
+        """The camera that these fields describe.
 
-def entry_from_fields(fields: CameraFields, image_size_wh: tuple[int, int] | None) -> Entry:
-    """The camera that these fields describe.
+        A camera without rotation and translation is not placed; a camera that has no lens either was never calibrated.
 
-    A camera without rotation and translation is not placed; a camera that has no lens either was never calibrated.
+        Args:
+            image_size_wh: width and height in pixels, if the fields have none.
+            metres_per_unit: unit of the translation, metres.
 
-    Args:
-        fields: fields of the camera.
-        image_size_wh: width and height in pixels, if the fields have none.
+        Raises:
+            InputError: a field is missing or wrong.
+        """
+        placed = self.first(*ROTATION, *TRANSLATION) is not None
+        if not placed and not self.has_lens:
+            return Entry(None, placed=False)
+        K, fisheye = self._intrinsics(), self._is_fisheye()
+        dist = self._distortion(fisheye=fisheye)
+        R, t_m = np.eye(3), np.zeros(3)
+        if placed:
+            R, t_m = self._rotation(), self.array(TRANSLATION, (3,)) * metres_per_unit
+        size_wh = self.size_wh or image_size_wh
+        if size_wh is None:
+            raise self.error("size or image_size", "width and height of the images", "none", "pass --size")
+        if self.values.get("rows_upwards"):
+            K[1, 2] += size_wh[1]
+        camera = make_camera(R=R, t_m=t_m, K=K, dist=dist.tolist(), image_size_wh=size_wh, fisheye=fisheye)
+        return Entry(camera, placed)
 
-    Raises:
-        InputError: a field is missing or wrong.
-    """
-    placed = fields.first(*ROTATION) is not None or fields.first(*TRANSLATION) is not None
-    if not placed and fields.first(*MATRIX, *DISTORTION) is None:
-        return Entry(None, placed=False)
-    return Entry(camera_from_fields(fields, image_size_wh, placed=placed), placed)
+    @property
+    def has_lens(self) -> bool:
+        """Whether there are intrinsics or a distortion."""
+        return self.first(*MATRIX, *DISTORTION) is not None
+
+    @property
+    def size_wh(self) -> tuple[int, int] | None:
+        """Width and height in pixels as the file states them; None where it does not."""
+        if name := self.first(*_SIZE):
+            sides = self.array(_SIZE, (2,))
+        elif self.first("image_width") and self.first("image_height"):
+            name = "image_width"
+            sides = np.array([self.array((f"image_{side}",), ()) for side in ("width", "height")])
+        elif name := self.first("image_shape"):
+            # NumPy's shape of an image: rows before columns.
+            sides = self.array(("image_shape",), (2,), (3,))[1::-1]
+        else:
+            return None
+        if (sides < 1).any() or (sides != np.round(sides)).any():
+            raise self.error(name, "whole numbers of pixels above 0", quoted(sides.tolist()))
+        return int(sides[0]), int(sides[1])
+
+    def _intrinsics(self) -> Float[np.ndarray, "3 3"]:
+        K = self.array(MATRIX, (3, 3))
+        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and np.array_equal(K[2], [0, 0, 1])):
+            expected = "intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]], fx and fy above 0"
+            raise self.error(str(self.first(*MATRIX)), expected, quoted(K.tolist()))
+        return K
+
+    def _is_fisheye(self) -> bool:
+        """Whether the fields name OpenCV's fisheye model."""
+        model = self.values.get("model") or self.values.get("distortion_model")
+        if isinstance(model, str):
+            return model.lower() in {"fisheye", "equidistant", "kannala_brandt"}
+        return bool(self.values.get("fisheye") or self.values.get("fisheye_model"))
+
+    def _distortion(self, *, fisheye: bool) -> Float[np.ndarray, " coefficients"]:
+        """The distortion coefficients in OpenCV's order; none if the field is missing or empty."""
+        name = self.first(*DISTORTION)
+        empty = name is None or (isinstance(self.values[name], list) and not self.values[name])
+        dist = np.zeros(0) if empty else self.array(DISTORTION, (-1,))
+        if fisheye and not dist[FISHEYE_COEFFICIENTS:].any():
+            dist = np.pad(dist[:FISHEYE_COEFFICIENTS], (0, 0 if dist.size else FISHEYE_COEFFICIENTS))
+        allowed = (FISHEYE_COEFFICIENTS,) if fisheye else PINHOLE_COEFFICIENTS
+        if dist.size not in allowed:
+            what = "coefficients of a fisheye" if fisheye else "coefficients"
+            raise self.error(str(name), f"{', '.join(map(str, allowed))} {what}", f"{dist.size}")
+        return dist
+
+    def _rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The rotation matrix of a field that holds a Rodrigues vector or a matrix."""
+        turn = self.array(ROTATION, (3,), (3, 3))
+        if turn.ndim == 1:
+            return Rotation.from_rotvec(turn).as_matrix()
+        return self.rotation_matrix(turn, str(self.first(*ROTATION)))
+
+    def rotation_matrix(self, turn: Float[np.ndarray, "3 3"], name: str) -> Float[np.ndarray, "3 3"]:
+        """A matrix of the field `name`, checked; the nearest rotation if its digits are rounded."""
+        off = np.abs(turn @ turn.T - np.eye(3)).max()
+        mirrored = np.linalg.det(turn) < 0
+        if off > _ROTATION_TOLERANCE or mirrored:
+            remedy = "its axes are mirrored" if mirrored else ""
+            raise self.error(name, "a rotation matrix", quoted(turn.tolist()), remedy)
+        if off < 1e-12:
+            return turn
+        left, _, right = np.linalg.svd(turn)
+        return left @ right
 
 
-def camera_from_fields(
-    fields: CameraFields, image_size_wh: tuple[int, int] | None, *, placed: bool
-) -> Camera:
-    """Make a camera from its fields; the translation stays in the file's unit.
-
-    Args:
-        fields: fields of the camera.
-        image_size_wh: width and height in pixels, if the fields have none.
-        placed: read the camera's pose; if not, the camera stands at the world's origin.
-
-    Raises:
-        InputError: a field is missing or wrong.
-    """
-    K = intrinsics(fields)
-    fisheye = is_fisheye(fields)
-    dist = distortion(fields, fisheye=fisheye)
-    R, t = np.eye(3), np.zeros(3)
+def camera_values(camera: Camera, *, placed: bool = True) -> dict[str, Any]:
+    """The keys of a `rig.toml` that describe a camera, in metres; without its place if `placed` is false."""
+    distortion, fisheye = lens_model(camera)
+    values = {
+        "size": [int(side) for side in camera.image_size_wh],
+        "K": camera.K.tolist(),
+        "model": "fisheye" if fisheye else "opencv",
+        "distortion": distortion,
+    }
     if placed:
-        R, t = rotation(fields), fields.array(TRANSLATION, (3,))
-    size = image_size(fields, image_size_wh)
-    return make_camera(R=R, t_m=t, K=K, dist=dist.tolist(), image_size_wh=size, fisheye=fisheye)
+        values["rvec"] = Rotation.from_matrix(camera.T_cam_world[:3, :3]).as_rotvec().tolist()
+        values["tvec"] = camera.T_cam_world[:3, 3].tolist()
+    return values
 
 
 def lens_model(camera: Camera) -> tuple[list[float], bool]:
@@ -131,82 +219,11 @@ def lens_model(camera: Camera) -> tuple[list[float], bool]:
     return (coefficients[:FISHEYE_COEFFICIENTS] if fisheye else coefficients), fisheye
 
 
-def intrinsics(fields: CameraFields) -> Float[np.ndarray, "3 3"]:
-    """The 3 x 3 matrix of the intrinsics, scaled so that its last element is 1."""
-    K = fields.array(MATRIX, (3, 3))
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and np.array_equal(K[2], [0, 0, 1])):
-        raise fields.error(
-            str(fields.first(*MATRIX)),
-            "intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]], fx and fy above 0",
-            quoted(K.tolist()),
-        )
-    return K
-
-
-def is_fisheye(fields: CameraFields) -> bool:
-    """Whether the fields name OpenCV's fisheye model."""
-    model = fields.values.get("model") or fields.values.get("distortion_model")
-    if isinstance(model, str):
-        return model.lower() in {"fisheye", "equidistant", "kannala_brandt"}
-    return bool(fields.values.get("fisheye") or fields.values.get("fisheye_model"))
-
-
-def distortion(fields: CameraFields, *, fisheye: bool) -> Float[np.ndarray, " coefficients"]:
-    """The distortion coefficients in OpenCV's order; none if the field is missing."""
-    name = fields.first(*DISTORTION)
-    if name is None:
-        return np.zeros(FISHEYE_COEFFICIENTS if fisheye else 0)
-    given = fields.values[name]
-    dist = np.zeros(0) if isinstance(given, list) and not given else fields.array(DISTORTION, (-1,))
-    if fisheye and not dist[FISHEYE_COEFFICIENTS:].any():
-        dist = np.pad(dist[:FISHEYE_COEFFICIENTS], (0, 0 if dist.size else FISHEYE_COEFFICIENTS))
-    allowed = (FISHEYE_COEFFICIENTS,) if fisheye else PINHOLE_COEFFICIENTS
-    if dist.size not in allowed:
-        what = "coefficients of a fisheye" if fisheye else "coefficients"
-        raise fields.error(name, f"{', '.join(map(str, allowed))} {what}", f"{dist.size}")
-    return dist
-
-
-def rotation(fields: CameraFields) -> Float[np.ndarray, "3 3"]:
-    """The rotation matrix of a field that holds a Rodrigues vector or a matrix."""
-    turn = fields.array(ROTATION, (3,), (3, 3))
-    if turn.ndim == 1:
-        return Rotation.from_rotvec(turn).as_matrix()
-    return rotation_matrix(turn, fields, str(fields.first(*ROTATION)))
-
-
-def rotation_matrix(
-    turn: Float[np.ndarray, "3 3"], fields: CameraFields, name: str
-) -> Float[np.ndarray, "3 3"]:
-    """A matrix of the field `name`, checked; the nearest rotation if its digits are rounded."""
-    off = np.abs(turn @ turn.T - np.eye(3)).max()
-    if off > _ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
-        remedy = "its axes are mirrored" if np.linalg.det(turn) < 0 else ""
-        raise fields.error(name, "a rotation matrix", quoted(turn.tolist()), remedy)
-    if off < 1e-12:
-        return turn
-    left, _, right = np.linalg.svd(turn)
-    return left @ right
-
-
-def image_size(fields: CameraFields, image_size_wh: tuple[int, int] | None) -> tuple[int, int]:
-    """Width and height in pixels: the camera's own, or else the given ones."""
-    if name := fields.first(*_SIZE):
-        sides = fields.array(_SIZE, (2,))
-    elif fields.first("image_width") and fields.first("image_height"):
-        name = "image_width"
-        sides = np.array([fields.array((f"image_{side}",), ()) for side in ("width", "height")])
-    elif fields.first("image_shape"):
-        # NumPy's shape of an image: rows before columns.
-        name = "image_shape"
-        sides = fields.array(("image_shape",), (2,), (3,))[1::-1]
-    elif image_size_wh is not None:
-        return image_size_wh
-    else:
-        raise fields.error("size or image_size", "width and height of the images", "none", "pass --size")
-    if (sides < 1).any() or (sides != np.round(sides)).any():
-        raise fields.error(name, "whole numbers of pixels above 0", quoted(sides.tolist()))
-    return int(sides[0]), int(sides[1])
+def stated_unit_m(path: Path, place: str, unit: Any) -> float | None:
+    """Length of the unit that a file names, metres; None where it names none."""
+    if unit is not None and unit not in list(UNITS_M):
+        raise InputError(f"{path}, {place}", expected=f"one of {', '.join(UNITS_M)}", found=f"{unit}")
+    return None if unit is None else UNITS_M[unit]
 
 
 def quoted(value: Any) -> str:

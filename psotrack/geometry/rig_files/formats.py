@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,21 +16,21 @@ from typing import Any
 import numpy as np
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import Camera, Rig, make_rig
+from psotrack.geometry import Rig, make_rig
 from psotrack.geometry.rig_files import (
-    argus,
     camera_tables,
-    dlt,
+    dpjait_calibration,
     easymocap,
     kalibr,
+    number_tables,
     opencv_storage,
     qualisys,
     rig_toml,
     text_blocks,
     vicon,
 )
-from psotrack.geometry.rig_files.dpjait_calibration import read_calibration, write_calibration
-from psotrack.geometry.rig_files.entries import UNITS_M, Entry, FileRig, Source
+from psotrack.geometry.rig_files.dpjait_calibration import write_calibration
+from psotrack.geometry.rig_files.fields import UNITS_M, CameraFields, Entry
 from psotrack.support import read_text, read_toml, refuse_to_overwrite
 
 _logger = logging.getLogger(__name__)
@@ -42,56 +41,52 @@ _CALISCOPE = "camera_array"
 
 @dataclass(frozen=True)
 class _Format:
-    """A format of rig files: how to read it, and how to write it if that is possible."""
+    """A format of rig files.
 
-    read: Callable[[Source], FileRig]
+    Attributes:
+        read: yields the fields of each camera, from the path and the text of a file.
+        recognises: whether a file has this format: by its tables for formats of TOML, else by its text.
+        write: writes a rig; None if the format is only read.
+    """
+
+    read: Callable[[Path, str], Iterable[CameraFields]]
+    recognises: Callable[[Any], bool]
     write: Callable[[Path, Rig], None] | None = None
 
 
-def _read_dpjait(source: Source) -> FileRig:
-    if source.image_size_wh is None:
-        raise source.missing_size()
-    size = source.image_size_wh
-    rig = read_calibration(source.path, defaultdict(lambda: size))
-    return FileRig({name: Entry(rig.cameras[index]) for index, name in enumerate(rig.names)}, 1.0)
-
-
-#: Formats by the name that `--format` takes.
-_FORMATS: Mapping[str, _Format] = {
-    "rig": _Format(rig_toml.read, rig_toml.write),
-    "dpjait": _Format(_read_dpjait, write_calibration),
-    "anipose": _Format(camera_tables.read_anipose, camera_tables.write_anipose),
-    "caliscope": _Format(camera_tables.read_caliscope, camera_tables.write_caliscope),
-    "pose2sim": _Format(camera_tables.read_pose2sim),
-    "opencv": _Format(opencv_storage.read, opencv_storage.write),
-    "qualisys": _Format(qualisys.read),
-    "vicon": _Format(vicon.read),
-    "easymocap": _Format(easymocap.read),
-    "kalibr": _Format(kalibr.read),
-    "dlt": _Format(dlt.read),
-    "argus": _Format(argus.read),
-    "handpose3d": _Format(text_blocks.read),
+#: Formats by the name that `--format` takes; the first that recognises a file is taken.
+_OF_TOML: Mapping[str, _Format] = {
+    "rig": _Format(rig_toml.read, rig_toml.recognises, rig_toml.write),
+    "caliscope": _Format(
+        camera_tables.read_metres, camera_tables.is_caliscope, camera_tables.write_caliscope
+    ),
+    "pose2sim": _Format(camera_tables.read_metres, camera_tables.is_pose2sim),
+    "anipose": _Format(camera_tables.read_anipose, lambda tables: True, camera_tables.write_anipose),
 }
-#: Format by what a text has in it, for texts that are no TOML; the first that fits is taken.
-_BY_CONTENT: Mapping[str, Callable[[str], bool]] = {
-    "qualisys": qualisys.recognises,
-    "vicon": vicon.recognises,
-    "easymocap": easymocap.recognises,
-    "kalibr": kalibr.recognises,
-    "handpose3d": text_blocks.recognises,
-    "argus": argus.recognises,
-    "dlt": dlt.recognises,
-    "opencv": lambda text: text.startswith(("%YAML", "{")) or "<opencv_storage" in text[:200],
-    "dpjait": lambda text: "cam_name" in text.partition("\n")[0],
+_OF_TEXT: Mapping[str, _Format] = {
+    "qualisys": _Format(qualisys.read, qualisys.recognises),
+    "vicon": _Format(vicon.read, vicon.recognises),
+    "easymocap": _Format(easymocap.read, easymocap.recognises),
+    "kalibr": _Format(kalibr.read, kalibr.recognises),
+    "handpose3d": _Format(text_blocks.read, text_blocks.recognises),
+    "argus": _Format(number_tables.read_argus, number_tables.is_argus),
+    "dlt": _Format(number_tables.read_dlt, number_tables.is_dlt),
+    "opencv": _Format(opencv_storage.read, opencv_storage.recognises, opencv_storage.write),
+    "dpjait": _Format(dpjait_calibration.read, dpjait_calibration.recognises, write_calibration),
 }
+_FORMATS = {**_OF_TOML, **_OF_TEXT}
+#: Format by the ending of a name, for files to be written, and for files whose content says nothing.
+_SUFFIXES = {".toml": "rig", ".csv": "dpjait", ".yml": "opencv", ".yaml": "opencv"}
 #: Names of the formats that can be read, and of those that can be written.
 RIG_FORMATS = tuple(_FORMATS)
 WRITTEN_RIG_FORMATS = tuple(name for name, one in _FORMATS.items() if one.write)
+#: Width and height of all cameras' images in pixels, or of each camera's by its name.
+Sizes = tuple[int, int] | Mapping[str, tuple[int, int]] | None
 
 
 def read_rig(
     path: Path | str,
-    image_size_wh: tuple[int, int] | None = None,
+    image_size_wh: Sizes = None,
     *,
     metres_per_unit: float | None = None,
     file_format: str | None = None,
@@ -111,8 +106,14 @@ def read_rig(
             camera is placed. The message names file and field.
         SettingsError: the format is unknown.
     """
-    entries = read_entries(path, image_size_wh, metres_per_unit=metres_per_unit, file_format=file_format)
-    placed = {key: entry for key, entry in entries.items() if entry.camera is not None and entry.placed}
+    cameras = read_cameras(path, file_format=file_format)
+    placed = {}
+    lacking: dict[str, list[str]] = {"lens": [], "pose": []}
+    for name, entry in entries_of(cameras, image_size_wh, metres_per_unit=metres_per_unit).items():
+        if entry.camera is not None and entry.placed:
+            placed[name] = entry.camera
+        else:
+            lacking["lens" if entry.camera is None else "pose"].append(name)
     if not placed:
         raise InputError(
             path,
@@ -121,53 +122,79 @@ def read_rig(
             remedy="read only the lenses (`psotrack calibrate convert --lenses`), and find the poses by "
             "`psotrack calibrate extrinsics` with this file as --intrinsics",
         )
-    for lacking, names in (
-        ("lens", [key for key, entry in entries.items() if entry.camera is None]),
-        (
-            "pose",
-            [key for key, entry in entries.items() if entry.camera is not None and not entry.placed],
-        ),
-    ):
+    for what, names in lacking.items():
         if names:
-            _logger.warning(
-                "%s: left out, because they have no %s: camera %s", path, lacking, ", ".join(names)
-            )
-    return make_rig({key: _camera(entry) for key, entry in placed.items()})
+            _logger.warning("%s: left out, because they have no %s: camera %s", path, what, ", ".join(names))
+    return make_rig(placed)
 
 
-def read_entries(
-    path: Path | str,
-    image_size_wh: tuple[int, int] | None = None,
-    *,
-    metres_per_unit: float | None = None,
-    file_format: str | None = None,
-) -> dict[str, Entry]:
-    """Read all cameras of a rig file by name, also those without lens or place, in metres.
-
-    Arguments and errors: see `read_rig`; a unit of length is needed only if a camera is placed.
-    """
-    path = Path(path)
-    file, name = _read(path, image_size_wh, file_format)
-    if not any(entry.camera is not None and entry.placed for entry in file.entries.values()):
-        return dict(file.entries)
-    factor = _metres(path, file, name, metres_per_unit)
-    return {key: _scaled(entry, factor) for key, entry in file.entries.items()}
-
-
-def read_lenses(
-    path: Path | str, image_size_wh: tuple[int, int] | None = None, *, file_format: str | None = None
-) -> Rig:
+def read_lenses(path: Path | str, image_size_wh: Sizes = None, *, file_format: str | None = None) -> Rig:
     """Read only the lenses of a rig file: all cameras stand at the world's origin.
 
     Arguments and errors: see `read_rig`; the file need not have poses.
     """
-    file, _ = _read(Path(path), image_size_wh, file_format)
-    cameras = {name: entry.camera for name, entry in file.entries.items() if entry.camera is not None}
+    entries = entries_of(read_cameras(path, file_format=file_format), image_size_wh, metres_per_unit=1.0)
+    cameras = {name: entry.camera for name, entry in entries.items() if entry.camera is not None}
     if not cameras:
         raise InputError(path, expected="the lenses of cameras", found="none")
     rig = make_rig(cameras)
     origin = np.tile(np.eye(4), (len(rig), 1, 1))
     return Rig(rig.names, replace(rig.cameras, T_cam_world=origin))
+
+
+def read_cameras(path: Path | str, *, file_format: str | None = None) -> dict[str, CameraFields]:
+    """What a rig file says of each camera, by name: of what it does not state, sizes and unit are still open.
+
+    Arguments and errors: see `read_rig`.
+    """
+    path = Path(path)
+    if file_format is not None and file_format not in _FORMATS:
+        raise SettingsError("format", expected=f"one of {', '.join(RIG_FORMATS)}", found=file_format)
+    text = read_text(path)
+    found: dict[str, CameraFields] = {}
+    for fields in _FORMATS[file_format or _recognise(path, text)].read(path, text):
+        if fields.name in found:
+            raise fields.error("", "each camera once", f"{fields.name} again")
+        found[fields.name] = fields
+    if not found:
+        raise InputError(path, expected="at least one camera", found="none")
+    return found
+
+
+def entries_of(
+    cameras: Mapping[str, CameraFields], image_size_wh: Sizes = None, *, metres_per_unit: float | None = None
+) -> dict[str, Entry]:
+    """The cameras of a rig file by name, also those without lens or place, in metres.
+
+    Args:
+        cameras: what the file says, from `read_cameras`.
+        image_size_wh: width and height of the images in pixels, for cameras whose size the file does not state.
+        metres_per_unit: unit of length in the file, metres; needed if a camera is placed and the unit is open.
+
+    Raises:
+        InputError: the unit is not known, or a field is missing or wrong. The message names file and field.
+    """
+    found = {}
+    for name, fields in cameras.items():
+        size_wh = image_size_wh.get(name) if isinstance(image_size_wh, Mapping) else image_size_wh
+        found[name] = fields.entry(size_wh, metres_per_unit or fields.unit_m or 1.0)
+    placed = next((cameras[name] for name, entry in found.items() if entry.placed), None)
+    if placed is None:
+        return found
+    if placed.unit_m is None and metres_per_unit is None:
+        raise InputError(
+            placed.path,
+            expected="a unit of lengths",
+            found="none, because the file leaves it open",
+            remedy=f"state {' or '.join(UNITS_M)}: --units of `psotrack calibrate convert` and `psotrack init`, "
+            "calibration_unit in a recording.toml",
+        )
+    if metres_per_unit is not None and placed.unit_m not in (None, metres_per_unit):
+        _logger.warning(
+            "%s: lengths are in units of %g m by the file, and are read in units of %g m, as asked for",
+            placed.path, placed.unit_m, metres_per_unit,
+        )  # fmt: skip
+    return found
 
 
 def write_rig(path: Path | str, rig: Rig, *, force: bool = False, file_format: str | None = None) -> None:
@@ -218,81 +245,24 @@ def write_lenses(path: Path | str, rig: Rig, *, force: bool = False) -> None:
 def _format_of_name(path: Path) -> str:
     if path.name.startswith(_CALISCOPE) and path.suffix.lower() == ".toml":
         return "caliscope"
-    suffixes = {".toml": "rig", ".csv": "dpjait", ".yml": "opencv", ".yaml": "opencv"}
-    if path.suffix.lower() not in suffixes:
-        raise InputError(path, expected=f"a file that ends in {', '.join(suffixes)}", found=path.name)
-    return suffixes[path.suffix.lower()]
+    if path.suffix.lower() not in _SUFFIXES:
+        raise InputError(path, expected=f"a file that ends in {', '.join(_SUFFIXES)}", found=path.name)
+    return _SUFFIXES[path.suffix.lower()]
 
 
-def _read(path: Path, image_size_wh: tuple[int, int] | None, file_format: str | None) -> tuple[FileRig, str]:
-    """The content of a file, and the name of its format."""
-    if file_format is not None and file_format not in _FORMATS:
-        raise SettingsError("format", expected=f"one of {', '.join(RIG_FORMATS)}", found=file_format)
-    source = Source(path, read_text(path), image_size_wh)
-    name = file_format or _recognise(source)
-    return _FORMATS[name].read(source), name
-
-
-def _recognise(source: Source) -> str:
+def _recognise(path: Path, text: str) -> str:
     """Name of the format of a file."""
-    start = source.text.lstrip()
-    suffix = source.path.suffix.lower()
-    if suffix == ".toml" or (not suffix.startswith(".y") and re.match(r"\[[\w.\"-]+\]\s*$", start, re.M)):
-        return _toml_format(read_toml(source.path))
-    found = next((name for name, recognises in _BY_CONTENT.items() if recognises(start)), None)
-    found = found or {".yml": "opencv", ".yaml": "opencv", ".csv": "dpjait"}.get(suffix)
+    start, suffix = text.lstrip(), path.suffix.lower()
+    is_toml = suffix == ".toml" or (
+        not suffix.startswith(".y") and re.match(r"\[[\w.\"-]+\]\s*$", start, re.M)
+    )
+    content, formats = (read_toml(path), _OF_TOML) if is_toml else (start, _OF_TEXT)
+    found = next((name for name, each in formats.items() if each.recognises(content)), _SUFFIXES.get(suffix))
     if found:
         return found
     raise InputError(
-        source.path,
+        path,
         expected="a rig file of a known format",
         found="other content",
         remedy=f"state its format, one of {', '.join(RIG_FORMATS)}, by --format",
     )
-
-
-def _toml_format(data: Mapping[str, Any]) -> str:
-    if rig_toml.recognises(data):
-        return "rig"
-    if camera_tables.recognises_caliscope(data):
-        return "caliscope"
-    return "pose2sim" if camera_tables.recognises_pose2sim(data) else "anipose"
-
-
-def _metres(path: Path, file: FileRig, name: str, given: float | None) -> float:
-    """Length of the unit of a file's translations, metres."""
-    if given is None and file.metres_per_unit is None:
-        raise InputError(
-            path,
-            expected="a unit of lengths",
-            found=f"none, because {name} leaves it open",
-            remedy=f"state {' or '.join(UNITS_M)}: --units of `psotrack calibrate convert` and `psotrack init`, "
-            "calibration_unit in a recording.toml",
-        )
-    if name == "dpjait":
-        # The reader has converted the lengths already, column by column.
-        if given is not None:
-            _logger.warning("%s: the header names the unit of lengths; the stated unit is not used", path)
-        return 1.0
-    if given is not None and file.metres_per_unit not in (None, given):
-        _logger.warning(
-            "%s: lengths are in units of %g m by the file, and are read in units of %g m, as asked for",
-            path,
-            file.metres_per_unit,
-            given,
-        )
-    return given if given is not None else float(file.metres_per_unit or 1.0)
-
-
-def _camera(entry: Entry) -> Camera:
-    assert entry.camera is not None
-    return entry.camera
-
-
-def _scaled(entry: Entry, factor: float) -> Entry:
-    """The camera with its translation multiplied."""
-    if factor == 1.0 or entry.camera is None or not entry.placed:
-        return entry
-    T = np.array(entry.camera.T_cam_world)
-    T[:3, 3] *= factor
-    return replace(entry, camera=replace(entry.camera, T_cam_world=T))

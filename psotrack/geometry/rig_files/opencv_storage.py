@@ -23,17 +23,15 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 
-from psotrack.errors import InputError
 from psotrack.geometry import Rig
-from psotrack.geometry.rig_files.entries import UNITS_M, Entry, FileRig, Source, collect
 from psotrack.geometry.rig_files.fields import (
     DISTORTION,
     MATRIX,
     ROTATION,
     TRANSLATION,
     CameraFields,
-    entry_from_fields,
     lens_model,
+    stated_unit_m,
 )
 from psotrack.geometry.rig_files.xml_text import parse_xml
 from psotrack.geometry.rig_files.yaml_text import as_matrix, parse_yaml
@@ -46,47 +44,43 @@ _OF_TWO = re.compile(
     re.IGNORECASE,
 )
 _SECOND = {"2", "right", "r"}
+_SIZES = ("image_size", "imageSize", "size", "image_width", "image_height")
 
 
-def read(source: Source) -> FileRig:
+def recognises(text: str) -> bool:
+    """Whether a text begins as OpenCV's files do."""
+    return text.startswith(("%YAML", "{")) or "<opencv_storage" in text[:200]
+
+
+def read(path: Path, text: str) -> Iterator[CameraFields]:
     """Read a file of OpenCV; the unit is the file's `unit`, if there is one."""
-    content = parse(source)
-    unit = content.get("unit")
-    if unit is not None and unit not in list(UNITS_M):
-        raise InputError(f"{source.path}, unit", expected=f"one of {', '.join(UNITS_M)}", found=f"{unit}")
-    entries = collect(source.path, _entries(source, content))
-    return FileRig(entries, metres_per_unit=None if unit is None else UNITS_M[unit])
+    content = parse(path, text)
+    unit_m = stated_unit_m(path, "unit", content.get("unit"))
+    for name, place, values in _cameras(path, content):
+        yield CameraFields(path, place, values, name, unit_m)
 
 
-def parse(source: Source) -> dict[str, Any]:
+def parse(path: Path, text: str) -> dict[str, Any]:
     """The top level of a file storage, as dictionaries, lists, arrays, numbers and text.
 
     Raises:
         InputError: the file is not valid YAML, XML or JSON.
     """
-    if not source.text.lstrip().startswith("<"):
-        return parse_yaml(source)
-    content = _of_element(parse_xml(source))
+    if not text.lstrip().startswith("<"):
+        return parse_yaml(path, text)
+    content = _of_element(parse_xml(path, text))
     return content if isinstance(content, dict) else {}
 
 
-def partner(path: Path) -> Path | None:
-    """The file with the poses beside a file with the lenses, or the other way around, by `intri` and `extri`."""
+def with_partner(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a file with that of its partner, by `intri` and `extri` in the names of lenses and poses."""
     match = re.search("intri|extri", path.name, re.IGNORECASE)
     if match is None:
-        return None
+        return dict(content)
     other = "ex" if match[0].lower() == "intri" else "in"
     shaped = other.upper() if match[0].isupper() else other.capitalize() if match[0].istitle() else other
     found = path.with_name(f"{path.name[: match.start()]}{shaped}{path.name[match.start() + 2 :]}")
-    return found if found.exists() else None
-
-
-def with_partner(source: Source, content: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of a file together with that of its partner."""
-    other = partner(source.path)
-    if other is None:
-        return dict(content)
-    return parse(Source(other, read_text(other))) | dict(content)
+    return (parse(found, read_text(found)) if found.exists() else {}) | dict(content)
 
 
 def write(path: Path, rig: Rig) -> None:
@@ -122,61 +116,53 @@ def write(path: Path, rig: Rig) -> None:
         temporary.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
-def _entries(source: Source, content: dict[str, Any]) -> Iterator[tuple[str, str, Entry]]:
+def _cameras(path: Path, content: dict[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Name, place in the file and fields of each camera."""
     cameras = content.get("cameras")
     if isinstance(cameras, list):
         for index, item in enumerate(cameras):
-            fields = CameraFields(source.path, f"cameras[{index}]", item if isinstance(item, dict) else {})
-            name = fields.first("name")
-            if name is None:
-                raise fields.error("name", "a name", "none")
-            place = f"cameras[{index}].name"
-            yield str(fields.values[name]), place, entry_from_fields(fields, source.image_size_wh)
+            values = item if isinstance(item, dict) else {}
+            if values.get("name") is None:
+                raise CameraFields(path, f"cameras[{index}]", values).error("name", "a name", "none")
+            yield str(values["name"]), f"cameras[{index}]", values
         return
     by_name = cameras if isinstance(cameras, dict) else content
     maps = {name: value for name, value in by_name.items() if _is_camera(value)}
+    for name, value in maps.items():
+        yield name, f"cameras.{name}" if by_name is cameras else name, value
     if maps:
-        for name, value in maps.items():
-            place = f"cameras.{name}" if by_name is cameras else name
-            fields = CameraFields(source.path, place, value)
-            yield name, place, entry_from_fields(fields, source.image_size_wh)
         return
-    both = with_partner(source, content)
+    both = with_partner(path, content)
     if any(_OF_TWO.fullmatch(key) for key in both):
-        yield from _stereo(source, both)
+        yield from _stereo(both)
         return
-    name = content.get("camera_name")
-    fields = CameraFields(source.path, "camera", content)
+    fields = CameraFields(path, "camera", content)
     if fields.first(*MATRIX) is None:
         raise fields.error(" or ".join(MATRIX[:3]), "3 x 3 numbers", "none")
-    shown = name if isinstance(name, str) and name else source.path.stem
-    yield shown, "camera_name", entry_from_fields(fields, source.image_size_wh)
+    name = content.get("camera_name")
+    yield name if isinstance(name, str) and name else path.stem, "camera", content
 
 
-def _stereo(source: Source, content: Mapping[str, Any]) -> Iterator[tuple[str, str, Entry]]:
+def _stereo(content: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
     """Two cameras; the poses of the second are `R` and `T`, which OpenCV calls the rotation and translation between."""
-    cameras: dict[bool, dict[str, Any]] = {False: {}, True: {}}
-    places: dict[bool, str] = {}
+    cameras: tuple[dict[str, Any], dict[str, Any]] = {}, {}
+    names = ["cam1", "cam2"]
     for key, value in content.items():
         match = _OF_TWO.fullmatch(key)
         if match and not isinstance(value, str):
-            second = match["which"].lower() in _SECOND
+            which = match["which"].lower()
+            second = which in _SECOND
             cameras[second]["K" if match["matrix"] else "D"] = value
-            places[second] = match["which"].lower()
-    shared = {key: content[key] for key in ("image_size", "imageSize", "size") if key in content}
-    shared |= {key: content[key] for key in ("image_width", "image_height") if key in content}
-    posed = any(content.get(key) is not None for key in (*ROTATION, *TRANSLATION))
-    if posed:
-        cameras[False] |= {"R": np.eye(3), "t": np.zeros(3)}
-        cameras[True] |= {
-            key: content[key] for key in (*ROTATION, *TRANSLATION) if content.get(key) is not None
-        }
-    for second, values in cameras.items():
-        number = "2" if second else "1"
-        which = places.get(second, number)
-        name = f"cam{which}" if which.isdigit() else {"l": "left", "r": "right"}.get(which, which)
-        fields = CameraFields(source.path, f"camera {name}", values | shared)
-        yield name, f"camera {name}", entry_from_fields(fields, source.image_size_wh)
+            names[second] = (
+                f"cam{which}" if which.isdigit() else {"l": "left", "r": "right"}.get(which, which)
+            )
+    pose = {key: content[key] for key in (*ROTATION, *TRANSLATION) if content.get(key) is not None}
+    if pose:
+        cameras[0].update(R=np.eye(3), t=np.zeros(3))
+        cameras[1].update(pose)
+    shared = {key: content[key] for key in _SIZES if key in content}
+    for name, values in zip(names, cameras, strict=True):
+        yield name, f"camera {name}", values | shared
 
 
 def _is_camera(value: Any) -> bool:

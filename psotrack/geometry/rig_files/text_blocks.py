@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 from psotrack.errors import InputError
-from psotrack.geometry.rig_files.entries import Entry, FileRig, Source, collect
-from psotrack.geometry.rig_files.fields import CameraFields, entry_from_fields
+from psotrack.geometry.rig_files.fields import CameraFields
 from psotrack.support import read_text
 
 _POSE = "rot_trans_"
@@ -23,34 +23,27 @@ def recognises(text: str) -> bool:
     return bool(re.match(r"\s*(intrinsic|R):", text)) and bool(re.search(r"^(distortion|T):", text, re.M))
 
 
-def read(source: Source) -> FileRig:
+def read(path: Path, text: str) -> Iterator[CameraFields]:
     """Read the cameras of a folder; the unit of length is open."""
-    return FileRig(collect(source.path, _entries(source)), metres_per_unit=None)
-
-
-def _entries(source: Source) -> Iterator[tuple[str, str, Entry]]:
-    folder, suffix = source.path.parent, source.path.suffix
+    folder, suffix = path.parent, path.suffix
     numbered = re.compile(rf"(?:{_POSE})?(\w*?\d+){re.escape(suffix)}")
-    stems = {match[1] for path in folder.iterdir() if (match := numbered.fullmatch(path.name))}
-    stems |= {source.path.stem.removeprefix(_POSE)}
+    stems = {match[1] for each in folder.iterdir() if (match := numbered.fullmatch(each.name))}
+    stems |= {path.stem.removeprefix(_POSE)}
     for stem in sorted(stems, key=lambda stem: (len(stem), stem)):
         paths = [folder / f"{prefix}{stem}{suffix}" for prefix in ("", _POSE)]
         values: dict[str, object] = {}
-        for path in paths:
-            if path.exists():
-                values |= _blocks(Source(path, read_text(path)))
-        if not values:
-            continue
-        # Videos of handpose3d are named cam0, its calibrations c0.
-        name = f"cam{stem[1:]}" if re.fullmatch(r"c\d+", stem) else stem
-        fields = CameraFields(paths[0], "", values)
-        yield name, name, entry_from_fields(fields, source.image_size_wh)
+        for each in paths:
+            values |= _blocks(each) if each.exists() else {}
+        if values:
+            # Videos of handpose3d are named cam0, its calibrations c0.
+            name = f"cam{stem[1:]}" if re.fullmatch(r"c\d+", stem) else stem
+            yield CameraFields(paths[0], "", values, name)
 
 
-def _blocks(source: Source) -> dict[str, object]:
+def _blocks(path: Path) -> dict[str, object]:
     found: dict[str, list[list[float]]] = {}
     rows: list[list[float]] = []
-    for number, line in enumerate(source.text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split()
         if not words or line.startswith("#"):
             continue
@@ -61,8 +54,7 @@ def _blocks(source: Source) -> dict[str, object]:
         try:
             rows.append([float(word) for word in words])
         except ValueError:
-            raise InputError(
-                f"{source.path}, line {number}", expected="numbers", found=repr(line[:60])
-            ) from None
+            where = f"{path}, line {number}"
+            raise InputError(where, expected="numbers", found=repr(line[:60])) from None
     found.pop("", None)
     return {key: value[0] if key == "D" and value else value for key, value in found.items()}

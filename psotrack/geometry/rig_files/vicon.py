@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -24,8 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import make_camera
-from psotrack.geometry.rig_files.entries import Entry, FileRig, Source, collect
+from psotrack.geometry import LENGTH_TOLERANCE
 from psotrack.geometry.rig_files.fields import CameraFields, quoted
 from psotrack.geometry.rig_files.radial_fit import fit_distortion
 from psotrack.geometry.rig_files.xml_text import attributes, number, parse_xml
@@ -43,38 +43,33 @@ def recognises(text: str) -> bool:
     return "<Cameras" in text[:4096] and "DEVICEID" in text
 
 
-def read(source: Source) -> FileRig:
+def read(path: Path, text: str) -> Iterator[CameraFields]:
     """Read an .xcp; lengths are millimetres. If it has video cameras, cameras for markers are left out."""
-    cameras = parse_xml(source).findall("Camera")
+    cameras = parse_xml(path, text).findall("Camera")
     videos = [one for one in cameras if _is_video(one)]
     if videos and len(videos) < len(cameras):
-        _logger.warning(
-            "%s: %d cameras that record no video are left out", source.path, len(cameras) - len(videos)
-        )
-    return FileRig(collect(source.path, _entries(source, videos or cameras)), metres_per_unit=1e-3)
+        _logger.warning("%s: %d cameras that record no video are left out", path, len(cameras) - len(videos))
+    for index, element in enumerate(videos or cameras):
+        name = element.get("DEVICEID")
+        if not name:
+            raise CameraFields(path, f"Camera[{index}]", {}).error("DEVICEID", "a number", "none")
+        place = f"Camera {name}"
+        yield CameraFields(path, place, _values(path, place, element), name, unit_m=1e-3)
 
 
 def _is_video(element: ElementTree.Element) -> bool:
     return "video" in element.get("TYPE", "").lower() or element.get("ISDV") == "1"
 
 
-def _entries(source: Source, cameras: list[ElementTree.Element]) -> Iterator[tuple[str, str, Entry]]:
-    for index, element in enumerate(cameras):
-        name = element.get("DEVICEID")
-        if not name:
-            raise CameraFields(source.path, f"Camera[{index}]", {}).error("DEVICEID", "a number", "none")
-        place = f"Camera {name}"
-        yield name, place, _entry(source, place, element)
-
-
-def _entry(source: Source, place: str, element: ElementTree.Element) -> Entry:
+def _values(path: Path, place: str, element: ElementTree.Element) -> dict[str, Any]:
+    """Lens and place of a camera; none of a camera that was not calibrated."""
     frames = element.findall("KeyFrames/KeyFrame")
     if not frames:
-        return Entry(None, placed=False)
+        return {}
     if len(frames) > 1:
-        _logger.warning("%s, %s: it moves; its first place is used", source.path, place)
-    outer = attributes(source, place, element)
-    fields = attributes(source, f"{place}, KeyFrame", frames[0])
+        _logger.warning("%s, %s: it moves; its first place is used", path, place)
+    outer = attributes(path, place, element)
+    fields = attributes(path, f"{place}, KeyFrame", frames[0])
     width, height = outer.array(("SENSOR_SIZE",), (2,))
     aspect = number(outer, "PIXEL_ASPECT_RATIO") if "PIXEL_ASPECT_RATIO" in outer.values else 1.0
     focal = number(fields, "FOCAL_LENGTH")
@@ -84,26 +79,24 @@ def _entry(source: Source, place: str, element: ElementTree.Element) -> Entry:
     K = np.array([[focal, 0.0, cx], [0.0, focal / aspect, cy], [0.0, 0.0, 1.0]])
     size = (int(width), int(height))
     quaternion = fields.array(("ORIENTATION",), (4,))
-    if abs(np.linalg.norm(quaternion) - 1) > 1e-3:
+    if abs(np.linalg.norm(quaternion) - 1) > LENGTH_TOLERANCE:
         raise fields.error("ORIENTATION", "a quaternion of length 1", quoted(quaternion.tolist()))
     R = Rotation.from_quat(quaternion).as_matrix()
     t = -R @ fields.array(("POSITION",), (3,))
-    dist = _distortion(source, fields, K, size)
-    return Entry(make_camera(R=R, t_m=t, K=K, dist=dist, image_size_wh=size))
+    return {"size": size, "K": K, "D": _distortion(fields, K, size), "R": R, "t": t}
 
 
-def _distortion(
-    source: Source, fields: CameraFields, K: Float[np.ndarray, "3 3"], size: tuple[int, int]
-) -> list[float]:
+def _distortion(fields: CameraFields, K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> list[float]:
     """OpenCV's coefficients for the radial correction of a key frame."""
-    centre, radial = K[:2, 2], np.zeros(0)
+    name, centre, radial = "VICON_RADIAL", K[:2, 2], np.zeros(0)
     if isinstance(text := fields.values.get("VICON_RADIAL2"), str):
+        name = "VICON_RADIAL2"
         values = _words(fields, text.split()[1:])
         if len(values) not in (4, 5):
-            raise fields.error("VICON_RADIAL2", "cx, cy and two or three coefficients", quoted(text))
+            raise fields.error(name, "cx, cy and two or three coefficients", quoted(text))
         centre, radial = values[:2], values[2:]
-    elif "VICON_RADIAL" in fields.values:
-        radial = fields.array(("VICON_RADIAL",), (2,))
+    elif name in fields.values:
+        radial = fields.array((name,), (2,))
     if not radial.any():
         return []
     # `fit_distortion` measures distances in focal lengths.
@@ -111,23 +104,18 @@ def _distortion(
         radial = radial * K[0, 0] ** (2.0 * np.arange(1, len(radial) + 1))
     fit = fit_distortion(K, size, centre, radial)
     if fit is None:
-        raise fields.error(
-            "VICON_RADIAL2" if "VICON_RADIAL2" in fields.values else "VICON_RADIAL",
-            "a correction that keeps the order of points up to the corners",
-            quoted(radial.tolist()),
-        )
+        expected = "a correction that keeps the order of points up to the corners"
+        raise fields.error(name, expected, quoted(radial.tolist()))
     coefficients, error_px = fit
     if error_px > _ACCEPTED_PX:
         _logger.warning(
             "%s, %s: OpenCV's lens model differs from Vicon's by up to %.2g pixels",
-            source.path,
-            fields.place,
-            error_px,
-        )
+            fields.path, fields.place, error_px,
+        )  # fmt: skip
     return coefficients.tolist()
 
 
-def _words(fields: CameraFields, words: list[Any]) -> Float[np.ndarray, " words"]:
+def _words(fields: CameraFields, words: list[str]) -> Float[np.ndarray, " words"]:
     try:
         return np.array([float(word) for word in words])
     except ValueError:

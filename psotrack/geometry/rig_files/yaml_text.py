@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
 from psotrack.errors import InputError
-from psotrack.geometry.rig_files.entries import Source
 
-_INTEGER = re.compile(r"[-+]?(0|[1-9]\d*)")
-_FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-_WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}
-_NOT_FINITE = {".nan": np.nan, ".inf": np.inf, "+.inf": np.inf, "-.inf": -np.inf}
+_INTEGER = re.compile(r"[-+]?(0|[1-9]\d{0,17})")
+_FLOAT = re.compile(r"[-+]?(?!0\d)(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_WORDS = {
+    "": None, "~": None, "null": None, "true": True, "false": False,
+    ".nan": np.nan, ".inf": np.inf, "+.inf": np.inf, "-.inf": -np.inf,
+}  # fmt: skip
 
 
 class _Loader(yaml.SafeLoader):
@@ -43,48 +45,30 @@ class _Loader(yaml.SafeLoader):
         return as_matrix(dict(pairs))
 
 
-def parse_yaml(source: Source) -> dict[str, Any]:
+def parse_yaml(path: Path, text: str) -> dict[str, Any]:
     """The top level of a YAML or JSON file; maps with rows, cols and data become arrays.
 
     Raises:
         InputError: the file is not valid; the message names the line.
     """
-    text = source.text.lstrip("\ufeff \n\r\t")
-    # OpenCV's header is not one of YAML's.
-    header, _, rest = text.partition("\n")
-    text = f"\n{rest}" if header.startswith("%YAML") else text
+    text = text.lstrip("\ufeff \n\r\t")
+    if text.startswith("%YAML"):
+        # OpenCV's header is not one of YAML's.
+        text = "\n" + text.partition("\n")[2]
+    place = ""
     try:
-        content = _from_json(json.loads(text)) if text.startswith("{") else yaml.load(text, _Loader)
+        is_json = text.startswith("{")
+        content = json.loads(text, object_hook=as_matrix) if is_json else yaml.load(text, _Loader)
+        return content if isinstance(content, dict) else {}
     except json.JSONDecodeError as error:
-        place, reason = f"line {error.lineno}", error.msg
+        place, reason = f", line {error.lineno}", error.msg
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}" if mark else ""
+        place = f", line {mark.line + 1}" if mark else ""
         reason = getattr(error, "problem", None) or str(error).splitlines()[0]
     except (RecursionError, ValueError) as error:
-        place, reason = "", "nested too deeply" if isinstance(error, RecursionError) else str(error)
-    else:
-        return content if isinstance(content, dict) else {}
-    where = f"{source.path}, {place}" if place else source.path
-    raise InputError(where, expected="valid YAML or JSON", found=f"an error ({reason})") from None
-
-
-def _scalar(text: str) -> Any:
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
-    if _INTEGER.fullmatch(text) and len(text) < 20:
-        return int(text)
-    if _FLOAT.fullmatch(text) and (text[:1] != "0" or "." in text or "e" in text.lower()):
-        return float(text)
-    return _NOT_FINITE.get(text.lower(), text)
-
-
-def _from_json(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_from_json(item) for item in value]
-    if isinstance(value, dict):
-        return as_matrix({key: _from_json(item) for key, item in value.items()})
-    return value
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
+    raise InputError(f"{path}{place}", expected="valid YAML or JSON", found=f"an error ({reason})") from None
 
 
 def as_matrix(values: dict[str, Any]) -> Any:
@@ -96,3 +80,11 @@ def as_matrix(values: dict[str, Any]) -> Any:
         return np.array(data, np.float64).reshape(int(values["rows"]), int(values["cols"]))
     except (TypeError, ValueError, OverflowError):
         return data
+
+
+def _scalar(text: str) -> Any:
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    return float(text) if _FLOAT.fullmatch(text) else text

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from psotrack.errors import InputError
 from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.inside_out.marker_map import SQUARE_TOLERANCE, MarkerMap, normals, sides_m
-from psotrack.recordings.datasets.dpjait import MarkerRow, read_marker_rows, split_label
+from psotrack.recordings.datasets import MarkerRow, read_marker_rows, split_label
 from psotrack.recordings.mocap import read_c3d
 
 #: Distance of a viewer from a marker's plane, in sides, below which the viewer is on neither side of the marker.

@@ -1,15 +1,64 @@
+from ._marker_corners import (
+    MarkerRow,
+    read_marker_centres,
+    read_marker_corners,
+    read_marker_rows,
+    split_label,
+    write_marker_corners,
+)
+from ._masks import MASKS, Masks, MaskWriter, join_archives, read_masks
+from ._mocap_markers import mocap_markers_file, read_mocap_markers, write_mocap_markers
+from ._onboard import (
+    ONBOARD_CALIBRATION,
+    onboard_pose_file,
+    onboard_video_file,
+    read_onboard,
+    read_onboard_calibration,
+    write_onboard_calibration,
+)
+from ._poses import pose_file, read_poses, unit_quaternion, write_poses
 from ._reference import read_own_reference
+from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
 from .drafting import Draft, DraftOptions, draft_recording
 from .opening import find_marker_corners, is_recording, open_recording, reference_files, videos_in
 
 __all__ = [
+    "CALIBRATION",
+    "DETECTIONS",
+    "MARKER_CORNERS",
+    "MASKS",
+    "ONBOARD_CALIBRATION",
     "Draft",
     "DraftOptions",
+    "MarkerRow",
+    "MaskWriter",
+    "Masks",
+    "detection_files",
     "draft_recording",
     "find_marker_corners",
     "is_recording",
+    "join_archives",
+    "mocap_markers_file",
+    "onboard_pose_file",
+    "onboard_video_file",
     "open_recording",
+    "pose_file",
+    "read_marker_centres",
+    "read_marker_corners",
+    "read_marker_rows",
+    "read_masks",
+    "read_mocap_markers",
+    "read_onboard",
+    "read_onboard_calibration",
     "read_own_reference",
+    "read_poses",
+    "read_sequence",
     "reference_files",
+    "split_label",
+    "unit_quaternion",
     "videos_in",
+    "write_marker_corners",
+    "write_mocap_markers",
+    "write_onboard_calibration",
+    "write_poses",
 ]

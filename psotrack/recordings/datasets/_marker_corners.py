@@ -27,24 +27,21 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
+from psotrack.geometry.rig_files import UNITS_M
+from psotrack.recordings.datasets._rows import lengths_of
 from psotrack.support import Column, Table, TextRow, read_rows, read_text, whole_number, write_rows
 
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "": 1.0}
+_METRES = UNITS_M | {"": 1.0}
 _UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<bracketed>[^\])]*?)\s*[\])]|_(?P<plain>mm|cm|m))")
 _IDS = re.compile("(?:id)?(?:marker|aruco|tag)(?:id)?|id|nr|no|number")
 _CORNER = re.compile("(?:corner|vertex|point)(?:id|no|nr|number|index)?|label|name")
-_NAMED = {
-    "tl": 1, "topleft": 1, "lefttop": 1, "upperleft": 1,
-    "tr": 2, "topright": 2, "righttop": 2, "upperright": 2,
-    "br": 3, "bottomright": 3, "rightbottom": 3, "lowerright": 3,
-    "bl": 4, "bottomleft": 4, "leftbottom": 4, "lowerleft": 4,
-}  # fmt: skip
-_WHICH = rf"(?:c|corner|p|pt|point|v|vertex)?(?P<{{group}}>[0-4]|{'|'.join(_NAMED)})"
-_WIDE = re.compile(
-    rf"(?P<before>[xyz]){_WHICH.format(group='after_axis')}|{_WHICH.format(group='before_axis')}(?P<after>[xyz])"
-)
-_LONG = re.compile(r"(?:pos|position|coord|corner|c|p|point)?(?P<axis>[xyz])")
+_NAMED = {"tl": 1, "topleft": 1, "tr": 2, "topright": 2, "br": 3, "bottomright": 3, "bl": 4, "bottomleft": 4}
+_WHICH = rf"(?:c|corner|p|pt|point|v|vertex)?([0-4]|{'|'.join(_NAMED)})"
+#: x1 and the like, 1x and the like, and x alone.
+_AXIS_FIRST = re.compile(rf"([xyz]){_WHICH}")
+_CORNER_FIRST = re.compile(rf"{_WHICH}([xyz])")
+_ALONE = re.compile(r"(?:pos|position|coord|corner|c|p|point)?([xyz])")
 _LABEL = re.compile(
     r"(?:marker|aruco|tag|id|m)?[ _]*(\d{1,9})[ ]?[:_. -][ ]?(?:corner|c)?([0-4])", re.IGNORECASE
 )
@@ -83,8 +80,11 @@ def read_marker_rows(path: Path | str) -> dict[int, MarkerRow]:
         InputError: as `read_marker_corners`.
     """
     table = _read_normalised(Path(path))
-    one_row_per_corner = table.find("corner") and not table.find("x1")
-    return _rows_per_corner(table) if one_row_per_corner else _rows_per_marker(table)
+    if table.find("corner") and not table.find("x1"):
+        return _rows_per_corner(table)
+    corners_m = lengths_of(table, _CORNERS, _METRES)
+    rows = _rows_by_marker(table)
+    return {marker: MarkerRow(row.where, corners_m(row).reshape(4, 3)) for marker, row in rows.items()}
 
 
 def read_marker_centres(path: Path | str) -> dict[int, Float[np.ndarray, "3"]] | None:
@@ -99,15 +99,8 @@ def read_marker_centres(path: Path | str) -> dict[int, Float[np.ndarray, "3"]] |
     table = _read_normalised(Path(path))
     if table.find("corner") or table.find("x1") or not all(table.find(name) for name in ("id", *"xyz")):
         return None
-    id_column, columns = table.column("id"), [table.column(axis) for axis in "xyz"]
-    metres = np.array([table.factor(column, _METRES) for column in columns])
-    found: dict[int, Float[np.ndarray, "3"]] = {}
-    for row in table.rows:
-        marker = _marker(row, id_column)
-        if marker in found:
-            raise row.error(id_column, "each marker once", f"{marker} again")
-        found[marker] = np.array([row.number(column) for column in columns]) * metres
-    return found
+    point_m = lengths_of(table, "xyz", _METRES)
+    return {marker: point_m(row) for marker, row in _rows_by_marker(table).items()}
 
 
 def split_label(label: str) -> tuple[int, int] | None:
@@ -129,26 +122,22 @@ def write_marker_corners(path: Path | str, corners_m: Mapping[int, Float[np.ndar
     write_rows(path, [header, *([marker, *corners_m[marker].ravel()] for marker in sorted(corners_m))])
 
 
-def _rows_per_marker(table: Table) -> dict[int, MarkerRow]:
-    """Corners from a table with one row per marker."""
-    id_column = table.column("id")
-    columns = [table.column(name) for name in _CORNERS]
-    metres = np.array([table.factor(column, _METRES) for column in columns])
-    found: dict[int, MarkerRow] = {}
+def _rows_by_marker(table: Table) -> dict[int, TextRow]:
+    """Rows of a table with one row per marker."""
+    column = table.column("id")
+    found: dict[int, TextRow] = {}
     for row in table.rows:
-        marker = _marker(row, id_column)
+        marker = _marker(row, column)
         if marker in found:
-            raise row.error(id_column, "each marker once", f"{marker} again")
-        values = np.array([row.number(column) for column in columns])
-        found[marker] = MarkerRow(row.where, (values * metres).reshape(4, 3))
+            raise row.error(column, "each marker once", f"{marker} again")
+        found[marker] = row
     return found
 
 
 def _rows_per_corner(table: Table) -> dict[int, MarkerRow]:
     """Corners from a table with one row per corner."""
     id_column, corner_column = table.column("id"), table.column("corner")
-    columns = [table.column(axis) for axis in "xyz"]
-    metres = np.array([table.factor(column, _METRES) for column in columns])
+    point_m = lengths_of(table, "xyz", _METRES)
     first = _first_corner(table, corner_column)
     rows: dict[int, dict[int, TextRow]] = {}
     for row in table.rows:
@@ -173,10 +162,7 @@ def _rows_per_corner(table: Table) -> dict[int, MarkerRow]:
                 found=f"none of number {numbers}",
                 remedy="add it, or leave the marker out",
             )
-        values = np.array(
-            [[of_marker[corner].number(column) for column in columns] for corner in range(1, 5)]
-        )
-        found[marker] = MarkerRow(where, values * metres)
+        found[marker] = MarkerRow(where, np.array([point_m(of_marker[corner]) for corner in range(1, 5)]))
     return found
 
 
@@ -287,16 +273,18 @@ def _canonical(name: str) -> str:
         return "id"
     if _CORNER.fullmatch(name):
         return "corner"
-    wide = _WIDE.fullmatch(name)
-    if wide is not None:
-        which = wide["after_axis"] or wide["before_axis"]
-        return f"{wide['before'] or wide['after']}{_NAMED.get(which, which)}"
-    single = _LONG.fullmatch(name)
-    return single["axis"] if single is not None else name
+    if match := _AXIS_FIRST.fullmatch(name):
+        return f"{match[1]}{_NAMED.get(match[2], match[2])}"
+    if match := _CORNER_FIRST.fullmatch(name):
+        return f"{match[2]}{_NAMED.get(match[1], match[1])}"
+    match = _ALONE.fullmatch(name)
+    return match[1] if match else name
 
 
 def _bare(name: str) -> str:
-    return re.sub(r"[\s_.:\"'-]", "", name.lower())
+    """A name without separators; upper and lower are top and bottom, and `left top` is `top left`."""
+    name = re.sub(r"[\s_.:\"'-]", "", name.lower()).replace("upper", "top").replace("lower", "bottom")
+    return re.sub("(left|right)(top|bottom)", r"\2\1", name)
 
 
 def _is_number(cell: str) -> bool:

@@ -13,7 +13,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 
@@ -24,7 +24,7 @@ from jaxtyping import Bool
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key, chosen_camera
 from psotrack.recordings import image_of
-from psotrack.recordings.datasets._archives import stored_entry
+from psotrack.support import atomic_write
 
 MASKS = "drone_masks.zip"
 #: What `zipfile` raises for archives that are damaged, encrypted, or compressed in a way that it does not know.
@@ -73,7 +73,7 @@ class MaskWriter:
             mask: (height, width), True where the drone is seen.
         """
         png = _png(mask) if mask.any() else _empty_png(*mask.shape)
-        self._archive.writestr(stored_entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
+        self._archive.writestr(_stored_entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
 
     def __exit__(
         self,
@@ -82,6 +82,39 @@ class MaskWriter:
         traceback: TracebackType | None,
     ) -> None:
         self._archive.close()
+
+
+def join_archives(path: Path, parts: Sequence[Path]) -> None:
+    """Join several archives into one archive, which appears at `path` when it is complete.
+
+    Args:
+        path: path of the new archive; archives with equal contents have equal bytes.
+        parts: paths of archives of `MaskWriter`; no name occurs in two archives.
+
+    Raises:
+        InputError: a part is not a ZIP archive.
+        OutputError: the file cannot be written.
+    """
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as joined:
+        for part in parts:
+            with _opened(part, "a ZIP archive") as archive:
+                for entry in archive.infolist():
+                    joined.writestr(_stored_entry(entry.filename), archive.read(entry))
+
+
+def _stored_entry(name: str) -> zipfile.ZipInfo:
+    """An entry that is not compressed and has the first date of the format, so that equal contents are equal bytes."""
+    entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+    entry.external_attr = 0o644 << 16
+    return entry
+
+
+def _opened(path: Path, expected: str) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except (OSError, *_ZIP_ERRORS) as error:
+        found = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise InputError(path, expected=expected, found=found.lower()) from error
 
 
 class Masks:
@@ -153,11 +186,7 @@ def read_masks(path: Path | str) -> Masks:
     if path.is_dir():
         files = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
         return Masks(path, _index_images(path, files), None)
-    try:
-        archive = zipfile.ZipFile(path)
-    except (OSError, *_ZIP_ERRORS) as error:
-        found = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(path, expected="a ZIP archive or a folder of masks", found=found.lower()) from error
+    archive = _opened(path, "a ZIP archive or a folder of masks")
     return Masks(path, _index_images(path, archive.namelist()), archive)
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry.rig_files import METRES_PER_UNIT
-from psotrack.recordings.datasets._frames import rows_by_frame
+from psotrack.recordings.datasets._rows import lengths_of, rows_by_frame
 from psotrack.support import read_table, write_rows
 
 #: Names of a drone's markers, in the order of the columns.
@@ -44,11 +43,9 @@ def read_mocap_markers(path: Path | str) -> Float[np.ndarray, "frames 4 3"]:
         InputError: the file cannot be read, a column is missing, a frame occurs twice, or a value is not a number.
     """
     table = read_table(path)
-    id_column = table.column("id")
-    columns = [table.column(name.lower()) for name in _COLUMNS]
-    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in columns])
-    rows = rows_by_frame(table, id_column)
+    lengths_m = lengths_of(table, [name.lower() for name in _COLUMNS])
+    rows = rows_by_frame(table)
     markers_m = np.full((max(rows) + 1, len(_COLUMNS)), np.nan)
     for frame, row in rows.items():
-        markers_m[frame] = np.array([row.number(column) for column in columns]) * metres
+        markers_m[frame] = lengths_m(row)
     return markers_m.reshape(-1, len(MOCAP_MARKERS), 3)

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import OnboardVideo, VideoInfo, probe
-from psotrack.recordings.datasets._poses import read_poses
+from psotrack.recordings import OnboardVideo, probe
+from psotrack.recordings.datasets._poses import poses_of_frames
 from psotrack.support import read_table, whole_number, write_rows
 
 ONBOARD_CALIBRATION = "drone_cameras_calibration.csv"
@@ -70,7 +70,11 @@ def read_onboard(folder: Path | str) -> dict[str, OnboardVideo]:
                 expected=f"{size_wh[0]} x {size_wh[1]} pixels as {name} has in {ONBOARD_CALIBRATION}",
                 found=f"{video.image_size_wh[0]} x {video.image_size_wh[1]}",
             )
-        position_m, orientation_wxyz = _video_poses(poses.get(number), video)
+        position_m = np.full((video.num_frames, 3), np.nan)
+        orientation_wxyz = np.full((video.num_frames, 4), np.nan)
+        if number in poses:
+            check_rate(poses[number], _POSES, video.fps)
+            position_m, orientation_wxyz = poses_of_frames(poses[number], video.num_frames)
         found[name] = OnboardVideo(video, K, position_m, orientation_wxyz)
     return found
 
@@ -151,19 +155,3 @@ def check_rate(path: Path, pattern: re.Pattern[str], fps: float) -> None:
     # 0.1 % is the accuracy of rates in containers; a larger difference would drift.
     if match is not None and abs(float(match["rate"]) - fps) > 1e-3 * fps:
         raise InputError(path, expected=f"poses at the {fps:g} Hz of the video", found=f"{match['rate']} Hz")
-
-
-def _video_poses(
-    path: Path | None, video: VideoInfo
-) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
-    """Positions and orientations at the frames of a video; NaN if unknown."""
-    position_m = np.full((video.num_frames, 3), np.nan)
-    orientation_wxyz = np.full((video.num_frames, 4), np.nan)
-    if path is not None:
-        check_rate(path, _POSES, video.fps)
-        position, orientation = read_poses(path)
-        shared = min(video.num_frames, len(position))
-        position_m[:shared] = position[:shared]
-        if orientation is not None:
-            orientation_wxyz[:shared] = orientation[:shared]
-    return position_m, orientation_wxyz

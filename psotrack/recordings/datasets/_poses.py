@@ -17,16 +17,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
-from psotrack.geometry.rig_files import METRES_PER_UNIT
-from psotrack.recordings.datasets._frames import rows_by_frame
+from psotrack.geometry import LENGTH_TOLERANCE
+from psotrack.recordings.datasets._rows import lengths_of, rows_by_frame
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
 
 Positions = Float[np.ndarray, "frames 3"]
 Orientations = Float[np.ndarray, "frames 4"]
 
 _QUATERNION = re.compile(r"(?P<stem>[a-z_ .]*q[a-z_ .]*?)[_ .]?(?P<axis>[wxyz])")
-#: Largest deviation of a quaternion's norm from 1: the effect of rounding to two decimals.
-_NORM_TOLERANCE = 0.02
 
 
 def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
@@ -39,21 +37,32 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
             number. The message names line and column.
     """
     table = read_table(path)
-    id_column = table.column("id")
-    position = [table.column(f"pos_{axis}") for axis in "xyz"]
-    metres = np.array([table.factor(column, METRES_PER_UNIT) for column in position])
+    lengths_m = lengths_of(table, ["pos_x", "pos_y", "pos_z"])
     quaternion = _quaternion_columns(table)
-    rows = rows_by_frame(table, id_column)
+    rows = rows_by_frame(table)
     position_m = np.full((max(rows) + 1, 3), np.nan)
     orientation_wxyz = np.full((max(rows) + 1, 4), np.nan)
     for frame, row in rows.items():
-        here_m = np.array([row.number(column) for column in position]) * metres
+        here_m = lengths_m(row)
         if frame == 0 and not here_m.any():
             continue
         position_m[frame] = here_m
         if quaternion:
-            orientation_wxyz[frame] = _unit_quaternion(row, quaternion)
+            orientation_wxyz[frame] = unit_quaternion(row, quaternion)
     return position_m, orientation_wxyz if quaternion else None
+
+
+def poses_of_frames(path: Path, num_frames: int) -> tuple[Positions, Orientations]:
+    """Positions and orientations at the first frames of a video; NaN where the file says nothing.
+
+    Arguments and errors: see `read_poses`.
+    """
+    position_m, orientation_wxyz = np.full((num_frames, 3), np.nan), np.full((num_frames, 4), np.nan)
+    position, orientation = read_poses(path)
+    position_m[: len(position)] = position[:num_frames]
+    if orientation is not None:
+        orientation_wxyz[: len(position)] = orientation[:num_frames]
+    return position_m, orientation_wxyz
 
 
 def write_poses(path: Path | str, position_m: Positions, orientation_wxyz: Orientations) -> None:
@@ -109,9 +118,10 @@ def _quaternion_columns(table: Table) -> list[Column]:
     return [complete[0][axis] for axis in "wxyz"] if complete else []
 
 
-def _unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, " 4"]:
+def unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4"]:
+    """The quaternion in four columns of a row, with length 1; raise `InputError` for another length."""
     quaternion = np.array([row.number(column) for column in columns])
     norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > _NORM_TOLERANCE:
+    if abs(norm - 1) > LENGTH_TOLERANCE:
         raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
     return quaternion / norm

@@ -18,83 +18,12 @@ import numpy as np
 
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, files_by_camera
-from psotrack.geometry.rig_files import read_calibration, read_camera_names, write_calibration
-from psotrack.recordings import (
-    Detections,
-    FrameTimes,
-    OnboardVideo,
-    Recording,
-    VideoInfo,
-    probe,
-    read_detections,
-    write_detections,
-)
-from psotrack.recordings.datasets._archives import join_archives
-from psotrack.recordings.datasets._marker_corners import (
-    MarkerRow,
-    read_marker_centres,
-    read_marker_corners,
-    read_marker_rows,
-    split_label,
-    write_marker_corners,
-)
-from psotrack.recordings.datasets._masks import MASKS, Masks, MaskWriter, read_masks
-from psotrack.recordings.datasets._mocap_markers import (
-    mocap_markers_file,
-    read_mocap_markers,
-    write_mocap_markers,
-)
-from psotrack.recordings.datasets._onboard import (
-    ONBOARD_CALIBRATION,
-    check_rate,
-    is_onboard_video,
-    numbered_files,
-    onboard_pose_file,
-    onboard_video_file,
-    read_onboard,
-    read_onboard_calibration,
-    write_onboard_calibration,
-)
-from psotrack.recordings.datasets._poses import pose_file, read_poses, write_poses
+from psotrack.geometry.rig_files import read_cameras, read_rig
+from psotrack.recordings import FrameTimes, OnboardVideo, Recording, VideoInfo, probe
+from psotrack.recordings.datasets._onboard import check_rate, is_onboard_video, numbered_files, read_onboard
+from psotrack.recordings.datasets._poses import poses_of_frames
 from psotrack.recordings.mocap import NoDronesError, body_trajectories, read_c3d
 from psotrack.trajectories import Trajectories
-
-__all__ = [
-    "CALIBRATION",
-    "DETECTIONS",
-    "MARKER_CORNERS",
-    "MASKS",
-    "ONBOARD_CALIBRATION",
-    "Detections",
-    "MarkerRow",
-    "MaskWriter",
-    "Masks",
-    "detection_files",
-    "join_archives",
-    "mocap_markers_file",
-    "onboard_pose_file",
-    "onboard_video_file",
-    "pose_file",
-    "read_calibration",
-    "read_detections",
-    "read_marker_centres",
-    "read_marker_corners",
-    "read_marker_rows",
-    "read_masks",
-    "read_mocap_markers",
-    "read_onboard",
-    "read_onboard_calibration",
-    "read_poses",
-    "read_sequence",
-    "reference_files_in",
-    "split_label",
-    "write_calibration",
-    "write_detections",
-    "write_marker_corners",
-    "write_mocap_markers",
-    "write_onboard_calibration",
-    "write_poses",
-]
 
 CALIBRATION = "cameras_calibration.csv"
 #: The folder of the detections, one file per camera.
@@ -126,10 +55,10 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     folder = Path(folder)
     _check_folder(folder)
     calibration = folder / CALIBRATION
-    names = read_camera_names(calibration)
+    names = tuple(read_cameras(calibration, file_format="dpjait"))
     files = sorted(folder.iterdir())
     videos = _videos(folder, files, names)
-    rig = read_calibration(calibration, _image_sizes(names, videos))
+    rig = read_rig(calibration, _image_sizes(names, videos), file_format="dpjait")
     _check_principal_points(rig, videos)
     detections = files_by_camera(_detection_files(folder / DETECTIONS), names)
     corners = folder / MARKER_CORNERS
@@ -309,14 +238,8 @@ def _pose_files(files: Sequence[Path], video: VideoInfo) -> dict[int, Path]:
 
 
 def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:
-    position_m = np.full((num_frames, len(poses), 3), np.nan)
-    orientation_wxyz = np.full((num_frames, len(poses), 4), np.nan)
-    for index, path in enumerate(poses.values()):
-        position, orientation = read_poses(path)
-        shared = min(num_frames, len(position))
-        position_m[:shared, index] = position[:shared]
-        if orientation is not None:
-            orientation_wxyz[:shared, index] = orientation[:shared]
+    read = [poses_of_frames(path, num_frames) for path in poses.values()]
+    position_m, orientation_wxyz = (np.stack(each, axis=1) for each in zip(*read, strict=True))
     frame = np.arange(num_frames)
     return Trajectories(
         frame,

@@ -11,11 +11,13 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, overload
+from typing import Literal
+
+import msgspec
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
-from psotrack.geometry.rig_files import UNITS_M, read_entries
+from psotrack.geometry.rig_files import read_cameras
 from psotrack.recordings import (
     RECORDING_FILE,
     CameraTable,
@@ -28,8 +30,6 @@ from psotrack.recordings import (
 from psotrack.recordings.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
 from psotrack.recordings.datasets.recording_files import recording_of
 
-#: Size that stands for one that a rig file does not state.
-_UNKNOWN_WH = (1, 1)
 _WORDS: Mapping[Kind, str] = {
     "video": "video",
     "images": "folder of images",
@@ -194,12 +194,7 @@ def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tupl
                 "--units", expected="a rig file, in the folder or by --calibration", found="none"
             )
         return {}
-    sizes: dict[str, tuple[int, int] | None] = {}
-    metres_per_unit = None if unit is None else UNITS_M[unit]
-    for name, entry in read_entries(calibration, _UNKNOWN_WH, metres_per_unit=metres_per_unit).items():
-        size = None if entry.camera is None else tuple(int(side) for side in entry.camera.image_size_wh)
-        sizes[name] = None if size is None or size == _UNKNOWN_WH else (size[0], size[1])
-    return sizes
+    return {name: fields.size_wh for name, fields in read_cameras(calibration).items()}
 
 
 def _names_of_files(folder: Path, found: Sequence[Found], options: DraftOptions) -> list[str]:
@@ -296,47 +291,34 @@ def _table(
 ) -> CameraTable:
     """Table of one camera."""
     files = matching.files[name]
-    video, images = files.get("video"), files.get("images")
-    fps = None
-    if video is None and "timestamps" not in files:
+    fps = size = None
+    if "video" not in files and "timestamps" not in files:
         fps = options.fps
         if fps is None:
             expected = f"frames per second of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
-    size = None
-    if images is None and (video is None or isinstance(video, str)):
+    if "images" not in files and not isinstance(files.get("video"), Path):
         size = size_wh or options.size_wh
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
-    return CameraTable(
-        video=_written(video, base),
-        images=None if images is None else _pattern(matching.folder, Path(images), base),
-        ignore=_written(files.get("ignore"), base),
-        detections=_written(files.get("detections"), base),
-        size=size,
-        fps=fps,
-        timestamps=_written(files.get("timestamps"), base),
-    )
+    written = {kind: _written(file, base) for kind, file in files.items()}
+    if "images" in files:
+        written["images"] += _pattern(matching.folder, Path(files["images"]))
+    return msgspec.convert({**written, "size": size, "fps": fps}, CameraTable)
 
 
-def _pattern(folder: Path, images: Path, base: Path) -> str:
-    """Pattern of the images of a folder, such as `left/*.png`."""
+def _pattern(folder: Path, images: Path) -> str:
+    """Pattern of the images in a folder, such as `/*.png`."""
     suffixes = sorted({path.suffix for path in image_files(images)})
     if len(suffixes) > 1:
         raise _unclear(folder, images, "images of one kind", " and ".join(suffixes), match=False)
-    return f"{_written(images, base)}/*{suffixes[0]}"
+    return f"/*{suffixes[0]}"
 
 
-@overload
-def _written(file: Path | str, base: Path) -> str: ...
-@overload
-def _written(file: None, base: Path) -> None: ...
-@overload
-def _written(file: Path | str | None, base: Path) -> str | None: ...
-def _written(file: Path | str | None, base: Path) -> str | None:
+def _written(file: Path | str, base: Path) -> str:
     """A path as it is written: relative to the folder of the draft, with slashes."""
-    if file is None or isinstance(file, str):
+    if isinstance(file, str):
         return file
     try:
         return Path(os.path.relpath(file, base)).as_posix()
@@ -356,14 +338,12 @@ def _video_of_no_camera(
 
 
 def _unclear(folder: Path, file: Path | str, expected: str, found: str, *, match: bool = True) -> InputError:
-    name = shlex.quote(_short(file) if isinstance(file, str) else os.path.relpath(file, folder))
+    name = shlex.quote(file if isinstance(file, str) else os.path.relpath(file, folder))
     remedy = f"leave it out with --leave-out {name}"
-    return InputError(
-        file if isinstance(file, Path) else folder,
-        expected=expected,
-        found=found,
-        remedy=f"say whose it is with --match CAMERA={name}, or {remedy}" if match else remedy,
-    )
+    if match:
+        remedy = f"say whose it is with --match CAMERA={name}, or {remedy}"
+    where = file if isinstance(file, Path) else folder
+    return InputError(where, expected=expected, found=found, remedy=remedy)
 
 
 def _short(file: Path | str) -> str:
@@ -376,14 +356,9 @@ def _nothing(folder: Path, matching: _Matching, calibration: Path | None) -> Inp
         given = "" if calibration is None else f" --calibration {shlex.quote(str(calibration))}"
         remedy = f"for the videos in {below.name}: psotrack init {shlex.quote(str(below))}{given}"
     else:
-        remedy = "" if calibration is None else "say which file is whose with --match CAMERA=FILE"
-    if calibration is None:
-        return InputError(
-            folder, expected="videos, folders of images, or detections", found="none", remedy=remedy
-        )
-    return InputError(
-        folder,
-        expected=f"files named like the cameras of {calibration.name}, {', '.join(matching.cameras)}",
-        found="none",
-        remedy=remedy,
-    )
+        remedy = "say which file is whose with --match CAMERA=FILE" if calibration else ""
+    expected = "videos, folders of images, or detections"
+    if calibration is not None:
+        names = ", ".join(matching.cameras)
+        expected = f"files named like the cameras of {calibration.name}, {names}"
+    return InputError(folder, expected=expected, found="none", remedy=remedy)

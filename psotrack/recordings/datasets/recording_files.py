@@ -11,11 +11,18 @@ from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, Rig, chosen_camera, make_rig
-from psotrack.geometry.rig_files import UNITS_M, Entry, camera_of_table, read_entries
+from psotrack.geometry.rig_files import (
+    KEYS,
+    UNITS_M,
+    Entry,
+    camera_values,
+    entries_of,
+    fields_of_table,
+    read_cameras,
+)
 from psotrack.recordings import (
     MOST_INSTANTS,
     RECORDING_FILE,
@@ -40,15 +47,12 @@ from psotrack.recordings import (
 from psotrack.recordings.datasets._reference import read_reference, reference_at
 
 _logger = logging.getLogger(__name__)
-#: Size of the images of a rig file that does not state it; no camera has this size.
-_UNKNOWN_WH = (1, 1)
 #: Rate of pictures until their timestamps are read.
 _UNKNOWN_HZ = 1.0
 #: Largest deviation of a rate from a thousandth of another one at which the unit of time was mistaken, not the rate.
 _SLIP_SHARE = 0.05
 #: How addresses of streams begin that OpenCV reads, with FFmpeg or with GStreamer.
 _SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtp", "udp", "tcp", "srt", "gstreamer")
-_LENS_AND_PLACE = ("K", "model", "distortion", "rvec", "R", "tvec")
 
 
 def read_recording_toml(path: Path | str, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
@@ -82,15 +86,11 @@ def recording_of(path: Path, content: RecordingFile) -> Recording:
         InputError: one of the files that the content names cannot be used; the message names it.
     """
     folder = path.parent
-    opened = {name: _open_camera(path, name, table) for name, table in content.cameras.items()}
+    tables = {name: _Named(path, name, table) for name, table in content.cameras.items()}
+    opened = {name: table.open() for name, table in tables.items()}
     _check_videos(path, opened)
-    for name, table in content.cameras.items():
-        _check_shutter(path, name, table, opened[name])
-    calibrated = _calibrated(path, content)
-    cameras = {
-        name: _camera(path, name, content.cameras[name], opened[name], calibrated.get(name))
-        for name in opened
-    }
+    calibrated = _calibrated(path, content, opened)
+    cameras = {name: _camera(table, opened[name], calibrated.get(name)) for name, table in tables.items()}
     placed = {name: camera for name, camera in cameras.items() if camera is not None}
     frame_times = {name: each.times for name, each in opened.items() if each.times is not None}
     recording = Recording(
@@ -140,41 +140,162 @@ class _Opened:
     detections: Path | None
 
 
-def _open_camera(path: Path, name: str, table: CameraTable) -> _Opened:
-    folder, place = path.parent, f"cameras.{name}"
-    stream = _stream(path, f"{place}.video", table.video)
-    video = None if stream else _open_video(path, name, table)
-    if video is not None and table.size is not None and table.size != video.image_size_wh:
-        raise _error(
-            path,
-            f"{place}.size",
-            _size_text(video.image_size_wh) + " as in the video",
-            _size_text(table.size),
-        )
-    size_wh = table.size if video is None else video.image_size_wh
-    detections = None
-    if table.detections is not None:
-        detections = _existing(folder, table.detections, path, f"{place}.detections")
-    silhouettes = None
-    if table.silhouettes is not None:
-        silhouettes = probe_silhouettes(_existing(folder, table.silhouettes, path, f"{place}.silhouettes"))
-    times = None if stream else _times(path, name, table, video, silhouettes, detections)
-    if video is not None and times is not None and not video.is_finished:
-        # The program that wrote video and times was stopped: the one that is longer is cut.
-        video = replace(video, num_frames=min(video.num_frames, times.num_frames))
-        times = times.cut(video.num_frames)
-        _logger.warning(
-            "%s: the video was not finished; its first %d frames are used", video.path, video.num_frames
-        )
-    ignore = None
-    if table.ignore is not None:
-        ignore = _existing(folder, table.ignore, path, f"{place}.ignore")
-        height, width = read_mask(ignore).shape
-        if size_wh is not None and (width, height) != size_wh:
-            raise InputError(
-                ignore, expected=f"{_size_text(size_wh)} as camera {name}", found=_size_text((width, height))
+@dataclass(frozen=True)
+class _Named:
+    """A table `[cameras.NAME]` and where it stands.
+
+    Attributes:
+        path: path of the file.
+        name: name of the camera.
+        table: the table.
+    """
+
+    path: Path
+    name: str
+    table: CameraTable
+
+    def error(self, key: str, expected: str, found: str, remedy: str = "") -> InputError:
+        """Error whose message names the key."""
+        return _error(self.path, f"cameras.{self.name}.{key}", expected, found, remedy)
+
+    def file(self, key: str) -> Path | None:
+        """The file that a key names, which must exist; None where the key is not there."""
+        written = getattr(self.table, key)
+        place = f"cameras.{self.name}.{key}"
+        return None if written is None else _existing(self.path.parent, str(written), self.path, place)
+
+    def open(self) -> _Opened:
+        """Open the files of the camera."""
+        table = self.table
+        stream = self._stream()
+        video = None if stream else self._video()
+        size_wh = table.size if video is None else video.image_size_wh
+        if table.size not in (None, size_wh):
+            raise self.error("size", f"{_size_text(size_wh)} as in the video", _size_text(table.size))
+        detections, stored = self.file("detections"), self.file("silhouettes")
+        silhouettes = None if stored is None else probe_silhouettes(stored)
+        times = None if stream else self._times(video, silhouettes, detections)
+        if video is not None and times is not None and not video.is_finished:
+            # The program that wrote video and times was stopped: the one that is longer is cut.
+            video = replace(video, num_frames=min(video.num_frames, times.num_frames))
+            times = times.cut(video.num_frames)
+            _logger.warning(
+                "%s: the video was not finished; its first %d frames are used", video.path, video.num_frames
             )
-    return _Opened(size_wh, video, silhouettes, stream, times, ignore, detections)
+        ignore = self.file("ignore")
+        if ignore is not None:
+            height, width = read_mask(ignore).shape
+            if size_wh not in (None, (width, height)):
+                expected = f"{_size_text(size_wh)} as camera {self.name}"
+                raise InputError(ignore, expected=expected, found=_size_text((width, height)))
+        opened = _Opened(size_wh, video, silhouettes, stream, times, ignore, detections)
+        self._check_shutter(opened)
+        return opened
+
+    def _check_shutter(self, opened: _Opened) -> None:
+        """Raise `InputError` where the rows of an image would take longer than the time from frame to frame."""
+        if opened.size_wh is None or opened.times is None:
+            return
+        longest_s = 1 / (opened.times.fps * opened.size_wh[1])
+        if abs(self.table.line_time_s) > longest_s:
+            expected = f"at most {longest_s:.2g} s, a frame's time for {opened.size_wh[1]} rows"
+            raise self.error("line_time_s", expected, f"{self.table.line_time_s:g}")
+
+    def _stream(self) -> str:
+        """Address of a stream, or "device" and number or path of a device; empty for a file."""
+        video = self.table.video
+        if isinstance(video, int):
+            if video < 0:
+                raise self.error("video", "the number of a device, from 0", f"{video}")
+            return f"device {video}"
+        if video is None:
+            return ""
+        if video.startswith("/dev/"):
+            return f"device {video}"
+        scheme, separator, rest = video.partition("://")
+        if not separator:
+            return ""
+        if scheme not in _SCHEMES:
+            schemes = "://, ".join(_SCHEMES)
+            expected = f"a file, the number of a device, or an address that begins with {schemes}://"
+            raise self.error("video", expected, f"{scheme}://")
+        try:
+            parts = urlsplit(video)
+            is_whole = bool(parts.hostname or rest.startswith("@")) and parts.port != 0
+        except ValueError:
+            is_whole = False
+        if not (bool(rest) if scheme == "gstreamer" else is_whole):
+            raise self.error("video", "an address with a host, and a port below 65536 if any", video)
+        return video
+
+    def _video(self) -> VideoInfo | None:
+        table, folder = self.table, self.path.parent
+        if table.images is not None:
+            where = f"{self.path}, cameras.{self.name}.images"
+            images = find_images(folder, table.images, where)
+            if table.timestamps is None:
+                warn_of_missing_numbers(images[0].parent, images)
+            return probe_images(images, self._rate(len(images)))
+        file = self.file("video")
+        if file is None:
+            return None
+        if file.suffix.lower() == ".zip":
+            raise self.error("video", "a video", f"an archive, {table.video}", "unpack it first")
+        if file.is_dir():
+            if table.fps is None and table.timestamps is None:
+                raise self.error("fps", "frames per second of the pictures, or timestamps", "none")
+            video = open_pictures(file, table.fps or _UNKNOWN_HZ)
+            return replace(video, fps=self._rate(video.num_frames))
+        video = probe(file)
+        if table.fps is not None:
+            return replace(video, fps=table.fps)
+        if table.timestamps is None:
+            check_rate(file, video.fps, f"write the rate as fps below [cameras.{self.name}]")
+        return video
+
+    def _rate(self, num_frames: int) -> float:
+        """Frames per second of pictures, which do not state it."""
+        if self.table.timestamps is not None:
+            return read_timestamps(self.path.parent / self.table.timestamps, num_frames).fps
+        assert self.table.fps is not None, "the schema asks for fps or timestamps of images"
+        return self.table.fps
+
+    def _times(
+        self, video: VideoInfo | None, silhouettes: StoredSilhouettes | None, detections: Path | None
+    ) -> FrameTimes:
+        """Times of the frames of a camera; without video it lasts as long as its silhouettes, or as `frames` says, or
+        until its last detection.
+        """
+        table, listed = self.table, self.file("timestamps")
+        if listed is not None:
+            return _listed_times(listed, video, silhouettes)
+        offset_s, where = table.time_offset_s or 0.0, f"{self.path}, cameras.{self.name}.frames"
+        if video is not None:
+            return FrameTimes(video.num_frames, video.fps, offset_s)
+        num_frames = 0
+        if silhouettes is not None:
+            num_frames = silhouettes.num_frames
+        elif table.frames is not None:
+            num_frames = table.frames
+        elif detections is not None:
+            num_frames, where = int(read_detections(detections).frame.max(initial=-1)) + 1, f"{detections}"
+        assert table.fps is not None, "the schema asks for fps of a camera without video"
+        if num_frames > MOST_INSTANTS:
+            raise InputError(where, expected=f"at most {MOST_INSTANTS} frames", found=f"{num_frames}")
+        return FrameTimes(num_frames, table.fps, offset_s)
+
+
+def _listed_times(file: Path, video: VideoInfo | None, silhouettes: StoredSilhouettes | None) -> FrameTimes:
+    """Times of a file, checked against the video or the silhouettes."""
+    times = read_timestamps(file, video.num_frames if video is not None and video.is_finished else None)
+    if video is not None and not video.images:
+        _check_seconds(file, times, video)
+    if video is None and silhouettes is not None:
+        if times.num_frames < silhouettes.num_frames:
+            expected = f"times of the {silhouettes.num_frames} frames of the silhouettes"
+            raise InputError(file, expected=expected, found=f"{times.num_frames}")
+        return times.cut(silhouettes.num_frames)
+    return times
 
 
 def _check_videos(path: Path, opened: Mapping[str, _Opened]) -> None:
@@ -204,116 +325,6 @@ def _check_videos(path: Path, opened: Mapping[str, _Opened]) -> None:
             )  # fmt: skip
 
 
-def _check_shutter(path: Path, name: str, table: CameraTable, opened: _Opened) -> None:
-    """Raise `InputError` where the rows of an image would take longer than the time from frame to frame."""
-    if opened.size_wh is None or opened.times is None:
-        return
-    longest_s = 1 / (opened.times.fps * opened.size_wh[1])
-    if abs(table.line_time_s) > longest_s:
-        expected = f"at most {longest_s:.2g} s, a frame's time for {opened.size_wh[1]} rows"
-        raise _error(path, f"cameras.{name}.line_time_s", expected, f"{table.line_time_s:g}")
-
-
-def _stream(path: Path, place: str, video: str | int | None) -> str:
-    """Address of a stream, or "device" and number or path of a device; empty for a file."""
-    if isinstance(video, int):
-        if video < 0:
-            raise _error(path, place, "the number of a device, from 0", f"{video}")
-        return f"device {video}"
-    if video is None:
-        return ""
-    if video.startswith("/dev/"):
-        return f"device {video}"
-    scheme, separator, rest = video.partition("://")
-    if not separator:
-        return ""
-    if scheme not in _SCHEMES:
-        expected = (
-            f"a file, the number of a device, or an address that begins with {'://, '.join(_SCHEMES)}://"
-        )
-        raise _error(path, place, expected, f"{scheme}://")
-    try:
-        parts = urlsplit(video)
-        is_whole = bool(parts.hostname or rest.startswith("@")) and parts.port != 0
-    except ValueError:
-        is_whole = False
-    if not (bool(rest) if scheme == "gstreamer" else is_whole):
-        raise _error(path, place, "an address with a host, and a port below 65536 if any", video)
-    return video
-
-
-def _open_video(path: Path, name: str, table: CameraTable) -> VideoInfo | None:
-    folder, place = path.parent, f"cameras.{name}"
-    if table.images is not None:
-        fps = table.fps
-        images = find_images(folder, table.images, f"{path}, {place}.images")
-        if table.timestamps is not None:
-            fps = read_timestamps(folder / table.timestamps, len(images)).fps
-        else:
-            warn_of_missing_numbers(images[0].parent, images)
-        assert fps is not None, "the schema asks for fps or timestamps of images"
-        return probe_images(images, fps)
-    if table.video is None:
-        return None
-    file = _existing(folder, str(table.video), path, f"{place}.video")
-    if file.suffix.lower() == ".zip":
-        raise _error(path, f"{place}.video", "a video", f"an archive, {table.video}", "unpack it first")
-    if file.is_dir():
-        if table.fps is None and table.timestamps is None:
-            raise _error(path, f"{place}.fps", "frames per second of the pictures, or timestamps", "none")
-        video = open_pictures(file, table.fps or _UNKNOWN_HZ)
-        if table.fps is None:
-            times = read_timestamps(folder / str(table.timestamps), video.num_frames)
-            video = replace(video, fps=times.fps)
-        return video
-    video = probe(file)
-    if table.fps is not None:
-        return replace(video, fps=table.fps)
-    if table.timestamps is None:
-        check_rate(file, video.fps, f"write the rate as fps below [{place}]")
-    return video
-
-
-def _times(
-    path: Path,
-    name: str,
-    table: CameraTable,
-    video: VideoInfo | None,
-    silhouettes: StoredSilhouettes | None,
-    detections: Path | None,
-) -> FrameTimes:
-    """Times of the frames of a camera; without video it lasts as long as its silhouettes, or as `frames` says, or until
-    its last detection.
-    """
-    if table.timestamps is not None:
-        file = _existing(path.parent, table.timestamps, path, f"cameras.{name}.timestamps")
-        times = read_timestamps(file, video.num_frames if video is not None and video.is_finished else None)
-        if video is not None and not video.images:
-            _check_seconds(file, times, video)
-        if video is None and silhouettes is not None:
-            if times.num_frames < silhouettes.num_frames:
-                expected = f"times of the {silhouettes.num_frames} frames of the silhouettes"
-                raise InputError(file, expected=expected, found=f"{times.num_frames}")
-            return times.cut(silhouettes.num_frames)
-        return times
-    offset_s = table.time_offset_s or 0.0
-    if video is not None:
-        return FrameTimes(video.num_frames, video.fps, offset_s)
-    if silhouettes is not None:
-        num_frames = silhouettes.num_frames
-    elif table.frames is not None:
-        num_frames = table.frames
-    else:
-        num_frames = 0 if detections is None else int(read_detections(detections).frame.max(initial=-1)) + 1
-    assert table.fps is not None, "the schema asks for fps of a camera without video"
-    if num_frames > MOST_INSTANTS:
-        where = (
-            detections if table.frames is None and silhouettes is None else f"{path}, cameras.{name}.frames"
-        )
-        raise InputError(where, expected=f"at most {MOST_INSTANTS} frames", found=f"{num_frames}")
-    return FrameTimes(num_frames, table.fps, offset_s)
-
-
 def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
     """Raise `InputError` for times in milliseconds: a thousandth of the video's own rate is no coincidence."""
     if abs(video.fps / times.fps / 1000 - 1) < _SLIP_SHARE:
@@ -325,19 +336,20 @@ def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
         )
 
 
-def _calibrated(path: Path, content: RecordingFile) -> dict[str, Entry]:
-    """The cameras of the rig file, by their names in the recording."""
+def _calibrated(path: Path, content: RecordingFile, opened: Mapping[str, _Opened]) -> dict[str, Entry]:
+    """The cameras of the rig file whose image size is known, by their names in the recording."""
     if content.calibration is None:
         return {}
-    unit = content.calibration_unit
-    entries = read_entries(
-        _existing(path.parent, content.calibration, path, "calibration"),
-        _UNKNOWN_WH,
-        metres_per_unit=None if unit is None else UNITS_M[unit],
-    )
-    known = {name: chosen_camera(name, tuple(entries)) for name in content.cameras}
+    stated = read_cameras(_existing(path.parent, content.calibration, path, "calibration"))
+    known = {name: chosen_camera(name, tuple(stated)) for name in content.cameras}
     _check_one_each(path, known)
-    return {name: entries[entry] for name, entry in known.items() if entry is not None}
+    sizes = {own: opened[name].size_wh or stated[own].size_wh for name, own in known.items() if own}
+    entries = entries_of(
+        {own: stated[own] for own, size_wh in sizes.items() if size_wh},
+        {own: size_wh for own, size_wh in sizes.items() if size_wh},
+        metres_per_unit=UNITS_M[content.calibration_unit] if content.calibration_unit else None,
+    )
+    return {name: entries[own] for name, own in known.items() if own in entries}
 
 
 def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
@@ -351,44 +363,24 @@ def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
             taken[entry] = name
 
 
-def _camera(
-    path: Path, name: str, table: CameraTable, opened: _Opened, calibrated: Entry | None
-) -> Camera | None:
+def _camera(named: _Named, opened: _Opened, calibrated: Entry | None) -> Camera | None:
     """A camera from its own keys and, where it has none, from the rig file; None where its place is not known."""
-    known = {} if calibrated is None else _keys(calibrated)
+    known: dict[str, Any] = {}
+    if calibrated is not None and calibrated.camera is not None:
+        known = camera_values(calibrated.camera, placed=calibrated.placed)
     # A size of the rig file that differs from the video's is an error of `Recording.usable`.
     size_wh = known.get("size") or opened.size_wh
     if size_wh is None and not opened.stream:
         expected = "width and height of the images, because the camera has no video"
-        raise _error(path, f"cameras.{name}.size", expected, "none")
-    own = msgspec.json.decode(msgspec.json.encode(table))
-    keys = known | {key: own[key] for key in (*known, *_LENS_AND_PLACE) if own.get(key) is not None}
-    if "R" in own and own["R"] is not None:
+        raise named.error("size", expected, "none")
+    own = msgspec.json.decode(msgspec.json.encode(named.table))
+    keys = known | {key: own[key] for key in KEYS if own.get(key) is not None}
+    if own.get("R") is not None:
         keys.pop("rvec", None)
     if size_wh is None or not keys.keys() - {"size"}:
         return None
-    entry = camera_of_table(path, name, {**keys, "size": list(size_wh)})
+    entry = fields_of_table(named.path, named.name, {**keys, "size": list(size_wh)}).entry(None, 1.0)
     return entry.camera if entry.placed else None
-
-
-def _keys(entry: Entry) -> dict[str, Any]:
-    """The keys of a `recording.toml` that say what a rig file says of a camera."""
-    camera = entry.camera
-    if camera is None:
-        return {}
-    fisheye = camera.fisheye is not None and bool(camera.fisheye)
-    keys: dict[str, Any] = {
-        "K": camera.K.tolist(),
-        "distortion": camera.dist.tolist(),
-        "model": "fisheye" if fisheye else "opencv",
-    }
-    size_wh = tuple(int(side) for side in camera.image_size_wh)
-    if size_wh != _UNKNOWN_WH:
-        keys["size"] = size_wh
-    if entry.placed:
-        T = np.asarray(camera.T_cam_world)
-        keys |= {"rvec": Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist(), "tvec": T[:3, 3].tolist()}
-    return keys
 
 
 def _no_rig() -> Rig:
@@ -416,8 +408,8 @@ def _existing(folder: Path, written: str, path: Path, place: str) -> Path:
     return file
 
 
-def _size_text(size_wh: tuple[int, int]) -> str:
-    return f"{size_wh[0]} x {size_wh[1]} pixels"
+def _size_text(size_wh: tuple[int, int] | None) -> str:
+    return "no size" if size_wh is None else f"{size_wh[0]} x {size_wh[1]} pixels"
 
 
 def _error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:

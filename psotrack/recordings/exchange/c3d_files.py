@@ -9,25 +9,33 @@ import numpy as np
 
 from psotrack.errors import InputError
 from psotrack.recordings import Recording
-from psotrack.recordings.exchange.formats import interval_s
+from psotrack.recordings.exchange.camera_boxes import Footage
+from psotrack.recordings.exchange.timed_paths import interval_s
 from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
+from psotrack.support import Report
 from psotrack.trajectories import Trajectories
 
 #: Rates that differ by less than this share are one rate: C3D has float32.
 _ONE_RATE = 1e-3
 
 
-def write_c3d_tracks(path: Path, trajectories: Trajectories) -> None:
+def write_c3d_tracks(
+    path: Path, trajectories: Trajectories, footage: Footage | None, report: Report
+) -> list[str]:
     """Write one point per drone; frames in which a drone is not seen have a residual of -1.
 
     Raises:
+        InputError: no drone is ever seen.
         SettingsError: there are more frames than the format can hold.
         OutputError: the file cannot be written.
     """
+    if not trajectories.seen.any():
+        raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
     frames = int(trajectories.frame[-1]) + 1
     position_m = np.full((frames, trajectories.num_drones, 3), np.nan)
     position_m[trajectories.frame] = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
     write_c3d(path, Markers(trajectories.drones, position_m, 1 / interval_s(trajectories)))
+    return []
 
 
 def read_c3d_tracks(path: Path, recording: Recording | None) -> Trajectories:

@@ -23,6 +23,23 @@ _ROLLING_PASSES = 2
 
 
 @dataclass(frozen=True, repr=False)
+class Footage:
+    """The recording from which tracks were made, for formats that hold boxes, cameras or images.
+
+    Attributes:
+        recording: the recording.
+        size_m: (drones, 3), full lengths of the tracked drones along the world's axes, metres; None if unknown.
+        images: whether the images of the cameras are exported too.
+    """
+
+    recording: Recording
+    size_m: Float[np.ndarray, "drones 3"] | None = None
+    images: bool = False
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, repr=False)
 class CameraFrames:
     """The frames of one camera during the tracks.
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
-from psotrack.errors import OutputError, SettingsError
-from psotrack.recordings.exchange.c3d_files import write_c3d_tracks
-from psotrack.recordings.exchange.formats import FORMATS, Footage, lost_quantities, seen_only
-from psotrack.recordings.exchange.json_files import write_json_tracks
-from psotrack.recordings.exchange.kitti_files import write_kitti
-from psotrack.recordings.exchange.mcap_files import write_mcap
-from psotrack.recordings.exchange.mot_files import write_mot_folder, write_mot_positions
+import numpy as np
+
+from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.recordings.exchange.camera_boxes import Footage
+from psotrack.recordings.exchange.formats import COVARIANCES, FORMATS, NAMES, ORIENTATIONS, TIMES, TrackFormat
+from psotrack.recordings.exchange.timed_paths import interval_s
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
-from psotrack.trajectories import Trajectories, write_trajectories
-from psotrack.trajectories.tum import write_tum
+from psotrack.trajectories import Status, Trajectories
 
 
 def export_tracks(
@@ -29,9 +28,9 @@ def export_tracks(
 ) -> tuple[str, ...]:
     """Write tracks in a format of other programs, as a file or as a folder; `read_tracks` reads them again.
 
-    tum: a folder with a file per drone, or one file that ends in .tum for one drone. kitti: a folder. mot: a file of
-    positions that ends in .txt, or with a recording a folder with positions and with boxes per camera. mcap: a file, or
-    the folder of a bag. c3d, csv, parquet, json: a file.
+    tum: a folder with a file per drone, or one file that ends in .tum or .txt for one drone. kitti: a folder. mot: a
+    file of positions that ends in .txt, or with a recording a folder with positions and with boxes per camera. mcap: a
+    file, or the folder of a bag. c3d, csv, parquet, json: a file.
 
     Args:
         trajectories: the tracks.
@@ -52,76 +51,97 @@ def export_tracks(
     """
     if to not in FORMATS:
         raise SettingsError("to", expected=f"one of {', '.join(FORMATS)}", found=to)
-    out = Path(out)
-    is_folder = _is_folder(trajectories, to, out, footage)
-    _check_replaceable(out, to, is_folder, force)
-    lost = lost_quantities(trajectories, to)
-    if to in ("csv", "parquet"):
-        write_trajectories(out, trajectories, force=force)
-        return tuple(lost)
-    seen, kept = seen_only(trajectories)
-    if footage is not None and footage.size_m is not None:
-        footage = replace(footage, size_m=footage.size_m[kept])
+    form, out = FORMATS[to], Path(out)
+    kept = np.flatnonzero(trajectories.seen.any(axis=0))
+    _check_name(out, to, len(kept), footage)
+    _check_replaceable(out, to, force)
+    lost = _lost_quantities(trajectories, form)
+    if not form.needs_all:
+        if not len(kept):
+            raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
+        trajectories = _of_drones(trajectories, kept.tolist())
+        if footage is not None and footage.size_m is not None:
+            footage = replace(footage, size_m=footage.size_m[kept])
     with atomic_write(out) as temporary:
-        if to == "json":
-            write_json_tracks(temporary, trajectories)
-        elif to == "c3d":
-            write_c3d_tracks(temporary, trajectories)
-        elif to == "kitti":
-            write_kitti(temporary, seen)
-        elif to == "mcap":
-            lost += write_mcap(temporary, seen, footage, report)
-        elif to == "tum":
-            one = replace(seen, drones=(temporary.stem,)) if not is_folder else seen
-            write_tum(temporary if is_folder else temporary.parent, one)
-        elif is_folder:
-            assert footage is not None
-            lost += write_mot_folder(temporary, seen, footage, report)
-        else:
-            lost += ["boxes, which need SEQ", "the rate"]
-            write_mot_positions(temporary, seen)
+        lost += form.write(temporary, trajectories, footage, report)
     return tuple(lost)
 
 
-def _is_folder(trajectories: Trajectories, to: str, out: Path, footage: Footage | None) -> bool:
-    """Whether the output is a folder; raise `SettingsError` if its name does not fit the format."""
-    suffix = FORMATS[to].suffix
-    if not FORMATS[to].is_folder:
-        _check_suffix(out, out.suffix == suffix, f"a file that ends in {suffix}")
-        return False
-    is_file = out.suffix.lower() in {each.suffix for each in FORMATS.values() if each.suffix}
-    if to == "mot":
-        with_boxes = footage is not None
-        expected = (
-            "a folder, for positions and boxes"
-            if with_boxes
-            else "a file that ends in .txt, for positions alone"
-        )
-        remedy = "" if with_boxes else "name SEQ for a folder with boxes per camera"
-        _check_suffix(out, not is_file if with_boxes else out.suffix == suffix, expected, remedy)
-        return with_boxes
-    expected = "a folder" if not suffix else f"a folder, or a file that ends in {suffix}"
-    _check_suffix(out, not is_file or out.suffix == suffix != "", expected)
-    if to == "tum" and is_file:
-        count = int(trajectories.seen.any(axis=0).sum())
-        _check_suffix(
-            out, count <= 1, f"a folder, because a TUM file holds one drone and the tracks have {count}"
-        )
-    return not is_file
+def _lost_quantities(trajectories: Trajectories, form: TrackFormat) -> list[str]:
+    """What these trajectories have and the format cannot hold, as noun phrases."""
+    frame, time_s, status = trajectories.frame, trajectories.time_s, trajectories.status
+    known = {
+        NAMES: trajectories.drones != tuple(str(k + 1) for k in range(trajectories.num_drones)),
+        # Frame numbers and a rate say the same as times of equal distance.
+        TIMES: len(frame) > 0 and np.abs(time_s - frame * interval_s(trajectories)).max() > 1e-6,
+        ORIENTATIONS: _any_known(trajectories.orientation_wxyz),
+        COVARIANCES: _any_known(trajectories.covariance_m2),
+        "covariances without constant errors": _any_known(trajectories.relative_covariance_m2),
+        "velocities": _any_known(trajectories.velocity_m_s),
+        "fitness": _any_known(trajectories.fitness),
+        "numbers of cameras": trajectories.num_cameras is not None,
+        "status": status is not None and (status == Status.COASTING).any(),
+    }
+    lost = [name for name, is_known in known.items() if is_known and name not in form.holds]
+    if "status" in form.holds:
+        return lost
+    seen = trajectories.seen
+    hidden = int((np.isfinite(trajectories.position_m).all(axis=-1) & ~seen).sum())
+    if hidden:
+        lost.append(f"{hidden} positions of lost drones")
+    never = [name for name, each in zip(trajectories.drones, seen.T, strict=True) if not each.any()]
+    if never and not form.needs_all:
+        lost.append(f"drones that are never seen ({', '.join(never)})")
+    return lost
 
 
-def _check_suffix(out: Path, fits: bool, expected: str, remedy: str = "") -> None:
+def _any_known(values: np.ndarray | None) -> bool:
+    return values is not None and bool(np.isfinite(values).any())
+
+
+def _of_drones(trajectories: Trajectories, kept: list[int]) -> Trajectories:
+    """The trajectories of some drones, by their indices."""
+    names = (
+        "position_m", "velocity_m_s", "orientation_wxyz", "fitness", "num_cameras", "status", "covariance_m2",
+        "relative_covariance_m2",
+    )  # fmt: skip
+    known: dict[str, Any] = {name: getattr(trajectories, name) for name in names}
+    of_kept = {name: value[:, kept] for name, value in known.items() if value is not None}
+    return replace(trajectories, drones=tuple(trajectories.drones[index] for index in kept), **of_kept)
+
+
+def _check_name(out: Path, to: str, num_seen: int, footage: Footage | None) -> None:
+    """Raise `SettingsError` for a name of the output that does not fit the format."""
+    form = FORMATS[to]
+    is_file = out.suffix in form.suffixes
+    is_folder = not any(out.suffix.lower() in each.suffixes for each in FORMATS.values())
+    expected = " or ".join(form.suffixes)
+    remedy = ""
+    if to == "mot" and footage is not None:
+        expected, fits = "a folder, for positions and boxes", is_folder
+    elif to == "mot":
+        expected, fits = f"a file that ends in {expected}, for positions alone", is_file
+        remedy = "name SEQ for a folder with boxes per camera"
+    elif not form.entries:
+        expected, fits = f"a file that ends in {expected}", is_file
+    else:
+        file = f", or a file that ends in {expected}" if form.suffixes else ""
+        expected, fits = f"a folder{file}", is_folder or is_file
+        if is_file and form.is_of_one and num_seen > 1:
+            expected = f"a folder, because a {to.upper()} file holds one drone and the tracks have {num_seen}"
+            fits = False
     if not fits:
         raise SettingsError("--out", expected=expected, found=out.name, remedy=remedy)
 
 
-def _check_replaceable(out: Path, to: str, is_folder: bool, force: bool) -> None:
+def _check_replaceable(out: Path, to: str, force: bool) -> None:
     """Refuse to replace what exists without `force`, and a folder that holds anything else than the format writes."""
+    form = FORMATS[to]
     refuse_to_overwrite(out, force)
-    if not is_folder or not out.exists():
+    if out.suffix in form.suffixes or not out.exists():
         return
     entries = [path.name for path in out.iterdir()] if out.is_dir() else [out.name]
-    foreign = [name for name in entries if not any(fnmatch(name, entry) for entry in FORMATS[to].entries)]
+    foreign = [name for name in entries if not any(fnmatch(name, entry) for entry in form.entries)]
     if foreign:
         raise OutputError(
             out,

@@ -1,16 +1,41 @@
-"""What each format of tracks can hold, and what is lost with it."""
+"""The formats of tracks: what each can hold, how it is written, and how a file or a folder of it is read."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from psotrack.errors import InputError
 from psotrack.recordings import Recording
-from psotrack.support import short_repr
-from psotrack.trajectories import Status, Trajectories
+from psotrack.recordings.exchange.c3d_files import read_c3d_tracks, write_c3d_tracks
+from psotrack.recordings.exchange.camera_boxes import Footage
+from psotrack.recordings.exchange.json_files import read_json_tracks, write_json_tracks
+from psotrack.recordings.exchange.kitti_files import POSES, read_kitti, write_kitti
+from psotrack.recordings.exchange.mcap_files import read_mcap, write_mcap
+from psotrack.recordings.exchange.mot_files import TRACKS, WORLD, read_mot_positions, write_mot
+from psotrack.recordings.exchange.number_lines import are_numbers, first_line, number_words
+from psotrack.recordings.exchange.timed_paths import joined, timed_path
+from psotrack.support import Report
+from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
+from psotrack.trajectories.tum import read_tum_path, tum_text, write_tum
+
+#: Quantities that some formats cannot hold, as messages name them.
+NAMES, TIMES, ORIENTATIONS, COVARIANCES = "names of drones", "times", "orientations", "covariances"
+_POSES = frozenset({NAMES, TIMES, ORIENTATIONS})
+_ALL = _POSES | {
+    COVARIANCES,
+    "covariances without constant errors",
+    "velocities",
+    "fitness",
+    "numbers of cameras",
+    "status",
+}
+#: Numbers per line of a TUM file and of a KITTI file; more than 6 with commas are MOT.
+_TUM, _KITTI = 8, 12
+#: Writes tracks to a path, and returns what is missing in it as noun phrases.
+Write = Callable[[Path, Trajectories, Footage | None, Report], list[str]]
+Read = Callable[[Path, Recording | None], Trajectories]
 
 
 @dataclass(frozen=True)
@@ -18,153 +43,123 @@ class TrackFormat:
     """A format of tracks.
 
     Attributes:
-        suffix: ending of the file's name; empty where the format is always a folder.
-        is_folder: whether the format may be a folder with several files.
-        holds: which of the quantities of `quantities` the format holds.
-        entries: names, or patterns of names, of what such a folder contains: a folder with anything else is not
-            replaced.
+        holds: which quantities the format holds.
+        write: writes a file, or a folder where the path has none of the endings.
+        suffixes: endings of a file's name; none where the format is always a folder.
+        entries: names, or patterns of names, of what a folder of the format contains: a folder with anything else is
+            not replaced. None where the format is always a file.
+        is_of_one: whether a file holds one drone only, and its name is the drone's.
+        needs_all: whether drones that are never seen are written, too.
     """
 
-    suffix: str
-    is_folder: bool
     holds: frozenset[str]
+    write: Write
+    suffixes: tuple[str, ...] = ()
     entries: tuple[str, ...] = ()
+    is_of_one: bool = False
+    needs_all: bool = False
 
 
-@dataclass(frozen=True, repr=False)
-class Footage:
-    """The recording from which tracks were made, for formats that hold boxes, cameras or images.
-
-    Attributes:
-        recording: the recording.
-        size_m: (drones, 3), full lengths of the tracked drones along the world's axes, metres; None if unknown.
-        images: whether the images of the cameras are exported too.
-    """
-
-    recording: Recording
-    size_m: Float[np.ndarray, "drones 3"] | None = field(default=None)
-    images: bool = False
-
-    __repr__ = short_repr
+def _write_tum(path: Path, tracks: Trajectories, footage: Footage | None, report: Report) -> list[str]:
+    if path.suffix in FORMATS["tum"].suffixes:
+        path.write_text(tum_text(tracks, 0), encoding="utf-8")
+    else:
+        write_tum(path, tracks)
+    return []
 
 
-_ORIENTATIONS, _TIMES, _COVARIANCES = "orientations", "times", "covariances"
-_ALL = frozenset(
-    {
-        "names of drones",
-        _TIMES,
-        _ORIENTATIONS,
-        _COVARIANCES,
-        "covariances without constant errors",
-        "velocities",
-        "fitness",
-        "numbers of cameras",
-        "status",
-    }
-)
+def _write_table(path: Path, tracks: Trajectories, footage: Footage | None, report: Report) -> list[str]:
+    write_trajectories(path, tracks)
+    return []
+
 
 #: The formats by name.
 FORMATS = {
-    "tum": TrackFormat(".tum", True, frozenset({"names of drones", _TIMES, _ORIENTATIONS}), ("*.tum",)),
-    "kitti": TrackFormat(
-        "", True, frozenset({"names of drones", _TIMES, _ORIENTATIONS}), ("poses", "sequences")
-    ),
-    "mot": TrackFormat(".txt", True, frozenset(), ("3d", "gt", "trackers")),
-    "c3d": TrackFormat(".c3d", False, frozenset({"names of drones"})),
-    "mcap": TrackFormat(
-        ".mcap",
-        True,
-        frozenset({"names of drones", _TIMES, _ORIENTATIONS, _COVARIANCES}),
-        ("*.mcap", "metadata.yaml"),
-    ),
-    "csv": TrackFormat(".csv", False, _ALL),
-    "parquet": TrackFormat(".parquet", False, _ALL),
-    "json": TrackFormat(".json", False, _ALL),
+    "tum": TrackFormat(_POSES, _write_tum, (".tum", ".txt"), ("*.tum",), is_of_one=True),
+    "kitti": TrackFormat(_POSES, write_kitti, entries=("poses", "sequences")),
+    "mot": TrackFormat(frozenset(), write_mot, (".txt",), ("3d", "gt", "trackers")),
+    "c3d": TrackFormat(frozenset({NAMES}), write_c3d_tracks, (".c3d",), needs_all=True),
+    "mcap": TrackFormat(_POSES | {COVARIANCES}, write_mcap, (".mcap",), ("*.mcap", "metadata.yaml")),
+    "csv": TrackFormat(_ALL, _write_table, (".csv",), needs_all=True),
+    "parquet": TrackFormat(_ALL, _write_table, (".parquet",), needs_all=True),
+    "json": TrackFormat(_ALL, write_json_tracks, (".json",), needs_all=True),
 }
 
 
-def lost_quantities(trajectories: Trajectories, to: str) -> list[str]:
-    """What these trajectories have and the format cannot hold, as noun phrases.
-
-    Args:
-        trajectories: the trajectories.
-        to: name of the format.
-    """
-    held = FORMATS[to].holds
-    known = _known(trajectories)
-    lost = [name for name, is_known in known.items() if is_known and name not in held]
-    if "status" in held:
-        return lost
-    hidden = np.isfinite(trajectories.position_m).all(axis=-1) & ~trajectories.seen
-    if hidden.any():
-        lost.append(f"{int(hidden.sum())} positions of lost drones")
-    never = [
-        name for name, seen in zip(trajectories.drones, trajectories.seen.T, strict=True) if not seen.any()
-    ]
-    if never and to != "c3d":
-        lost.append(f"drones that are never seen ({', '.join(never)})")
-    return lost
+def read_folder(path: Path, recording: Recording | None) -> Trajectories:
+    """Read a folder of TUM, KITTI or MCAP files, or the one that an export to MOT wrote."""
+    if (path / WORLD / TRACKS).is_file():
+        return read_mot_positions(path / WORLD / TRACKS, recording)
+    if any(path.glob("*.mcap")):
+        return read_mcap(path, recording)
+    if files := sorted(path.glob("*.tum")):
+        return _read_tum(path, files, recording)
+    folder = path / POSES if (path / POSES).is_dir() else path
+    files = [file for file in sorted(folder.glob("*.txt")) if not file.stem.endswith("times")]
+    counts = {len(number_words(first_line(file))) for file in files}
+    if counts == {_TUM}:
+        return _read_tum(path, files, recording)
+    if counts == {_KITTI}:
+        return joined(path, [read_kitti(file, recording) for file in files], recording)
+    found = "files of boxes alone" if (path / "trackers").is_dir() else "a folder without them"
+    raise InputError(path, expected=KINDS, found=found)
 
 
-def _known(trajectories: Trajectories) -> dict[str, bool]:
-    frame, time_s, status = trajectories.frame, trajectories.time_s, trajectories.status
-    has_times = len(frame) > 0 and bool(np.abs(time_s - frame * interval_s(trajectories)).max() > 1e-6)
-    return {
-        "names of drones": trajectories.drones != tuple(str(k + 1) for k in range(trajectories.num_drones)),
-        # Frame numbers and a rate say the same as times of equal distance.
-        _TIMES: has_times,
-        _ORIENTATIONS: _any_known(trajectories.orientation_wxyz),
-        _COVARIANCES: _any_known(trajectories.covariance_m2),
-        "covariances without constant errors": _any_known(trajectories.relative_covariance_m2),
-        "velocities": _any_known(trajectories.velocity_m_s),
-        "fitness": _any_known(trajectories.fitness),
-        "numbers of cameras": trajectories.num_cameras is not None,
-        "status": status is not None and bool((status == Status.COASTING).any()),
-    }
+def read_file(path: Path, recording: Recording | None) -> Trajectories:
+    """Read a file by its ending; a text by its first line."""
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(path, expected=KINDS, found=repr(path.name))
+    if path.stat().st_size == 0:
+        raise InputError(path, expected="tracks", found="an empty file")
+    return read(path, recording)
 
 
-def _any_known(values: np.ndarray | None) -> bool:
-    return values is not None and bool(np.isfinite(values).any())
+def _read_tum(where: Path, files: Sequence[Path], recording: Recording | None) -> Trajectories:
+    paths = []
+    for file in files:
+        read = read_tum_path(file)
+        turns = None if read.orientation_wxyz is None else read.orientation_wxyz[:, 0]
+        paths.append(timed_path(file.stem, read.time_s, read.position_m[:, 0], turns))
+    return joined(where, paths, recording)
 
 
-def interval_s(trajectories: Trajectories) -> float:
-    """Mean time from frame to frame, seconds.
-
-    Raises:
-        InputError: there is one frame only, which is not frame 0, at a time that is not above 0.
-    """
-    frame, time_s = trajectories.frame, trajectories.time_s
-    if len(frame) > 1:
-        interval = float(np.ptp(time_s) / np.ptp(frame))
-    else:
-        interval = float(time_s[0] / frame[0]) if len(frame) and frame[0] else 1.0
-    if not interval > 0:
-        raise InputError("tracks", expected="times that increase from frame to frame", found="equal times")
-    return interval
+def _read_table(path: Path, recording: Recording | None) -> Trajectories:
+    return read_trajectories(path, fps=None if recording is None else recording.fps)
 
 
-def seen_only(trajectories: Trajectories) -> tuple[Trajectories, list[int]]:
-    """The drones that are seen in some frame, and their indices.
+def _read_csv(path: Path, recording: Recording | None) -> Trajectories:
+    """Read a table with names of columns, or lines of numbers without, as in a MOT file."""
+    read = _read_text if are_numbers(number_words(first_line(path))) else _read_table
+    return read(path, recording)
 
-    Raises:
-        InputError: no drone is ever seen.
-    """
-    kept = np.flatnonzero(trajectories.seen.any(axis=0)).tolist()
-    if not kept:
-        raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
 
-    def of_kept(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[:, kept]
+def _read_text(path: Path, recording: Recording | None) -> Trajectories:
+    line = first_line(path)
+    count = len(number_words(line))
+    if "," in line or count == 10:
+        return read_mot_positions(path, recording)
+    if count == _TUM:
+        return _read_tum(path, [path], recording)
+    if count == _KITTI:
+        return joined(path, [read_kitti(path, recording)], recording)
+    raise InputError(
+        path,
+        expected="8 numbers per line (TUM), 12 (KITTI), or 10 with commas (MOT)",
+        found=repr(line[:80]) if line else "no line with numbers",
+    )
 
-    return replace(
-        trajectories,
-        drones=tuple(trajectories.drones[index] for index in kept),
-        position_m=trajectories.position_m[:, kept],
-        velocity_m_s=of_kept(trajectories.velocity_m_s),
-        orientation_wxyz=of_kept(trajectories.orientation_wxyz),
-        fitness=of_kept(trajectories.fitness),
-        num_cameras=of_kept(trajectories.num_cameras),
-        status=of_kept(trajectories.status),
-        covariance_m2=of_kept(trajectories.covariance_m2),
-        relative_covariance_m2=of_kept(trajectories.relative_covariance_m2),
-    ), kept
+
+#: How a file is read, by its ending.
+_READERS: dict[str, Read] = {
+    ".csv": _read_csv,
+    ".parquet": _read_table,
+    ".json": read_json_tracks,
+    ".tum": lambda path, recording: _read_tum(path, [path], recording),
+    ".txt": _read_text,
+    ".c3d": read_c3d_tracks,
+    ".mcap": read_mcap,
+}
+KINDS = (
+    f"tracks as {', '.join(_READERS)} (.txt: TUM, KITTI or MOT), or a folder of TUM, KITTI, MOT or MCAP files"
+)

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.support import read_json
+from psotrack.recordings import Recording
+from psotrack.recordings.exchange.camera_boxes import Footage
+from psotrack.support import Report, read_json
 from psotrack.trajectories import Status, Trajectories, check_cells
 
 #: Value of the key `format`, and version of the keys' meaning.
@@ -28,7 +30,9 @@ QUANTITIES: dict[str, tuple[str, tuple[int, ...]]] = {
 _STATUS = {status.label: int(status) for status in Status}
 
 
-def write_json_tracks(path: Path, trajectories: Trajectories) -> None:
+def write_json_tracks(
+    path: Path, trajectories: Trajectories, footage: Footage | None, report: Report
+) -> list[str]:
     """Write all quantities of trajectories; numbers have all digits."""
     known = {
         name: getattr(trajectories, name) for name in QUANTITIES if getattr(trajectories, name) is not None
@@ -46,9 +50,10 @@ def write_json_tracks(path: Path, trajectories: Trajectories) -> None:
         ],
     }
     path.write_text(json.dumps(content, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+    return []
 
 
-def read_json_tracks(path: Path) -> Trajectories:
+def read_json_tracks(path: Path, recording: Recording | None) -> Trajectories:
     """Read trajectories from JSON.
 
     Raises:

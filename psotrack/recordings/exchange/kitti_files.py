@@ -14,9 +14,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
+from psotrack.recordings import Recording
+from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.recordings.exchange.number_lines import read_numbers
-from psotrack.recordings.exchange.timed_paths import TimedPath, known_orientations
-from psotrack.support import check_file_name, first_repeat
+from psotrack.recordings.exchange.timed_paths import instants_s, timed_path
+from psotrack.support import Report, check_file_name, first_repeat
 from psotrack.trajectories import Trajectories
 
 POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
@@ -24,8 +26,10 @@ POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
 _ROTATION = 1e-4
 
 
-def write_kitti(folder: Path, trajectories: Trajectories) -> int:
-    """Write the poses and times of each drone into a new folder; return the number of files.
+def write_kitti(
+    folder: Path, trajectories: Trajectories, footage: Footage | None, report: Report
+) -> list[str]:
+    """Write the poses and times of each drone into a new folder; nothing is missing in it.
 
     Raises:
         InputError: a drone's name cannot be the name of a file.
@@ -34,11 +38,11 @@ def write_kitti(folder: Path, trajectories: Trajectories) -> int:
         check_file_name(name, "drones")
         seen = trajectories.seen[:, drone]
         poses = np.zeros((int(seen.sum()), 3, 4))
-        poses[:, :, :3] = _rotations(trajectories, drone)[seen]
+        poses[:, :, :3] = _rotations(trajectories, drone)
         poses[:, :, 3] = trajectories.position_m[seen, drone]
         _write(folder / POSES / f"{name}.txt", poses.reshape(-1, 12))
         _write(folder / SEQUENCES / name / TIMES, trajectories.time_s[seen].astype(float)[:, None])
-    return 2 * trajectories.num_drones
+    return []
 
 
 def find_times(file: Path) -> Path | None:
@@ -51,12 +55,12 @@ def find_times(file: Path) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def read_kitti(file: Path, instant_s: Float[np.ndarray, "instants"] | None) -> TimedPath:
+def read_kitti(file: Path, recording: Recording | None) -> Trajectories:
     """The path in a file of poses. Without a file of times, line k is instant k of the recording.
 
     Args:
         file: file of poses; the drone has its name.
-        instant_s: (instants,), times of the recording's instants, seconds; None if no recording is known.
+        recording: the recording, or None if none is known.
 
     Raises:
         InputError: a file cannot be read, a line is no pose, or poses and times differ in number; there are no times
@@ -70,14 +74,10 @@ def read_kitti(file: Path, instant_s: Float[np.ndarray, "instants"] | None) -> T
         line = int(np.argmax((off > _ROTATION) | mirrored)) + 1
         raise InputError(f"{file}, pose {line}", expected="a rotation matrix", found="another matrix")
     orientation = Rotation.from_matrix(poses[:, :, :3]).as_quat(scalar_first=True, canonical=True)
-    return TimedPath(
-        file.stem, _times(file, len(poses), instant_s), poses[:, :, 3], known_orientations(orientation)
-    )
+    return timed_path(file.stem, _times(file, len(poses), recording), poses[:, :, 3], orientation)
 
 
-def _times(
-    file: Path, count: int, instant_s: Float[np.ndarray, "instants"] | None
-) -> Float[np.ndarray, "rows"]:
+def _times(file: Path, count: int, recording: Recording | None) -> Float[np.ndarray, "rows"]:
     beside = find_times(file)
     if beside is not None:
         time_s = read_numbers(beside, 1, "one time in seconds per line")[:, 0]
@@ -93,6 +93,7 @@ def _times(
                 found=f"{time_s[again]:g} s",
             )
         return time_s
+    instant_s = instants_s(recording)
     if instant_s is None:
         raise InputError(
             file,
@@ -106,21 +107,16 @@ def _times(
             expected=f"{len(instant_s)} poses, one for each instant of the recording, or a file of times",
             found=f"{count} poses",
         )
-    return instant_s.astype(np.float64)
+    return instant_s
 
 
-def _rotations(trajectories: Trajectories, drone: int) -> Float[np.ndarray, "frames 3 3"]:
-    """Rotations of a drone; the identity in every frame if one of its seen frames has no orientation."""
-    identity = np.broadcast_to(np.eye(3), (trajectories.num_frames, 3, 3))
-    if trajectories.orientation_wxyz is None:
-        return identity
-    orientation = trajectories.orientation_wxyz[:, drone].astype(float)
-    known = np.isfinite(orientation).all(axis=-1)
-    if not known[trajectories.seen[:, drone]].all():
-        return identity
-    rotations = identity.copy()
-    rotations[known] = Rotation.from_quat(orientation[known], scalar_first=True).as_matrix()
-    return rotations
+def _rotations(trajectories: Trajectories, drone: int) -> Float[np.ndarray, "rows 3 3"]:
+    """Rotations of a drone where it is seen; the identity everywhere if one of these frames has no orientation."""
+    seen = trajectories.seen[:, drone]
+    orientation = trajectories.orientation_wxyz
+    if orientation is None or not np.isfinite(orientation[seen, drone]).all():
+        return np.broadcast_to(np.eye(3), (int(seen.sum()), 3, 3))
+    return Rotation.from_quat(orientation[seen, drone].astype(float), scalar_first=True).as_matrix()
 
 
 def _write(path: Path, rows: Float[np.ndarray, "rows columns"]) -> None:

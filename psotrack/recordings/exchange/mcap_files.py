@@ -20,7 +20,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -29,12 +29,11 @@ import cv2
 import numpy as np
 
 from psotrack.errors import InputError, SettingsError, install_command
-from psotrack.recordings import read_frames
+from psotrack.recordings import Recording, read_frames
 from psotrack.recordings.exchange import ros_messages as ros
-from psotrack.recordings.exchange.camera_boxes import CameraFrames, camera_frames
-from psotrack.recordings.exchange.formats import Footage
-from psotrack.recordings.exchange.timed_paths import TimedPath
-from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat, short_repr
+from psotrack.recordings.exchange.camera_boxes import CameraFrames, Footage, camera_frames
+from psotrack.recordings.exchange.timed_paths import joined, timed_path
+from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat
 from psotrack.trajectories import Trajectories
 
 WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
@@ -42,6 +41,8 @@ _JPEG_QUALITY = 90
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 #: Time in nanoseconds, topic, type and content of a message.
 _Message = tuple[int, str, str, dict[str, Any]]
+#: Time in seconds, position, orientation and the 36 numbers of the covariance of a pose.
+_Row = tuple[float, list[float], list[float], np.ndarray]
 
 
 def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, report: Report) -> list[str]:
@@ -99,11 +100,12 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     return missing
 
 
-def read_mcap(path: Path) -> list[TimedPath]:
+def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
     """The paths in the poses of an MCAP file: a drone for each topic of poses, with or without covariance, or odometry.
 
     Args:
         path: the file, or the folder of a bag with one MCAP file.
+        recording: the recording, or None if none is known.
 
     Raises:
         SettingsError: the libraries are not installed.
@@ -116,7 +118,7 @@ def read_mcap(path: Path) -> list[TimedPath]:
         path = files[0]
     make_reader = _library("mcap.reader").make_reader
     decoder = _library("mcap_ros2.decoder").DecoderFactory()
-    rows: dict[str, _Rows] = {}
+    rows: dict[str, list[_Row]] = {}
     names: dict[str, str] = {}
     try:
         # The library also prints what it finds in a damaged file.
@@ -128,15 +130,12 @@ def read_mcap(path: Path) -> list[TimedPath]:
             for record in reader.iter_metadata():
                 if record.name == METADATA:
                     names = json.loads(record.metadata["drones"])
-            topics = [
-                channel.topic
-                for channel in summary.channels.values()
-                if _reader_of(summary.schemas[channel.schema_id].name) is not None
-            ]
+            kinds = {each.topic: summary.schemas[each.schema_id].name for each in summary.channels.values()}
+            topics = [topic for topic, kind in kinds.items() if kind in _READ]
             for schema, channel, _, message in reader.iter_decoded_messages(topics=topics) if topics else ():
-                position = _reader_of(schema.name)
-                assert position is not None
-                rows.setdefault(channel.topic, _Rows()).add(message.header.stamp, *position(message))
+                rows.setdefault(channel.topic, []).append(
+                    _row(message.header.stamp, *_READ[schema.name](message))
+                )
     except OSError as error:
         raise InputError(
             path, expected="a file to read", found=(error.strerror or f"{error}").lower()
@@ -147,66 +146,52 @@ def read_mcap(path: Path) -> list[TimedPath]:
         found = f"a damaged or shortened file ({type(error).__name__}: {error})".partition("\n")[0]
         raise InputError(path, expected="an MCAP file", found=found, remedy="copy it again") from error
     if not rows:
-        found = ", ".join(sorted({channel.topic for channel in summary.channels.values()})) or "no topic"
+        found = ", ".join(sorted(kinds)) or "no topic"
         raise InputError(path, expected="a topic with poses or odometry of ROS 2", found=found)
-    return [
-        each.path(path, topic, names.get(topic) or _drone_of(topic, rows)) for topic, each in rows.items()
+    paths = [
+        _path(f"{path}, topic {topic}", names.get(topic) or _drone_of(topic, rows), each)
+        for topic, each in rows.items()
     ]
+    return joined(path, paths, recording)
 
 
-@dataclass(repr=False)
-class _Rows:
-    """The poses of a topic, as they are read."""
-
-    time_s: list[float] = field(default_factory=list)
-    position: list[list[float]] = field(default_factory=list)
-    wxyz: list[list[float]] = field(default_factory=list)
-    covariance: list[Any] = field(default_factory=list)
-
-    __repr__ = short_repr
-
-    def add(self, stamp: Any, pose: Any, covariance: Any) -> None:
-        self.time_s.append(stamp.sec + stamp.nanosec * 1e-9)
-        self.position.append([pose.position.x, pose.position.y, pose.position.z])
-        turn = pose.orientation
-        self.wxyz.append([turn.w, turn.x, turn.y, turn.z])
-        self.covariance.append(np.zeros(36) if covariance is None else np.asarray(covariance, float))
-
-    def path(self, where: Path, topic: str, name: str) -> TimedPath:
-        order = np.argsort(self.time_s, kind="stable")
-        time_s = np.array(self.time_s)[order]
-        again = first_repeat(time_s)
-        if again is not None:
-            found = f"two at {time_s[again]:g} s"
-            raise InputError(f"{where}, topic {topic}", expected="one pose per time", found=found)
-        covariance = np.array(self.covariance)[order].reshape(-1, 6, 6)
-        orientation = np.array(self.wxyz)[order]
-        if (far := np.abs(orientation) > LARGEST).any():
-            found = f"{orientation[far][0]:g} in an orientation"
-            raise InputError(f"{where}, topic {topic}", expected=MODERATE, found=found)
-        length = np.linalg.norm(orientation, axis=1, keepdims=True)
-        unknown = (covariance[:, [3, 4, 5], [3, 4, 5]] >= ros.UNKNOWN_RAD2).any(axis=1) | (length[:, 0] == 0)
-        orientation = np.where(unknown[:, None], np.nan, orientation / np.where(length == 0, 1, length))
-        block = covariance[:, :3, :3]
-        stated = block.any(axis=(1, 2)) & (block[:, 0, 0] >= 0)
-        block = np.where(stated[:, None, None], (block + block.swapaxes(1, 2)) / 2, np.nan)
-        return TimedPath(
-            name,
-            time_s,
-            np.array(self.position)[order],
-            None if unknown.all() else orientation,
-            block if stated.any() else None,
-        )
+def _row(stamp: Any, pose: Any, covariance: Any) -> _Row:
+    place, turn = pose.position, pose.orientation
+    known = np.zeros(36) if covariance is None else np.asarray(covariance, float)
+    return (
+        stamp.sec + stamp.nanosec * 1e-9,
+        [place.x, place.y, place.z],
+        [turn.w, turn.x, turn.y, turn.z],
+        known,
+    )
 
 
-def _reader_of(kind: str) -> Callable[[Any], tuple[Any, Any]] | None:
-    """The function that takes pose and covariance from a message of a type; None for a type without a pose."""
-    readers: dict[str, Callable[[Any], tuple[Any, Any]]] = {
-        ros.POSE: lambda message: (message.pose.pose, message.pose.covariance),
-        "nav_msgs/msg/Odometry": lambda message: (message.pose.pose, message.pose.covariance),
-        "geometry_msgs/msg/PoseStamped": lambda message: (message.pose, None),
-    }
-    return readers.get(kind)
+def _path(where: str, name: str, rows: list[_Row]) -> Trajectories:
+    """The path of a drone from the poses of its topic."""
+    rows = sorted(rows, key=lambda row: row[0])
+    time_s, position_m, orientation, covariance = (np.array(column) for column in zip(*rows, strict=True))
+    again = first_repeat(time_s)
+    if again is not None:
+        raise InputError(where, expected="one pose per time", found=f"two at {time_s[again]:g} s")
+    if (far := np.abs(orientation) > LARGEST).any():
+        raise InputError(where, expected=MODERATE, found=f"{orientation[far][0]:g} in an orientation")
+    length = np.linalg.norm(orientation, axis=1)
+    variance_rad2 = covariance[:, [21, 28, 35]]
+    unknown = (variance_rad2 >= ros.UNKNOWN_RAD2).any(axis=1) | (length == 0)
+    orientation[~unknown] /= length[~unknown, None]
+    orientation[unknown] = np.nan
+    block = covariance.reshape(-1, 6, 6)[:, :3, :3]
+    stated = block.any(axis=(1, 2)) & (block[:, 0, 0] >= 0)
+    block = np.where(stated[:, None, None], (block + block.swapaxes(1, 2)) / 2, np.nan)
+    return timed_path(name, time_s, position_m, orientation, block if stated.any() else None)
+
+
+#: The functions that take pose and covariance from a message, by its type.
+_READ: dict[str, Callable[[Any], tuple[Any, Any]]] = {
+    ros.POSE: lambda message: (message.pose.pose, message.pose.covariance),
+    "nav_msgs/msg/Odometry": lambda message: (message.pose.pose, message.pose.covariance),
+    "geometry_msgs/msg/PoseStamped": lambda message: (message.pose, None),
+}
 
 
 def _drone_of(topic: str, topics: dict[str, Any]) -> str:
@@ -236,23 +221,18 @@ def _check_different(names: Sequence[str]) -> None:
 
 def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advance) -> Iterator[_Message]:
     """A pose for each drone that is seen at a time, and one message of transforms for all."""
-    seen, orientation, covariance = (
-        trajectories.seen,
-        trajectories.orientation_wxyz,
-        trajectories.covariance_m2,
-    )
-    for row, time_ns in enumerate(
-        np.round(trajectories.time_s.astype(float) * 1e9).astype(np.int64).tolist()
-    ):
+    seen, orientation = trajectories.seen, trajectories.orientation_wxyz
+    covariance = trajectories.covariance_m2
+    times_ns = np.round(trajectories.time_s.astype(float) * 1e9).astype(np.int64).tolist()
+    for row, time_ns in enumerate(times_ns):
         head = ros.header(time_ns, WORLD)
         transforms = []
         advance(1)
         for drone in np.flatnonzero(seen[row]).tolist():
             position_m = trajectories.position_m[row, drone]
             turned = None if orientation is None else orientation[row, drone]
-            message = ros.pose_message(
-                head, position_m, turned, None if covariance is None else covariance[row, drone]
-            )
+            spread = None if covariance is None else covariance[row, drone]
+            message = ros.pose_message(head, position_m, turned, spread)
             yield time_ns, f"/{names[drone]}/pose", ros.POSE, message
             transforms.append(ros.transform(head, names[drone], position_m, turned))
         if transforms:
@@ -305,12 +285,8 @@ def _image_messages(
         info = ros.camera_message(head, one)
         if info is not None and time_ns > 0:
             yield time_ns, f"/{name}/camera_info", ros.CAMERA_INFO, info
-        yield (
-            time_ns,
-            f"/{name}/image/compressed",
-            ros.IMAGE,
-            {"header": head, "format": "jpeg", "data": encoded},
-        )
+        content = {"header": head, "format": "jpeg", "data": encoded}
+        yield time_ns, f"/{name}/image/compressed", ros.IMAGE, content
 
 
 def _write_bag_file(
@@ -322,16 +298,9 @@ def _write_bag_file(
     total = sum(counts.values())
     span = {"duration": {"nanoseconds": last_ns - first_ns}, "message_count": total}
     start = {"starting_time": {"nanoseconds_since_epoch": first_ns}}
+    shared = {"serialization_format": "cdr", "offered_qos_profiles": ""}
     topics = [
-        {
-            "topic_metadata": {
-                "name": topic,
-                "type": kind,
-                "serialization_format": "cdr",
-                "offered_qos_profiles": "",
-            },
-            "message_count": count,
-        }
+        {"topic_metadata": {"name": topic, "type": kind} | shared, "message_count": count}
         for (topic, kind), count in sorted(counts.items())
     ]
     content = {

@@ -21,9 +21,9 @@ from jaxtyping import Float, Int
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Recording
-from psotrack.recordings.exchange.camera_boxes import boxes_in_camera, camera_frames
-from psotrack.recordings.exchange.formats import Footage, interval_s
+from psotrack.recordings.exchange.camera_boxes import Footage, boxes_in_camera, camera_frames
 from psotrack.recordings.exchange.number_lines import read_numbers
+from psotrack.recordings.exchange.timed_paths import interval_s
 from psotrack.support import Report, check_file_name
 from psotrack.trajectories import UNASSIGNED, Trajectories, check_cells
 from psotrack.trajectories.association import align, fixed_identity
@@ -38,6 +38,18 @@ _SLOWEST_HZ = 1e-6
 _COLUMNS = "frame, id, left, top, width, height, confidence, x, y, z"
 
 
+def write_mot(path: Path, trajectories: Trajectories, footage: Footage | None, report: Report) -> list[str]:
+    """Write a file of positions, or with a recording a new folder with boxes, too; return what is missing in it.
+
+    Raises:
+        SettingsError: the sizes of the drones are not known, for boxes.
+    """
+    if footage is not None:
+        return _write_folder(path, trajectories, footage, report)
+    write_mot_positions(path, trajectories)
+    return ["boxes, which need SEQ", "the rate"]
+
+
 def write_mot_positions(path: Path, trajectories: Trajectories) -> None:
     """Write positions in MOT15's 3D columns; drones have the numbers 1, 2, ... in their order."""
     lines = []
@@ -48,14 +60,11 @@ def write_mot_positions(path: Path, trajectories: Trajectories) -> None:
     path.write_text("".join(lines), encoding="ascii")
 
 
-def write_mot_folder(folder: Path, trajectories: Trajectories, footage: Footage, report: Report) -> list[str]:
-    """Write positions, and boxes per camera, into a new folder; return what is missing in it, as noun phrases.
+def _write_folder(folder: Path, trajectories: Trajectories, footage: Footage, report: Report) -> list[str]:
+    """Write positions, and boxes per camera.
 
     Boxes are those of the drones' ellipsoids, as in `geometry.boxes`, at the time at which the camera exposed the
     frame. Boxes of the reference have the sizes of the tracks that belong to its drones.
-
-    Raises:
-        SettingsError: the sizes of the drones are not known.
     """
     recording, size_m = footage.recording, footage.size_m
     if size_m is None:

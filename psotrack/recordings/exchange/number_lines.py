@@ -19,6 +19,14 @@ def number_words(line: str) -> list[str]:
     return [word for word in _SEPARATOR.split(line.strip()) if word]
 
 
+def are_numbers(words: list[str]) -> bool:
+    """Whether all words are numbers, and there is at least one."""
+    try:
+        return bool(words) and bool([float(word) for word in words])
+    except ValueError:
+        return False
+
+
 def first_line(path: Path) -> str:
     """The first line that is neither empty nor a comment; empty if there is none.
 

@@ -21,49 +21,46 @@ IMAGE = "sensor_msgs/msg/CompressedImage"
 #: Variance of each angle of an orientation that is not known, rad²: the message has no other way to say so.
 UNKNOWN_RAD2 = 1e9
 
-_PARTS = {
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
-    ),
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "sensor_msgs/RegionOfInterest": (
-        "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
-    ),
-}
-_WHOLE = {
-    POSE: (
-        "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose",
-        ("std_msgs/Header", "builtin_interfaces/Time", "geometry_msgs/PoseWithCovariance", "geometry_msgs/Pose",
-         "geometry_msgs/Point", "geometry_msgs/Quaternion"),
-    ),
-    TRANSFORMS: (
-        "geometry_msgs/TransformStamped[] transforms",
-        ("geometry_msgs/TransformStamped", "std_msgs/Header", "builtin_interfaces/Time", "geometry_msgs/Transform",
-         "geometry_msgs/Vector3", "geometry_msgs/Quaternion"),
-    ),
+#: Lines of the definition of each message, and of the types of its fields.
+_LINES = {
+    POSE: ("std_msgs/Header header", "geometry_msgs/PoseWithCovariance pose"),
+    TRANSFORMS: ("geometry_msgs/TransformStamped[] transforms",),
     CAMERA_INFO: (
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n"
-        "float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi",
-        ("std_msgs/Header", "builtin_interfaces/Time", "sensor_msgs/RegionOfInterest"),
+        "std_msgs/Header header", "uint32 height", "uint32 width", "string distortion_model", "float64[] d",
+        "float64[9] k", "float64[9] r", "float64[12] p", "uint32 binning_x", "uint32 binning_y",
+        "sensor_msgs/RegionOfInterest roi",
     ),
-    IMAGE: (
-        "std_msgs/Header header\nstring format\nuint8[] data",
-        ("std_msgs/Header", "builtin_interfaces/Time"),
+    IMAGE: ("std_msgs/Header header", "string format", "uint8[] data"),
+    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
+    "geometry_msgs/PoseWithCovariance": ("geometry_msgs/Pose pose", "float64[36] covariance"),
+    "geometry_msgs/Pose": ("geometry_msgs/Point position", "geometry_msgs/Quaternion orientation"),
+    "geometry_msgs/Point": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/Vector3": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/Quaternion": ("float64 x", "float64 y", "float64 z", "float64 w"),
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header", "string child_frame_id", "geometry_msgs/Transform transform",
+    ),
+    "geometry_msgs/Transform": ("geometry_msgs/Vector3 translation", "geometry_msgs/Quaternion rotation"),
+    "sensor_msgs/RegionOfInterest": (
+        "uint32 x_offset", "uint32 y_offset", "uint32 height", "uint32 width", "bool do_rectify",
     ),
 }  # fmt: skip
 
+
+def _definition(message: str) -> str:
+    """Definition of a message with those of its parts."""
+    names = [message]
+    # Names are found while the list is read.
+    for name in names:
+        kinds = [line.split()[0].removesuffix("[]") for line in _LINES[name]]
+        names += dict.fromkeys(kind for kind in kinds if kind in _LINES and kind not in names)
+    parts = [f"{'=' * 80}\nMSG: {name}\n" + "\n".join(_LINES[name]) for name in names[1:]]
+    return "\n".join([*_LINES[message], *parts]) + "\n"
+
+
 #: Definition of each message with those of its parts.
-DEFINITIONS = {
-    name: "\n".join([text, *(f"{'=' * 80}\nMSG: {part}\n{_PARTS[part]}" for part in parts)]) + "\n"
-    for name, (text, parts) in _WHOLE.items()
-}
+DEFINITIONS = {name: _definition(name) for name in (POSE, TRANSFORMS, CAMERA_INFO, IMAGE)}
 
 
 def header(time_ns: int, frame: str) -> dict[str, Any]:

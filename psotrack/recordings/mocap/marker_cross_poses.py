@@ -31,16 +31,11 @@ class CrossPoses:
         position_m: (frames, 3), centroid of the learned cross in the world, metres; NaN if unknown. The centroid does
             not jump when a marker appears or disappears.
         orientation_wxyz: (frames, 4), unit quaternions from cross to world; NaN if unknown.
-        residual_m: (frames,), root mean square distance of the seen markers from the fitted cross, metres; NaN without
-            a fit.
-        num_markers: (frames,), number of seen markers in the fit.
         bridged: (frames,), True where the pose is interpolated over a gap.
     """
 
     position_m: Float[np.ndarray, "frames 3"]
     orientation_wxyz: Float[np.ndarray, "frames 4"]
-    residual_m: Float[np.ndarray, "frames"]
-    num_markers: Int[np.ndarray, "frames"]
     bridged: Bool[np.ndarray, "frames"]
 
 
@@ -69,9 +64,7 @@ def estimate_poses(
     if known.any():
         turns = Rotation.from_matrix(fits.rotation[known])
         orientation_wxyz[known] = turns.as_quat(scalar_first=True)
-    with_gaps = CrossPoses(
-        fits.position_m, orientation_wxyz, fits.residual_m, fits.num_markers, np.zeros(len(known), bool)
-    )
+    with_gaps = CrossPoses(fits.position_m, orientation_wxyz, np.zeros(len(known), bool))
     return _bridge_gaps(with_gaps, rate_hz, max_gap_s)
 
 
@@ -151,8 +144,6 @@ def interpolate_poses(found: CrossPoses, rate_hz: float, time_s: Float[np.ndarra
     return CrossPoses(
         position_m=position_m,
         orientation_wxyz=orientation_wxyz,
-        residual_m=np.where(inside, found.residual_m[[before, after]].max(axis=0), np.nan),
-        num_markers=np.where(inside, found.num_markers[[before, after]].min(axis=0), 0),
         bridged=inside & found.bridged[[before, after]].any(axis=0),
     )
 
@@ -209,7 +200,7 @@ def _bridge_gaps(with_gaps: CrossPoses, rate_hz: float, max_gap_s: float) -> Cro
         if np.isfinite(turns).all():
             slerp = Slerp([start, end], Rotation.from_quat(turns, scalar_first=True))
             orientation_wxyz[inner] = slerp(inner).as_quat(scalar_first=True)
-    return CrossPoses(position_m, orientation_wxyz, with_gaps.residual_m, with_gaps.num_markers, bridged)
+    return CrossPoses(position_m, orientation_wxyz, bridged)
 
 
 def _slope(

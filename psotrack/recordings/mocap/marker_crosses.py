@@ -7,7 +7,6 @@ least squares (Kabsch 1976; Umeyama 1991, without scale); the shape is a general
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,13 +65,11 @@ class RigidFit:
             markers are seen.
         residual_m: (frames,), root mean square distance of the seen markers from the fitted cross, metres; NaN like
             the rotation.
-        num_markers: (frames,), number of seen markers.
     """
 
     rotation: Float[np.ndarray, "frames 3 3"]
     position_m: Float[np.ndarray, "frames 3"]
     residual_m: Float[np.ndarray, "frames"]
-    num_markers: Int[np.ndarray, "frames"]
 
 
 def fit_rigid(
@@ -105,7 +102,6 @@ def fit_rigid(
         rotation=np.where(turned[:, None, None], rotation, np.nan),
         position_m=np.where(placed[:, None], position, np.nan),
         residual_m=np.where(turned, np.sqrt((share * off_m2).sum(axis=1)), np.nan),
-        num_markers=count,
     )
 
 
@@ -154,23 +150,6 @@ def identify_markers(cross: Cross, points_m: Float[np.ndarray, "points 3"]) -> I
     best = labellings[np.argmin(residual_m)]
     marker_of_point[best[best >= 0]] = np.flatnonzero(best >= 0)
     return marker_of_point
-
-
-def identify_cross(crosses: Sequence[Cross], points_m: Float[np.ndarray, "points 3"]) -> int | None:
-    """Identify the cross to which a set of points belongs, from the distances between the points.
-
-    Args:
-        crosses: possible crosses.
-        points_m: (points, 3), positions, metres, such as the markers of a cross from `learn_cross`.
-
-    Returns:
-        Index of the cross that fits most points with the smallest residual; None if no cross fits, or if two fit.
-    """
-    fits = [_labellings(cross, points_m) for cross in crosses]
-    counts = np.array([(found >= 0).sum(axis=1).max(initial=0) for found, _ in fits])
-    most = np.flatnonzero((counts == counts.max(initial=0)) & (counts > 0))
-    residual_m = np.array([fits[index][1].min() for index in most])
-    return int(most[np.argmin(residual_m)]) if len(most) and _is_unique(residual_m) else None
 
 
 def _labellings(

@@ -16,8 +16,7 @@ from psotrack.evaluation import errors_over_time
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.pipeline import TrackedRecording
 from psotrack.recordings import RECORDING_FILE, Recording, VideoInfo
-from psotrack.recordings.datasets import open_recording
-from psotrack.recordings.datasets.dpjait import CALIBRATION
+from psotrack.recordings.datasets import CALIBRATION, open_recording
 from psotrack.recordings.exchange import read_tracks
 from psotrack.show.flights.run_record import RunRecord, as_run_record, read_run_record
 from psotrack.support import drone_colour, short_repr

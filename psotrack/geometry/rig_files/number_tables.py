@@ -1,0 +1,135 @@
+"""Tables of nothing but numbers: DLT coefficients, and Argus's profile of lenses.
+
+Direct linear transformation (DLT) has 11 coefficients per camera, as DLTdv, easyWand and Argus write them:
+
+    u = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1)
+    v = (L5 X + L6 Y + L7 Z + L8) / (L9 X + L10 Y + L11 Z + 1)
+
+A file has 11 lines of numbers, one column per camera; 11 numbers per line and one line per camera are read too. The
+unit of X, Y, Z is open. Argus and DLTdv before version 8 measure v upwards from the lower edge of the image, DLTdv8 and
+other programs downwards; the sign of the determinant of the 3 x 3 part says which, if the world's origin is in front of
+the cameras, as a calibration object or a wand at the origin is. A camera alone with the other sign has the origin
+behind it.
+
+Upwards, v is the image's height less the row, where the first row is 0; u is 0 in the first column. That is Argus's
+count (`DLCclicker.py` and `frameFinderPyglet.py` of https://github.com/backyardbiomech/argus_gui). DLTdv, in MATLAB,
+counts columns from 1 (and DLTdv8 rows, too; `dlt_invert.m` of https://github.com/tlhedrick/dltdv changes from one
+origin to the other). Places from its files are therefore shown 1 pixel too far to the right (and below): a file does
+not say which program wrote it. There is no lens distortion: pixels must be undistorted ones.
+
+Argus's profile has a line `camera fx w h cx cy AR k1 k2 t1 t2 k3` per camera and no poses. AR is fy / fx; k1, k2, t1,
+t2, k3 are OpenCV's k1, k2, p1, p2, k3. The format: `docs/user-guide.md` of the same repository (there k1, k2, k3 are
+r2, r4, r6). Argus takes cy and t1 for pixels counted upwards where it undistorts clicked points
+(`tools.undistort_pts`), but estimates them on images, downwards (`patterns`). Here they are those of images; the two
+differ only if cy is not in the middle or t1 is not 0. Argus undistorts with fx alone; AR is 1 in its profiles.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import rq
+
+from psotrack.errors import InputError
+from psotrack.geometry.rig_files.fields import CameraFields
+
+_COEFFICIENTS = 11
+#: Largest condition number of the 3 x 3 part. That of a camera is below the square of its focal length in pixels.
+_LARGEST_CONDITION = 1e12
+_ARGUS = ("camera", "fx", "w", "h", "cx", "cy", "AR", "k1", "k2", "t1", "t2", "k3")
+
+
+def is_dlt(text: str) -> bool:
+    """Whether a text is a table of 11 numbers per camera."""
+    return _COEFFICIENTS in _numbers(text)[0].shape
+
+
+def is_argus(text: str) -> bool:
+    """Whether a text is a table of 12 numbers per line, with an image size where Argus has it."""
+    values = _numbers(text)[0]
+    if values.shape[1] != len(_ARGUS):
+        return False
+    sizes = values[:, 2:4]
+    return bool((sizes >= 1).all() and (sizes == np.round(sizes)).all())
+
+
+def read_argus(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read the lenses; no camera is placed."""
+    values = _numbers(text)[0]
+    if values.shape[1] != len(_ARGUS):
+        raise InputError(path, expected=f"lines of {' '.join(_ARGUS)}", found="other text")
+    for number, fx, width, height, cx, cy, aspect, *dist in values.tolist():
+        K = [[fx, 0, cx], [0, fx * aspect, cy], [0, 0, 1]]
+        name = f"cam{number:.9g}"
+        yield CameraFields(path, name, {"size": [width, height], "K": K, "D": dist}, name)
+
+
+def read_dlt(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read DLT coefficients; the unit of length is open."""
+    values, header = _numbers(text)
+    if _COEFFICIENTS not in values.shape:
+        found = " x ".join(map(str, values.shape)) if values.size else "other text"
+        raise InputError(path, expected="11 lines of numbers, one column per camera", found=found)
+    by_column = len(values) == _COEFFICIENTS
+    columns = values.T if by_column else values
+    named = by_column and len(header) == len(columns)
+    names = header if named else [f"cam{index + 1}" for index in range(len(columns))]
+    matrices = [_projection(path, name, column) for name, column in zip(names, columns, strict=True)]
+    signs = np.sign([np.linalg.det(matrix[:, :3]) for matrix in matrices])
+    if not signs.sum():
+        raise InputError(
+            path,
+            expected="cameras most of which have the world's origin in front of them",
+            found="as many with it behind, so that the direction of v is not known",
+        )
+    upwards = bool(signs.sum() < 0)
+    for name, matrix in zip(names, matrices, strict=True):
+        K, R, t = _parts_of(matrix * [[1.0], [-1.0], [1.0]] if upwards else matrix)
+        values_of = {"K": K, "R": R, "t": t, "rows_upwards": upwards}
+        yield CameraFields(path, f"camera {name}", values_of, name)
+
+
+def _projection(path: Path, name: str, column: Float[np.ndarray, "11"]) -> Float[np.ndarray, "3 4"]:
+    """The projection matrix of 11 coefficients."""
+    fields = CameraFields(path, f"camera {name}", {"coefficients": column})
+    P = np.append(fields.array(("coefficients",), (_COEFFICIENTS,)), 1.0).reshape(3, 4)
+    if np.linalg.cond(P[:, :3]) > _LARGEST_CONDITION:
+        raise fields.error("", "the coefficients of a camera", "a determinant of 0")
+    return P
+
+
+def _parts_of(
+    P: Float[np.ndarray, "3 4"],
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """K, R and t of a projection matrix, which may have any scale and sign."""
+    P = P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3])
+    K, R = rq(P[:, :3])
+    flip = np.sign(np.diag(K))
+    K, R = K * flip, flip[:, None] * R
+    return K / K[2, 2], R, np.linalg.solve(K, P[:, 3])
+
+
+def _numbers(text: str) -> tuple[Float[np.ndarray, "rows columns"], Sequence[str]]:
+    """The numbers of a text and the words of a line above them; an empty table if the text is no table of numbers."""
+    rows = [
+        [word.strip("\"'") for word in re.split(r"[,;\t ]+", line.strip().strip(",;"))]
+        for line in text.splitlines()
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    header: list[str] = []
+    if rows and not _are_numbers(rows[0]):
+        header, *rows = rows
+    if not rows or len({len(row) for row in rows}) > 1 or not all(map(_are_numbers, rows)):
+        return np.zeros((0, 0)), header
+    return np.array(rows, np.float64), header
+
+
+def _are_numbers(words: list[str]) -> bool:
+    try:
+        return bool([float(word) for word in words])
+    except ValueError:
+        return False
