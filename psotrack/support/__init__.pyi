@@ -22,12 +22,10 @@ from .html import html_block, html_lines, html_paths, html_table
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
-from .program_seals import is_whole_program
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
 from .representation import short_repr
 from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
-from .stored_programs import load_ahead, stored_jit
 from .times import LEAST_STEP_S, first_repeat
 
 __all__ = [
@@ -67,11 +65,9 @@ __all__ = [
     "html_table",
     "identify",
     "is_moderate",
-    "is_whole_program",
     "joined",
     "keep_compiled",
     "left_over",
-    "load_ahead",
     "make_plugin",
     "map_in_processes",
     "nearest",
@@ -93,7 +89,6 @@ __all__ = [
     "share_processors",
     "short_repr",
     "standard_error",
-    "stored_jit",
     "terminal_bar",
     "toml_key",
     "toml_value",
