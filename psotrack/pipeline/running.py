@@ -112,7 +112,8 @@ def track_recording(
         raise tracked
     if run.clocks is None and len(recording.rig) > 2:
         advise_on_clocks(run, result.tracks)
-    return replace(tracked, record=with_real_time(tracked.record, time.perf_counter() - began))
+    record = {**tracked.record, "frames_asked": recording.num_instants}
+    return replace(tracked, record=with_real_time(record, time.perf_counter() - began))
 
 
 def track_runs(
