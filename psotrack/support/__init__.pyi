@@ -1,3 +1,4 @@
+from .calls import bind, check_records, checked
 from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
@@ -23,7 +24,7 @@ from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderat
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
-from .representation import short_repr
+from .representation import short_repr, short_text
 from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
 from .standard_errors import standard_error
 from .times import LEAST_STEP_S, first_repeat
@@ -47,10 +48,13 @@ __all__ = [
     "assign",
     "atomic_write",
     "atomic_write_all",
+    "bind",
     "check_file_name",
     "check_interface",
     "check_no_nul",
+    "check_records",
     "check_types",
+    "checked",
     "convert",
     "digest_file",
     "digest_record",
@@ -88,6 +92,7 @@ __all__ = [
     "save_figure",
     "share_processors",
     "short_repr",
+    "short_text",
     "standard_error",
     "terminal_bar",
     "toml_key",
