@@ -205,13 +205,12 @@ class TestPictures:
         plots.draw_trajectories(axes, est, two)
         assert labels(axes)[-1] == "false track"
 
-    @pytest.mark.parametrize("save", [plots.save_trajectories, plots.save_errors, plots.save_overview])
-    def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path, save):
+    def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path):
         path = tmp_path / "picture.png"
         est, ref = flights()
         # Each drone has a different error, so that no line hides another.
         est.position_m[..., 1] += [0.0, 0.03, 0.06]
-        save(path, est, ref)
+        plots.save_overview(path, est, ref)
         rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
         for drone in range(3):
             colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
@@ -222,9 +221,9 @@ class TestPictures:
         path = tmp_path / "picture.png"
         path.write_text("precious")
         with pytest.raises(OutputError, match="pass --force"):
-            plots.save_errors(path, *flights())
+            plots.save_overview(path, *flights())
         assert path.read_text() == "precious"
-        plots.save_errors(path, *flights(), force=True)
+        plots.save_overview(path, *flights(), force=True)
         assert cv2.imread(str(path)) is not None
 
     def test_recordings_without_common_frames_leave_no_file(self, tmp_path):

@@ -84,13 +84,15 @@ def test_messages_of_wrong_calls(call, message):
 
 def test_single_settings_by_the_last_part_of_their_names(monkeypatch):
     taken = {}
-    monkeypatch.setattr(
-        "psotrack.api.track_recording",
-        lambda recording, settings, **more: taken.update(more, settings=settings),
-    )
-    recording = pt.Recording("flight", Path(), ring_rig(2), {})
-    score = Dice()
-    pt.track(recording, {"swarm.kind": "joint"}, particles=50, smooth=True, method="fused", score=score)
+
+    def track_recording(recording, settings, **more):
+        taken.update(more, settings=settings)
+        raise SettingsError("the test", expected="to stop here", found="an end")
+
+    monkeypatch.setattr("psotrack.api.track_recording", track_recording)
+    recording, score = pt.Recording("flight", Path(), ring_rig(2), {}), Dice()
+    with pytest.raises(SettingsError, match="to stop here"):
+        pt.track(recording, {"swarm.kind": "joint"}, particles=50, smooth=True, method="fused", score=score)
     settings = taken["settings"]
     assert (settings.swarm.particles, settings.swarm.kind, settings.smooth) == (50, "joint", True)
     assert (settings.method, taken["score"]) == ("fused", score)

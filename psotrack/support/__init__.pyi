@@ -19,7 +19,7 @@ from .files import (
     refuse_to_overwrite,
     user_cache,
 )
-from .html import html_block, html_lines, html_paths, html_table
+from .html import html_block, html_lines, html_table
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
 from .processes import map_in_processes, with_traceback, worker_processes
@@ -65,7 +65,6 @@ __all__ = [
     "has_negative_eigenvalue",
     "html_block",
     "html_lines",
-    "html_paths",
     "html_table",
     "identify",
     "is_moderate",

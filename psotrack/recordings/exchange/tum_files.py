@@ -7,7 +7,7 @@ from pathlib import Path
 
 from psotrack.errors import InputError
 from psotrack.recordings.exchange.timed_paths import TimedPath, known_orientations
-from psotrack.trajectories.tum import read_tum_path
+from psotrack.trajectories.tum import read_tum
 
 
 def read_tum_files(where: Path, files: Sequence[Path]) -> list[TimedPath]:
@@ -20,7 +20,7 @@ def read_tum_files(where: Path, files: Sequence[Path]) -> list[TimedPath]:
         raise InputError(where, expected="a folder with TUM files", found="none")
     paths = []
     for file in files:
-        read = read_tum_path(file)
+        read = read_tum(file)
         orientation = (
             None if read.orientation_wxyz is None else known_orientations(read.orientation_wxyz[:, 0])
         )
