@@ -137,6 +137,23 @@ class TestTable:
         )
         assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
 
+    def test_text_begins_with_the_mean_error_and_prints_the_table(self):
+        evaluation = evaluate(*flights())
+        assert repr(evaluation).startswith("Evaluation(mean error 20.0 mm, missed 6.7%, MOTA 0.933, ")
+        assert str(evaluation).splitlines()[0].strip() == "50 frames, 3 drones, errors in mm"
+        assert len(str(evaluation).splitlines()) == len(print_table(tables.render(evaluation)))
+        assert next(iter(evaluation.to_dict())) == "mean_error_m"
+
+    def test_tracks_of_the_first_frames_are_said_to_end_early(self, caplog):
+        """Found: "missed 84 %" without a word after `track --frames 40`."""
+        est, ref = flights()
+        evaluate(est.at_frames(np.arange(48)), ref)
+        assert not caplog.messages
+        assert evaluate(est.at_frames(np.arange(8)), ref).missed_rate == pytest.approx(0.84)
+        (line,) = caplog.messages
+        assert "end with frame 7, the reference with frame 49" in line
+        assert "missed in the last 84 % of the frames" in line
+
     def test_data_frame_of_drones(self):
         est, ref = flights()
         est.status[:, 2] = Status.LOST

@@ -1,13 +1,14 @@
 """`Trajectories`: checks of the arrays, `seen`, and the choice of frames."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import jaxtyping
 import numpy as np
+import pandas as pd
 import pytest
 
 from psotrack.errors import InputError
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import Status, Trajectories, write_trajectories
 
 FRAMES, DRONES = 5, 3
 
@@ -109,3 +110,17 @@ def test_a_covariance_of_wrong_shape_is_refused():
     # With the tests' import hook the annotations are checked before the shapes; both messages name the field.
     with pytest.raises((InputError, jaxtyping.TypeCheckError), match="covariance_m2"):
         make_trajectories(covariance_m2=np.zeros((FRAMES, DRONES + 1, 3, 3)))
+
+
+def test_a_data_frame_has_the_columns_and_rows_of_a_file(tmp_path):
+    position_m = np.arange(18.0).reshape(3, 2, 3)
+    position_m[1, 1] = np.nan
+    tracks = Trajectories(
+        np.arange(3), np.arange(3) / 25, ("a", "b"), position_m, num_cameras=np.full((3, 2), 4)
+    )
+    write_trajectories(tmp_path / "tracks.csv", tracks)
+    frame, written = tracks.to_pandas(), pd.read_csv(tmp_path / "tracks.csv")
+    pd.testing.assert_frame_equal(frame, written, check_dtype=False)
+    assert frame["num_cameras"].tolist() == [4] * 6
+    unknown = replace(tracks, num_cameras=None).to_pandas()
+    assert unknown["num_cameras"].isna().all()

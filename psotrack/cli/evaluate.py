@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, SEQUENCE, TRACKS, plot_option
-from psotrack.cli.output import output_json
+from psotrack.cli.output import output_json, print_line
 from psotrack.errors import InputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ def evaluate(
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
         plots.save_overview(picture, estimate, truth, force=force)
+        print_line(quiet, json_path, f"{picture}: paths, and errors over time")
     if not quiet and json_path != Path("-"):
         title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
         Console().print(tables.render(evaluation, title=title))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.evaluation.records import drone_label
+from psotrack.evaluation.tables import drone_label
 from psotrack.support import drone_colour, save_figure
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Shaped
 from psotrack.trajectories.status import Status
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from psotrack.trajectories.trajectories import Trajectories
 
 #: Columns and their units, in written order.
@@ -72,6 +74,14 @@ def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows
             zip(ORIENTATION_COLUMNS, np.moveaxis(trajectories.orientation_wxyz, -1, 0), strict=True)
         )
     return {name: column.ravel() for name, column in columns.items()}
+
+
+def data_frame(trajectories: Trajectories) -> DataFrame:
+    """The columns as a data frame; what is not known is NaN."""
+    import pandas as pd
+
+    columns = columns_of(trajectories)
+    return pd.DataFrame({name: pd.Series(values).where(is_known(values)) for name, values in columns.items()})
 
 
 def is_known(column: Shaped[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
 from psotrack.support import html_block, short_repr
-from psotrack.trajectories.columns import columns_of, is_known
+from psotrack.trajectories.columns import data_frame
 from psotrack.trajectories.status import Status
 from psotrack.trajectories.summaries import drones_html
 
@@ -92,11 +92,7 @@ class Trajectories:
 
     def to_pandas(self) -> DataFrame:
         """A data frame with the rows and columns of a file of tracks; what is not known is NaN."""
-        import pandas as pd
-
-        return pd.DataFrame(
-            {name: pd.Series(values).where(is_known(values)) for name, values in columns_of(self).items()}
-        )
+        return data_frame(self)
 
     @property
     def num_frames(self) -> int:
