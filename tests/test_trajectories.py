@@ -6,9 +6,10 @@ import jaxtyping
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
-from psotrack.trajectories import Status, Trajectories, write_trajectories
+from psotrack.trajectories import Status, Trajectories, resample, write_trajectories
 
 FRAMES, DRONES = 5, 3
 
@@ -124,3 +125,32 @@ def test_a_data_frame_has_the_columns_and_rows_of_a_file(tmp_path):
     assert frame["num_cameras"].tolist() == [4] * 6
     unknown = replace(tracks, num_cameras=None).to_pandas()
     assert unknown["num_cameras"].isna().all()
+
+
+def test_orientations_between_samples_are_those_of_a_steady_turn():
+    """Found: splines went through the entries of rotation matrices, which are no steady turn between samples."""
+    sample_s, wanted_s = np.arange(6.0), np.linspace(0, 5, 21)
+
+    def turned(at_s):
+        return Rotation.from_rotvec(np.deg2rad(60) * at_s[:, None] * [0.0, 0.0, 1.0])
+
+    given = Trajectories(
+        np.arange(6),
+        sample_s,
+        ("a",),
+        np.zeros((6, 1, 3)),
+        orientation_wxyz=turned(sample_s).as_quat(scalar_first=True)[:, None],
+    )
+    found = resample(given, np.arange(21), wanted_s).orientation_wxyz[:, 0]
+    apart = Rotation.from_quat(found, scalar_first=True).inv() * turned(wanted_s)
+    assert np.rad2deg(apart.magnitude()).max() < 1e-6
+
+
+def test_orientations_are_unknown_in_gaps_and_in_half_turns():
+    turn_deg = np.array([[0.0], [5.0], [10.0], [175.0], [180.0], [185.0]])
+    turns = Rotation.from_rotvec(turn_deg * [0.0, 0.0, 1.0], degrees=True).as_quat(scalar_first=True)
+    sample_s = np.array([0.0, 0.04, 0.08, 0.12, 0.16, 1.0])
+    given = Trajectories(np.arange(6), sample_s, ("a",), np.zeros((6, 1, 3)), orientation_wxyz=turns[:, None])
+    wanted_s = np.array([0.02, 0.08, 0.1, 0.12, 0.14, 0.5, 1.0])
+    found = resample(given, np.arange(7), wanted_s).orientation_wxyz[:, 0]
+    assert np.isfinite(found).all(axis=1).tolist() == [True, True, False, True, True, False, True]
