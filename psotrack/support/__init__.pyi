@@ -1,4 +1,4 @@
-from .calls import bind, check_records, checked
+from .calls import check_records, checked
 from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
@@ -25,7 +25,18 @@ from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_
 from .processes import map_in_processes, with_traceback, worker_processes
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
 from .representation import short_repr, short_text
-from .schema import assign, check_types, convert, nearest, plain, read_json, read_toml, toml_key, toml_value
+from .schema import (
+    assign,
+    bind,
+    check_types,
+    convert,
+    nearest,
+    plain,
+    read_json,
+    read_toml,
+    toml_key,
+    toml_value,
+)
 from .standard_errors import standard_error
 from .times import LEAST_STEP_S, first_repeat
 

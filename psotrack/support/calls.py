@@ -13,7 +13,7 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +22,7 @@ from jaxtyping import AbstractArray, Shaped
 
 from psotrack.errors import SettingsError
 from psotrack.support.representation import short_text
-from psotrack.support.schema import nearest
+from psotrack.support.schema import bind
 
 _Called = TypeVar("_Called", bound=Callable[..., Any])
 
@@ -76,29 +76,6 @@ def checked(function: _Called) -> _Called:
         return function(*args, **kwargs)
 
     return typing.cast(_Called, call)
-
-
-def bind(
-    name: str, signature: inspect.Signature, args: Sequence[Any], kwargs: dict[str, Any]
-) -> inspect.BoundArguments:
-    """The arguments of a call by name.
-
-    Raises:
-        SettingsError: an argument is unknown, given twice, or missing.
-    """
-    try:
-        return signature.bind(*args, **kwargs)
-    except TypeError as error:
-        variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-        parameters = [key for key, each in signature.parameters.items() if each.kind not in variable]
-        unknown = next((each for each in kwargs if each not in parameters), None)
-        near = nearest(unknown, parameters) if unknown else ""
-        raise SettingsError(
-            name,
-            expected=f"the arguments {', '.join(parameters)}" if parameters else "no arguments",
-            found=f"{unknown}" if unknown else f"{error}",
-            remedy=f"did you mean {near}?" if near else "",
-        ) from None
 
 
 @functools.cache

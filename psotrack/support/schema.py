@@ -12,7 +12,8 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from inspect import BoundArguments, Parameter, Signature
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -187,6 +188,27 @@ def nearest(name: str, names: Iterable[str]) -> str:
             return others[close[0]]
     begun = [other for part, other in last_parts.items() if len(last) > 2 and part.startswith(last)]
     return begun[0] if len(begun) == 1 else ""
+
+
+def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str, Any]) -> BoundArguments:
+    """The arguments of a call by name.
+
+    Raises:
+        SettingsError: an argument is unknown, given twice, or missing.
+    """
+    try:
+        return signature.bind(*args, **kwargs)
+    except TypeError as error:
+        variable = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
+        parameters = [key for key, each in signature.parameters.items() if each.kind not in variable]
+        unknown = next((each for each in kwargs if each not in parameters), None)
+        near = nearest(unknown, parameters) if unknown else ""
+        raise SettingsError(
+            name,
+            expected=f"the arguments {', '.join(parameters)}" if parameters else "no arguments",
+            found=f"{unknown}" if unknown else f"{error}",
+            remedy=f"did you mean {near}?" if near else "",
+        ) from None
 
 
 def _can_hold(container: Any, token: str | int) -> bool:
