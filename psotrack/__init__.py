@@ -28,10 +28,26 @@ Names are loaded when they are first used. Importing the package has no effects:
 JAX is changed. Every part of the package is a room with its own documentation: `help(psotrack.tracking)`, for example.
 """
 
+import inspect as _inspect
+from dataclasses import is_dataclass as _is_dataclass
 from importlib.metadata import version as _version
+from typing import Any as _Any
 
 import lazy_loader
 
 __version__ = _version("psotrack")
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> _Any:
+    """A public name; calls of functions and of records are checked (`psotrack.support.calls`)."""
+    value = _load(name)
+    if name in globals():
+        from psotrack.support import check_records, checked
+
+        if _inspect.isfunction(value):
+            value = globals()[name] = checked(value)
+        elif _is_dataclass(value):
+            check_records(value)
+    return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import UInt8
@@ -14,7 +14,7 @@ from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.pipeline import Parts, TrackedRecording, check_detections, track_recording
 from psotrack.recordings import Recording
 from psotrack.recordings.datasets import open_recording
-from psotrack.settings import TrackSettings
+from psotrack.settings import TrackSettings, full_name
 from psotrack.support import no_progress, progress_bar, user_cache
 
 
@@ -42,7 +42,7 @@ def track(
     cache: Path | str | None = None,
     jobs: int | None = None,
     progress: bool = False,
-    **brought: Unpack[Parts],
+    **more: Any,
 ) -> TrackedRecording:
     """Track the drones of a recording.
 
@@ -50,21 +50,30 @@ def track(
 
     Args:
         recording: recording from `read_recording`, or its `recording.toml` or folder.
-        settings: settings, or dotted names and values such as {"swarm.particles": 50}; None takes the defaults.
+        settings: settings, or names and values such as {"swarm.particles": 50}; None takes the defaults.
         cache: folder of stored silhouettes and detections; None takes the user's cache folder.
         jobs: number of processes for the silhouettes; None is one per processor.
         progress: whether to show progress bars.
-        **brought: parts that the caller brings: `search`, `score`, `method`, `background`, `detector` (see `Parts`).
+        **more: single settings by the last part of their names, such as `particles=50`; and parts that the caller
+            brings: `search`, `score`, `method`, `background`, `detector` (see `Parts`).
 
     Raises:
         InputError: a file cannot be used, or no drones are found.
         SettingsError: a setting does not exist, or does not fit the recording.
     """
+    # A text is the name of a part, and so a setting.
+    parts = {
+        name: part
+        for name, part in more.items()
+        if name in Parts.__annotations__ and not isinstance(part, str)
+    }
+    single = {full_name(name): value for name, value in more.items() if name not in parts}
     if not isinstance(settings, TrackSettings):
         settings = TrackSettings().changed(settings or {})
+    settings = settings.changed(single)
     if not isinstance(recording, Recording):
         recording = read_recording(recording)
-        if "detector" not in brought:
+        if "detector" not in parts:
             check_detections(recording, settings)
     return track_recording(
         recording,
@@ -72,7 +81,7 @@ def track(
         cache=user_cache() if cache is None else cache,
         jobs=jobs,
         report=progress_bar if progress else no_progress,
-        **brought,
+        **cast(Parts, parts),
     )
 
 

@@ -7,6 +7,7 @@ fast.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
@@ -16,7 +17,7 @@ from msgspec import Meta
 
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import SilhouetteSettings
-from psotrack.support import NotNegative, Positive, Share, check_types, nearest, plain
+from psotrack.support import NotNegative, Positive, Share, bind, check_types, nearest, plain
 
 SwarmKind = Literal["joint", "per-drone"]
 Clocks = Literal["given", "auto"]
@@ -44,7 +45,15 @@ def _metavar(values: str) -> Meta:
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
-class _Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Checked(msgspec.StructMeta):
+    """The class of records whose wrong names of fields are answered like wrong options."""
+
+    def __call__(self, *args: Any, **values: Any) -> Any:
+        bind(f"{self.__name__}()", inspect.signature(self), args, values)
+        return super().__call__(*args, **values)
+
+
+class _Settings(msgspec.Struct, metaclass=_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of the records: all values must have the annotated types, lie in their ranges and be finite.
 
     Attributes:
@@ -323,9 +332,7 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         parts: dict[str, dict[str, Any]] = {}
         for name, value in values.items():
             if name not in setting_names():
-                near = nearest(name, setting_names())
-                remedy = f"did you mean {near}?" if near else ""
-                raise SettingsError(name, expected="the name of a setting", found=name, remedy=remedy)
+                raise _unknown(name)
             part, _, field = name.rpartition(".")
             parts.setdefault(part, {})[field] = plain(value)
         own = parts.pop("", {})
@@ -337,6 +344,29 @@ class TrackSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
 def setting_names() -> tuple[str, ...]:
     """Dotted names of all settings, such as `seed`, `swarm.particles`, `silhouettes.reduction`."""
     return tuple(dict(flatten(msgspec.to_builtins(TrackSettings()))))
+
+
+def full_name(name: str) -> str:
+    """The dotted name of a setting that is named by its last part, such as `swarm.particles` by `particles`.
+
+    Raises:
+        SettingsError: no setting has the name, or several have it.
+    """
+    if name in setting_names():
+        return name
+    found = [other for other in setting_names() if other.rpartition(".")[2] == name]
+    if len(found) > 1:
+        remedy = f"pass it in a dict as second argument, such as {{{found[0]!r}: ...}}"
+        raise SettingsError(name, expected=f"one of {', '.join(found)}", found=name, remedy=remedy)
+    if not found:
+        raise _unknown(name)
+    return found[0]
+
+
+def _unknown(name: str) -> SettingsError:
+    near = nearest(name, setting_names())
+    remedy = f"did you mean {near}?" if near else ""
+    return SettingsError(name, expected="the name of a setting", found=name, remedy=remedy)
 
 
 def flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

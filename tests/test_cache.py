@@ -1,9 +1,7 @@
 """`psotrack cache`: entries are listed, checked and removed; what is no entry stays."""
 
-import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -23,8 +21,7 @@ from psotrack.support import atomic_write
 Run = Callable[..., Output]
 SIZE_WH = (64, 48)
 DAY_S = 24 * 3600
-NAME_OF_PROGRAM = f"psotrack.tracking.swarm.batch._track_batch-{'a' * 40}.program"
-NAME_IN_CACHE_OF_JAX = f"jit__scores-{'a' * 64}-cache"
+NAME_OF_PROGRAM = f"jit__scores-{'a' * 64}-cache"
 
 
 def _compute(tmp_path: Path) -> Silhouettes:
@@ -49,10 +46,8 @@ def cache(tmp_path: Path) -> Path:
     keys = _compute(tmp_path).keys
     folder = tmp_path / "cache"
     (folder / "compiled").mkdir()
-    content = b"a program"
-    program = b"psotrack program 1\n" + hashlib.sha256(content).digest() + content
-    (folder / "compiled" / NAME_OF_PROGRAM).write_bytes(program)
-    (folder / "compiled" / "notes.program").write_text("mine")
+    (folder / "compiled" / NAME_OF_PROGRAM).write_bytes(b"a program")
+    (folder / "compiled" / "notes-cache").write_text("mine")
     (folder / ("c" * 40)).mkdir()
     (folder / ("c" * 40) / "thesis.txt").write_text("mine")
     (tmp_path / "elsewhere").mkdir()
@@ -72,7 +67,7 @@ def _listed(run: Run, cache: Path) -> list[dict[str, object]]:
 
 
 def _strangers(cache: Path) -> list[Path]:
-    paths = cache / "compiled" / "notes.program", cache / ("c" * 40) / "thesis.txt", cache / ("d" * 40)
+    paths = cache / "compiled" / "notes-cache", cache / ("c" * 40) / "thesis.txt", cache / ("d" * 40)
     return [path for path in paths if path.exists()]
 
 
@@ -95,15 +90,13 @@ def test_check_names_what_is_damaged(run_psotrack: Run, cache: Path) -> None:
     whole = run_psotrack("cache", "check", "--cache", cache)
     assert (whole.code, "0 damaged" in whole.out) == (0, True)
     silhouettes = Path(str(_listed(run_psotrack, cache)[0]["path"]))
-    program = cache / "compiled" / NAME_OF_PROGRAM
-    of_jax = shutil.copy(program, cache / "compiled" / NAME_IN_CACHE_OF_JAX)
-    for path in (silhouettes / "c" / "0" / "0" / "0", program, of_jax):
-        content = bytearray(path.read_bytes())
-        content[-1] ^= 1
-        path.write_bytes(content)
+    chunk = silhouettes / "c" / "0" / "0" / "0"
+    content = bytearray(chunk.read_bytes())
+    content[-1] ^= 1
+    chunk.write_bytes(content)
     result = run_psotrack("cache", "check", "--cache", cache, "--json", "-")
     assert result.code == 2
-    assert set(json.loads(result.out)["damaged"]) == {str(silhouettes), str(program), str(of_jax)}
+    assert set(json.loads(result.out)["damaged"]) == {str(silhouettes)}
 
 
 def test_prune_removes_what_is_old_and_then_what_is_too_much(run_psotrack: Run, cache: Path) -> None:

@@ -69,17 +69,15 @@ def test_a_program_is_compiled_once(tmp_path: Path) -> None:
 
 
 def test_a_damaged_entry_is_named_and_replaced(tmp_path: Path) -> None:
-    """JAX by itself does not notice each changed bit, and never replaces an entry."""
+    """JAX by itself never replaces an entry, such as one that a full disk cut short."""
     run(tmp_path)
     whole = entry(tmp_path).read_bytes()
-    places = [*range(0, len(whole), len(whole) // 40), len(whole) - 1]
-    damaged = [whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :] for place in places]
-    damaged += [b"", whole[:300], whole[:-1]]
+    damaged = [b"", whole[:300], whole[:-1], b"foreign" * 99]
     for number, content in enumerate(damaged):
         (tmp_path / f"{number}.damaged").write_bytes(content)
     printed, said = run_program(PROGRAM + AGAIN, tmp_path)
     assert printed.splitlines()[1:] == [RESULT] * len(damaged)
-    line = "damaged entry, or entry of an older version: jit_twice_the_sine; the program is compiled again"
+    line = "damaged entry jit_twice_the_sine; the program is compiled again"
     assert said.splitlines() == [f"{tmp_path}: {line}"] * len(damaged)
     assert entry(tmp_path).stat().st_size == pytest.approx(len(whole), rel=0.1)  # It holds its compile time.
 

@@ -197,8 +197,8 @@ KEYS = [
 
 
 class TestContract:
-    def test_keys_in_order(self):
-        assert list(evaluate(TRUTH, TRUTH).to_dict()) == KEYS
+    def test_keys(self):
+        assert sorted(evaluate(TRUTH, TRUTH).to_dict()) == sorted(KEYS)
 
     def test_json_is_strict_if_values_are_undefined(self):
         text = json.dumps(evaluate(on_x_axis([0] * 5), TRUTH).to_dict(), allow_nan=False)

@@ -137,6 +137,23 @@ class TestTable:
         )
         assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
 
+    def test_text_begins_with_the_mean_error_and_prints_the_table(self):
+        evaluation = evaluate(*flights())
+        assert repr(evaluation).startswith("Evaluation(mean error 20.0 mm, missed 6.7%, MOTA 0.933, ")
+        assert str(evaluation).splitlines()[0].strip() == "50 frames, 3 drones, errors in mm"
+        assert len(str(evaluation).splitlines()) == len(print_table(tables.render(evaluation)))
+        assert next(iter(evaluation.to_dict())) == "mean_error_m"
+
+    def test_tracks_of_the_first_frames_are_said_to_end_early(self, caplog):
+        """Found: "missed 84 %" without a word after `track --frames 40`."""
+        est, ref = flights()
+        evaluate(est.at_frames(np.arange(48)), ref)
+        assert not caplog.messages
+        assert evaluate(est.at_frames(np.arange(8)), ref).missed_rate == pytest.approx(0.84)
+        (line,) = caplog.messages
+        assert "end with frame 7, the reference with frame 49" in line
+        assert "missed in the last 84 % of the frames" in line
+
     def test_data_frame_of_drones(self):
         est, ref = flights()
         est.status[:, 2] = Status.LOST
@@ -205,13 +222,12 @@ class TestPictures:
         plots.draw_trajectories(axes, est, two)
         assert labels(axes)[-1] == "false track"
 
-    @pytest.mark.parametrize("save", [plots.save_trajectories, plots.save_errors, plots.save_overview])
-    def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path, save):
+    def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path):
         path = tmp_path / "picture.png"
         est, ref = flights()
         # Each drone has a different error, so that no line hides another.
         est.position_m[..., 1] += [0.0, 0.03, 0.06]
-        save(path, est, ref)
+        plots.save_overview(path, est, ref)
         rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
         for drone in range(3):
             colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
@@ -222,9 +238,9 @@ class TestPictures:
         path = tmp_path / "picture.png"
         path.write_text("precious")
         with pytest.raises(OutputError, match="pass --force"):
-            plots.save_errors(path, *flights())
+            plots.save_overview(path, *flights())
         assert path.read_text() == "precious"
-        plots.save_errors(path, *flights(), force=True)
+        plots.save_overview(path, *flights(), force=True)
         assert cv2.imread(str(path)) is not None
 
     def test_recordings_without_common_frames_leave_no_file(self, tmp_path):

@@ -16,7 +16,7 @@ from psotrack.foreground.detection import LabelSettings, write_data_set
 from psotrack.foreground.silhouettes import masks_out
 from psotrack.live import recording_folder
 from psotrack.pipeline.archives import Manifest
-from psotrack.pipeline.archives.sealed_zip import write_sealed
+from psotrack.pipeline.archives.zip_file import write_archive
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange import Footage, export_tracks
 from psotrack.show.flights import TrackedFlight
@@ -189,7 +189,7 @@ def test_names_of_files_in_an_archive(tmp_path):
     manifest = Manifest(psotrack="0.2.0", sequence="flight", tracks="tracks.csv", settings={})
     for name in ("detections/../evil.csv", "silhouettes/..", "/evil", "a\\b"):
         with pytest.raises(InputError, match=r"a\.psotrack: expected names of files inside of the folder"):
-            write_sealed(tmp_path / "a.psotrack", manifest, {name: b"x"}, force=False, report=no_progress)
+            write_archive(tmp_path / "a.psotrack", manifest, {name: b"x"}, force=False, report=no_progress)
     assert not list(tmp_path.iterdir())
 
 

@@ -10,9 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import ring_rig
 
 import psotrack as pt
-from psotrack.errors import SettingsError
+from psotrack.errors import PsotrackError, SettingsError
 from psotrack.foreground.silhouettes import ForegroundSettings
 from psotrack.geometry import project_boxes
 from psotrack.support import short_repr
@@ -26,6 +27,76 @@ def test_every_name_is_there_and_documented():
         if inspect.isclass(value) or inspect.isfunction(value):
             assert len(value.__doc__) > 30, name
         assert name in pt.__doc__, name
+
+
+#: Arguments that are right nowhere, but for a text that is the path of no file.
+WRONG = (object(), None, 3, 2.5, "nothing", b"nothing", ())
+CALLED = [
+    name
+    for name in pt.__all__
+    if callable(getattr(pt, name)) and not getattr(getattr(pt, name), "_is_protocol", False)
+]
+
+
+@pytest.mark.parametrize("name", CALLED)
+def test_a_wrong_call_is_answered_like_a_wrong_option(name, tmp_path, monkeypatch):
+    """Found: TypeError and AttributeError from the middle of the package."""
+    monkeypatch.chdir(tmp_path)
+    function = getattr(pt, name)
+    for args, values, words in (
+        ([], {"unknown": 1}, r"\(\): expected .*, found unknown"),
+        ([1] * 40, {}, r"\(\): expected .*, found too many positional arguments"),
+    ):
+        if name != "track" or args:
+            with pytest.raises(SettingsError, match=rf"^{name}{words}"):
+                function(*args, **values)
+    needed = [each for each in inspect.signature(function).parameters.values() if each.default is each.empty]
+    checks_fields = not inspect.isclass(function) or hasattr(function, "__post_init__")
+    for wrong in WRONG if checks_fields else ():
+        args = [wrong for each in needed if each.kind is each.POSITIONAL_OR_KEYWORD]
+        values = {each.name: wrong for each in needed if each.kind is each.KEYWORD_ONLY}
+        if args or values:
+            with pytest.raises(PsotrackError, match=r"expected .*, found ") as error:
+                function(*args, **values)
+            assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: pt.evaluate(1, 2), "evaluate(), traj_est: expected a Trajectories, found 1"),
+        (lambda: pt.read_trajectories(None), "path: expected a path or text, found None"),
+        (lambda: pt.track("missing"), "missing: expected a recording.toml"),
+        (
+            lambda: pt.track("missing", particles="many"),
+            'swarm.particles: expected a whole number, found "many"',
+        ),
+        (lambda: pt.track("missing", particels=3), "found particels; did you mean swarm.particles?"),
+        (lambda: pt.track("missing", kind="hard"), "expected one of swarm.kind, score.kind, found kind"),
+        (lambda: pt.SwarmSettings(particels=3), "found particels; did you mean particles?"),
+        (lambda: pt.read_rig("rig.toml", metres=1), "found metres; did you mean metres_per_unit?"),
+    ],
+)
+def test_messages_of_wrong_calls(call, message):
+    with pytest.raises(PsotrackError, match=re.escape(message)):
+        call()
+
+
+def test_single_settings_by_the_last_part_of_their_names(monkeypatch):
+    taken = {}
+
+    def track_recording(recording, settings, **more):
+        taken.update(more, settings=settings)
+        raise SettingsError("the test", expected="to stop here", found="an end")
+
+    monkeypatch.setattr("psotrack.api.track_recording", track_recording)
+    recording, score = pt.Recording("flight", Path(), ring_rig(2), {}), Dice()
+    with pytest.raises(SettingsError, match="to stop here"):
+        pt.track(recording, {"swarm.kind": "joint"}, particles=50, smooth=True, method="fused", score=score)
+    settings = taken["settings"]
+    assert (settings.swarm.particles, settings.swarm.kind, settings.smooth) == (50, "joint", True)
+    assert (settings.method, taken["score"]) == ("fused", score)
+    assert "method" not in taken
 
 
 def test_importing_loads_nothing_heavy():

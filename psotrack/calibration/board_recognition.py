@@ -120,7 +120,7 @@ def detect_board(square_m: float, images: Sequence[UInt8[np.ndarray, "height wid
     if most < _LEAST_MARKERS:
         return Board(_size_of_chessboard(images), square_m, None, kind="chessboard")
     largest = f"{family}_1000" if _FAMILIES[family] else family
-    seen = _seen_markers(largest, [255 - grey if inverted else grey for grey in images])
+    seen = _seen_markers(family, [255 - grey if inverted else grey for grey in images])
     # Those first that show most of the board.
     order = sorted(range(len(images)), key=lambda index: -len(seen[index]))
     clearest = [images[index] for index in order]

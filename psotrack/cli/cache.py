@@ -67,7 +67,7 @@ def list_command(output: Output, cache: Path | None) -> None:
 @JSON
 @pass_output
 def check(output: Output, cache: Path | None) -> None:
-    """Check every byte of the silhouettes and of the stored programs, and name what is damaged.
+    """Check every byte of the silhouettes, and name what is damaged.
 
     The exit code is 2 if an entry is damaged. The next run that needs a damaged entry makes it anew.
 

@@ -9,6 +9,7 @@ References:
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -35,6 +36,11 @@ from psotrack.trajectories.association import (
     paired_values,
     partners_per_frame,
 )
+
+logger = logging.getLogger(__name__)
+
+#: Share of the frames after the end of the tracks that is worth a warning.
+_MUCH = 0.05
 
 
 def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
@@ -73,6 +79,15 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     """
     pair = align(traj_est, traj_ref)
     known = pair.truth_known
+    beyond = int((pair.frame > traj_est.frame[-1]).sum())
+    if beyond > _MUCH * len(pair.frame):
+        logger.warning(
+            "the tracks end with frame %d, the reference with frame %d: all drones count as missed in the last %.0f %% "
+            "of the frames; were only the first frames tracked (--frames)?",
+            traj_est.frame[-1],
+            pair.frame[-1],
+            100 * beyond / len(pair.frame),
+        )
     partner = fixed_identity(pair)
     followed = _follow(pair, partner)
 

@@ -1,6 +1,6 @@
 """Plots of an estimate and its reference: paths in 3D, and the error over time.
 
-Functions `draw_*` draw into given axes, so that other figures can use them; functions `save_*` write a PNG. Matplotlib
+Functions `draw_*` draw into given axes, so that other figures can use them; `save_overview` writes a PNG. Matplotlib
 is imported only for drawing; `pyplot` is never imported, because it has global state.
 """
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.evaluation.records import drone_label
+from psotrack.evaluation.tables import drone_label
 from psotrack.support import drone_colour, save_figure
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (
@@ -40,37 +40,15 @@ _BARS_TOP = 0.975
 _BARS_STEP = 0.025
 
 
-def save_trajectories(
+def save_overview(
     path: Path | str, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
 ) -> None:
-    """Save a PNG of the paths in 3D; see `draw_trajectories`.
+    """Save a PNG of the paths in 3D and the error over time.
 
     Raises:
         InputError: the estimate and the reference do not fit together.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-
-    def draw(figure: Figure) -> None:
-        draw_trajectories(figure.add_subplot(projection="3d"), traj_est, traj_ref)
-
-    save_figure(Path(path), (7.5, 5.5), draw, force)
-
-
-def save_errors(
-    path: Path | str, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
-) -> None:
-    """Save a PNG of the error over time; see `draw_errors`. It raises the same errors as `save_trajectories`."""
-
-    def draw(figure: Figure) -> None:
-        draw_errors(figure.add_subplot(), traj_est, traj_ref)
-
-    save_figure(Path(path), (9.0, 4.0), draw, force)
-
-
-def save_overview(
-    path: Path | str, traj_est: Trajectories, traj_ref: Trajectories, *, force: bool = False
-) -> None:
-    """Save a PNG of the paths and the error over time. It raises the same errors as `save_trajectories`."""
 
     def draw(figure: Figure) -> None:
         grid = figure.add_gridspec(2, 1, height_ratios=(1.6, 1.0))

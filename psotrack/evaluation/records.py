@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from psotrack.support import short_repr
+from psotrack.evaluation.tables import as_text, to_html
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Gospa:
 
 
 @dataclass(frozen=True)
-class DroneEvaluation(ErrorSummary, PathErrors, Consistency):
+class DroneEvaluation(Consistency, PathErrors, ErrorSummary):
     """Errors of one drone of the reference.
 
     Attributes:
@@ -104,13 +104,8 @@ class DroneEvaluation(ErrorSummary, PathErrors, Consistency):
     offset_frame: Literal["body", "world"] | None
 
 
-def drone_label(drone: str, track: str | None) -> str:
-    """Name of a drone in the reference, and of the track that follows it, such as "dron2 (track 0)"."""
-    return drone if track in (None, drone) else f"{drone} (track {track})"
-
-
 @dataclass(frozen=True, repr=False)
-class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
+class Evaluation(Consistency, PathErrors, Gospa, Hota, ErrorSummary):
     """Figures of an estimate compared with its reference; see `evaluate` for the definitions."""
 
     frames: int
@@ -124,47 +119,22 @@ class Evaluation(ErrorSummary, Hota, Gospa, PathErrors, Consistency):
     offset_removed_mean_error_m: float | None
     per_drone: tuple[DroneEvaluation, ...]
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        mean = "unknown" if self.mean_error_m is None else f"{1e3 * self.mean_error_m:.1f} mm"
+        return (
+            f"Evaluation(mean error {mean}, missed {self.missed_rate:.1%}, MOTA {self.mota:.3f}, "
+            f"identity switches {self.id_switches}; {self.drones} drones, {self.frames} frames)"
+        )
+
+    def __str__(self) -> str:
+        """The table of `psotrack evaluate`."""
+        return as_text(self)
 
     def _repr_html_(self) -> str:
         """What a notebook shows: the table of `psotrack evaluate`."""
-        from psotrack.evaluation.tables import to_html
-
         return to_html(self)
 
     def to_dict(self) -> dict[str, Any]:
         """The figures with the contract's keys, for strict JSON; None becomes null."""
-        values = asdict(self)
-        return {key: values[key] for key in _CONTRACT} | {
-            "per_drone": [{key: drone[key] for key in _CONTRACT_DRONE} for drone in values["per_drone"]]
-        }
-
-
-_ERRORS = ("mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m")
-_PATHS = ("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg")
-_CONSISTENCY = (
-    "inside_90_rate",
-    "mean_nees",
-    "offset_removed_inside_90_rate",
-    "offset_removed_mean_nees",
-)
-#: Keys of `Evaluation.to_dict`, in this order.
-_CONTRACT = (
-    *("frames", "drones"),
-    *_ERRORS,
-    *("missed_rate", "id_switches", "mota", "motp_m", "idf1"),
-    *("matched_mean_error_m", "offset_removed_mean_error_m"),
-    *("hota", "deta", "assa", "loca"),
-    *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
-    *_PATHS,
-    *_CONSISTENCY,
-    "per_drone",
-)
-_CONTRACT_DRONE = (
-    *("drone", "estimate", "frames"),
-    *_ERRORS,
-    *("missed_rate", "offset_removed_mean_error_m"),
-    *("offset_m", "offset_standard_error_m", "offset_frame"),
-    *_PATHS,
-    *_CONSISTENCY,
-)
+        drones = [{"drone": each.drone, "estimate": each.estimate, **asdict(each)} for each in self.per_drone]
+        return {**asdict(self), "per_drone": drones}

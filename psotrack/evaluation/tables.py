@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from psotrack.evaluation.records import DroneEvaluation, Evaluation, drone_label
 from psotrack.support import html_block, html_lines, html_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+    from psotrack.evaluation.records import DroneEvaluation, Evaluation
 
 _COLUMNS = ("mean", "median", "std", "p95", "max", "missed", "centred", "offset x y z")
 
@@ -43,25 +45,28 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
     table.add_column("drone", overflow="fold", max_width=20)
     for name in _COLUMNS:
         table.add_column(name, justify="right", no_wrap=True)
-    for drone in evaluation.per_drone:
-        table.add_row(
-            Text(drone_label(drone.drone, drone.estimate)), *_cells(drone, unit), unit.vector(drone.offset_m)
-        )
+    *drones, together = _rows(evaluation, unit)
+    for name, *cells in drones:
+        table.add_row(Text(name), *cells)
     table.add_section()
-    table.add_row("all", *_cells(evaluation, unit), "", style="bold")
+    table.add_row(*together, style="bold")
     return table
+
+
+def as_text(evaluation: Evaluation) -> str:
+    """The table as text without colours."""
+    console = Console(width=80, color_system=None)
+    with console.capture() as capture:
+        console.print(render(evaluation))
+    return capture.get().rstrip()
 
 
 def to_html(evaluation: Evaluation) -> str:
     """The same as HTML for notebooks."""
     unit = _unit_of(evaluation)
-    rows = [
-        [drone_label(drone.drone, drone.estimate), *_cells(drone, unit), unit.vector(drone.offset_m)]
-        for drone in evaluation.per_drone
-    ]
     return html_block(
         f"Evaluation: {_heading(evaluation, unit)}",
-        html_table(["drone", *_COLUMNS], [*rows, ["all", *_cells(evaluation, unit), ""]]),
+        html_table(["drone", *_COLUMNS], _rows(evaluation, unit)),
         html_lines(_scores(evaluation, unit)),
     )
 
@@ -114,16 +119,24 @@ def _heading(evaluation: Evaluation, unit: _Unit) -> str:
     return f"{evaluation.frames} frames, {evaluation.drones} drones, errors in {unit.name}"
 
 
+def drone_label(drone: str, track: str | None) -> str:
+    """Name of a drone in the reference, and of the track that follows it, such as "dron2 (track 0)"."""
+    return drone if track in (None, drone) else f"{drone} (track {track})"
+
+
+def _rows(evaluation: Evaluation, unit: _Unit) -> list[list[str]]:
+    """The cells of each drone, and last of all drones."""
+    drones = [
+        [drone_label(drone.drone, drone.estimate), *_cells(drone, unit), unit.vector(drone.offset_m)]
+        for drone in evaluation.per_drone
+    ]
+    return [*drones, ["all", *_cells(evaluation, unit), ""]]
+
+
 def _cells(errors: Evaluation | DroneEvaluation, unit: _Unit) -> list[str]:
-    values_m = (
-        errors.mean_error_m,
-        errors.median_error_m,
-        errors.std_error_m,
-        errors.p95_error_m,
-        errors.max_error_m,
-    )
+    names = ("mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m")
     return [
-        *map(unit.number, values_m),
+        *(unit.number(getattr(errors, name)) for name in names),
         f"{errors.missed_rate:.1%}",
         unit.number(errors.offset_removed_mean_error_m),
     ]
@@ -131,16 +144,22 @@ def _cells(errors: Evaluation | DroneEvaluation, unit: _Unit) -> list[str]:
 
 def _scores(evaluation: Evaluation, unit: _Unit) -> dict[str, str]:
     """Label and sentence of each score; the second sentence about a label has none."""
-    # These errors are always below the gate of matching, so millimetres fit.
+    # Errors of matched pairs, and GOSPA, have at most the size of the gate, so millimetres fit.
     matched = _MILLIMETRES.number(evaluation.matched_mean_error_m)
+    motp = _MILLIMETRES.number(evaluation.motp_m)
+    parts = ("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m")
+    gospa, localisation, missed, false = (_MILLIMETRES.number(getattr(evaluation, part)) for part in parts)
     lines = {
-        "CLEAR": _clear(evaluation),
+        "CLEAR": (
+            f"MOTA {evaluation.mota:.3f}, MOTP {motp} mm, IDF1 {evaluation.idf1:.3f}, "
+            f"identity switches {evaluation.id_switches}"
+        ),
         "": f"mean when matched anew in each frame {matched} mm",
         "HOTA": (
             f"{evaluation.hota:.3f}: DetA {evaluation.deta:.3f}, AssA {evaluation.assa:.3f}, "
             f"LocA {_score(evaluation.loca)}"
         ),
-        "GOSPA": _gospa(evaluation),
+        "GOSPA": f"{gospa} mm: localisation {localisation}, missed {missed}, false {false}",
         "RMSE": _paths(evaluation, unit),
     }
     if evaluation.inside_90_rate is not None:
@@ -160,27 +179,6 @@ def _centred(evaluation: Evaluation, unit: _Unit) -> str:
     parts_m = [part_m for drone in drones for part_m in drone.offset_standard_error_m or ()]
     known = f", known to {unit.number(max(parts_m))} {unit.name}" if parts_m else ""
     return f"without each drone's offset ({' or '.join(frames) or 'no'} frame{known})"
-
-
-def _clear(evaluation: Evaluation) -> str:
-    return (
-        f"MOTA {evaluation.mota:.3f}, MOTP {_MILLIMETRES.number(evaluation.motp_m)} mm, IDF1 {evaluation.idf1:.3f}, "
-        f"identity switches {evaluation.id_switches}"
-    )
-
-
-def _gospa(evaluation: Evaluation) -> str:
-    # GOSPA has the size of its cut-off, so millimetres fit.
-    total, localisation, missed, false = map(
-        _MILLIMETRES.number,
-        (
-            evaluation.gospa_m,
-            evaluation.gospa_localisation_m,
-            evaluation.gospa_missed_m,
-            evaluation.gospa_false_m,
-        ),
-    )
-    return f"{total} mm: localisation {localisation}, missed {missed}, false {false}"
 
 
 def _paths(evaluation: Evaluation, unit: _Unit) -> str:

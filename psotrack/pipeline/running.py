@@ -40,7 +40,7 @@ from psotrack.pipeline.results import (
 )
 from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
-from psotrack.support import Report, load_ahead, no_progress, processors
+from psotrack.support import Report, no_progress, processors
 from psotrack.tracking.births import MovingPoints, first_drones, given_state, known_motion, start_source
 from psotrack.tracking.camera_errors import (
     CameraViews,
@@ -106,14 +106,14 @@ def track_recording(
             scaled = scaled_settings(settings.silhouettes, recording)
             model = find_background(settings.silhouettes.background, scaled)
             parts = parts if isinstance(model, Living) else {**parts, "background": model}
-    load_ahead()
     ((run, result),) = _track(recording, silhouettes, [settings], parts, report)
     tracked = finish(run, result)
     if isinstance(tracked, InputError):
         raise tracked
     if run.clocks is None and len(recording.rig) > 2:
         advise_on_clocks(run, result.tracks)
-    return replace(tracked, record=with_real_time(tracked.record, time.perf_counter() - began))
+    record = {**tracked.record, "frames_asked": recording.num_instants}
+    return replace(tracked, record=with_real_time(record, time.perf_counter() - began))
 
 
 def track_runs(

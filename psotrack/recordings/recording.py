@@ -108,7 +108,7 @@ class Recording:
         return inventory_html(self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """Cameras, videos, detections and reference, as plain data: `psotrack init --show --json`. All detections are read.
+        """Cameras, videos, detections and reference as plain data: `psotrack init --show --json`; detections are read.
 
         Raises:
             InputError: a file of detections cannot be read.

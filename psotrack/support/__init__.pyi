@@ -1,3 +1,4 @@
+from .calls import check_records, checked
 from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
@@ -18,7 +19,7 @@ from .files import (
     refuse_to_overwrite,
     user_cache,
 )
-from .html import html_block, html_lines, html_paths, html_table
+from .html import html_block, html_lines, html_table
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,
@@ -30,11 +31,11 @@ from .plugins import (
     register_plugin,
 )
 from .processes import map_in_processes, with_traceback, worker_processes
-from .program_seals import is_whole_program
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
-from .representation import short_repr
+from .representation import short_repr, short_text
 from .schema import (
     assign,
+    bind,
     check_types,
     convert,
     nearest,
@@ -46,7 +47,6 @@ from .schema import (
     toml_value,
 )
 from .standard_errors import standard_error
-from .stored_programs import load_ahead, stored_jit
 from .times import LEAST_STEP_S, first_repeat
 
 __all__ = [
@@ -68,10 +68,13 @@ __all__ = [
     "assign",
     "atomic_write",
     "atomic_write_all",
+    "bind",
     "check_file_name",
     "check_interface",
     "check_no_nul",
+    "check_records",
     "check_types",
+    "checked",
     "convert",
     "digest_file",
     "digest_record",
@@ -82,16 +85,13 @@ __all__ = [
     "has_negative_eigenvalue",
     "html_block",
     "html_lines",
-    "html_paths",
     "html_table",
     "identify",
     "is_moderate",
-    "is_whole_program",
     "joined",
     "keep_compiled",
     "lasting_name",
     "left_over",
-    "load_ahead",
     "make_plugin",
     "map_in_processes",
     "nearest",
@@ -112,8 +112,8 @@ __all__ = [
     "save_figure",
     "share_processors",
     "short_repr",
+    "short_text",
     "standard_error",
-    "stored_jit",
     "terminal_bar",
     "toml_key",
     "toml_text",

@@ -10,16 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jax._src import compilation_cache as cache_of_jax
-
-from psotrack.support.program_seals import seal_program, unseal_program
-from psotrack.support.stored_programs import forget_programs, store_programs
 
 logger = logging.getLogger(__name__)
-
-_compress, _decompress = cache_of_jax.compress_executable, cache_of_jax.decompress_executable
-#: Reason why JAX does not use an entry; JAX's warning contains these words.
-_DAMAGED = "damaged entry, or entry of an older version"
 
 #: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
 WORTH_KEEPING_S = 0.3
@@ -27,14 +19,14 @@ WORTH_KEEPING_S = 0.3
 _MOST_MAPS = 0.5
 _MAPS = Path("/proc/self/maps")
 _MAP_LIMIT = Path("/proc/sys/vm/max_map_count")
-_UNREADABLE_ENTRY = re.compile(r"persistent compilation cache entry for '([\w.]+)'")
+#: JAX's warning about an entry of the cache that it cannot read or write.
+_FAILED = re.compile(r"Error (reading|writing) persistent compilation cache entry for '([\w.]+)'")
 
 
 def keep_compiled(folder: Path | str) -> None:
     """Let JAX store compiled programs in a folder, and load programs that other processes stored there.
 
-    The largest programs of this package are also stored whole there (`stored_jit`), and loaded without tracing. The
-    folder's files are run, so nobody else may be allowed to write to it.
+    The folder's files are run, so nobody else may be allowed to write to it.
 
     For programs, not for libraries: the function changes JAX, and the display of warnings, for the whole process. It
     changes nothing if the user has already chosen a folder (`JAX_COMPILATION_CACHE_DIR`).
@@ -46,44 +38,23 @@ def keep_compiled(folder: Path | str) -> None:
     folder = Path(folder)
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
-    store_programs(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_S)
-    # JAX stores programs without a digest. Its developers offer no public way to add one.
-    cache_of_jax.compress_executable = _compress_and_seal
-    cache_of_jax.decompress_executable = _check_and_decompress
     show = warnings.showwarning
 
     def show_or_repair(message: Warning | str, *where: Any, **more: Any) -> None:
-        unreadable = _UNREADABLE_ENTRY.search(str(message))
-        if unreadable is None:
+        failed = _FAILED.search(str(message))
+        if failed is None:
             show(message, *where, **more)
             return
-        if _DAMAGED in str(message):
-            logger.warning("%s: %s: %s; the program is compiled again", folder, _DAMAGED, unreadable[1])
-        else:
-            logger.info("%s: %s", folder, message)
+        logger.info("%s: %s", folder, message)
         # JAX never replaces an entry, so an entry that a full disk cut short would fail in every later run.
-        for entry in folder.glob(f"{unreadable[1]}-*-cache"):
+        for entry in folder.glob(f"{failed[2]}-*-cache"):
             entry.unlink(missing_ok=True)
+            if failed[1] == "reading":
+                logger.warning("%s: damaged entry %s; the program is compiled again", folder, failed[2])
 
     warnings.showwarning = show_or_repair
-
-
-def _compress_and_seal(executable: bytes) -> bytes:
-    return seal_program(_compress(executable))
-
-
-def _check_and_decompress(executable: bytes) -> bytes:
-    """The program of an entry of JAX's cache.
-
-    Raises:
-        ValueError: the entry is damaged or was not written by psotrack; JAX then warns and compiles.
-    """
-    content = unseal_program(executable)
-    if content is None:
-        raise ValueError(_DAMAGED)
-    return bytes(_decompress(content))
 
 
 def drop_programs_if_many(most_maps: int | None = None) -> bool:
@@ -107,7 +78,6 @@ def drop_programs_if_many(most_maps: int | None = None) -> bool:
     if maps <= limit:
         return False
     jax.clear_caches()
-    forget_programs()
     # Programs are freed with the functions that refer to each other.
     gc.collect()
     logger.info("dropped compiled programs from memory, because the process had %d memory maps", maps)

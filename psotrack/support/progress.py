@@ -7,11 +7,9 @@ A `Report` shows the progress of one stage: `progress_bar` where the reader is (
 from __future__ import annotations
 
 import contextlib
-import html
 import sys
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator
 
 #: Function that is called with the number of steps done since the last call.
@@ -26,7 +24,7 @@ LONG_S = 20.0
 _EVERY_S, _AT_LATEST_S = 20.0, 300.0
 #: Least share of the stage between two lines about it, unless `_AT_LATEST_S` have passed.
 _SHARE = 0.1
-#: Time between two changes of a bar in a notebook, seconds.
+#: Time between two changes of a line in a notebook, seconds.
 _REDRAWN_S = 0.2
 
 
@@ -39,11 +37,11 @@ def no_progress(description: str, total: int) -> Iterator[Advance]:
 def progress_bar(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
     """Show progress where the reader is.
 
-    On a terminal this is a bar on stderr that disappears at the end of the work, in a notebook a bar that stays in the
-    saved notebook as one line. Elsewhere, lines on stderr show work that takes longer than `LONG_S`.
+    On a terminal this is a bar on stderr that disappears at the end of the work, in a notebook a line that changes,
+    and stays in the saved notebook. Elsewhere, lines on stderr show work that takes longer than `LONG_S`.
     """
     if _in_notebook():
-        return _notebook_bar(description, total)
+        return _in_a_cell(description, total)
     from rich.console import Console
 
     if Console(stderr=True).is_terminal:
@@ -79,32 +77,10 @@ def progress_lines(
         long_s: shortest stage whose end is written, seconds.
         clock: time that only increases, seconds.
     """
-    write = _to_stderr if write is None else write
+    said = _to_stderr if write is None else write
 
-    @contextlib.contextmanager
-    def report(description: str, total: int) -> Iterator[Advance]:
-        stage = _Stage(description, total, clock)
-        lock, written_s, written_done = threading.Lock(), clock(), 0
-
-        def advance(steps: int) -> None:
-            nonlocal written_s, written_done
-            with lock:
-                stage.done += steps
-                since_s, share = clock() - written_s, (stage.done - written_done) / max(total, 1)
-                is_due = not written_done or share >= _SHARE or since_s >= _AT_LATEST_S or not total
-                if since_s < _EVERY_S or not is_due or 0 < total <= stage.done:
-                    return
-                written_s, written_done = clock(), stage.done
-            write(stage.so_far())
-
-        try:
-            yield advance
-        except BaseException:
-            if written_done or stage.seconds >= long_s:
-                write(stage.stopped())
-            raise
-        if written_done or stage.seconds >= long_s:
-            write(stage.finished())
+    def report(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
+        return _said(_Stage(description, total, clock), said, _is_line_due, long_s)
 
     return report
 
@@ -131,33 +107,75 @@ class _Stage:
 
     def __init__(self, description: str, total: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._description, self.total, self._clock = description, total, clock
-        self._began_s = clock()
-        self.done = 0
+        self._began_s = self._said_s = clock()
+        self.done = self.said_done = 0
+        #: Time and steps at the first sentence.
+        self._first: tuple[float, int] | None = None
 
     @property
     def seconds(self) -> float:
         """Time since the stage began, seconds."""
         return self._clock() - self._began_s
 
+    @property
+    def silent_s(self) -> float:
+        """Time since the last sentence, or since the stage began, seconds."""
+        return self._clock() - self._said_s
+
     def so_far(self) -> str:
-        """What is done, the time that it took, and about how long the rest takes."""
+        """What is done, the time that it took, and about how long the rest takes.
+
+        The rest is as fast as what followed the first sentence: the first steps may have waited for a compilation.
+        """
+        spent_s, first = self.seconds, self._first
+        self._said_s, self.said_done = self._clock(), self.done
+        self._first = first or (spent_s, self.done)
         if not self.total:
-            return f"{self._description}: {self.done}, {_duration(self.seconds)}"
-        left_s = self.seconds * (self.total - self.done) / max(self.done, 1)
-        left = f", about {_duration(left_s)} left" if 0 < self.done < self.total else ""
-        return f"{self._steps()} ({self.done / self.total:.0%}), {_duration(self.seconds)}{left}"
+            return f"{self._steps()}, {_duration(spent_s)}"
+        left = ""
+        if first and first[1] < self.done < self.total:
+            left_s = (spent_s - first[0]) * (self.total - self.done) / (self.done - first[1])
+            left = f", about {_duration(left_s)} left"
+        return f"{self._steps()} ({self.done / self.total:.0%}), {_duration(spent_s)}{left}"
 
-    def finished(self) -> str:
-        """What was done, and the time that it took."""
-        return f"{self._steps()} in {_duration(self.seconds)}"
-
-    def stopped(self) -> str:
-        """What was done until an error or Ctrl-C ended the stage."""
-        return f"{self._steps()}, stopped after {_duration(self.seconds)}"
+    def ended(self, how: str) -> str:
+        """What was done, and the time that it took; `how` stands before the time."""
+        return f"{self._steps()}{how} {_duration(self.seconds)}"
 
     def _steps(self) -> str:
         of = f" of {self.total}" if self.total else ""
         return f"{self._description}: {self.done}{of}"
+
+
+@contextlib.contextmanager
+def _said(
+    stage: _Stage, say: Callable[[str], None], is_due: Callable[[_Stage], bool], long_s: float
+) -> Iterator[Advance]:
+    """Say how a stage goes on whenever that is due, and how it ended if that is worth it."""
+    lock = threading.Lock()
+
+    def advance(steps: int) -> None:
+        with lock:
+            stage.done += steps
+            if not is_due(stage):
+                return
+            sentence = stage.so_far()
+        say(sentence)
+
+    how = ", stopped after"
+    try:
+        yield advance
+        how = " in"
+    finally:
+        if stage.said_done or stage.seconds >= long_s:
+            say(stage.ended(how))
+
+
+def _is_line_due(stage: _Stage) -> bool:
+    if stage.silent_s < _EVERY_S or 0 < stage.total <= stage.done:
+        return False
+    share = (stage.done - stage.said_done) / max(stage.total, 1)
+    return not stage.said_done or share >= _SHARE or stage.silent_s >= _AT_LATEST_S or not stage.total
 
 
 def _duration(seconds: float) -> str:
@@ -182,32 +200,14 @@ def _in_notebook() -> bool:
     return getattr(shell, "kernel", None) is not None
 
 
-@contextlib.contextmanager
-def _notebook_bar(description: str, total: int) -> Iterator[Advance]:
-    """Show a bar in the output of a notebook's cell: one output, which changes, and is one line at the end."""
-    from IPython.display import display, update_display
+def _in_a_cell(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
+    """Show progress in the output of a notebook's cell: one line, which changes."""
+    from IPython.display import display
 
-    stage, name = _Stage(description, total), uuid.uuid4().hex
-    drawn_s = 0.0
+    stage = _Stage(description, total)
+    handle = display({"text/plain": f"{description}: 0"}, raw=True, display_id=True)
 
-    def shown(text: str, *, ended: bool = False) -> dict[str, str]:
-        # A bar without a value moves: it is for a stage of unknown length that goes on.
-        steps = (min(stage.done, total), total) if total else (1, 1)
-        value = f' value="{steps[0]}" max="{steps[1]}"' if total or ended else ""
-        bar = f'<progress{value} style="width: 12em; vertical-align: middle"></progress>'
-        return {"text/plain": text, "text/html": f"<div>{bar} {html.escape(text)}</div>"}
+    def say(sentence: str) -> None:
+        handle.update({"text/plain": sentence}, raw=True)
 
-    def advance(steps: int) -> None:
-        nonlocal drawn_s
-        stage.done += steps
-        if time.monotonic() - drawn_s >= _REDRAWN_S:
-            drawn_s = time.monotonic()
-            update_display(shown(stage.so_far()), raw=True, display_id=name)
-
-    display(shown(stage.so_far()), raw=True, display_id=name)
-    try:
-        yield advance
-    except BaseException:
-        update_display(shown(stage.stopped(), ended=True), raw=True, display_id=name)
-        raise
-    update_display(shown(stage.finished(), ended=True), raw=True, display_id=name)
+    return _said(stage, say, lambda stage: stage.silent_s >= _REDRAWN_S, 0.0)

@@ -25,11 +25,12 @@ def short_repr(record: Any) -> str:
       name='left',
       values=float64 (3, 2))
     """
-    lines = [f"\n  {each.name}={_short(getattr(record, each.name))}" for each in fields(record)]
+    lines = [f"\n  {each.name}={short_text(getattr(record, each.name))}" for each in fields(record)]
     return f"{type(record).__name__}({','.join(lines)})"
 
 
-def _short(value: Any) -> str:
+def short_text(value: Any) -> str:
+    """A value in at most 60 characters: an array by type and shape, a long collection by its length."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{value.dtype} {tuple(value.shape)}" if value.shape else f"{value}"
     if isinstance(value, Mapping) and len(value) > 3:

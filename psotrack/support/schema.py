@@ -12,7 +12,8 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from inspect import BoundArguments, Parameter, Signature
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,6 +41,8 @@ _TYPE_WORDS = {
 }
 #: Longest part of a wrong value that a message quotes, characters.
 _QUOTED = 60
+#: Least similarity of a name that is suggested (`difflib`): a wrong letter in four.
+_SIMILAR = 0.75
 
 
 def convert(data: dict[str, Any], kind: type[Record], error: MakeError) -> Record:
@@ -185,46 +188,41 @@ def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> Non
 def nearest(name: str, names: Iterable[str]) -> str:
     """The name in `names` that was probably meant, or "" if there is none.
 
-    That is the most similar one of the names that slips of typing turn into `name`: one slip per four letters begun, so
-    that "median" is not suggested for "mean", which is another word. If there is none, it is the only name that begins
-    with `name`. Dotted names are compared both as a whole and by their last parts.
+    That is the name with the same letters, or else the most similar one of about this length, compared as a whole or by
+    its last part where names have dots; or the only one that begins with `name`.
     """
+    last_parts = {other.rpartition(".")[2]: other for other in names}
+    wholes = {other: other for other in last_parts.values()}
     last = name.rpartition(".")[2]
-
-    def similarity(other: str) -> float:
-        pairs = ((name, other), (last, other.rpartition(".")[2]))
-        return max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs if _is_slip(*pair))
-
-    names = list(names)
-    slips = [other for other in names if _is_slip(name, other) or _is_slip(last, other.rpartition(".")[2])]
-    if slips:
-        return max(slips, key=similarity)
-    begun = [
-        other
-        for other in names
-        if len(last) > 2 and (other.startswith(name) or other.rpartition(".")[2].startswith(last))
-    ]
+    for word, others in ((name, wholes), (last, last_parts)):
+        # "median" is similar to "mean", but is another word and no slip.
+        near = [other for other in others if abs(len(other) - len(word)) <= -(-len(word) // 4)]
+        swapped = [other for other in near if sorted(other) == sorted(word)]
+        if close := swapped or difflib.get_close_matches(word, near, 1, _SIMILAR):
+            return others[close[0]]
+    begun = [other for part, other in last_parts.items() if len(last) > 2 and part.startswith(last)]
     return begun[0] if len(begun) == 1 else ""
 
 
-def _is_slip(typed: str, name: str) -> bool:
-    """Whether few letters were added, left out, replaced or exchanged with their neighbours."""
-    # The default threshold of `difflib.get_close_matches`, for names of very few letters.
-    similar = difflib.SequenceMatcher(None, typed, name).ratio() >= 0.6
-    return similar and _slips(typed, name) <= -(-len(typed) // 4)
+def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str, Any]) -> BoundArguments:
+    """The arguments of a call by name.
 
-
-def _slips(typed: str, name: str) -> int:
-    """Optimal string alignment distance: the number of slips that turn one text into the other."""
-    rows = [list(range(len(name) + 1))]
-    for i, letter in enumerate(typed, 1):
-        row = [i]
-        for j, other in enumerate(name, 1):
-            row.append(min(rows[-1][j] + 1, row[-1] + 1, rows[-1][j - 1] + (letter != other)))
-            if i > 1 and j > 1 and letter == name[j - 2] and typed[i - 2] == other:
-                row[-1] = min(row[-1], rows[-2][j - 2] + 1)
-        rows.append(row)
-    return rows[-1][-1]
+    Raises:
+        SettingsError: an argument is unknown, given twice, or missing.
+    """
+    try:
+        return signature.bind(*args, **kwargs)
+    except TypeError as error:
+        variable = (Parameter.VAR_KEYWORD, Parameter.VAR_POSITIONAL)
+        parameters = [key for key, each in signature.parameters.items() if each.kind not in variable]
+        unknown = next((each for each in kwargs if each not in parameters), None)
+        near = nearest(unknown, parameters) if unknown else ""
+        raise SettingsError(
+            name,
+            expected=f"the arguments {', '.join(parameters)}" if parameters else "no arguments",
+            found=f"{unknown}" if unknown else f"{error}",
+            remedy=f"did you mean {near}?" if near else "",
+        ) from None
 
 
 def _can_hold(container: Any, token: str | int) -> bool:

@@ -2,10 +2,10 @@ from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import check_cells, read_trajectories, write_ambiguity, write_trajectories
 from .resampling import resample
 from .row_streams import RowStream
-from .showing import drones_html
-from .summaries import DroneSummary, summarise, summary_columns
+from .status import Status
+from .summaries import DroneSummary, drones_html, summarise, summary_columns
 from .tracks import ARRAYS, Arrival, Tracks, padded
-from .trajectories import Status, Trajectories
+from .trajectories import Trajectories
 
 __all__ = [
     "ARRAYS",

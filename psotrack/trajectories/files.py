@@ -29,7 +29,16 @@ from psotrack.support import (
     has_negative_eigenvalue,
     refuse_to_overwrite,
 )
-from psotrack.trajectories.trajectories import Status, Trajectories
+from psotrack.trajectories.columns import (
+    COLUMNS,
+    COVARIANCE_COLUMNS,
+    ORIENTATION_COLUMNS,
+    RELATIVE_COLUMNS,
+    columns_of,
+    is_known,
+)
+from psotrack.trajectories.status import Status
+from psotrack.trajectories.trajectories import Trajectories
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,34 +46,11 @@ if TYPE_CHECKING:
 #: Version of the columns' names, units and words; a change of meaning needs a new version.
 SCHEMA_VERSION = 1
 
-#: Columns and their units, in written order.
-COLUMNS = {
-    "frame": "1",
-    "time_s": "s",
-    "drone": "name",
-    "x_m": "m",
-    "y_m": "m",
-    "z_m": "m",
-    "vx_m_s": "m/s",
-    "vy_m_s": "m/s",
-    "vz_m_s": "m/s",
-    "fitness": "1",
-    "num_cameras": "1",
-    "status": "tracked, coasting or lost",
-}
-
-#: Further columns if covariances of the positions are known: the upper triangle, row by row.
-COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
-#: The same of covariances without the error that is constant for a drone, if they are known.
-RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
-#: The unit quaternion that turns body coordinates into world coordinates, if orientations are known.
-ORIENTATION_COLUMNS = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
 #: Numbers of frames times drones that are never refused, and per row of a file.
 _LEAST_CELLS, _CELLS_PER_ROW = 1_000_000, 100
 _READ = COLUMNS | COVARIANCE_COLUMNS | RELATIVE_COLUMNS | ORIENTATION_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
-_UPPER = np.triu_indices(3)
 #: Index of the covariance column for each element of the matrix.
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _STATUS = {status.label: status for status in Status}
@@ -195,43 +181,6 @@ def _by_suffix(path: Path, functions: Mapping[str, Callable]) -> Callable:
 # Writing
 
 
-def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
-    """One array per column; unknown values are NaN, and -1 in `num_cameras`."""
-    shape = (trajectories.num_frames, trajectories.num_drones)
-    unknown = np.full(shape, np.nan, np.float32)
-    velocity_m_s = trajectories.velocity_m_s
-    status = trajectories.status
-    if status is None:
-        status = np.where(trajectories.seen, Status.TRACKED, Status.LOST)
-    labels = np.array([status.label for status in Status])
-    columns = {
-        "frame": np.broadcast_to(trajectories.frame[:, None], shape),
-        "time_s": np.broadcast_to(trajectories.time_s[:, None], shape),
-        "drone": np.broadcast_to(np.array(trajectories.drones, str), shape),
-        "x_m": trajectories.position_m[..., 0],
-        "y_m": trajectories.position_m[..., 1],
-        "z_m": trajectories.position_m[..., 2],
-        "vx_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 0],
-        "vy_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 1],
-        "vz_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 2],
-        "fitness": unknown if trajectories.fitness is None else trajectories.fitness,
-        "num_cameras": np.full(shape, -1) if trajectories.num_cameras is None else trajectories.num_cameras,
-        "status": labels[status],
-    }
-    columns = {name: columns[name] for name in COLUMNS}
-    for names, covariance_m2 in (
-        (COVARIANCE_COLUMNS, trajectories.covariance_m2),
-        (RELATIVE_COLUMNS, trajectories.relative_covariance_m2),
-    ):
-        if covariance_m2 is not None:
-            columns |= dict(zip(names, np.moveaxis(covariance_m2[..., *_UPPER], -1, 0), strict=True))
-    if trajectories.orientation_wxyz is not None:
-        columns |= dict(
-            zip(ORIENTATION_COLUMNS, np.moveaxis(trajectories.orientation_wxyz, -1, 0), strict=True)
-        )
-    return {name: column.ravel() for name, column in columns.items()}
-
-
 def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -242,7 +191,7 @@ def _write_csv(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) ->
 def words_of(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> Iterator[tuple[str, ...]]:
     """The words of each row of a CSV file."""
     # NumPy writes the shortest digits that read back as the same number in the array's own precision.
-    words = [np.where(_known(column), column.astype(str), "") for column in columns.values()]
+    words = [np.where(is_known(column), column.astype(str), "") for column in columns.values()]
     return zip(*words, strict=True)
 
 
@@ -258,7 +207,7 @@ def parquet_table(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> pa.Table
 
     schema = parquet_schema(list(columns))
     arrays = [
-        pa.array(columns[field.name], field.type, mask=~_known(columns[field.name])) for field in schema
+        pa.array(columns[field.name], field.type, mask=~is_known(columns[field.name])) for field in schema
     ]
     return pa.table(arrays, schema=schema)
 
@@ -271,12 +220,6 @@ def parquet_schema(names: Sequence[str]) -> pa.Schema:
     units = {name: _READ[name] for name in names}
     metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
     return pa.schema([(name, types.get(name, pa.float64())) for name in names], metadata)
-
-
-def _known(column: Shaped[np.ndarray, "rows"]) -> Shaped[np.ndarray, "rows"]:
-    if column.dtype.kind == "f":
-        return ~np.isnan(column)
-    return column >= 0 if column.dtype.kind in "iu" else np.ones(len(column), bool)
 
 
 # Reading

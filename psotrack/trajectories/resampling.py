@@ -7,13 +7,16 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, RotationSpline
 
-from psotrack.geometry import rotation_matrices
 from psotrack.trajectories.trajectories import Trajectories
 
 #: Longest gap over which positions are interpolated, seconds; for slow trajectories 1.5 sample intervals.
 MAX_GAP_S = 0.1
+#: Largest turn between two samples between which orientations are interpolated, radians.
+_MOST_TURN = np.deg2rad(150)
+#: Times nearer than this are one time, seconds.
+_SAME_S = 1e-9
 
 _At = Callable[[Float[np.ndarray, "times"]], np.ndarray]
 
@@ -28,7 +31,7 @@ def resample(
 ) -> Trajectories:
     """Positions and orientations at other times, by cubic splines; NaN outside of the trajectories and in their gaps.
 
-    Orientations are also NaN between samples that are about half a turn apart.
+    Orientations are also NaN between samples that are more than 150 degrees apart: which way they turned is not known.
 
     Args:
         trajectories: trajectories with at least two samples.
@@ -41,15 +44,39 @@ def resample(
     position_m = interpolated(trajectories.time_s, trajectories.position_m, gap_s)(wanted_s)
     orientation_wxyz = None
     if trajectories.orientation_wxyz is not None:
-        matrices = rotation_matrices(trajectories.orientation_wxyz)
-        rotation = interpolated(trajectories.time_s, matrices, gap_s)(wanted_s)
-        orientation_wxyz = np.full((*rotation.shape[:2], 4), np.nan)
-        known = np.asarray(np.isfinite(rotation).all(axis=(-2, -1)))
-        # Between samples that are about half a turn apart, the spline gives matrices that are no rotations.
-        known[known] = np.linalg.det(rotation[known]) > 0
-        if known.any():
-            orientation_wxyz[known] = Rotation.from_matrix(rotation[known]).as_quat(scalar_first=True)
+        longest_s = longest_gap_s(trajectories.time_s) if gap_s is None else gap_s
+        turns = [
+            _turned(trajectories.time_s, trajectories.orientation_wxyz[:, drone], wanted_s, longest_s)
+            for drone in range(trajectories.num_drones)
+        ]
+        orientation_wxyz = np.stack(turns, axis=1)
     return Trajectories(frame, time_s, trajectories.drones, position_m, orientation_wxyz=orientation_wxyz)
+
+
+def _turned(
+    time_s: Float[np.ndarray, "samples"],
+    orientation_wxyz: Float[np.ndarray, "samples 4"],
+    wanted_s: Float[np.ndarray, "times"],
+    longest_s: float,
+) -> Float[np.ndarray, "times 4"]:
+    """Orientations of one drone at other times, by a spline through each piece without a gap or a large turn."""
+    found = np.full((len(wanted_s), 4), np.nan)
+    known = np.flatnonzero(np.isfinite(orientation_wxyz).all(axis=-1))
+    if not len(known):
+        return found
+    sample_s = time_s[known]
+    rotation = Rotation.from_quat(orientation_wxyz[known], scalar_first=True)
+    turn = (rotation[:-1].inv() * rotation[1:]).magnitude() if len(known) > 1 else np.empty(0)
+    ends = np.flatnonzero((np.diff(sample_s) > longest_s) | (turn > _MOST_TURN)) + 1
+    for piece in np.split(np.arange(len(known)), ends):
+        first_s, last_s = sample_s[piece[0]], sample_s[piece[-1]]
+        inside = (wanted_s > first_s - _SAME_S) & (wanted_s < last_s + _SAME_S)
+        if inside.any():
+            spline = RotationSpline(sample_s[piece], rotation[piece]) if len(piece) > 1 else None
+            at_s = np.clip(wanted_s[inside], first_s, last_s)
+            turned = spline(at_s) if spline else rotation[np.repeat(piece, len(at_s))]
+            found[inside] = turned.as_quat(scalar_first=True)
+    return found
 
 
 def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
@@ -71,7 +98,7 @@ def between_samples(
     before_s, after_s = wanted_s - sample_s[after - 1], sample_s[after] - wanted_s
     inside = (np.minimum(before_s, after_s) >= 0) & (before_s + after_s <= longest_s)
     # The samples at both ends of a gap are valid; the tolerance is for rounding errors.
-    return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < 1e-9)
+    return inside | (np.minimum(np.abs(before_s), np.abs(after_s)) < _SAME_S)
 
 
 def interpolated(time_s: Float[np.ndarray, "samples"], values: np.ndarray, gap_s: float | None = None) -> _At:

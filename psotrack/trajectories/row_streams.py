@@ -19,7 +19,8 @@ import numpy as np
 
 from psotrack.errors import InputError, OutputError
 from psotrack.support import atomic_write, refuse_to_overwrite
-from psotrack.trajectories.files import columns_of, parquet_schema, words_of
+from psotrack.trajectories.columns import columns_of
+from psotrack.trajectories.files import parquet_schema, words_of
 from psotrack.trajectories.trajectories import Trajectories
 
 if TYPE_CHECKING:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.trajectories.trajectories import Status, Trajectories
+from psotrack.support import html_table
+from psotrack.trajectories.status import Status
+
+if TYPE_CHECKING:
+    from psotrack.trajectories.trajectories import Trajectories
 
 #: Text of an unknown number.
 UNKNOWN = "-"
@@ -78,6 +83,12 @@ def summary_columns(
         for heading, cells in columns.items()
         if heading == "drone" or any(cell != UNKNOWN for cell in cells)
     }
+
+
+def drones_html(trajectories: Trajectories, size_m: Float[np.ndarray, "drones 3"] | None = None) -> str:
+    """The summaries as a table for notebooks; see `summary_columns`."""
+    columns = summary_columns(trajectories, size_m)
+    return html_table(list(columns), zip(*columns.values(), strict=True))
 
 
 def _summary(trajectories: Trajectories, drone: int) -> DroneSummary:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.support import short_repr
-from psotrack.trajectories.trajectories import Status
+from psotrack.trajectories.status import Status
 
 
 @dataclass(frozen=True)

@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
-from psotrack.support import short_repr
+from psotrack.support import html_block, short_repr
+from psotrack.trajectories.columns import data_frame
+from psotrack.trajectories.status import Status
+from psotrack.trajectories.summaries import drones_html
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 #: Largest asymmetry of a covariance relative to its largest element: about a hundred roundings of float32.
 SYMMETRY = 1e-5
-
-
-class Status(IntEnum):
-    """Status of a drone in a frame."""
-
-    #: The position comes from a measurement.
-    TRACKED = 0
-    #: The position is predicted over a gap without measurements.
-    COASTING = 1
-    #: The position is the last prediction, for display only; the drone counts as missed.
-    LOST = 2
-
-    @property
-    def label(self) -> str:
-        """Word in tables and files."""
-        return self.name.lower()
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,16 +85,14 @@ class Trajectories:
                 _check_symmetric(name, getattr(self, name))
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a table with a row for each drone, and the paths from above."""
-        from psotrack.support import html_block
-        from psotrack.trajectories.showing import drones_html
-
+        """What a notebook shows: a table with a row for each drone."""
         drones, frames = self.num_drones, self.num_frames
-        return html_block(f"Trajectories: {drones} drones, {frames} frames{self._span}", drones_html(self))
+        span = f", {self.time_s[0]:.2f} s to {self.time_s[-1]:.2f} s" if frames else ""
+        return html_block(f"Trajectories: {drones} drones, {frames} frames{span}", drones_html(self))
 
-    @property
-    def _span(self) -> str:
-        return f", {self.time_s[0]:.2f} s to {self.time_s[-1]:.2f} s" if self.num_frames else ""
+    def to_pandas(self) -> DataFrame:
+        """A data frame with the rows and columns of a file of tracks; what is not known is NaN."""
+        return data_frame(self)
 
     @property
     def num_frames(self) -> int:

@@ -11,8 +11,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import InputError, check_positive
-from psotrack.support import LEAST_STEP_S, atomic_write, check_file_name, is_moderate, refuse_to_overwrite
+from psotrack.errors import InputError
+from psotrack.support import (
+    LEAST_STEP_S,
+    atomic_write,
+    check_file_name,
+    is_moderate,
+    read_text,
+    refuse_to_overwrite,
+)
 from psotrack.trajectories.trajectories import Trajectories
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw"
@@ -49,40 +56,7 @@ def write_tum(folder: Path | str, trajectories: Trajectories, *, force: bool = F
     return paths
 
 
-def read_tum(path: Path | str, *, fps: float) -> Trajectories:
-    """Read one TUM file, or all `*.tum` files of a folder in the order of their names, which are the drones' names.
-
-    Args:
-        path: path of a file or a folder.
-        fps: frames per second; frame k is at k / fps seconds, and every timestamp must be within 0.1 frames of a frame.
-
-    Raises:
-        InputError: there is no file, a line is not a pose, a timestamp belongs to no frame, or two lines belong to one
-            frame. The message names file and line.
-    """
-    path = Path(path)
-    check_positive("fps", fps)
-    files = sorted(path.glob("*.tum")) if path.is_dir() else [path]
-    if not files or not files[0].is_file():
-        raise InputError(path, expected="a TUM file, or a folder with TUM files", found="none")
-    poses = [_read_file(file, fps) for file in files]
-    frame = np.unique(np.concatenate([numbers for numbers, _ in poses]))
-    if not len(frame):
-        raise InputError(path, expected="at least one pose", found="none")
-    values = np.full((len(frame), len(files), 7), np.nan)
-    for drone, (numbers, pose) in enumerate(poses):
-        values[np.searchsorted(frame, numbers), drone] = pose
-    orientation_wxyz = np.roll(values[..., 3:], 1, axis=-1)
-    return Trajectories(
-        frame=frame,
-        time_s=frame / fps,
-        drones=tuple(file.stem for file in files),
-        position_m=values[..., :3],
-        orientation_wxyz=orientation_wxyz if np.isfinite(orientation_wxyz).any() else None,
-    )
-
-
-def read_tum_path(path: Path | str) -> Trajectories:
+def read_tum(path: Path | str) -> Trajectories:
     """Read one TUM file with its own times; frames are numbered by line, and the drone has the file's name.
 
     Raises:
@@ -90,7 +64,7 @@ def read_tum_path(path: Path | str) -> Trajectories:
             line.
     """
     path = Path(path)
-    lines = _read_lines(path)
+    lines = read_text(path).splitlines()
     poses: list[list[float]] = []
     for place, values in _poses(path, lines):
         if poses and values[0] - poses[-1][0] < LEAST_STEP_S:
@@ -123,30 +97,6 @@ def tum_text(trajectories: Trajectories, drone: int) -> str:
     words = [column.astype(str) for column in columns]
     lines = [_HEADER] + [_UNKNOWN] * (not known) + [" ".join(row) for row in zip(*words, strict=True)]
     return "".join(f"{line}\n" for line in lines)
-
-
-def _read_file(path: Path, fps: float) -> tuple[np.ndarray, Float[np.ndarray, "rows 7"]]:
-    """Frame numbers, and positions with orientations (x, y, z, w); unknown orientations are NaN."""
-    lines = _read_lines(path)
-    poses: dict[int, list[float]] = {}
-    for place, (time_s, *pose) in _poses(path, lines):
-        frame = round(time_s * fps)
-        if abs(time_s * fps - frame) > 0.1 or frame < 0:
-            raise InputError(place, expected=f"the time of a frame at {fps:g} fps", found=f"{time_s:g} s")
-        if poses.setdefault(frame, pose) is not pose:
-            raise InputError(place, expected="one line per frame", found=f"a second line for frame {frame}")
-    values = np.array([poses[frame] for frame in sorted(poses)]).reshape(-1, 7)
-    values[:, 3:] = _unit(values[:, 3:])
-    if _UNKNOWN in lines:
-        values[:, 3:] = np.nan
-    return np.array(sorted(poses), int), values
-
-
-def _read_lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except (UnicodeDecodeError, OSError) as error:
-        raise InputError(path, expected="a readable text file", found=f"{error}") from error
 
 
 def _poses(path: Path, lines: list[str]) -> Iterator[tuple[str, list[float]]]:

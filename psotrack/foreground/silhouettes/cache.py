@@ -20,9 +20,9 @@ from psotrack.foreground.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole
 from psotrack.recordings import ARRAY_FILE
 from psotrack.support import left_over
 
-#: Name of a folder of silhouettes, and names of compiled programs: of psotrack's own store, and of JAX's cache.
+#: Name of a folder of silhouettes, and names of compiled programs in JAX's cache.
 _KEY = re.compile(r"[0-9a-f]{40}")
-_PROGRAM = re.compile(r"psotrack\.[\w.]+-[0-9a-f]{40}\.program|jit_\w+-[0-9a-f]{64}-(cache|atime)")
+_PROGRAM = re.compile(r"jit_\w+-[0-9a-f]{64}-(cache|atime)")
 #: Folder of the compiled programs, in the cache.
 _COMPILED = "compiled"
 
@@ -63,15 +63,8 @@ def list_entries(cache: Path) -> list[CacheEntry]:
 
 
 def is_damaged(entry: CacheEntry) -> bool:
-    """Whether an entry was changed or cut short after it was written; every byte is read."""
-    if entry.kind == "silhouettes":
-        return not is_whole(entry.path)
-    # The time of the last use of a program in JAX's cache: eight bytes, whose damage has no effect.
-    if entry.path.name.endswith("-atime"):
-        return False
-    from psotrack.support import is_whole_program
-
-    return not is_whole_program(entry.path)
+    """Whether silhouettes were changed or cut short after they were written; every byte is read."""
+    return entry.kind == "silhouettes" and not is_whole(entry.path)
 
 
 def choose_to_prune(

@@ -1,7 +1,7 @@
 from .comparison import ArchiveComparison, compare_with_archive
 from .manifest import FORMAT_VERSION, MANIFEST_FILE, Manifest, PackedVideo, read_manifest
 from .packing import pack_tracks
-from .sealed_zip import unpack
+from .zip_file import unpack
 
 __all__ = [
     "FORMAT_VERSION",

@@ -10,14 +10,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from psotrack.errors import InputError
-from psotrack.pipeline.archives.manifest import Manifest
+from psotrack.pipeline.archives.manifest import Manifest, TrackRecord, read_record
 from psotrack.settings import TrackSettings, flatten
-from psotrack.support import read_text
-from psotrack.trajectories import Trajectories, read_trajectories
+from psotrack.trajectories import read_trajectories
 
-#: Parts of a record that say by what a result was computed.
-_ENVIRONMENT = ("versions", "device")
 #: Arrays of trajectories that are compared.
 _ARRAYS = (
     "frame", "time_s", "position_m", "velocity_m_s", "fitness", "num_cameras", "status", "covariance_m2",
@@ -35,29 +31,21 @@ class ArchiveComparison:
             drones.
         from_s: time of this frame, seconds.
         max_distance_m: largest distance between both positions of a drone; None where no positions can be compared.
-        unlike: what cannot be compared, in words: "frames" or "drones"; empty where both are alike.
+        unlike: what cannot be compared, in words: "frames" or "drones"; None where both are alike.
         differences: values of the archive and of now by name, of settings, cameras, inputs, versions and device.
     """
 
     same: bool
-    from_frame: int | None
-    from_s: float | None
-    max_distance_m: float | None
-    unlike: str
     differences: Mapping[str, tuple[Any, Any]]
+    from_frame: int | None = None
+    from_s: float | None = None
+    max_distance_m: float | None = None
+    unlike: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The comparison, fit for JSON."""
-        return {
-            "same": self.same,
-            "from_frame": self.from_frame,
-            "from_s": self.from_s,
-            "max_distance_m": self.max_distance_m,
-            "unlike": self.unlike or None,
-            "differences": {
-                name: {"archive": was, "now": now} for name, (was, now) in self.differences.items()
-            },
-        }
+        differences = {name: {"archive": was, "now": now} for name, (was, now) in self.differences.items()}
+        return {**vars(self), "differences": differences}
 
     def sentence(self, archive: str) -> str:
         """The comparison in one line.
@@ -72,15 +60,13 @@ class ArchiveComparison:
             return f"the same tracks as in {archive}" + (
                 f", although there differ: {listed}" if listed else ""
             )
-        if self.unlike:
-            how = f"other {self.unlike} than"
-        else:
-            distance = (
-                "" if self.max_distance_m is None else f", by at most {1e3 * self.max_distance_m:.3g} mm"
-            )
-            how = f"other tracks from frame {self.from_frame} ({self.from_s:.3f} s) on{distance}, than"
+        how = f"other {self.unlike}"
+        if self.unlike is None:
+            apart_m = self.max_distance_m
+            apart = "" if apart_m is None else f", by at most {1e3 * apart_m:.3g} mm"
+            how = f"other tracks from frame {self.from_frame} ({self.from_s:.3f} s) on{apart},"
         reason = listed or "nothing that is recorded: another processor, or other settings of XLA or of JAX?"
-        return f"{how} in {archive}; there differ: {reason}"
+        return f"{how} than in {archive}; there differ: {reason}"
 
 
 def compare_with_archive(
@@ -99,42 +85,40 @@ def compare_with_archive(
         InputError: a file of the archive cannot be read.
     """
     was = folder / manifest.tracks
-    exact = was.suffix == tracks.suffix
     old, new = read_trajectories(was), read_trajectories(tracks)
-    old_record = _read_record(folder / manifest.record)
-    differences = _differences(
-        {**dict(flatten(manifest.settings)), **_circumstances(old_record)},
-        # By way of JSON, which has lists and no tuples.
-        {**dict(flatten(msgspec.json.decode(msgspec.json.encode(settings)))), **_circumstances(record)},
-    )
-    unlike = ""
+    before = _circumstances(manifest.settings, read_record(was))
+    now = _circumstances(msgspec.to_builtins(settings), msgspec.convert(record, TrackRecord))
+    differences = {
+        name: (before.get(name), now.get(name))
+        for name in {**before, **now}
+        if before.get(name) != now.get(name)
+    }
     if not np.array_equal(old.frame, new.frame):
-        unlike = "frames"
-    elif old.drones != new.drones:
-        unlike = "drones"
-    if unlike:
-        return ArchiveComparison(False, None, None, None, unlike, differences)
+        return ArchiveComparison(False, differences, unlike="frames")
+    if old.drones != new.drones:
+        return ArchiveComparison(False, differences, unlike="drones")
+    exact = was.suffix == tracks.suffix
     differs = np.zeros(old.num_frames, bool)
     for name in _ARRAYS:
         differs |= _differing_frames(getattr(old, name), getattr(new, name), exact)
     if not differs.any():
-        return ArchiveComparison(True, None, None, 0.0, "", differences)
+        return ArchiveComparison(True, differences, max_distance_m=0.0)
     first = int(differs.argmax())
+    distance_m = np.linalg.norm(old.position_m - new.position_m, axis=-1)
+    known = np.isfinite(distance_m)
     return ArchiveComparison(
-        same=False,
+        False,
+        differences,
         from_frame=int(old.frame[first]),
         from_s=float(old.time_s[first]),
-        max_distance_m=_largest_distance_m(old, new),
-        unlike="",
-        differences=differences,
+        max_distance_m=float(distance_m[known].max()) if known.any() else None,
     )
 
 
 def _differing_frames(old: np.ndarray | None, new: np.ndarray | None, exact: bool) -> np.ndarray:
     """(frames,), whether the values of a frame differ; where one of both is unknown, all frames."""
     if old is None or new is None:
-        known = old if old is not None else new
-        return np.zeros(1, bool) if known is None else np.ones(len(known), bool)
+        return np.array([old is not new])
     if not exact and old.dtype.kind == "f":
         # CSV has the digits of the tracker's float32, Parquet has float64.
         old, new = old.astype(np.float32), new.astype(np.float32)
@@ -142,39 +126,16 @@ def _differing_frames(old: np.ndarray | None, new: np.ndarray | None, exact: boo
     return unequal.reshape(len(old), -1).any(axis=1)
 
 
-def _largest_distance_m(old: Trajectories, new: Trajectories) -> float | None:
-    distance_m = np.linalg.norm(old.position_m - new.position_m, axis=-1)
-    known = np.isfinite(distance_m)
-    return float(distance_m[known].max()) if known.any() else None
-
-
-def _circumstances(record: Mapping[str, Any]) -> dict[str, Any]:
-    """What a record says of the run besides the settings."""
-    found = {
-        "cameras": record.get("cameras"),
-        "frames": record.get("frames"),
-        "causal": record.get("causal", False),
-        **dict(flatten(record.get("parts", {}), "parts.")),
-        **dict(flatten(record.get("input_keys", {}), "input_keys.")),
-    }
-    for part in _ENVIRONMENT:
-        found |= record.get(part, {})
-    return found
-
-
-def _differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    names = [*was, *(name for name in now if name not in was)]
-    return {name: (was.get(name), now.get(name)) for name in names if was.get(name) != now.get(name)}
+def _circumstances(settings: Mapping[str, Any], record: TrackRecord) -> dict[str, Any]:
+    """Settings that were asked for, and what the record says of the run besides: all on which the tracks depend."""
+    of_run = {name: getattr(record, name) for name in ("cameras", "frames", "causal")}
+    parts = {name: getattr(record, name) for name in ("parts", "input_keys")}
+    # By way of JSON, which has lists and no tuples.
+    plain = msgspec.json.decode(msgspec.json.encode({**settings, **of_run, **parts}))
+    return {**dict(flatten(plain)), **record.versions, **record.device}
 
 
 def _word(value: Any) -> str:
     if isinstance(value, list):
         return ",".join(map(_word, value))
     return "none" if value is None else f"{value}"
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    try:
-        return msgspec.json.decode(read_text(path), type=dict[str, Any])
-    except msgspec.DecodeError as error:
-        raise InputError(path, expected="the record of the tracks", found=f"{error}") from error

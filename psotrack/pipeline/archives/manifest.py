@@ -1,15 +1,16 @@
-"""The manifest of an archive: a JSON file that says what the archive holds, and how its tracks were made."""
+"""What an archive says of itself: its manifest, a JSON file, and the record of the run that made its tracks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from psotrack.errors import InputError
 from psotrack.settings import TrackSettings
+from psotrack.support import read_json
 
 #: Name of the manifest in the archive and in the unpacked folder.
 MANIFEST_FILE = "psotrack.json"
@@ -19,18 +20,7 @@ FORMAT_VERSION = 1
 FORMAT = "psotrack archive"
 
 Count = Annotated[int, msgspec.Meta(ge=0)]
-
-
-class PackedFile(msgspec.Struct, frozen=True):
-    """A file of an archive.
-
-    Attributes:
-        size: number of bytes.
-        blake2b: digest of the content, BLAKE2b with 160 bits as hexadecimal digits.
-    """
-
-    size: Count
-    blake2b: str
+_Content = TypeVar("_Content", bound=msgspec.Struct)
 
 
 class PackedVideo(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,7 +54,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
         causal: whether the tracks were computed without the future.
         most_drones: largest number of drones at one time of such tracks; None where it is not known.
         videos: the videos by camera name.
-        files: the files of the archive by path, without the manifest.
+        files: paths of the files of the archive, without the manifest.
     """
 
     format: str = FORMAT
@@ -77,7 +67,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     causal: bool = False
     most_drones: int | None = None
     videos: Mapping[str, PackedVideo] = {}
-    files: Mapping[str, PackedFile] = {}
+    files: tuple[str, ...] = ()
 
     @property
     def record(self) -> str:
@@ -93,33 +83,22 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.convert(self.settings, TrackSettings)
 
 
-def manifest_of(content: bytes, where: Path) -> Manifest:
-    """The manifest from its JSON.
+class TrackRecord(msgspec.Struct, frozen=True):
+    """What archives need of the record of a run; a record has more (see the page on the contract)."""
 
-    Args:
-        content: content of the manifest.
-        where: the archive or the manifest, for messages.
-
-    Raises:
-        InputError: the content is no manifest, or that of a newer version.
-    """
-    try:
-        data = msgspec.json.decode(content)
-        if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise InputError(
-                where, expected="an archive of psotrack", found=f"{MANIFEST_FILE} of another kind"
-            )
-        version = data.get("version")
-        if isinstance(version, int) and version > FORMAT_VERSION:
-            raise InputError(
-                where,
-                expected=f"an archive of version {FORMAT_VERSION} or older",
-                found=f"version {version}, written by psotrack {data.get('psotrack', 'of an unknown version')}",
-                remedy="install a newer psotrack",
-            )
-        return msgspec.convert(data, Manifest)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(where, expected=f"a whole {MANIFEST_FILE}", found=f"{error}") from error
+    sequence: str
+    cameras: list[str]
+    frames: int
+    frames_asked: int | None
+    rate_hz: float
+    settings: TrackSettings
+    input_keys: dict[str, str]
+    volume: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
+    versions: dict[str, str] = {}
+    device: dict[str, str] = {}
+    causal: bool = False
+    most_drones: int | None = None
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -129,9 +108,36 @@ def read_manifest(folder: Path) -> Manifest:
         InputError: there is no manifest, or it is that of a newer version.
     """
     path = folder / MANIFEST_FILE
+    data = read_json(path, "the manifest of an archive of psotrack")
+    version = data.get("version")
+    if data.get("format") != FORMAT:
+        raise InputError(path, expected="the manifest of an archive of psotrack", found="another JSON file")
+    if isinstance(version, int) and version > FORMAT_VERSION:
+        raise InputError(
+            path,
+            expected=f"an archive of version {FORMAT_VERSION} or older",
+            found=f"version {version}, written by psotrack {data.get('psotrack', 'of an unknown version')}",
+            remedy="install a newer psotrack",
+        )
+    return _converted(path, data, Manifest, "a whole manifest")
+
+
+def read_record(tracks: Path) -> TrackRecord:
+    """Read the record that lies beside a file of tracks.
+
+    Raises:
+        InputError: there is no record, or it is not that of `track` of this version.
+    """
+    path, expected = tracks.with_suffix(".json"), "the record of the tracks, which `track` writes"
+    if not path.is_file():
+        raise InputError(path, expected=expected, found="no such file")
+    return _converted(path, read_json(path, expected), TrackRecord, expected, "track again")
+
+
+def _converted(
+    path: Path, data: dict[str, Any], kind: type[_Content], expected: str, remedy: str = ""
+) -> _Content:
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        found = (error.strerror or f"{error}").lower()
-        raise InputError(path, expected="the manifest of an archive", found=found) from error
-    return manifest_of(content, path)
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(path, expected=expected, found=f"{error}", remedy=remedy) from error

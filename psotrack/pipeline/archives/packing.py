@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,15 +12,14 @@ from typing import Any
 import msgspec
 
 from psotrack.errors import InputError
-from psotrack.foreground.silhouettes import SEAL_FILE, compute, stored_silhouettes
+from psotrack.foreground.silhouettes import compute, stored_silhouettes
 from psotrack.geometry import Camera
 from psotrack.geometry.rig_files import lens_model
 from psotrack.pipeline import detection_files_of, usable_for
-from psotrack.pipeline.archives.manifest import Manifest, PackedVideo
-from psotrack.pipeline.archives.sealed_zip import Source, write_sealed
+from psotrack.pipeline.archives.manifest import Manifest, PackedVideo, TrackRecord, read_record
+from psotrack.pipeline.archives.zip_file import Source, write_archive
 from psotrack.recordings import (
     ARRAY_FILE,
-    MADE_OF,
     RECORDING_FILE,
     CameraTable,
     FrameTimes,
@@ -37,51 +34,15 @@ from psotrack.recordings import (
     recording_file_text,
 )
 from psotrack.recordings.datasets import reference_files
-from psotrack.settings import YOLO, TrackSettings
+from psotrack.settings import YOLO
 from psotrack.support import Report, digest_file, no_progress, refuse_to_overwrite
 from psotrack.trajectories import read_trajectories
 
 #: Prefix of the input keys of detections that the method "fused" read beside silhouettes.
 _DETECTIONS_OF = "detections of "
 
-
-class _TrackRecord(msgspec.Struct, frozen=True):
-    """What packing reads of the record of a run; a record has more."""
-
-    sequence: str
-    cameras: list[str]
-    frames: int
-    rate_hz: float
-    settings: TrackSettings
-    input_keys: dict[str, str]
-    camera_times: dict[str, dict[str, Any]] = {}
-    volume: dict[str, Any] = {}
-    causal: bool = False
-    most_drones: int | None = None
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A run of tracking, and the recording as the run used it.
-
-    Attributes:
-        tracks: file of the tracks.
-        record: record of the run.
-        opened: the recording as it was opened.
-        used: the recording with the cameras and frames of the run.
-        frames: number of instants that the run used, from the start; None for all.
-    """
-
-    tracks: Path
-    record: _TrackRecord
-    opened: Recording
-    used: Recording
-    frames: int | None
-
-    @property
-    def settings(self) -> TrackSettings:
-        """Settings of the run, with the largest speed that the run found."""
-        return self.record.settings
+#: Files of an archive by their paths in it.
+_Files = dict[str, Source]
 
 
 def pack_tracks(
@@ -116,274 +77,192 @@ def pack_tracks(
         SettingsError: the silhouettes cannot be made.
         OutputError: the archive exists and `force` is not set, or it cannot be written.
     """
-    tracks, out = Path(tracks), Path(out)
+    tracks, out, cache = Path(tracks), Path(out), Path(cache)
     refuse_to_overwrite(out, force)
-    run = _run_of(tracks, recording)
-    settings, used = run.settings, run.used
-    silhouettes = (
-        stored_silhouettes(used, settings.silhouettes, Path(cache)) if settings.needs_silhouettes else {}
-    )
-    detections = used.detections or {}
+    record = read_record(tracks)
+    settings = record.settings
+    used = _recording_of(tracks, record, recording)
+    silhouettes = stored_silhouettes(used, settings.silhouettes, cache) if settings.needs_silhouettes else {}
+    detections: Mapping[str, Path] = used.detections or {}
+    keys = {name: stored.key for name, stored in silhouettes.items()}
     if settings.reads_detections:
         detections = detection_files_of(used, settings.detections)
-    _check_inputs(run, silhouettes, detections)
+        prefix = _DETECTIONS_OF if settings.needs_silhouettes else ""
+        # `pipeline` (`read_sightings`) makes these keys.
+        digests = {name: digest_file(path, algorithm="sha256")[:16] for name, path in detections.items()}
+        keys |= {f"{prefix}{name}": digest for name, digest in digests.items()}
+    for name in sorted(record.input_keys):
+        if keys.get(name) != record.input_keys[name]:
+            raise _other_recording(tracks, record, recording, f"other content of {name}")
     if silhouettes:
         compute(used, settings.silhouettes, cache=cache, all_videos=False, report=report)
-    packing = _Packing(run, silhouettes, detections, videos)
-    files, content = packing.files()
+
+    files: _Files = {f"tracks{tracks.suffix}": tracks, "tracks.json": tracks.with_suffix(".json")}
+    if (ambiguity := tracks.with_suffix(".ambiguity.csv")).is_file():
+        files["tracks.ambiguity.csv"] = ambiguity
+    changes: dict[str, Any] = {}
+    if settings.init not in ("auto", "truth"):
+        changes["init"] = f"start/{Path(settings.init).name}"
+        files[changes["init"]] = Path(settings.init)
+    if record.volume.get("speed_from") != "given":
+        changes["motion.max_speed_m_s"] = None
+    if settings.reads_detections:
+        changes["detections"] = YOLO
+
+    shown = _Shown(silhouettes, detections, videos)
+    content, packed_videos, more = _recording_file(recording, used, shown)
     manifest = Manifest(
         psotrack=version("psotrack"),
-        sequence=run.record.sequence,
+        sequence=record.sequence,
         tracks=f"tracks{tracks.suffix}",
-        settings=_open_settings(run, files),
-        frames=run.frames,
-        causal=run.record.causal,
-        most_drones=run.record.most_drones,
-        videos={name: packing.video(name, video) for name, video in run.used.videos.items()},
+        settings=msgspec.to_builtins(settings.changed(changes)),
+        frames=record.frames_asked,
+        causal=record.causal,
+        most_drones=record.most_drones,
+        videos=packed_videos,
     )
-    text = recording_file_text(content).encode()
-    return write_sealed(out, manifest, {RECORDING_FILE: text, **files}, force=force, report=report)
-
-
-def _run_of(tracks: Path, opened: Recording) -> _Run:
-    """The run that a file of tracks comes from.
-
-    Raises:
-        InputError: the file or its record cannot be read, or the recording has other cameras or another length.
-    """
-    rows = read_trajectories(tracks)
-    record = _read_record(tracks.with_suffix(".json"))
-    if not record.causal and rows.num_frames != record.frames:
-        raise InputError(
-            tracks,
-            expected=f"{record.frames} frames, as {tracks.with_suffix('.json').name} says",
-            found=f"{rows.num_frames}",
-        )
-    missing = [name for name in record.cameras if name not in opened.rig.names]
-    if missing:
-        raise _other_recording(tracks, record, opened, f"no camera {missing[0]}")
-    whole = usable_for(opened, record.settings, cameras=record.cameras)
-    frames = _frames_used(record, whole)
-    if frames == 0:
-        found = f"{whole.at_rate(record.settings.rate_hz).num_frames} frames at {whole.fps:g} Hz"
-        raise _other_recording(tracks, record, opened, found)
-    used = whole if frames is None else whole.usable(num_frames=frames, videos=False)
-    return _Run(tracks, record, opened, used, frames)
-
-
-def _read_record(path: Path) -> _TrackRecord:
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=_TrackRecord)
-    except OSError as error:
-        found = (error.strerror or f"{error}").lower()
-        raise InputError(
-            path, expected="the record of the tracks, which `track` writes", found=found
-        ) from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        expected = "a record of `track` with settings of this version"
-        raise InputError(path, expected=expected, found=f"{error}", remedy="track again") from error
-
-
-def _frames_used(record: _TrackRecord, whole: Recording) -> int | None:
-    """Number of instants that a run used of a recording; None for all, and 0 where the recording has other instants."""
-
-    def fits(frames: int | None) -> bool:
-        part = whole if frames is None else whole.usable(num_frames=frames, videos=False)
-        timeline = part.at_rate(record.settings.rate_hz).timeline()
-        counts = {name: each["frames"] for name, each in record.camera_times.items()}
-        return (
-            timeline.num_instants == record.frames
-            and math.isclose(timeline.rate_hz, record.rate_hz, rel_tol=1e-9)
-            and part.rig.names == tuple(record.cameras)
-            and all(part.frame_times[name].num_frames == count for name, count in counts.items())
-        )
-
-    if fits(None):
-        return None
-    # `Recording.at_rate` rounds the number of instants, so that several numbers may give the run's number.
-    ratio = 1.0 if record.settings.rate_hz is None else whole.fps / record.settings.rate_hz
-    first, last = (math.floor((record.frames + off) * ratio) for off in (-1, 1))
-    numbers = range(max(1, first), min(last + 1, whole.num_frames) + 1)
-    return next((frames for frames in numbers if fits(frames)), 0)
-
-
-def _other_recording(tracks: Path, record: _TrackRecord, opened: Recording, found: str) -> InputError:
-    return InputError(
-        tracks,
-        expected=f"tracks of {opened.folder}",
-        found=f"tracks of {record.sequence} with {len(record.cameras)} cameras and {record.frames} frames at "
-        f"{record.rate_hz:g} Hz, while {opened.name} has {found}",
-        remedy="name the recording that was tracked",
-    )
-
-
-def _check_inputs(
-    run: _Run, silhouettes: Mapping[str, StoredSilhouettes], detections: Mapping[str, Path]
-) -> None:
-    """Raise `InputError` unless the run's silhouettes and detections were those of the recording."""
-    known = {name: each.key for name, each in silhouettes.items()}
-    if run.settings.reads_detections:
-        prefix = _DETECTIONS_OF if run.settings.needs_silhouettes else ""
-        # `pipeline` (`read_sightings`) makes these keys.
-        known |= {
-            f"{prefix}{name}": digest_file(path, algorithm="sha256")[:16] for name, path in detections.items()
-        }
-    for name, key in run.record.input_keys.items():
-        own = known.get(name) or known.get(name.removeprefix(_DETECTIONS_OF))
-        if own != key:
-            found = "with other content, or read in another way" if own else "that does not exist"
-            raise InputError(
-                run.tracks,
-                expected=f"tracks of {run.opened.folder}",
-                found=f"tracks of {run.record.sequence}, for which {name} was a camera {found}",
-                remedy="name the recording that was tracked, or track again with this version",
-            )
-
-
-def _open_settings(run: _Run, files: Mapping[str, Source]) -> dict[str, Any]:
-    """Settings that compute the tracks again from the archive."""
-    changes: dict[str, Any] = {}
-    if run.record.volume.get("speed_from") != "given":
-        changes["motion.max_speed_m_s"] = None
-    if run.settings.reads_detections:
-        changes["detections"] = YOLO
-    start = next((name for name in files if name.startswith("start/")), None)
-    if start is not None:
-        changes["init"] = start
-    return msgspec.to_builtins(run.settings.changed(changes))
+    files = {RECORDING_FILE: recording_file_text(content).encode(), **files, **more}
+    return write_archive(out, manifest, files, force=force, report=report)
 
 
 @dataclass(frozen=True)
-class _Packing:
-    """The files of an archive, and the `recording.toml` that names them.
+class _Shown:
+    """What an archive holds of what the cameras show.
 
     Attributes:
-        run: the run.
         silhouettes: stored silhouettes by camera name.
         detections: files of detections by camera name.
         with_videos: whether the videos are packed.
     """
 
-    run: _Run
     silhouettes: Mapping[str, StoredSilhouettes]
     detections: Mapping[str, Path]
     with_videos: bool
 
-    def files(self) -> tuple[dict[str, Source], RecordingFile]:
-        """The files by their paths in the archive, and the content of `recording.toml`."""
-        used, opened, run = self.run.used, self.run.opened, self.run
-        files: dict[str, Source] = {f"tracks{run.tracks.suffix}": run.tracks}
-        files["tracks.json"] = run.tracks.with_suffix(".json")
-        ambiguity = run.tracks.with_suffix(".ambiguity.csv")
-        if ambiguity.is_file():
-            files["tracks.ambiguity.csv"] = ambiguity
-        if run.settings.init not in ("auto", "truth"):
-            files[f"start/{Path(run.settings.init).name}"] = Path(run.settings.init)
-        tables = {name: self._table(name, camera, files) for name, camera in _cameras(used)}
-        reference = None
-        if references := reference_files(opened):
-            names = [f"reference/{path.name}" for path in references]
-            if len(set(names)) < len(names):
-                names = [f"reference/{index}/{path.name}" for index, path in enumerate(references)]
-            files |= dict(zip(names, references, strict=True))
-            reference = ReferenceTable(
-                files=tuple(names),
-                time_offset_s=opened.reference_offset_s,
-                bodies={name: tuple(labels) for name, labels in opened.bodies.items()},
-            )
-        markers = None
-        if opened.marker_corners is not None:
-            files["marker_corners.csv"] = opened.marker_corners
-            markers = MarkersTable(corners="marker_corners.csv")
-        bounds_m = opened.bounds_m
-        world = WorldTable()
-        if bounds_m is not None:
-            x0, x1, y0, y1, z0, z1 = bounds_m
-            world = WorldTable(bounds_m=((x0, y0, z0), (x1, y1, z1)))
-        content = RecordingFile(version=1, cameras=tables, world=world, reference=reference, markers=markers)
-        return files, content
 
-    def video(self, name: str, video: VideoInfo) -> PackedVideo:
-        """What the manifest says of the video of a camera."""
-        stored = self.silhouettes.get(name)
-        return PackedVideo(
-            name=video.path.name,
-            frames=video.num_frames,
-            digest=digest_video(video) if stored is None else stored.made_of["content"],
-            packed_as=_video_path(name, video) if self.with_videos else None,
-        )
+def _recording_file(
+    recording: Recording, used: Recording, shown: _Shown
+) -> tuple[RecordingFile, dict[str, PackedVideo], _Files]:
+    """The content of `recording.toml`, what the manifest says of each video, and the files that both name.
 
-    def _table(self, name: str, camera: Camera, files: dict[str, Source]) -> CameraTable:
-        """The table of a camera; the files that it names are added to `files`."""
-        opened = self.run.opened
-        video = opened.videos.get(name) if self.with_videos else None
-        ignore, detections = opened.ignore.get(name), self.detections.get(name)
-        stored, times = self.silhouettes.get(name), opened.frame_times[name]
-        table: dict[str, Any] = {}
+    Args:
+        recording: the recording as it was opened.
+        used: the recording with the cameras and frames of the run.
+        shown: what the archive holds of what the cameras show.
+    """
+    files: _Files = {}
+    tables, packed_videos = {}, {}
+    for index, name in enumerate(used.rig.names):
+        table = _lens_and_place(used.rig.cameras[index])
+        table["line_time_s"] = recording.line_time_s.get(name, 0.0)
+        video, stored = used.videos.get(name), shown.silhouettes.get(name)
         if video is not None:
-            table["video"] = _video_path(name, video)
-            files |= dict(_video_files(table["video"], video))
+            digest = digest_video(video) if stored is None else stored.made_of["content"]
+            path = f"videos/{name}{'' if video.images else video.path.suffix}" if shown.with_videos else None
+            packed_videos[name] = PackedVideo(
+                name=video.path.name, frames=video.num_frames, digest=digest, packed_as=path
+            )
+            if path is not None:
+                table["video"] = path
+                files |= _video_files(path, recording.videos[name])
         if stored is not None:
             table["silhouettes"] = f"silhouettes/{name}"
-            files |= dict(_array_files(table["silhouettes"], stored))
-        if ignore is not None:
-            table["ignore"] = f"ignore/{name}{ignore.suffix}"
-            files[table["ignore"]] = ignore
-        if detections is not None:
-            table["detections"] = f"detections/{name}.csv"
-            files[table["detections"]] = detections
+            files |= _array_files(table["silhouettes"], stored.path)
+        for key, path_of in (("ignore", recording.ignore), ("detections", shown.detections)):
+            if name in path_of:
+                table[key] = f"{key}/{name}{path_of[name].suffix}"
+                files[table[key]] = path_of[name]
+        times = recording.frame_times[name]
         if times.listed_s is not None:
             table["timestamps"] = f"timestamps/{name}.csv"
             files[table["timestamps"]] = _timestamps(times)
         else:
             table |= {"fps": times.fps, "time_offset_s": times.time_offset_s or None}
-            if video is None and stored is None:
+            if stored is None and "video" not in table:
                 table["frames"] = times.num_frames
-        distortion, fisheye = lens_model(camera)
-        width, height = (int(side) for side in camera.image_size_wh)
-        table |= {
-            "size": (width, height),
-            "line_time_s": opened.line_time_s.get(name, 0.0),
-            "K": camera.K.tolist(),
-            "model": "fisheye" if fisheye else "opencv",
-            "distortion": tuple(distortion),
-            # A Rodrigues vector would change the last digits of the rotation.
-            "R": camera.T_cam_world[:3, :3].tolist(),
-            "tvec": camera.T_cam_world[:3, 3].tolist(),
-        }
-        return CameraTable(**table)
+        tables[name] = CameraTable(**table)
+
+    reference = markers = None
+    if references := reference_files(recording):
+        names = [f"reference/{index}/{path.name}" for index, path in enumerate(references)]
+        files |= dict(zip(names, references, strict=True))
+        reference = ReferenceTable(
+            files=tuple(names),
+            time_offset_s=recording.reference_offset_s,
+            bodies={name: tuple(labels) for name, labels in recording.bodies.items()},
+        )
+    if recording.marker_corners is not None:
+        markers = MarkersTable(corners="marker_corners.csv")
+        files["marker_corners.csv"] = recording.marker_corners
+    world = WorldTable()
+    if used.bounds_m is not None:
+        x0, x1, y0, y1, z0, z1 = used.bounds_m
+        world = WorldTable(bounds_m=((x0, y0, z0), (x1, y1, z1)))
+    content = RecordingFile(version=1, cameras=tables, world=world, reference=reference, markers=markers)
+    return content, packed_videos, files
 
 
-def _cameras(recording: Recording) -> Iterator[tuple[str, Camera]]:
-    for index, name in enumerate(recording.rig.names):
-        yield name, recording.rig.cameras[index]
+def _recording_of(tracks: Path, record: TrackRecord, opened: Recording) -> Recording:
+    """The recording with the cameras and frames from which tracks were computed.
+
+    Raises:
+        InputError: the tracks do not fit their record, or the recording has other cameras or another rate.
+    """
+    rows = read_trajectories(tracks).num_frames
+    if not record.causal and rows != record.frames:
+        expected = f"{record.frames} frames, as {tracks.with_suffix('.json').name} says"
+        raise InputError(tracks, expected=expected, found=f"{rows}")
+    for name in record.cameras:
+        if name not in opened.rig.names:
+            raise _other_recording(tracks, record, opened, f"no camera {name}")
+    used = usable_for(opened, record.settings, cameras=record.cameras)
+    if record.frames_asked is not None and record.frames_asked <= used.num_frames:
+        used = used.usable(num_frames=record.frames_asked, videos=False)
+    timeline = used.at_rate(record.settings.rate_hz).timeline()
+    if timeline.num_instants < record.frames or not math.isclose(timeline.rate_hz, record.rate_hz):
+        found = f"{timeline.num_instants} frames at {timeline.rate_hz:g} Hz"
+        raise _other_recording(tracks, record, opened, found)
+    return used
 
 
-def _video_path(name: str, video: VideoInfo) -> str:
-    """Path of a video in the archive; of the folder of its pictures where the frames are pictures."""
-    return f"videos/{name}" if video.images else f"videos/{name}{video.path.suffix}"
+def _other_recording(tracks: Path, record: TrackRecord, opened: Recording, has: str) -> InputError:
+    return InputError(
+        tracks,
+        expected=f"tracks of {opened.folder}",
+        found=f"tracks of {record.sequence} with {len(record.cameras)} cameras and {record.frames} frames at "
+        f"{record.rate_hz:g} Hz, while {opened.name} has {has}",
+        remedy="name the recording that was tracked, or track again with this version",
+    )
 
 
-def _video_files(path: str, video: VideoInfo) -> Iterator[tuple[str, Source]]:
+def _lens_and_place(camera: Camera) -> dict[str, Any]:
+    distortion, fisheye = lens_model(camera)
+    width, height = (int(side) for side in camera.image_size_wh)
+    return {
+        "size": (width, height),
+        "K": camera.K.tolist(),
+        "model": "fisheye" if fisheye else "opencv",
+        "distortion": tuple(distortion),
+        # A Rodrigues vector would change the last digits of the rotation.
+        "R": camera.T_cam_world[:3, :3].tolist(),
+        "tvec": camera.T_cam_world[:3, 3].tolist(),
+    }
+
+
+def _video_files(path: str, video: VideoInfo) -> _Files:
     if not video.images:
-        yield path, video.path
-    for index, image in enumerate(video.images):
-        yield f"{path}/{index:08d}{image.suffix}", image
+        return {path: video.path}
+    return {f"{path}/{index:08d}{image.suffix}": image for index, image in enumerate(video.images)}
 
 
-def _array_files(path: str, stored: StoredSilhouettes) -> Iterator[tuple[str, Source]]:
-    """The files of stored silhouettes, which say what they were made of."""
-    description = json.loads((stored.path / ARRAY_FILE).read_text(encoding="utf-8"))
-    # Silhouettes in a store of an older version do not say it.
-    description["attributes"][MADE_OF] = dict(stored.made_of)
-    yield f"{path}/{ARRAY_FILE}", json.dumps(description, indent=1, sort_keys=True).encode()
-    for folder, folders, names in os.walk(stored.path):
-        folders.sort()
-        for name in sorted(names):
-            file = Path(folder, name)
-            # The description that is packed may differ, and the archive has digests of its own.
-            if file not in (stored.path / ARRAY_FILE, stored.path / SEAL_FILE):
-                yield f"{path}/{file.relative_to(stored.path).as_posix()}", file
+def _array_files(path: str, folder: Path) -> _Files:
+    """The description of stored silhouettes and their chunks, which lie in folders; other files are of the store."""
+    files = sorted(each for each in folder.rglob("*") if each.is_file())
+    return {
+        f"{path}/{each.relative_to(folder).as_posix()}": each
+        for each in files
+        if each.parent != folder or each.name == ARRAY_FILE
+    }
 
 
 def _timestamps(times: FrameTimes) -> bytes:

@@ -16,7 +16,7 @@ from psotrack.recordings.datasets._poses import read_poses
 from psotrack.recordings.mocap import body_trajectories, read_c3d
 from psotrack.support import read_text
 from psotrack.trajectories import Trajectories, read_trajectories, resample
-from psotrack.trajectories.tum import read_tum_path
+from psotrack.trajectories.tum import read_tum
 
 _logger = logging.getLogger(__name__)
 #: Ending of a pose file's name that states its rate, such as `dron1_pos_25`.
@@ -116,7 +116,7 @@ def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
             markers, fps=markers.rate_hz, num_frames=len(markers.position_m), where=path, named=bodies
         )
     if suffix in (".tum", ".txt"):
-        return read_tum_path(path)
+        return read_tum(path)
     if suffix == ".parquet" or (suffix == ".csv" and "x_m" in _header(path)):
         return read_trajectories(path, fps=fps)
     if suffix == ".csv":

@@ -302,10 +302,10 @@ def _table(
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
-    written = {kind: _written(file, base) for kind, file in files.items()}
+    written: dict[str, Any] = {kind: _written(file, base) for kind, file in files.items()}
     if "images" in files:
         written["images"] += _pattern(matching.folder, Path(files["images"]))
-    return msgspec.convert({**written, "size": size, "fps": fps}, CameraTable)
+    return msgspec.convert(written | {"size": size, "fps": fps}, CameraTable)
 
 
 def _pattern(folder: Path, images: Path) -> str:

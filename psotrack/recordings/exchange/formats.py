@@ -18,7 +18,7 @@ from psotrack.recordings.exchange.number_lines import are_numbers, first_line, n
 from psotrack.recordings.exchange.timed_paths import joined, timed_path
 from psotrack.support import Report
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
-from psotrack.trajectories.tum import read_tum_path, tum_text, write_tum
+from psotrack.trajectories.tum import read_tum, tum_text, write_tum
 
 #: Quantities that some formats cannot hold, as messages name them.
 NAMES, TIMES, ORIENTATIONS, COVARIANCES = "names of drones", "times", "orientations", "covariances"
@@ -118,7 +118,7 @@ def read_file(path: Path, recording: Recording | None) -> Trajectories:
 def _read_tum(where: Path, files: Sequence[Path], recording: Recording | None) -> Trajectories:
     paths = []
     for file in files:
-        read = read_tum_path(file)
+        read = read_tum(file)
         turns = None if read.orientation_wxyz is None else read.orientation_wxyz[:, 0]
         paths.append(timed_path(file.stem, read.time_s, read.position_m[:, 0], turns))
     return joined(where, paths, recording)

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.support import stored_jit
 from psotrack.support.array_types import Array
 from psotrack.tracking.motion import MotionParams, MotionState, kalman
 
@@ -57,7 +56,7 @@ def log_change(swap_odds: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "fra
     return np.log(np.where(np.eye(2), 1.0, odds) / (1 + odds))
 
 
-@stored_jit
+@jax.jit
 def step(
     last: Labellings,
     dt_s: Float[Array, ""],

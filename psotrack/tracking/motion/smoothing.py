@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
 from psotrack.geometry.estimation import backward_step
-from psotrack.support import stored_jit
 from psotrack.support.array_types import Array
 from psotrack.tracking.motion import kalman
 from psotrack.tracking.motion.kalman import MotionParams, MotionState
@@ -212,18 +211,18 @@ def _without_error(states: MotionState) -> tuple[Array, ...]:
     return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
 
 
-@stored_jit
+@jax.jit
 def _filter(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
     """Filtered states of all frames."""
     return _without_error(_filtered(measured, params)[1])
 
 
-@stored_jit
+@jax.jit
 def _last_state(measured: _Measured, params: MotionParams) -> MotionState:
     return jax.tree.map(itemgetter(-1), _filtered(measured, params)[1])
 
 
-@stored_jit
+@jax.jit
 def _smoothed(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
     """Smoothed states of all frames."""
     predicted, filtered, _ = _filtered(measured, params)
@@ -249,7 +248,7 @@ def _smoothed(measured: _Measured, params: MotionParams) -> tuple[Array, ...]:
     return _without_error(jax.tree.map(lambda part, end: jnp.concatenate([part, end[None]]), smoothed, last))
 
 
-@stored_jit
+@jax.jit
 def _log_likelihoods(measured: _Measured, params: MotionParams, densities: Array) -> Array:
     """(tried, drones), log likelihood of all measurements under each jerk density of `densities`, (tried, drones)."""
 

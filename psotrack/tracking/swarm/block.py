@@ -22,7 +22,7 @@ from jaxtyping import Int, UInt8
 
 from psotrack.foreground.silhouettes import Exposures
 from psotrack.geometry import Camera, Rig
-from psotrack.support import processors, stored_jit
+from psotrack.support import processors
 from psotrack.tracking.births import FrameBlobs
 from psotrack.tracking.swarm import tracker
 from psotrack.tracking.swarm.patches import make_pyramid
@@ -201,7 +201,7 @@ class Engine:
         return [one(jobs[0])] if len(jobs) == 1 else list(self._threads.map(one, jobs))
 
 
-_one_run = stored_jit(tracker.track, static_argnames="program")
+_one_run = jax.jit(tracker.track, static_argnames="program")
 
 
 @partial(jax.jit, static_argnames=("structure", "program"))

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.support import stored_jit
 from psotrack.support.array_types import Key
 from psotrack.tracking.births import (
     NEW,
@@ -452,7 +451,7 @@ class SwarmRun:
             self._memory[index] = replace(frames, tracked=tracked)
 
 
-@partial(stored_jit, static_argnames="count")
+@partial(jax.jit, static_argnames="count")
 def _empty_slots(key: Key, count: int, params: TrackerParams) -> Slots:
     """One program, because each operation alone would be a program of its own."""
     return empty_slots(key, count, params)

@@ -1,0 +1,91 @@
+"""The columns of tracks: one row per frame and drone, in files and in data frames."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Shaped
+
+from psotrack.trajectories.status import Status
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from psotrack.trajectories.trajectories import Trajectories
+
+#: Columns and their units, in written order.
+COLUMNS = {
+    "frame": "1",
+    "time_s": "s",
+    "drone": "name",
+    "x_m": "m",
+    "y_m": "m",
+    "z_m": "m",
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "vz_m_s": "m/s",
+    "fitness": "1",
+    "num_cameras": "1",
+    "status": "tracked, coasting or lost",
+}
+
+#: Further columns if covariances of the positions are known: the upper triangle, row by row.
+COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
+#: The same of covariances without the error that is constant for a drone, if they are known.
+RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
+#: The unit quaternion that turns body coordinates into world coordinates, if orientations are known.
+ORIENTATION_COLUMNS = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
+_UPPER = np.triu_indices(3)
+
+
+def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
+    """One array per column; unknown values are NaN, and -1 in `num_cameras`."""
+    shape = (trajectories.num_frames, trajectories.num_drones)
+    unknown = np.full(shape, np.nan, np.float32)
+    velocity_m_s = trajectories.velocity_m_s
+    status = trajectories.status
+    if status is None:
+        status = np.where(trajectories.seen, Status.TRACKED, Status.LOST)
+    labels = np.array([status.label for status in Status])
+    columns = {
+        "frame": np.broadcast_to(trajectories.frame[:, None], shape),
+        "time_s": np.broadcast_to(trajectories.time_s[:, None], shape),
+        "drone": np.broadcast_to(np.array(trajectories.drones, str), shape),
+        "x_m": trajectories.position_m[..., 0],
+        "y_m": trajectories.position_m[..., 1],
+        "z_m": trajectories.position_m[..., 2],
+        "vx_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 0],
+        "vy_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 1],
+        "vz_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 2],
+        "fitness": unknown if trajectories.fitness is None else trajectories.fitness,
+        "num_cameras": np.full(shape, -1) if trajectories.num_cameras is None else trajectories.num_cameras,
+        "status": labels[status],
+    }
+    columns = {name: columns[name] for name in COLUMNS}
+    for names, covariance_m2 in (
+        (COVARIANCE_COLUMNS, trajectories.covariance_m2),
+        (RELATIVE_COLUMNS, trajectories.relative_covariance_m2),
+    ):
+        if covariance_m2 is not None:
+            columns |= dict(zip(names, np.moveaxis(covariance_m2[..., *_UPPER], -1, 0), strict=True))
+    if trajectories.orientation_wxyz is not None:
+        columns |= dict(
+            zip(ORIENTATION_COLUMNS, np.moveaxis(trajectories.orientation_wxyz, -1, 0), strict=True)
+        )
+    return {name: column.ravel() for name, column in columns.items()}
+
+
+def data_frame(trajectories: Trajectories) -> DataFrame:
+    """The columns as a data frame; what is not known is NaN."""
+    import pandas as pd
+
+    columns = columns_of(trajectories)
+    return pd.DataFrame({name: pd.Series(values).where(is_known(values)) for name, values in columns.items()})
+
+
+def is_known(column: Shaped[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
+    """(rows,), whether the values of a column are known."""
+    if column.dtype.kind == "f":
+        return ~np.isnan(column)
+    return column >= 0 if column.dtype.kind in "iu" else np.ones(len(column), bool)
