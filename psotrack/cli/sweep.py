@@ -119,13 +119,9 @@ def sweep(
         outcome = _run_here(grid, out, data, cache, jobs, device, report_to(quiet))
     else:
         outcome = _run_on_cluster(grid, out, data, cache, where_to_run, quiet)
-    counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
-    output_json(json_path, counts, force)
-    failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
-    print_line(
-        quiet, json_path, f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}"
-    )
-    if counts["failed"]:
+    output_json(json_path, outcome.to_dict(), force)
+    print_line(quiet, json_path, f"{outcome}")
+    if outcome.count("failed"):
         sys.exit(2)
 
 
@@ -239,14 +235,11 @@ def _show(
         for cell in cells
     ]
     expected = estimate(cells, inputs, store)
-    output_json(
-        json_path, {"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}}, force
-    )
+    output_json(json_path, {"cells": listed, "estimate": expected.to_dict()}, force)
     for number, cell in enumerate(listed):
         print_line(
             quiet, json_path, f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items())
         )
-    print_line(quiet, json_path, f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
     for fault in expected.faults:
         print_line(quiet, json_path, f"cannot be read: {fault}")
     print_line(quiet, json_path, f"{expected}")

@@ -1,3 +1,4 @@
+from .compile_time import measured_compiling
 from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
@@ -74,6 +75,7 @@ __all__ = [
     "load_ahead",
     "make_plugin",
     "map_in_processes",
+    "measured_compiling",
     "nearest",
     "no_progress",
     "plain",
