@@ -247,7 +247,14 @@ def track(
     """
     started = click.get_current_context().obj or time.perf_counter()
     from psotrack.foreground.detection import DetectorSettings, find_detector
-    from psotrack.pipeline import Parts, check_detections, track_recording, usable_for, with_real_time
+    from psotrack.pipeline import (
+        Parts,
+        check_detections,
+        speed_in_words,
+        track_recording,
+        usable_for,
+        with_real_time,
+    )
     from psotrack.recordings.datasets import open_recording
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
@@ -299,7 +306,7 @@ def track(
         quiet,
         json_path,
         f"{out}: {tracked.trajectories.num_drones} drones, {tracked.trajectories.num_frames} frames, "
-        f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {record['real_time_factor']:.2g} of real time{sentence}",
+        f"{seen:.1%} seen, {record['seconds']['total']:.1f} s, {speed_in_words(record['real_time_factor'])}{sentence}",
     )
     print_drones(quiet, json_path, tracked.trajectories, tracked.size_m)
 
@@ -317,7 +324,7 @@ def _track_causally(
     started: float,
 ) -> None:
     """Track a recording without the future, and write the rows of each frame as it is done."""
-    from psotrack.pipeline import track_causally, with_real_time
+    from psotrack.pipeline import speed_in_words, track_causally, with_real_time
     from psotrack.trajectories import RowStream, read_trajectories
 
     start_s = time.perf_counter() - started
@@ -340,7 +347,7 @@ def _track_causally(
         quiet,
         json_path,
         f"{out}: {record['drones']} drones, {record['frames']} frames, {record['seconds']['total']:.1f} s, "
-        f"{record['real_time_factor']:.2g} of real time{sentence}",
+        f"{speed_in_words(record['real_time_factor'])}{sentence}",
     )
     # A file without rows is none of tracks.
     if record["drones"] and not quiet:

@@ -148,4 +148,4 @@ def _boxes(store: Store, rows: pd.DataFrame, cells: pd.DataFrame) -> Markup:
     for _, cell in best.head(_MOST_BOXES).iterrows():
         seeds = rows.loc[rows["cell"] == cell["cell"], "seed"].tolist()
         errors.setdefault(cell["sequence"], {})[cell["method"]] = store.errors(cell["cell"], seeds)
-    return figure_svg(error_per_drone(errors)) if errors else Markup("")
+    return figure_svg(error_per_drone(errors, rows["method"])) if errors else Markup("")
