@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -68,36 +68,22 @@ class Grid:
             [(f"grid.{name}[{index}]", name, value) for index, value in enumerate(values)]
             for name, values in self.axes.items()
         ]
-        variants = [
-            (places, cell)
-            for method in self.methods or ("",)
-            for choices in itertools.product(*options)
-            for places, cell in self._cells_of_draws(method, choices)
-        ]
-        placed = [
-            ((f"sequences[{index}]", *places), replace(cell, sequence=sequence))
-            for index, sequence in enumerate(self.sequences)
-            for places, cell in variants
-        ]
+        sequences = [(f"sequences[{index}]", sequence) for index, sequence in enumerate(self.sequences)]
+        combinations = itertools.product(sequences, self.methods or ("",), [*itertools.product(*options)])
+        placed = []
+        for (place, sequence), method, choices in combinations:
+            cell = replace(self._cell(method, choices), sequence=sequence)
+            # A combination that uses no random numbers has one cell.
+            for draw in range(self.draws or 1) if cell.is_random else (0,):
+                perturbation = msgspec.structs.replace(cell.perturbation, draw=draw)
+                axes = cell.axes if self.draws is None else {**cell.axes, "draw": draw}
+                places = (place, f"methods.{method}", *(place for place, _, _ in choices))
+                placed.append((places, replace(cell, perturbation=perturbation, axes=axes)))
         self._check_different(placed)
         if self.draws is not None and not any(cell.is_random for _, cell in placed):
             expected = f"a random choice in [grid]: a number of cameras, {', '.join(PERTURBATIONS)}"
             raise self._error("grid.draws", expected=expected, found="none")
         return tuple(cell for _, cell in placed)
-
-    def _cells_of_draws(
-        self, method: str, choices: tuple[_Choice, ...]
-    ) -> Iterator[tuple[tuple[str, ...], Cell]]:
-        """Yield places and cell of each draw of one combination; the cells have no sequence yet.
-
-        A combination that uses no random numbers has one cell.
-        """
-        cell = self._cell(method, choices)
-        places = (f"methods.{method}", *(place for place, _, _ in choices))
-        for draw in range(self.draws or 1) if cell.is_random else (0,):
-            perturbation = msgspec.structs.replace(cell.perturbation, draw=draw)
-            axes = cell.axes if self.draws is None else {**cell.axes, "draw": draw}
-            yield places, replace(cell, perturbation=perturbation, axes=axes)
 
     def _cell(self, method: str, choices: tuple[_Choice, ...]) -> Cell:
         own = self.methods.get(method, {})
@@ -218,10 +204,7 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
             remedy = "" if isinstance(values, list | tuple | dict) else f"write [{values}]"
             expected, found = "a list of values", f"{values!r}"
             raise SettingsError(f"{where}: grid.{name}", expected=expected, found=found, remedy=remedy)
-        for place, set_there in {
-            "settings": settings,
-            **{f"methods.{of}": methods[of] for of in methods},
-        }.items():
+        for place, set_there in (("settings", settings), *((f"methods.{of}", methods[of]) for of in methods)):
             if name in set_there:
                 found = f"{place}.{name} as well"
                 raise SettingsError(f"{where}: grid.{name}", expected="the name in one place", found=found)
