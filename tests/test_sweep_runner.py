@@ -3,6 +3,7 @@
 Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
 """
 
+import importlib
 import json
 import os
 import shutil
@@ -24,7 +25,7 @@ from sweeps import SETTINGS, all_rows, grid_file, psotrack, small_sequence, stam
 from psotrack.cli import main
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
-from psotrack.support import compiled
+from psotrack.support import compiled, register_plugin
 from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, sweep
 from psotrack.sweep import grid as grid_of
 from psotrack.sweep import inputs as inputs_of_cells
@@ -350,6 +351,21 @@ def test_a_changed_tracker_runs_every_cell_again(
     Tracker(monkeypatch)
     assert sweep(varied(3), out, **folders)["cell"].tolist() == older["cell"].tolist()
     assert Store(out).rows()["cell"].tolist() == older["cell"].tolist()
+
+
+@pytest.mark.slow
+def test_a_changed_plugin_runs_every_cell_again(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "own_score.py"
+    file.write_text("def make(settings): ...")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("psotrack.support.plugins._registered", {})
+    register_plugin("score", "own", importlib.import_module("own_score").make)
+    (cell,) = grid_of(varied(3, **{"score.kind": "own"})).cells()
+    before = Inputs(root, root / "cache").keys_of(cell)
+    file.write_text("def make(settings): return 1")
+    assert Inputs(root, root / "cache").keys_of(cell) != before
 
 
 def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path, monkeypatch) -> None:

@@ -21,7 +21,15 @@ from .files import (
 )
 from .html import html_block, html_lines, html_paths, html_table
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
-from .plugins import PluginKind, check_interface, identify, make_plugin, plugin_names, register_plugin
+from .plugins import (
+    PluginKind,
+    check_interface,
+    identify,
+    make_plugin,
+    plugin_names,
+    plugin_source,
+    register_plugin,
+)
 from .processes import map_in_processes, with_traceback, worker_processes
 from .program_seals import is_whole_program
 from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
@@ -80,6 +88,7 @@ __all__ = [
     "no_progress",
     "plain",
     "plugin_names",
+    "plugin_source",
     "processors",
     "progress_bar",
     "progress_lines",

@@ -18,7 +18,7 @@ import msgspec
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings, flatten, setting_names
-from psotrack.support import convert, nearest, read_toml
+from psotrack.support import assign, convert, nearest, read_toml
 from psotrack.sweep.cells import Cell, Perturbation, cameras_label
 
 #: Dotted names that the tables [settings] and [methods.NAME] may contain.
@@ -260,13 +260,8 @@ def _check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
 def _nest(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
     """Nested tables from dotted names and values; dotted names that are not among `names` are left out."""
     data: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in names:
-            *outer, last = name.split(".")
-            inner = data
-            for part in outer:
-                inner = inner.setdefault(part, {})
-            inner[last] = value
+    for name in values.keys() & set(names):
+        assign(data, name, values[name], _unplaced)
     return data
 
 

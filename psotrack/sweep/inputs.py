@@ -14,7 +14,7 @@ from psotrack.pipeline import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import YOLO
-from psotrack.support import digest_file, digest_record, plain
+from psotrack.support import PluginKind, digest_file, digest_record, plain, plugin_source
 from psotrack.sweep.cells import Cell, input_digest
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.machine import code_digest
@@ -78,11 +78,21 @@ class Inputs:
             SettingsError: the sequence has fewer frames than the cell needs.
         """
         recording, keys = self._source(cell)
-        keys = {**keys, "code": code_digest()}
-        if Path(cell.settings.init).is_file():
-            keys["init"] = digest_file(Path(cell.settings.init))
-        if cell.settings.reads_detections:
-            files = detection_files_of(recording, cell.settings.detections)
+        settings, keys = cell.settings, {**keys, "code": code_digest()}
+        named: dict[PluginKind, str] = {
+            "method": settings.method,
+            "search": settings.swarm.search,
+            "score": settings.score.kind,
+            "background": settings.silhouettes.background,
+        }
+        for kind, name in named.items():
+            source = plugin_source(kind, name)
+            if source is not None:
+                keys[f"{kind} {name}"] = digest_file(source)
+        if Path(settings.init).is_file():
+            keys["init"] = digest_file(Path(settings.init))
+        if settings.reads_detections:
+            files = detection_files_of(recording, settings.detections)
             keys |= {f"detections of {name}": digest_file(path) for name, path in files.items()}
         return keys
 
