@@ -46,13 +46,6 @@ def test_lines_of_a_stage_of_two_minutes() -> None:
     ]
 
 
-def test_what_is_done_once_is_not_in_the_time_that_is_left() -> None:
-    """The first cell of a sweep makes silhouettes and compiles: 93 s, and the others take an eighth of a second."""
-    lines = lines_of([(93.0, 1)] + [(0.125, 1)] * 539, 540)
-    assert lines[0] == "track: 1 of 540 (0%), 93 s"
-    assert lines[1] == "track: 161 of 540 (30%), 2 min, about 47 s left"
-
-
 def test_long_stages_have_a_line_at_least_every_five_minutes() -> None:
     lines = lines_of([(60.0, 1)] * 600, 600)
     # One per five minutes of ten hours; the last of them is the end.

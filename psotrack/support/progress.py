@@ -89,7 +89,7 @@ def progress_lines(
         def advance(steps: int) -> None:
             nonlocal written_s, written_done
             with lock:
-                stage.advance(steps)
+                stage.done += steps
                 since_s, share = clock() - written_s, (stage.done - written_done) / max(total, 1)
                 is_due = not written_done or share >= _SHARE or since_s >= _AT_LATEST_S or not total
                 if since_s < _EVERY_S or not is_due or 0 < total <= stage.done:
@@ -133,27 +133,18 @@ class _Stage:
         self._description, self.total, self._clock = description, total, clock
         self._began_s = clock()
         self.done = 0
-        #: Steps and time at the end of the first step, in which programs are compiled and silhouettes made.
-        self._first: tuple[int, float] | None = None
 
     @property
     def seconds(self) -> float:
         """Time since the stage began, seconds."""
         return self._clock() - self._began_s
 
-    def advance(self, steps: int) -> None:
-        """Count steps that are done."""
-        self.done += steps
-        self._first = self._first or (self.done, self._clock())
-
     def so_far(self) -> str:
         """What is done, the time that it took, and about how long the rest takes."""
         if not self.total:
             return f"{self._description}: {self.done}, {_duration(self.seconds)}"
-        left, (first, first_s) = "", self._first or (0, 0.0)
-        if first < self.done < self.total:
-            step_s = (self._clock() - first_s) / (self.done - first)
-            left = f", about {_duration(step_s * (self.total - self.done))} left"
+        left_s = self.seconds * (self.total - self.done) / max(self.done, 1)
+        left = f", about {_duration(left_s)} left" if 0 < self.done < self.total else ""
         return f"{self._steps()} ({self.done / self.total:.0%}), {_duration(self.seconds)}{left}"
 
     def finished(self) -> str:
@@ -208,7 +199,7 @@ def _notebook_bar(description: str, total: int) -> Iterator[Advance]:
 
     def advance(steps: int) -> None:
         nonlocal drawn_s
-        stage.advance(steps)
+        stage.done += steps
         if time.monotonic() - drawn_s >= _REDRAWN_S:
             drawn_s = time.monotonic()
             update_display(shown(stage.so_far()), raw=True, display_id=name)
