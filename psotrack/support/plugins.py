@@ -125,13 +125,19 @@ def check_interface(where: str, part: object, interface: type) -> None:
         )
 
 
+def lasting_name(name: str) -> str:
+    """The dotted name of a class without the rooms of this package, which may move: `psotrack.Living`."""
+    package, _, rest = name.partition(".")
+    return f"{package}.{rest.rpartition('.')[2]}" if package == __name__.partition(".")[0] else name
+
+
 def identify(part: Any) -> dict[str, Any]:
     """Identity of a plugged-in part, fit for JSON: its class, and its `key` where the part has a key.
 
     Raises:
         SettingsError: the key is no plain data.
     """
-    name = f"{type(part).__module__}.{type(part).__qualname__}"
+    name = lasting_name(f"{type(part).__module__}.{type(part).__qualname__}")
     if not hasattr(part, "key"):
         return {"class": name}
     try:

@@ -28,7 +28,7 @@ from psotrack.foreground.silhouettes.store import LEFT_OUT, Task, open_stored, r
 from psotrack.foreground.silhouettes.usable_frames import Interval, in_words
 from psotrack.geometry import Rig, looking_depths_m
 from psotrack.recordings import FrameTimes, Recording, StoredSilhouettes, TruncatedVideoError
-from psotrack.support import Report, identify, make_plugin, map_in_processes, no_progress
+from psotrack.support import Report, identify, lasting_name, make_plugin, map_in_processes, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -250,7 +250,7 @@ def _check_made_with(
 
 def _made_how(settings: ForegroundSettings, background: Mapping[str, Any]) -> dict[str, Any]:
     """Settings by name, with the class and the key of the background model."""
-    model = {"background": background["class"], "background.key": background["key"]}
+    model = {"background": lasting_name(background["class"]), "background.key": background["key"]}
     return msgspec.to_builtins(settings) | model
 
 
