@@ -150,6 +150,8 @@ def _distributed() -> Any:
         ) from error
     # At the level INFO, Dask reports every worker that starts and ends.
     logging.getLogger("distributed").setLevel(logging.WARNING)
+    # What happens to a worker is in the results of its cells; that it ends slowly is none of the user's business.
+    logging.getLogger("distributed.nanny").setLevel(logging.ERROR)
     return distributed
 
 
