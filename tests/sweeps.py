@@ -24,6 +24,16 @@ silhouettes.reduction = 2
 swarm.iterations = {iterations}
 """
 
+#: The same settings for a mapping.
+SETTINGS = {
+    "swarm.particles": 8,
+    "swarm.kind": "joint",
+    "score.kind": "hard",
+    "init": "truth",
+    "drones.size_m": [0.5, 0.5, 0.2],
+    "silhouettes.reduction": 2,
+}
+
 #: Compiled programs are stored per number of devices, so one device is set, with the suite's settings of XLA.
 COMPILER = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=1"}
 

@@ -13,7 +13,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
 from psotrack.sweep import Perturbation, cell_key, grid, read_grid
-from psotrack.sweep.names import SETTINGS
+from psotrack.sweep.grid_files import SETTINGS
 
 FILE = """
 sequences = ["S01_D2_A", "S04_D10"]
@@ -365,7 +365,7 @@ def test_the_number_of_runs_is_not_in_the_key():
     ).cells()[0]
     assert few != many
     assert cell_key(few, INPUT) == cell_key(many, INPUT)
-    assert re.fullmatch("[0-9a-f]{40}", cell_key(few, INPUT))
+    assert re.fullmatch("[0-9a-f]{20}-[0-9a-f]{20}", cell_key(few, INPUT))
 
 
 def test_the_place_of_a_sequence_is_not_in_the_key():

@@ -3,6 +3,7 @@
 Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
 """
 
+import importlib
 import json
 import os
 import shutil
@@ -10,6 +11,8 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -17,24 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
+from sweeps import SETTINGS, all_rows, grid_file, psotrack, small_sequence, stamps
 
 from psotrack.cli import main
 from psotrack.errors import InputError
-from psotrack.support import compiled
+from psotrack.recordings.datasets import open_recording
+from psotrack.support import compiled, register_plugin
 from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, sweep
 from psotrack.sweep import grid as grid_of
-from psotrack.sweep.estimates import FRAME_S, WORK_S
+from psotrack.sweep import inputs as inputs_of_cells
 from psotrack.sweep.locks import Locks
 
-SETTINGS = {
-    "swarm.particles": 8,
-    "swarm.kind": "joint",
-    "score.kind": "hard",
-    "init": "truth",
-    "drones.size_m": [0.5, 0.5, 0.2],
-    "silhouettes.reduction": 2,
-}
 METHODS = """
 [methods.usual]
 [methods.calm]
@@ -199,47 +195,25 @@ def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.slow
-def test_an_estimate_says_its_parts_and_its_basis(
-    root: Path, swept: Path, capsys: pytest.CaptureFixture[str]
+def test_an_estimate_counts_the_cells_and_takes_the_time_of_finished_runs(
+    root: Path, tracker: Tracker, tmp_path: Path
 ) -> None:
-    def estimated(grid: Path, out: Path, cache: Path = root / "cache") -> str:
-        code, lines, err = called(
-            capsys, "sweep", grid, "--dry-run", "--data", root, "--out", out, "--cache", cache
-        )
-        assert code == 0, err
-        return lines[-1]
-
-    more = swept / "more.toml"
-    more.write_text((swept / "good.toml").read_text().replace("6", "6, 30").replace("runs = 2", "runs = 3"))
-    known = estimated(more, swept / "results")
-    assert "for 6 cells (tracking " in known
-    assert f"estimated from 8 runs on this device in {swept / 'results'}" in known
-    assert "silhouettes" not in known
-    # Finished cells take no time; without results the rule of thumb is used, and silhouettes may be missing.
-    assert estimated(swept / "good.toml", swept / "results") == "nothing to run"
-    unknown = estimated(swept / "good.toml", swept / "nothing", swept / "nothing")
-    assert "estimated from a rule of thumb" in unknown
-    assert "silhouettes" in unknown
-
-
-@pytest.mark.slow
-def test_an_estimate_follows_the_rows_and_the_work(root: Path, tracker: Tracker, tmp_path: Path) -> None:
-    """If rows took ten times as long as by the rule of thumb, the estimate of all cells is ten times as long."""
     store, inputs = Store(tmp_path), Inputs(root, root / "cache")
-    by_rule = estimate(grid_of(varied(3)).cells(), inputs, store)
-    work = 8 * 3 * 2 * 8
-    assert by_rule.tracking_s == pytest.approx(6 * (FRAME_S + WORK_S * work))
-    rows = sweep(varied(3), tmp_path, data=root, cache=root / "cache")
-    rows["drones"], rows["seconds.track"] = 2, 10 * by_rule.tracking_s
-    store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0]}))
-    more = estimate(grid_of(varied(3, 30, runs=2)).cells(), inputs, store)
-    assert more.cells == 2
-    assert more.tracking_s == pytest.approx(
-        60 * (FRAME_S + WORK_S * work) + 120 * (FRAME_S + 10 * WORK_S * work)
+    cells = grid_of(varied(3, 30, runs=2)).cells()
+    before = estimate(cells, inputs, store)
+    assert (before.cells, before.finished, before.runs, before.total_s) == (2, 0, 4, None)
+    assert f"{before}" == (
+        "2 cells: 0 finished, 2 to run (4 runs); how long they take is known when a cell is finished"
     )
-    rows["device.processor"] = "another"
-    store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0]}))
-    assert "1 runs on another device" in str(estimate(grid_of(varied(30)).cells(), inputs, store))
+    rows = sweep(varied(3, runs=2), tmp_path, data=root, cache=root / "cache")
+    # Two runs in a batch of 31 s, each of which compiled for 10 s.
+    rows["seconds.batch"], rows["seconds.compile"] = 31.0, 10.0
+    store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0, 1]}))
+    after = estimate(cells, inputs, store)
+    assert f"{after}" == (
+        "2 cells: 1 finished, 1 to run (2 runs), about 11 s at 5.5 s per run, as the finished runs"
+    )
+    assert after.to_dict()["total_s"] == 11.0
 
 
 def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -254,9 +228,8 @@ def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture
         "swarm.iterations=6",
     ]
     assert lines[2:] == [
-        "2 cells, 4 runs",
         "cannot be read: data: expected the sequence S01_D2_A, found none; name the data's root with --data",
-        "nothing to run; without 2 cells whose input cannot be read",
+        "2 cells: 0 finished, 2 cannot be read, 0 to run (0 runs)",
     ]
 
 
@@ -360,6 +333,113 @@ def test_only_one_process_at_a_time_makes_the_silhouettes(root: Path, tmp_path: 
     given = inputs.read(cell)
     assert given is not None
     assert given.silhouettes.num_frames == 6
+
+
+@pytest.mark.slow
+def test_a_changed_tracker_runs_every_cell_again(
+    root: Path, tracker: Tracker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows of the older code stay in the folder, and no table mixes them with the new ones."""
+    out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
+    older = sweep(varied(3), out, **folders)
+    monkeypatch.setattr(inputs_of_cells, "code_digest", lambda: "changed")
+    newer = sweep(varied(3), out, **folders)
+    assert tracker.runs == [(3, [0]), (3, [0])]
+    assert older["cell"][0] != newer["cell"][0]
+    assert Store(out).rows()["cell"].tolist() == newer["cell"].tolist()
+    monkeypatch.undo()
+    Tracker(monkeypatch)
+    assert sweep(varied(3), out, **folders)["cell"].tolist() == older["cell"].tolist()
+    assert Store(out).rows()["cell"].tolist() == older["cell"].tolist()
+
+
+@pytest.mark.slow
+def test_a_changed_plugin_runs_every_cell_again(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "own_score.py"
+    file.write_text("def make(settings): ...")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("psotrack.support.plugins._registered", {})
+    register_plugin("score", "own", importlib.import_module("own_score").make)
+    (cell,) = grid_of(varied(3, **{"score.kind": "own"})).cells()
+    before = Inputs(root, root / "cache").keys_of(cell)
+    file.write_text("def make(settings): return 1")
+    assert Inputs(root, root / "cache").keys_of(cell) != before
+
+
+def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path, monkeypatch) -> None:
+    """A change of the tracker changes the digest, one of the command line does not; no row needs what is left out."""
+
+    def digest(package: Path) -> str:
+        monkeypatch.setattr(machine, "_PACKAGE", package)
+        machine.code_digest.cache_clear()
+        return machine.code_digest()
+
+    package = shutil.copytree(machine._PACKAGE, tmp_path / "psotrack")
+    before = digest(package)
+    with (package / "cli" / "sweep.py").open("a") as file:
+        file.write("# another line")
+    assert digest(package) == before
+    with (package / "tracking" / "swarm" / "tracker.py").open("a") as file:
+        file.write("# another line")
+    assert digest(package) != before
+    monkeypatch.undo()
+    machine.code_digest.cache_clear()
+    program = "import sys; from psotrack.sweep import runner, perturbations; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    names = [name.replace(".", "/") for name in done.stdout.split() if name.startswith("psotrack.")]
+    needless = ("sweep/grid_files", "sweep/locks", "sweep/tables")
+    left_out = tuple(f"psotrack/{name}" for name in machine.COMPUTES_NO_ROW if name not in needless)
+    assert [name for name in names if f"{name}/".startswith(left_out)] == []
+
+
+@pytest.mark.slow
+def test_only_the_instants_of_a_run_count(root: Path, tmp_path: Path) -> None:
+    """With fewer frames, or another rate, than the reference: drones are not missed where nothing was tracked."""
+    folders = {"data": root, "cache": root / "cache"}
+    grid = {"sequences": ["S01_D2_A"], "settings": SETTINGS, "grid": {"frames": [4], "rate_hz": [25.0, 12.5]}}
+    rows = sweep(grid, tmp_path / "out", **folders)
+    assert rows["missed_rate"].tolist() == [0.0, 0.0]
+    assert (rows["mean_error_m"] < 0.2).all()
+    frames = [Store(tmp_path / "out").errors(key, [0])["frame"].nunique() for key in rows["cell"]]
+    known = open_recording(root / "Simulated_Data" / "S01_D2_A").truth.seen.any(axis=1)
+    assert frames == [known[:4].sum(), known[:4:2].sum()]
+
+
+@pytest.mark.slow
+def test_everything_that_a_cell_reads_changes_its_key(root: Path, tmp_path: Path) -> None:
+    """Rates, times of frames and rows, kinds of lenses and names of cameras, without videos of other content."""
+    (cell,) = grid_of(varied(3)).cells()
+
+    def key(change) -> str:
+        inputs = Inputs(root, root / "cache")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(inputs_of_cells, "open_recording", lambda folder: change(open_recording(folder)))
+            return cell_key(cell, inputs.keys_of(cell))
+
+    def slower(recording):
+        videos = {name: replace(video, fps=20.0) for name, video in recording.videos.items()}
+        return replace(recording, videos=videos, frame_times={})
+
+    def with_lens(recording, *, fisheye):
+        cameras = recording.rig.cameras
+        count = len(recording.rig)
+        # Without distortion, pinholes and fisheyes have the same coefficients.
+        changed = replace(cameras, dist=np.zeros((count, 4)), fisheye=fisheye and np.ones(count, bool))
+        return replace(recording, rig=replace(recording.rig, cameras=changed))
+
+    changes = [
+        lambda recording: recording,
+        slower,
+        partial(with_lens, fisheye=None),
+        partial(with_lens, fisheye=True),
+        lambda recording: replace(recording, line_time_s=dict.fromkeys(recording.rig.names, 1e-5)),
+        lambda recording: replace(recording, line_time_s=dict.fromkeys(recording.rig.names, 2e-5)),
+        lambda recording: replace(recording, bounds_m=(-1.0, 1.0, -1.0, 1.0, 0.0, 2.0)),
+    ]
+    keys = [key(change) for change in changes]
+    assert len(set(keys)) == len(keys)
 
 
 def test_a_commit_is_empty_outside_of_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,6 +85,27 @@ def test_a_seed_that_is_run_again_replaces_its_row(tmp_path: Path) -> None:
     assert store.errors(KEY, range(2))["error_m"].tolist() == [0.01, 0.01, 6.0, 6.0]
 
 
+def test_only_the_input_that_was_used_last_counts(tmp_path: Path) -> None:
+    """Rows of an older tracker, or of another recording, stay in the folder and are not mixed with the others."""
+    store = Store(tmp_path)
+    for key, error_m in (("a-old", 1.0), ("a-new", 2.0), ("b-old", 3.0)):
+        add(store, key, rows(0, error_m=error_m))
+    store.change_manifest(lambda manifest: manifest["inputs"].update(old={}, new={}))
+    assert store.rows()["mean_error_m"].tolist() == [2.0, 3.0]
+    assert store.status()["finished"] == 2
+    # The older tracker is used again.
+    store.change_manifest(lambda manifest: manifest["inputs"].update(old=manifest["inputs"].pop("old")))
+    assert store.rows()["mean_error_m"].tolist() == [1.0, 3.0]
+    assert store.rows({"a-new": [0]})["mean_error_m"].tolist() == [2.0]
+
+
+def test_cells_are_sorted_by_their_settings(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for key, particles in (("c", 20), ("a", 100), ("b", 3)):
+        add(store, key, rows(0).assign(sequence="S01", **{"settings.swarm.particles": particles}))
+    assert store.rows()["settings.swarm.particles"].tolist() == [3, 20, 100]
+
+
 def test_rows_of_some_cells_and_seeds(tmp_path: Path) -> None:
     store, other = Store(tmp_path), "1" * 40
     add(store, KEY, rows(0, 1, 2))
@@ -111,7 +132,6 @@ def test_a_half_written_file_is_no_result(tmp_path: Path) -> None:
 def test_a_failure_is_stored_until_it_is_removed(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.add_failure(KEY, "no such camera", {"sequence": "S01", "method": "ours"})
-    assert store.failure(KEY) == "no such camera"
     assert store.status() == {
         "finished": 0,
         "failed": 1,
@@ -121,7 +141,6 @@ def test_a_failure_is_stored_until_it_is_removed(tmp_path: Path) -> None:
     }
     store.remove_failure(KEY)
     store.remove_failure(KEY)
-    assert store.failure(KEY) is None
     assert store.status()["failed"] == 0
 
 
@@ -132,13 +151,13 @@ def test_the_folder_is_a_parquet_data_set_of_the_rows(tmp_path: Path) -> None:
     add(store, "1" * 40, rows(2))
     store.add_failure("2" * 40, "no such camera", {"sequence": "S01", "method": "ours"})
     store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
-    with store.lock("3" * 40, "S01 ours"):
+    with store.lock("3" * 40):
         pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
 
 
 def test_one_runner_at_a_time_locks_a_cell(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    with store.lock(KEY, "S01 ours") as first:
+    with store.lock(KEY) as first:
         assert first
         for other in (store, Store(tmp_path)):
             with other.lock(KEY) as second:
@@ -147,7 +166,6 @@ def test_one_runner_at_a_time_locks_a_cell(tmp_path: Path) -> None:
             status = reader.status()
             assert status["claimed"] == 1
             assert f"process {os.getpid()} on " in status["at_work"][0]
-            assert status["at_work"][0].endswith(": S01 ours")
     assert store.status()["claimed"] == 0
     with store.lock(KEY) as third:
         assert third
@@ -162,7 +180,7 @@ def test_a_lock_is_released_when_the_work_fails(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="process start times are read from /proc")
 def test_the_lock_of_a_killed_process_of_this_machine_lapses_at_once(tmp_path: Path) -> None:
     code = "import sys; from pathlib import Path; from psotrack.sweep import Store\n"
-    code += "with Store(Path(sys.argv[1])).lock(sys.argv[2], 'S01 ours'):\n"
+    code += "with Store(Path(sys.argv[1])).lock(sys.argv[2]):\n"
     code += "    print('locked', flush=True)\n    sys.stdin.read()"
     store = Store(tmp_path)
     command = [sys.executable, "-c", code, str(tmp_path), KEY]
@@ -370,11 +388,3 @@ def test_a_damaged_cell_is_run_again(tmp_path: Path, caplog: pytest.LogCaptureFi
     assert f"{path}: damaged rows of a cell" in caplog.text
     add(store, KEY, rows(0, 1))
     pd.testing.assert_frame_equal(store.rows(), rows(0, 1))
-
-
-def test_other_programs_read_the_files_and_older_files_are_read(tmp_path: Path) -> None:
-    store, path = Store(tmp_path), tmp_path / "cells" / f"{KEY}.parquet"
-    add(store, KEY, rows(0, 1))
-    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), rows(0, 1))
-    rows(4).to_parquet(path, index=False)
-    assert store.finished_seeds(KEY) == {4}

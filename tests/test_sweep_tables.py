@@ -2,12 +2,10 @@
 
 import csv
 import io
-import itertools
 import logging
 import math
 import statistics
 
-import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given
@@ -56,23 +54,6 @@ def test_figures_equal_the_standard_librarys():
         assert found["runs"] == 3
     assert list(table.index) == ["ours", "paper"]
     assert list(table.columns.names) == ["particles", "figure"]
-
-
-@given(
-    numbers=st.lists(
-        st.tuples(st.integers(0, 2), st.integers(0, 2), st.one_of(st.none(), st.floats(-1e3, 1e3))),
-        min_size=1,
-        max_size=30,
-    )
-)
-def test_figures_with_missing_values_equal_those_of_pandas(numbers):
-    rows = pd.DataFrame(numbers, columns=["a", "b", "value"]).astype({"value": float})
-    table = pivot(rows, rows_by=["a"], columns_by=["b"], value="value")
-    oracle = rows.groupby(["a", "b"])["value"].agg(["mean", "std", "count"])
-    for a, b in itertools.product(table.index, table.columns.get_level_values("b").unique()):
-        expected = oracle.loc[(a, b)] if (a, b) in oracle.index else [math.nan, math.nan, 0]
-        # pandas sums in another order; the tolerance is float64 rounding at 1e3, and of the variance.
-        np.testing.assert_allclose(table.loc[a, b], expected, rtol=1e-9, atol=1e-6)
 
 
 def test_labels_are_sorted_by_numbers_and_words_for_every_order_of_rows():
@@ -163,11 +144,13 @@ def test_a_warning_names_settings_that_a_figure_mixes(caplog):
     assert caplog.messages == ["figures are not only over runs: they mix different settings.swarm.particles"]
 
 
-def test_mixing_draws_gives_no_warning(caplog):
+def test_mixing_draws_gives_no_warning_and_mixing_code_does(caplog):
     rows = results(**{"perturbation.draw": 0})
     rows["perturbation.draw"] = rows["settings.seed"]
     in_mm(rows)
     assert caplog.messages == []
+    in_mm(rows.assign(code=rows["settings.seed"].map({0: "a", 1: "b", 2: "b"})))
+    assert caplog.messages == ["figures are not only over runs: they mix different code"]
 
 
 # --- layouts

@@ -116,11 +116,9 @@ def sweep(
         outcome = _run_here(grid, out, data, cache, jobs, device, output.report)
     else:
         outcome = _run_on_cluster(output, grid, out, data, cache, where_to_run)
-    counts = {state: outcome.count(state) for state in ("finished", "failed", "left")}
-    output.json(counts)
-    failed = f", {counts['failed']} failed (see {out}/cells/*.error.json)" if counts["failed"] else ""
-    output.say(f"{out}: {counts['finished']} cells finished now, {counts['left']} before{failed}")
-    if counts["failed"]:
+    output.json(outcome.to_dict())
+    output.say(f"{outcome}")
+    if outcome.count("failed"):
         sys.exit(2)
 
 
@@ -178,10 +176,9 @@ def _show(output: Output, grid: Grid, inputs: Inputs, store: Store | None) -> No
         for cell in cells
     ]
     expected = estimate(cells, inputs, store)
-    output.json({"cells": listed, "estimate": vars(expected) | {"total_s": expected.total_s}})
+    output.json({"cells": listed, "estimate": expected.to_dict()})
     for number, cell in enumerate(listed):
         output.say(f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items()))
-    output.say(f"{len(cells)} cells, {sum(cell.runs for cell in cells)} runs")
     for fault in expected.faults:
         output.say(f"cannot be read: {fault}")
     output.say(f"{expected}")

@@ -121,7 +121,13 @@ def track(
       psotrack track my_lab --config paper.toml --out again.csv
     """
     from psotrack.foreground.detection import DetectorSettings, find_detector
-    from psotrack.pipeline import Parts, check_detections, track_recording, usable_for, with_real_time
+    from psotrack.pipeline import (
+        Parts,
+        check_detections,
+        track_recording,
+        usable_for,
+        with_real_time,
+    )
     from psotrack.recordings.datasets import open_recording
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
@@ -163,15 +169,15 @@ def track(
         write_json(record_file, record)
     output.json(record)
     seen = f"{tracks.num_drones} drones, {tracks.num_frames} frames, {tracks.seen.mean():.1%} seen"
-    output.say(f"{out}: {seen}, {_seconds(record)}{sentence}")
+    output.say(f"{out}: {seen}, {_speed(record)}{sentence}")
     output.drones(tracks, tracked.size_m)
 
 
-def _seconds(record: dict[str, Any]) -> str:
+def _speed(record: dict[str, Any]) -> str:
     """How long the work took, and how that compares with the time that was filmed."""
-    factor = max(record["real_time_factor"], 1e-3)
-    compared = f"{factor:.2g} times as fast as" if factor >= 1 else f"{1 / factor:.2g} times slower than"
-    return f"{record['seconds']['total']:.1f} s, {compared} the video"
+    from psotrack.pipeline import speed_in_words
+
+    return f"{record['seconds']['total']:.1f} s, {speed_in_words(record['real_time_factor'])}"
 
 
 def _track_causally(output: Output, run: _Run, most_drones: int) -> None:
@@ -196,9 +202,7 @@ def _track_causally(output: Output, run: _Run, most_drones: int) -> None:
     record, sentence = with_comparison(record, run.out, run.settings)
     write_json(record_path, record)
     output.json(record)
-    output.say(
-        f"{run.out}: {record['drones']} drones, {record['frames']} frames, {_seconds(record)}{sentence}"
-    )
+    output.say(f"{run.out}: {record['drones']} drones, {record['frames']} frames, {_speed(record)}{sentence}")
     # A file without rows is none of tracks.
     if record["drones"] and output.shows:
         output.drones(read_trajectories(run.out))

@@ -5,6 +5,7 @@ from .results import (
     TrackedRecording,
     changed_settings,
     environment,
+    speed_in_words,
     warn_of_missing_drones,
     with_real_time,
 )
@@ -22,6 +23,7 @@ __all__ = [
     "detection_files_of",
     "environment",
     "prepare",
+    "speed_in_words",
     "track_causally",
     "track_recording",
     "track_runs",

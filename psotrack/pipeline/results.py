@@ -221,6 +221,14 @@ def environment() -> dict[str, Any]:
     }
 
 
+def speed_in_words(real_time_factor: float) -> str:
+    """How fast a run was, from its seconds of video per second of wall clock: "16 times slower than the video"."""
+    times = max(real_time_factor, 1 / real_time_factor)
+    if times < 1.05:
+        return "as fast as the video"
+    return f"{times:.2g} times {'faster' if real_time_factor > 1 else 'slower'} than the video"
+
+
 def with_real_time(record: Mapping[str, Any], wall_s: float, *, start_s: float = 0.0) -> dict[str, Any]:
     """The record with its real-time factors: seconds of video per second of wall clock.
 

@@ -1,4 +1,5 @@
 from .calls import check_records, checked
+from .compile_time import measured_compiling
 from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
@@ -28,6 +29,7 @@ from .plugins import (
     lasting_name,
     make_plugin,
     plugin_names,
+    plugin_source,
     register_plugin,
 )
 from .processes import map_in_processes, with_traceback, worker_processes
@@ -94,10 +96,12 @@ __all__ = [
     "left_over",
     "make_plugin",
     "map_in_processes",
+    "measured_compiling",
     "nearest",
     "no_progress",
     "plain",
     "plugin_names",
+    "plugin_source",
     "processors",
     "progress_bar",
     "progress_lines",

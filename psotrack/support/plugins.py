@@ -17,9 +17,11 @@ process only, for scripts, notebooks and sweeps in them.
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 from psotrack.errors import SettingsError
@@ -96,6 +98,21 @@ def make_plugin(
     made = _load(kind, name, setting, built_in)(settings)
     check_interface(f"{setting} {name}", made, interface)
     return made
+
+
+def plugin_source(kind: PluginKind, name: str) -> Path | None:
+    """The file with the code that makes a plugin; None where no plugin has this name, or its code is in no file.
+
+    Raises:
+        SettingsError: the plugin cannot be imported.
+    """
+    if name not in plugin_names(kind):
+        return None
+    try:
+        source = inspect.getsourcefile(_load(kind, name, kind, ()))
+    except TypeError:  # an object that can be called, whose class is what has a file
+        source = inspect.getsourcefile(type(_load(kind, name, kind, ())))
+    return Path(source) if source and Path(source).is_file() else None
 
 
 def check_interface(where: str, part: object, interface: type) -> None:

@@ -1,17 +1,18 @@
+from .cells import Cell, Perturbation, cameras_label, cell_key
 from .cluster import Cluster, run_on_cluster
-from .estimates import estimate
+from .estimates import Estimate, estimate
 from .frames import sweep
-from .grid_files import Cell, Grid, Perturbation, cameras_label, cell_key, grid, read_grid
+from .grid_files import Grid, grid, read_grid
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
-from .printing import render_table
 from .runner import SweepOutcome, run_in_process
 from .store import Store, is_results_folder
-from .tables import pivot
+from .tables import pivot, render_table
 
 __all__ = [
     "Cell",
     "Cluster",
+    "Estimate",
     "Grid",
     "Inputs",
     "Perturbation",

@@ -1,8 +1,11 @@
-"""Cells, the combinations of a grid, and the key under which the results of a cell are stored."""
+"""Cells, the combinations of a grid, and the key under which the results of a cell are stored.
+
+A key is NAME-INPUT. NAME is a digest of the combination alone. INPUT is a digest of everything that the cell reads and
+of the code that computes its rows, so that rows of another recording or of another tracker have another key.
+"""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,10 +16,11 @@ import msgspec
 
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import check_whole
-from psotrack.settings import TrackSettings
+from psotrack.settings import TrackSettings, flatten
+from psotrack.support import digest_record
 
-#: Part of every key. Raise it when the same cell would give other rows.
-SCHEMA = 1
+#: Number of hexadecimal digits of a digest in names.
+_DIGITS = 20
 
 
 class Perturbation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -88,33 +92,59 @@ class Cell:
         return isinstance(self.cameras, int) or self.perturbation.is_random
 
 
-def cell_key(cell: Cell, input_keys: Mapping[str, str]) -> str:
-    """Key of a cell's results: a digest, 40 hexadecimal digits, of everything except the seed that decides a row.
+def input_digest(keys: Mapping[str, str]) -> str:
+    """One digest of the digests of everything on which a cell's rows depend besides its combination."""
+    return digest_record(keys)[:_DIGITS]
 
-    `runs`, `first_seed` and `axes` are not part of the key. Rows of a cell are distinguished by their seeds, so more
-    runs of a finished cell only add rows. The key contains the name of the sequence's folder and the sequence's
-    content, but not the folder's place. It contains the method's name, because rows have a column with this name.
+
+def cell_name(cell: Cell) -> str:
+    """Digest of a cell's combination: of everything that a grid says of the cell, except its seeds.
+
+    `runs`, `first_seed` and `axes` are not part of it: rows of a cell are distinguished by their seeds, so more runs of
+    a finished cell only add rows. The place of the sequence's folder is not part of it either. The method's name is,
+    because rows have a column with this name.
+    """
+    return digest_record(
+        {
+            "sequence": Path(cell.sequence).name,
+            "method": cell.method,
+            "cameras": cell.cameras,
+            "frames": cell.frames,
+            "perturbation": cell.perturbation,
+            "settings": msgspec.structs.replace(cell.settings, seed=0),
+        }
+    )[:_DIGITS]
+
+
+def cell_key(cell: Cell, input_keys: Mapping[str, str]) -> str:
+    """Key of a cell's results: a digest of everything except the seed that decides a row.
 
     Args:
         cell: the cell.
-        input_keys: digests of everything that the cell reads, by name (see `Inputs.keys_of`).
+        input_keys: digests of everything that the cell reads, and of the code, by name (see `Inputs.keys_of`).
     """
-    made_of = {
-        "schema": SCHEMA,
+    return f"{cell_name(cell)}-{input_digest(input_keys)}"
+
+
+def cameras_label(cameras: tuple[str, ...] | int | None) -> str:
+    """Text for a cell's cameras: `all`, their number such as `4`, or names such as `cam1+cam2`."""
+    if cameras is None:
+        return "all"
+    return str(cameras) if isinstance(cameras, int) else "+".join(cameras)
+
+
+def describe(cell: Cell) -> dict[str, Any]:
+    """Description of a cell as a flat table, whose names have dots."""
+    settings = msgspec.to_builtins(cell.settings)
+    del settings["seed"]
+    return {
         "sequence": Path(cell.sequence).name,
         "method": cell.method,
-        "cameras": cell.cameras,
+        "cameras": cameras_label(cell.cameras),
         "frames": cell.frames,
-        "perturbation": msgspec.to_builtins(cell.perturbation),
-        "settings": msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0)),
-        "input": dict(input_keys),
+        **{f"perturbation.{name}": value for name, value in msgspec.to_builtins(cell.perturbation).items()},
+        **{f"settings.{name}": value for name, value in flatten(settings)},
     }
-    return hashlib.blake2b(msgspec.json.encode(made_of, order="deterministic"), digest_size=20).hexdigest()
-
-
-def failure_name(cell: Cell) -> str:
-    """Name under which a cell's failure is stored; it does not depend on whether the cell's input can be read."""
-    return cell_key(cell, {"sequence": cell.sequence})
 
 
 def title(cell: Cell) -> str:

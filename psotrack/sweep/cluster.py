@@ -7,9 +7,9 @@ killed, cells may run again, and other runners may work on the same folder.
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import logging
 import os
+import re
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -38,11 +38,10 @@ from psotrack.sweep.machine import provenance
 from psotrack.sweep.runner import (
     Result,
     SweepOutcome,
-    find_finished,
     open_store,
     outcome,
     run_cell,
-    sort_by_input,
+    sort_out,
     store_failure,
 )
 from psotrack.sweep.store import Store
@@ -51,6 +50,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
+
+#: Addresses at which data are encrypted, or stay on this machine.
+_SAFE = re.compile(r"(tls|wss|inproc)://.*|(\w+://)?(localhost|127\.[\d.]+|\[::1\])(:\d+)?")
 
 
 @dataclass(frozen=True)
@@ -73,25 +75,6 @@ class Cluster:
     def __post_init__(self) -> None:
         if self.workers is not None and self.address != "local":
             raise SettingsError("--workers", expected="--cluster local", found=f"--cluster {self.address}")
-
-
-def _warn_of_open_network(address: str) -> None:
-    """Warn of a scheduler to which data go unencrypted: Dask runs pickled code of whoever reaches the connection."""
-    protocol, _, place = address.rpartition("://")
-    host = place.rpartition(":")[0].strip("[]")
-    if protocol not in ("tls", "wss", "inproc") and not _is_loopback(host):
-        logger.warning(
-            "--cluster %s: neither TLS nor this machine; whoever reaches this network can run code in the workers: "
-            "use tls://",
-            address,
-        )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 @dataclass(frozen=True)
@@ -131,7 +114,7 @@ def run_on_cluster(
         data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes and of compiled programs.
         cluster: the cluster.
-        report: progress bar for the cells.
+        report: progress bar for the cells that are not finished.
         say: receives the address at which the scheduler of a local cluster listens.
 
     Raises:
@@ -144,24 +127,17 @@ def run_on_cluster(
     # Each row names the device on which it was made, which may differ from this one.
     origin = {name: value for name, value in provenance().items() if name != "device"} | {"cluster": True}
     store, inputs = open_store(grid, out, data, origin), Inputs(data, cache)
-    results, cells = [], []
-    for cell in sort_by_input(grid.cells()):
-        result = _result_without_worker(cell, inputs, store)
-        if result is None:
-            cells.append(cell)
-        else:
-            results.append(result)
+    results, cells = sort_out(grid, inputs, store)
     workers = cluster.workers or (1 if cluster.device == "gpu" else processors())
     devices = max(1, processors() // workers) if cluster.address == "local" else None
     job = _Job(out, data, cache, cluster.device, devices, secrets.token_hex(8))
-    with report("sweep", len(cells) + len(results)) as advance:
-        advance(len(results))
+    with report("sweep", len(cells)) as advance, contextlib.ExitStack() as stack:
         if cells:
-            with _client(dask, cluster.address, workers, say) as client:
-                for result in _results(dask, client, cells, job, inputs, store):
-                    results.append(result)
-                    advance(1)
-    return outcome(grid, results)
+            client = stack.enter_context(_client(dask, cluster.address, workers, say))
+            for result in _results(dask, client, cells, job, inputs, store):
+                results.append(result)
+                advance(1)
+    return outcome(grid, results, store)
 
 
 def _distributed() -> Any:
@@ -173,6 +149,8 @@ def _distributed() -> Any:
         ) from error
     # At the level INFO, Dask reports every worker that starts and ends.
     logging.getLogger("distributed").setLevel(logging.WARNING)
+    # What happens to a worker is in the results of its cells; that it ends slowly is none of the user's business.
+    logging.getLogger("distributed.nanny").setLevel(logging.ERROR)
     return distributed
 
 
@@ -187,14 +165,22 @@ def _client(dask: Any, address: str, workers: int, say: Callable[[str], object])
                 processes=True,
                 memory_limit=0,  # Dask sets no limit besides the system's.
                 dashboard_address="127.0.0.1:0",  # Any free port: another sweep may use the default port.
+                # What happens to a cell is in its result. When Ctrl-C ends the cluster, workers would report their
+                # cancelled tasks on the terminal of the sweep.
+                silence_logs=logging.CRITICAL,
             ) as cluster,
             dask.Client(cluster) as client,
         ):
-            client.register_plugin(_quiet_worker(dask))
             say(cluster.scheduler_address)
             yield client
         return
-    _warn_of_open_network(address)
+    if not _SAFE.fullmatch(address):
+        # Dask runs pickled code of whoever reaches the connection.
+        logger.warning(
+            "--cluster %s: neither TLS nor this machine; whoever reaches this network can run code in the workers: "
+            "use tls://",
+            address,
+        )
     try:
         client = dask.Client(address)
     except (OSError, ValueError, TypeError) as error:  # TypeError: tls:// without certificates
@@ -204,41 +190,18 @@ def _client(dask: Any, address: str, workers: int, say: Callable[[str], object])
         yield client
 
 
-def _quiet_worker(dask: Any) -> Any:
-    """A plugin for local workers, which write to the terminal of the sweep.
-
-    What happens to a cell is in its result. When Ctrl-C ends the cluster, workers would report their cancelled tasks.
-    """
-
-    class QuietWorker(dask.WorkerPlugin):
-        def setup(self, worker: object) -> None:
-            logging.getLogger("distributed").setLevel(logging.CRITICAL)
-
-    return QuietWorker()
-
-
-def _result_without_worker(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
-    """Result of a cell that is finished or whose input cannot be read; None for all other cells."""
-    try:
-        return find_finished(cell, inputs, store)
-    except PsotrackError as error:
-        return store_failure(cell, None, error, store)
-
-
 def _results(
     dask: Any, client: Client, cells: list[Cell], job: _Job, inputs: Inputs, store: Store
 ) -> Iterator[Result]:
     """Yield the result of each cell when it ends. Each cell waits for its silhouettes, one task per camera."""
     silhouettes: dict[Any, list[Any]] = {}
+    futures = {}
     for cell in cells:
-        if source_of(cell) not in silhouettes:
+        source = source_of(cell)
+        if source not in silhouettes:
             cameras = inputs.recording_of(cell).rig.names if cell.settings.needs_silhouettes else ()
-            silhouettes[source_of(cell)] = client.map(
-                _make_silhouettes, cameras, cell=cell, job=job, pure=False
-            )
-    futures = {
-        client.submit(_run, cell, job, silhouettes[source_of(cell)], pure=False): cell for cell in cells
-    }
+            silhouettes[source] = client.map(_make_silhouettes, cameras, cell=cell, job=job, pure=False)
+        futures[client.submit(_run, cell, job, silhouettes[source], pure=False)] = cell
     for future in dask.as_completed(futures):
         try:
             yield future.result()

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from psotrack.errors import SettingsError
 from psotrack.support import COLOURS, atomic_write, drone_colour, refuse_to_overwrite
+from psotrack.sweep.tables import natural
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +27,12 @@ _DPI = 150
 _MARKERS = "osD^vP"
 #: Width of all boxes of a drone, as a share of the distance between drones.
 _BOXES = 0.8
+
+
+def method_colours(methods: Iterable[str]) -> dict[str, str]:
+    """A colour for each method, which does not depend on the order in which the methods come."""
+    names = sorted(set(methods), key=natural)
+    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
 def save(path: Path | str, figure: Figure, *, force: bool = False) -> None:
@@ -70,7 +77,7 @@ def error_against_work(
         published: lowest and highest published error of a sequence, metres, drawn as a band.
     """
     cells = _cells(rows, error)
-    sequences, methods = list(dict.fromkeys(cells["sequence"])), list(dict.fromkeys(cells["method"]))
+    sequences, colours = list(dict.fromkeys(cells["sequence"])), method_colours(cells["method"])
     figure = _figure(4.6 * len(sequences), 4.4)
     panels = figure.subplots(1, len(sequences), sharey=True, squeeze=False)[0]
     for axes, sequence in zip(panels, sequences, strict=True):
@@ -88,14 +95,14 @@ def error_against_work(
             label="Pareto front",
             drawstyle="steps-post",
         )
-        for number, method in enumerate(methods):
+        for number, (method, colour) in enumerate(colours.items()):
             of = here[here["method"] == method]
             axes.errorbar(
                 of["work"],
                 of["error"],
                 of["std"],
                 fmt=_MARKERS[number % len(_MARKERS)],
-                color=COLOURS[number % len(COLOURS)],
+                color=colour,
                 markersize=5,
                 linewidth=0.8,
                 label=method,
@@ -139,35 +146,19 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
                 of["time_s"], 1e3 * of["error_m"], color=drone_colour(number), linewidth=1.0, label=drone
             )
             missed = of[of["error_m"].isna()]
-            if len(missed):
-                axes.plot([], [], color=_GREY, linewidth=1.5, label="missed")
-            axes.plot(
+            _mark(
+                axes,
                 missed["time_s"],
-                np.full(len(missed), 0.97 - 0.03 * number),
-                linestyle="",
+                0.97 - 0.03 * number,
                 marker="_",
-                markersize=3,
                 color=drone_colour(number),
-                transform=axes.get_xaxis_transform(),
+                label="missed",
             )
-        for own, of in ((True, run), (False, rows[rows["seed"] != seed])):
-            moments = np.unique(of.loc[of["switch"], "time_s"])
-            if own:
-                label = "identity switch"
-                for index, moment in enumerate(moments):
-                    axes.axvline(
-                        moment, color=_DARK, linestyle=":", linewidth=1.1, label=label if not index else None
-                    )
-            elif len(moments):
-                axes.plot(
-                    moments,
-                    np.full(len(moments), 0.02),
-                    linestyle="",
-                    marker="|",
-                    color=_GREY,
-                    transform=axes.get_xaxis_transform(),
-                    label="switch in another run",
-                )
+        own, others = (np.unique(of.loc[of["switch"], "time_s"]) for of in (run, rows[rows["seed"] != seed]))
+        if len(own):
+            heights = axes.get_xaxis_transform()
+            axes.vlines(own, 0, 1, color=_DARK, linestyle=":", label="identity switch", transform=heights)
+        _mark(axes, others, 0.02, marker="|", color=_GREY, label="switch in another run")
         error_mm = 1e3 * run["error_m"].dropna()
         # A few very small errors would take half of the logarithmic scale.
         smallest_mm = error_mm.quantile(0.02)
@@ -184,27 +175,32 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
     return figure
 
 
-def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
+def error_per_drone(
+    errors: Mapping[str, Mapping[str, pd.DataFrame]], methods: Iterable[str] | None = None
+) -> Figure:
     """A panel per sequence, a box per drone and method: the errors of all frames and runs.
 
     A box holds the middle half of the errors, its line is the median, and the whiskers hold 90 % of the errors.
 
     Args:
         errors: rows of `errors_over_time`, by sequence and method.
+        methods: all methods of the results, for their colours, where `errors` has only some of them.
     """
+    shown = [name for each in errors.values() for name in each]
+    colours = method_colours(shown if methods is None else methods)
     figure = _figure(9.0, 0.8 + 2.3 * len(errors))
     panels = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
-    for axes, (sequence, methods) in zip(panels, errors.items(), strict=True):
-        width = _BOXES / len(methods)
-        for number, (method, rows) in enumerate(methods.items()):
+    for axes, (sequence, runs) in zip(panels, errors.items(), strict=True):
+        width = _BOXES / len(runs)
+        for number, (method, rows) in enumerate(sorted(runs.items(), key=lambda each: natural(each[0]))):
             # Runs without any drone have no errors.
             if rows.empty:
                 continue
-            colour = COLOURS[number % len(COLOURS)]
+            colour = colours[method]
             groups = [
                 (str(name), of["error_m"].dropna()) for name, of in rows.groupby("drone", observed=True)
             ]
-            places = np.arange(len(groups)) + (number - (len(methods) - 1) / 2) * width
+            places = np.arange(len(groups)) + (number - (len(runs) - 1) / 2) * width
             boxes = axes.boxplot(
                 [1e3 * values for _, values in groups],
                 positions=places,
@@ -226,26 +222,23 @@ def error_per_drone(errors: Mapping[str, Mapping[str, pd.DataFrame]]) -> Figure:
     return figure
 
 
+def _mark(axes: Axes, time_s: Any, height: float, **style: Any) -> None:
+    """Mark moments at a height, as a share of the panel's height."""
+    if len(time_s):
+        heights = np.full(len(time_s), height)
+        axes.plot(time_s, heights, linestyle="", markersize=3, transform=axes.get_xaxis_transform(), **style)
+
+
 def _cells(rows: pd.DataFrame, error: str) -> pd.DataFrame:
     """One row per cell: sequence, method, particles, iterations, work (ms per frame), error and its spread (mm)."""
-    needed = {
-        "sequence": "sequence",
-        "method": "method",
-        "particles": "settings.swarm.particles",
-        "iterations": "settings.swarm.iterations",
-    }
-    for name in (*needed.values(), "track_ms_per_frame", error):
+    settings = [f"settings.swarm.{name}" for name in ("particles", "iterations")]
+    for name in ("sequence", "method", *settings, "track_ms_per_frame", error):
         if name not in rows:
             raise SettingsError("rows", expected=f"a column {name}", found="none")
-    cells = rows.groupby(list(needed.values()), sort=False)
-    table = pd.DataFrame(
-        {
-            "work": cells["track_ms_per_frame"].mean(),
-            "error": 1e3 * cells[error].mean(),
-            "std": 1e3 * cells[error].std().fillna(0.0),
-        }
-    ).reset_index()
-    return table.rename(columns={long: short for short, long in needed.items()})
+    runs = rows.assign(error=1e3 * rows[error], work=rows["track_ms_per_frame"])
+    cells = runs.groupby(["sequence", "method", *settings], sort=False)
+    table = cells[["work", "error"]].mean().assign(std=cells["error"].std().fillna(0.0)).reset_index()
+    return table.rename(columns={name: name.rpartition(".")[2] for name in settings})
 
 
 def _median_run(rows: pd.DataFrame) -> Any:

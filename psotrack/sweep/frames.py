@@ -8,13 +8,11 @@ from typing import Any
 
 import pandas as pd
 
-from psotrack.errors import InputError
 from psotrack.support import Report, no_progress
 from psotrack.sweep.cluster import Cluster, run_on_cluster
 from psotrack.sweep.grid_files import Grid, read_grid
 from psotrack.sweep.grid_files import grid as grid_of
 from psotrack.sweep.runner import run_in_process
-from psotrack.sweep.store import Store
 
 
 def sweep(
@@ -65,15 +63,7 @@ def sweep(
     """
     read = read_grid(Path(grid)) if isinstance(grid, Path | str) else grid
     read = read if isinstance(read, Grid) else grid_of(read)
-    out, data, cache = Path(out), Path(data), Path(cache)
     if cluster is None:
-        outcome = run_in_process(read, out, data=data, cache=cache, jobs=jobs, report=report)
-    else:
-        cluster = Cluster(cluster) if isinstance(cluster, str) else cluster
-        outcome = run_on_cluster(read, out, data=data, cache=cache, cluster=cluster, report=report)
-    if not outcome.seeds:
-        found = f"that all failed: {outcome.errors[0]}"
-        raise InputError(out, expected="a cell that can be run", found=found)
-    rows = Store(out).rows(outcome.seeds)
-    rows.attrs["errors"] = outcome.errors
-    return rows
+        return run_in_process(read, out, data=data, cache=cache, jobs=jobs, report=report).rows()
+    cluster = Cluster(cluster) if isinstance(cluster, str) else cluster
+    return run_on_cluster(read, out, data=data, cache=cache, cluster=cluster, report=report).rows()

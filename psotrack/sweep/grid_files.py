@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,12 +17,18 @@ import msgspec
 
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import check_whole
-from psotrack.settings import TrackSettings, flatten
-from psotrack.support import convert, read_toml
-from psotrack.sweep.cells import Cell, Perturbation, cell_key
-from psotrack.sweep.names import INPUTS, PERTURBATIONS, SETTINGS, check_name, nest, place_of, table
+from psotrack.settings import TrackSettings, flatten, setting_names
+from psotrack.support import assign, convert, nearest, read_toml
+from psotrack.sweep.cells import Cell, Perturbation, cameras_label
 
-__all__ = ["Cell", "Grid", "Perturbation", "cell_key", "grid", "read_grid"]
+#: Dotted names that the tables [settings] and [methods.NAME] may contain.
+SETTINGS = tuple(name for name in setting_names() if name != "seed")
+#: Names of the perturbations that [grid] may vary.
+PERTURBATIONS = tuple(name for name in Perturbation.__struct_fields__ if name != "draw")
+
+#: Names that [grid] may vary in addition to the settings.
+INPUTS = ("cameras", "frames", *PERTURBATIONS)
+
 
 #: A value of a cell: place in the file, dotted name, and the value as it is in the file.
 _Choice = tuple[str, str, Any]
@@ -62,36 +68,22 @@ class Grid:
             [(f"grid.{name}[{index}]", name, value) for index, value in enumerate(values)]
             for name, values in self.axes.items()
         ]
-        variants = [
-            (places, cell)
-            for method in self.methods or ("",)
-            for choices in itertools.product(*options)
-            for places, cell in self._cells_of_draws(method, choices)
-        ]
-        placed = [
-            ((f"sequences[{index}]", *places), replace(cell, sequence=sequence))
-            for index, sequence in enumerate(self.sequences)
-            for places, cell in variants
-        ]
+        sequences = [(f"sequences[{index}]", sequence) for index, sequence in enumerate(self.sequences)]
+        combinations = itertools.product(sequences, self.methods or ("",), [*itertools.product(*options)])
+        placed = []
+        for (place, sequence), method, choices in combinations:
+            cell = replace(self._cell(method, choices), sequence=sequence)
+            # A combination that uses no random numbers has one cell.
+            for draw in range(self.draws or 1) if cell.is_random else (0,):
+                perturbation = msgspec.structs.replace(cell.perturbation, draw=draw)
+                axes = cell.axes if self.draws is None else {**cell.axes, "draw": draw}
+                places = (place, f"methods.{method}", *(place for place, _, _ in choices))
+                placed.append((places, replace(cell, perturbation=perturbation, axes=axes)))
         self._check_different(placed)
         if self.draws is not None and not any(cell.is_random for _, cell in placed):
             expected = f"a random choice in [grid]: a number of cameras, {', '.join(PERTURBATIONS)}"
             raise self._error("grid.draws", expected=expected, found="none")
         return tuple(cell for _, cell in placed)
-
-    def _cells_of_draws(
-        self, method: str, choices: tuple[_Choice, ...]
-    ) -> Iterator[tuple[tuple[str, ...], Cell]]:
-        """Yield places and cell of each draw of one combination; the cells have no sequence yet.
-
-        A combination that uses no random numbers has one cell.
-        """
-        cell = self._cell(method, choices)
-        places = (f"methods.{method}", *(place for place, _, _ in choices))
-        for draw in range(self.draws or 1) if cell.is_random else (0,):
-            perturbation = msgspec.structs.replace(cell.perturbation, draw=draw)
-            axes = cell.axes if self.draws is None else {**cell.axes, "draw": draw}
-            yield places, replace(cell, perturbation=perturbation, axes=axes)
 
     def _cell(self, method: str, choices: tuple[_Choice, ...]) -> Cell:
         own = self.methods.get(method, {})
@@ -102,8 +94,8 @@ class Grid:
         )
         places = {name: place for place, name, _ in given}
         values = {name: value for _, name, value in given}
-        settings = self._record(TrackSettings, nest(values, SETTINGS), places)
-        perturbation = self._record(Perturbation, nest(values, PERTURBATIONS), places)
+        settings = self._record(TrackSettings, _nest(values, SETTINGS), places)
+        perturbation = self._record(Perturbation, _nest(values, PERTURBATIONS), places)
         if settings.reads_detections:
             # These perturbations change silhouettes, and would have no effect on detections.
             for name in ("clock_frames", "flipped"):
@@ -126,7 +118,7 @@ class Grid:
             # The error names the field, perhaps by its last part only, but not the field's place in the file.
             field, _, sentence = str(fault).partition(": expected ")
             expected, _, found = sentence.partition(", found ")
-            raise self._error(place_of(field, places), expected=expected, found=found) from None
+            raise self._error(_place_of(field, places), expected=expected, found=found) from None
 
     def _cameras(self, values: Mapping[str, Any], places: Mapping[str, str]) -> tuple[str, ...] | int | None:
         value = values.get("cameras", "all")
@@ -194,16 +186,16 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
         [{'swarm.particles': 20, 'silhouettes.reduction': 4}, {'swarm.particles': 50, 'silhouettes.reduction': 4}]
     """
     for name in mapping:
-        check_name(f"{where}: ", name, _File.__struct_fields__)
+        _check_name(f"{where}: ", name, _File.__struct_fields__)
     data = dict(mapping)
     if isinstance(data.get("sequences"), list | tuple):
         data["sequences"] = [os.fspath(one) if isinstance(one, Path) else one for one in data["sequences"]]
     file: _File = convert(data, _File, lambda field, *said: _unplaced(f"{where}: {field}", *said))
-    settings = table(where, "settings", file.settings, SETTINGS)
+    settings = _table(where, "settings", file.settings, SETTINGS)
     methods = {
-        name: table(where, f"methods.{name}", content, SETTINGS) for name, content in file.methods.items()
+        name: _table(where, f"methods.{name}", content, SETTINGS) for name, content in file.methods.items()
     }
-    axes = table(where, "grid", file.grid, (*SETTINGS, *INPUTS, "draws"))
+    axes = _table(where, "grid", file.grid, (*SETTINGS, *INPUTS, "draws"))
     draws = axes.pop("draws", None)
     if draws is not None:
         check_whole(f"{where}: grid.draws", draws, lowest=1)
@@ -212,10 +204,7 @@ def grid(mapping: Mapping[str, Any], where: str = "grid") -> Grid:
             remedy = "" if isinstance(values, list | tuple | dict) else f"write [{values}]"
             expected, found = "a list of values", f"{values!r}"
             raise SettingsError(f"{where}: grid.{name}", expected=expected, found=found, remedy=remedy)
-        for place, set_there in {
-            "settings": settings,
-            **{f"methods.{of}": methods[of] for of in methods},
-        }.items():
+        for place, set_there in (("settings", settings), *((f"methods.{of}", methods[of]) for of in methods)):
             if name in set_there:
                 found = f"{place}.{name} as well"
                 raise SettingsError(f"{where}: grid.{name}", expected="the name in one place", found=found)
@@ -237,8 +226,50 @@ def _unplaced(field: str, expected: str, found: str, remedy: str) -> SettingsErr
     return SettingsError(field, expected=expected, found=found, remedy=remedy)
 
 
-def cameras_label(cameras: tuple[str, ...] | int | None) -> str:
-    """Text for a cell's cameras: `all`, their number such as `4`, or names such as `cam1+cam2`."""
-    if cameras is None:
-        return "all"
-    return str(cameras) if isinstance(cameras, int) else "+".join(cameras)
+def _table(where: str, place: str, content: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """Values of the table at a place in the file by dotted name; its names are dotted, or lead to inner tables."""
+    if not isinstance(content, Mapping):
+        raise SettingsError(f"{where}: {place}", expected="a table", found=f"{content!r}")
+    values: dict[str, Any] = {}
+    for name, value in flatten(content):
+        _check_name(f"{where}: {place}.", name, names)
+        if name in values:
+            raise SettingsError(f"{where}: {place}.{name}", expected="the name once", found="the name twice")
+        values[name] = value
+    return values
+
+
+def _check_name(prefix: str, name: str, names: tuple[str, ...]) -> None:
+    """Raise `SettingsError`, which suggests a name, if a name is not allowed; `prefix` begins the message."""
+    if name in names:
+        return
+    if any(other.startswith(f"{name}.") for other in names):
+        raise SettingsError(f"{prefix}{name}", expected="a table with names", found="none")
+    near = nearest(name, names)
+    if name == "seed":
+        remedy = "every run has a seed of its own: set runs = 10, and first_seed if the first seed is not 0"
+    elif name in INPUTS:
+        remedy = "it belongs in [grid], with a list of values"
+    elif name in SETTINGS:
+        remedy = "it belongs in [settings], or in [grid] with a list of values"
+    else:
+        remedy = f"did you mean {near}?" if near else f"allowed names are {', '.join(names)}"
+    raise SettingsError(f"{prefix}{name}", expected="an allowed name", found=name, remedy=remedy)
+
+
+def _nest(values: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    """Nested tables from dotted names and values; dotted names that are not among `names` are left out."""
+    data: dict[str, Any] = {}
+    for name in values.keys() & set(names):
+        assign(data, name, values[name], _unplaced)
+    return data
+
+
+def _place_of(field: str, places: Mapping[str, str]) -> str:
+    """Place in the file of a field of a record: its dotted name or its last part, perhaps with the index of an item."""
+    name, bracket, item = field.partition("[")
+    for dotted, place in places.items():
+        if name in (dotted, dotted.rpartition(".")[2]):
+            return f"{place}{bracket}{item}"
+    # The file does not contain the field: a value in the file does not fit the field's default.
+    return f"the default of {field}"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +10,16 @@ import numpy as np
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.foreground.silhouettes import Silhouettes, SilhouetteSettings, compute, stored_silhouettes
-from psotrack.geometry import Camera
 from psotrack.pipeline import check_detections, detection_files_of, usable_for
 from psotrack.recordings import Recording
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import YOLO
-from psotrack.support import digest_file
-from psotrack.sweep.cells import Cell
+from psotrack.support import PluginKind, digest_file, digest_record, plain, plugin_source
+from psotrack.sweep.cells import Cell, input_digest
 from psotrack.sweep.locks import Locks
+from psotrack.sweep.machine import code_digest
 from psotrack.sweep.perturbations import perturb
+from psotrack.trajectories import Trajectories, resample
 
 #: Folders below the data's root in which a sequence is looked for.
 HALVES = ("Simulated_Data", "Real_Data", ".")
@@ -36,6 +35,18 @@ class Input:
 
     recording: Recording
     silhouettes: Silhouettes | None
+
+    def reference(self, rate_hz: float | None) -> Trajectories:
+        """The reference at the instants at which the recording is tracked, and at no others.
+
+        Args:
+            rate_hz: instants per second of a run; None is the recording's own rate.
+        """
+        truth, instant = self.recording.truth, np.arange(self.recording.at_rate(rate_hz).num_frames)
+        assert truth is not None
+        if rate_hz is None:
+            return truth.at_frames(np.intersect1d(truth.frame, instant))
+        return resample(truth, instant, self.recording.timeline(rate_hz).time_s)
 
 
 @dataclass
@@ -57,18 +68,31 @@ class Inputs:
     _last: tuple[Any, Input | PsotrackError] | None = None
 
     def keys_of(self, cell: Cell) -> dict[str, str]:
-        """Digests of everything that a cell reads: silhouettes, calibration, reference, initial tracks, detections.
+        """Digests of everything on which a cell's rows depend besides its combination: what it reads, and the code.
+
+        That is the content of videos and what silhouettes are made of, or detections; lenses and poses of the cameras;
+        the times of their frames and rows; the reference, the room's bounds and the first positions.
 
         Raises:
             InputError: a file cannot be read.
             SettingsError: the sequence has fewer frames than the cell needs.
         """
         recording, keys = self._source(cell)
-        keys = dict(keys)
-        if Path(cell.settings.init).is_file():
-            keys["init"] = digest_file(Path(cell.settings.init))
-        if cell.settings.reads_detections:
-            files = detection_files_of(recording, cell.settings.detections)
+        settings, keys = cell.settings, {**keys, "code": code_digest()}
+        named: dict[PluginKind, str] = {
+            "method": settings.method,
+            "search": settings.swarm.search,
+            "score": settings.score.kind,
+            "background": settings.silhouettes.background,
+        }
+        for kind, name in named.items():
+            source = plugin_source(kind, name)
+            if source is not None:
+                keys[f"{kind} {name}"] = digest_file(source)
+        if Path(settings.init).is_file():
+            keys["init"] = digest_file(Path(settings.init))
+        if settings.reads_detections:
+            files = detection_files_of(recording, settings.detections)
             keys |= {f"detections of {name}": digest_file(path) for name, path in files.items()}
         return keys
 
@@ -87,32 +111,31 @@ class Inputs:
         Raises:
             PsotrackError: the input cannot be read or made.
         """
-        wanted, last = (source_of(cell), cell.cameras, cell.perturbation), self._last
-        if last is None or last[0] != wanted:
+        wanted = (source_of(cell), cell.cameras, cell.perturbation)
+        if self._last is None or self._last[0] != wanted:
             given = self._make(cell)
             if given is None:
                 return None
-            last = self._last = wanted, given
-        if isinstance(last[1], PsotrackError):
-            raise last[1]
-        return last[1]
+            self._last = wanted, given
+        if isinstance(self._last[1], PsotrackError):
+            raise self._last[1]
+        return self._last[1]
 
     def _make(self, cell: Cell) -> Input | PsotrackError | None:
         """Input of a cell, or the error of making it; None as long as another process makes the silhouettes."""
-        recording = self.recording_of(cell)
+        recording, silhouettes = self.recording_of(cell), None
         try:
-            if not cell.settings.needs_silhouettes:
-                return Input(*perturb(recording, None, cell.perturbation, cell.cameras))
-            with self.locks.attempt(self.silhouettes_lock(cell), f"silhouettes of {cell.sequence}") as locked:
-                if not locked:
-                    return None
-                silhouettes = compute(
-                    recording,
-                    cell.settings.silhouettes,
-                    cache=self.cache,
-                    jobs=self.jobs,
-                    all_videos=cell.settings.needs_each_video,
-                )
+            if cell.settings.needs_silhouettes:
+                with self.locks.attempt(self.silhouettes_lock(cell)) as locked:
+                    if not locked:
+                        return None
+                    silhouettes = compute(
+                        recording,
+                        cell.settings.silhouettes,
+                        cache=self.cache,
+                        jobs=self.jobs,
+                        all_videos=cell.settings.needs_each_video,
+                    )
             return Input(*perturb(recording, silhouettes, cell.perturbation, cell.cameras))
         except PsotrackError as error:
             return error
@@ -133,16 +156,14 @@ class Inputs:
             keys = {}
             if cell.settings.needs_silhouettes:
                 stored = stored_silhouettes(recording, cell.settings.silhouettes, self.cache)
-                keys = {name: each.key for name, each in stored.items()}
-            keys |= {
-                "calibration": _digest_arrays(*_arrays_of(recording.rig.cameras)),
-                "reference": _digest_arrays(recording.truth.position_m, recording.truth.orientation_wxyz),
+                keys = {f"silhouettes of {name}": each.key for name, each in stored.items()}
+            read = {
+                "cameras": recording.rig,
+                "times": recording.timeline(),
+                "reference": recording.truth,
+                "bounds": recording.bounds_m,
             }
-            timeline = recording.timeline()
-            if not timeline.is_synchronous:
-                keys["times"] = _digest_arrays(timeline.time_s, timeline.frame, timeline.offset_s)
-            if recording.bounds_m is not None:
-                keys["bounds"] = _digest_arrays(np.array(recording.bounds_m))
+            keys |= {name: digest_record(_plain(value)) for name, value in read.items()}
             self._sources[source] = recording, keys
         return self._sources[source]
 
@@ -170,19 +191,8 @@ def folder_of(sequence: str, data: Path) -> Path:
     )
 
 
-def input_digest(keys: Mapping[str, str]) -> str:
-    """One digest of the digests of everything that a cell reads."""
-    lines = [f"{name} {keys[name]}" for name in sorted(keys)]
-    return hashlib.blake2b("\n".join(lines).encode(), digest_size=20).hexdigest()
-
-
-def _arrays_of(cameras: Camera) -> list[Any]:
-    """The arrays of a calibration; whether lenses are fisheyes counts only where one is."""
-    return [value for name, value in vars(cameras).items() if name != "fisheye" or value is not None]
-
-
-def _digest_arrays(*arrays: Any) -> str:
-    digest = hashlib.blake2b(digest_size=20)
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes() if array is not None else b"none")
-    return digest.hexdigest()
+def _plain(value: Any) -> Any:
+    """A record of arrays as plain data."""
+    if is_dataclass(value):
+        return {each.name: _plain(getattr(value, each.name)) for each in fields(value)}
+    return plain(value)

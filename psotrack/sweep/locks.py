@@ -2,23 +2,20 @@
 
 A lock is a lease of the library `filelock`: its file names the process, which touches the file as long as it works. The
 lock of a process that has ended lapses at once on the same machine; the lock of another machine lapses when its file
-was not touched for `LEASE_S`. A second hidden file beside the lock says for people what the work is.
+was not touched for `LEASE_S`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import time
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 from filelock import LeaseCompromise, SoftFileLease, Timeout
 
 from psotrack.errors import OutputError
-from psotrack.support import atomic_write
 
 logger = logging.getLogger(__name__)
 
@@ -43,12 +40,11 @@ class Locks:
         self._leases: dict[Path, SoftFileLease] = {}
 
     @contextlib.contextmanager
-    def attempt(self, path: Path, work: str = "") -> Iterator[bool]:
+    def attempt(self, path: Path) -> Iterator[bool]:
         """Try to hold a lock until the block ends; yields whether this thread holds the lock.
 
         Args:
             path: the lock's file; its folder is made.
-            work: description of the work, for `holder`.
 
         Raises:
             OutputError: the folder cannot be written, or the disk is full.
@@ -63,19 +59,11 @@ class Locks:
                 found=error.strerror or f"{error}",
                 remedy="earlier results are unchanged",
             ) from error
-        if not is_held:
-            yield False
-            return
         try:
-            if work:
-                with atomic_write(_note(path)) as temporary:
-                    note = {"since": datetime.now(UTC).isoformat(timespec="seconds"), "work": work}
-                    temporary.write_text(json.dumps(note), encoding="utf-8")
-            yield True
+            yield is_held
         finally:
-            if lease.compromise is None:
-                _note(path).unlink(missing_ok=True)
-            lease.release()
+            if is_held:
+                lease.release()
 
     @contextlib.contextmanager
     def wait(self, path: Path) -> Iterator[None]:
@@ -88,7 +76,7 @@ class Locks:
             time.sleep(POLL_S)
 
     def holder(self, path: Path) -> str | None:
-        """Description of the process that holds a lock, and of its work; None if no process holds the lock."""
+        """The process that holds a lock; None if no process holds the lock."""
         lease = self._lease(path)
         try:
             if not lease.is_locked and _acquire(lease):
@@ -97,13 +85,11 @@ class Locks:
             # This process has not watched the file, so the clocks of both machines are compared instead.
             if time.time() - path.stat().st_mtime > LEASE_S:
                 return None
-            owner = lease.owner
-            note = json.loads(_note(path).read_text(encoding="utf-8")) if _note(path).exists() else {}
         except FileNotFoundError:
             return None
+        owner = lease.owner
         # filelock adds the container to the host's name, after a question mark.
-        process = f"process {owner.pid} on {owner.hostname.partition('?')[0]}" if owner else "a process"
-        return f"{process} since {note['since']}: {note['work']}" if note else process
+        return f"process {owner.pid} on {owner.hostname.partition('?')[0]}" if owner else "a process"
 
     def _lease(self, path: Path) -> SoftFileLease:
         if path not in self._leases:
@@ -111,7 +97,7 @@ class Locks:
                 path, lease_duration=LEASE_S, heartbeat_interval=HEARTBEAT_S, on_compromise=_warn
             )
             # Threads that come at the same time must get the same lease.
-            return self._leases.setdefault(path, lease)
+            self._leases.setdefault(path, lease)
         return self._leases[path]
 
 
@@ -126,10 +112,6 @@ def _acquire(lease: SoftFileLease) -> bool:
             if status.st_size == 0 and time.time() - status.st_mtime > LEASE_S:
                 Path(lease.lock_file).unlink()
         return False
-
-
-def _note(path: Path) -> Path:
-    return path.with_name(f".{path.name.removeprefix('.')}.json")
 
 
 def _warn(lost: LeaseCompromise) -> None:

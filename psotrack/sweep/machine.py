@@ -1,4 +1,4 @@
-"""The origin of results: device, processor, versions and commit."""
+"""The origin of results: code, device, processor, versions and commit."""
 
 from __future__ import annotations
 
@@ -9,16 +9,35 @@ from pathlib import Path
 from typing import Any
 
 from psotrack.pipeline import environment
-from psotrack.support import processors
+from psotrack.support import digest_record, processors
 
 _PACKAGE = Path(__file__).parents[1]
+#: Rooms and modules that compute no part of a row, by the beginnings of their paths in the package.
+COMPUTES_NO_ROW = (
+    *("__main__", "api", "cli/", "demo", "inside_out/", "live/", "show/", "simulation/"),
+    *(
+        f"sweep/{name}"
+        for name in ("cluster", "estimates", "figures", "frames", "grid_files", "locks", "tables")
+    ),
+)
+
+
+@cache
+def code_digest() -> str:
+    """Digest of the source of everything that computes a row of results.
+
+    A change of one of these files changes the key of every cell, so that its rows are computed again.
+    """
+    files = {path.relative_to(_PACKAGE).as_posix(): path for path in _PACKAGE.rglob("*.py")}
+    kept = {name: path for name, path in files.items() if not name.startswith(COMPUTES_NO_ROW)}
+    return digest_record({name: path.read_text(encoding="utf-8") for name, path in kept.items()})
 
 
 def provenance() -> dict[str, Any]:
-    """Versions, device and commit, as nested tables for JSON."""
+    """Versions, device, code and commit, as nested tables for JSON."""
     this = environment()
     device = this["device"] | {"processor": _processor(), "processors": processors()}
-    return {"versions": this["versions"], "device": device, "commit": commit()}
+    return {"versions": this["versions"], "device": device, "code": code_digest(), "commit": commit()}
 
 
 @cache
@@ -33,9 +52,8 @@ def commit(package: Path = _PACKAGE) -> str:
 
 
 def _git(folder: Path, *words: str) -> str:
-    return subprocess.run(
-        ["git", "--no-optional-locks", *words], cwd=folder, capture_output=True, text=True, check=True
-    ).stdout.strip()
+    command = ["git", "--no-optional-locks", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
 
 
 @cache

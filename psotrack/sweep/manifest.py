@@ -1,7 +1,8 @@
 """The manifest of a folder of results: which grids were run, on which machines, from which inputs.
 
     runs      one entry per grid, version and machine: the grid, and when it was first and last run
-    inputs    for each value of the rows' column `input`: the sequence, its frames, digests of its files
+    inputs    for each value of the rows' column `input`: the sequence, its frames, digests of its files and of
+              the code; what was used last comes last
 
 Several grids may be run into one folder, on several machines; each has its own entry.
 """
@@ -17,9 +18,8 @@ from typing import Any
 
 import msgspec
 
-from psotrack.sweep.cells import Cell
+from psotrack.sweep.cells import Cell, input_digest
 from psotrack.sweep.grid_files import Grid
-from psotrack.sweep.inputs import input_digest
 
 
 def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) -> None:
@@ -28,7 +28,7 @@ def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) ->
     Args:
         manifest: content of the manifest, changed in place.
         grid: the grid.
-        origin: versions, device and commit.
+        origin: versions, device, code and commit.
     """
     content = {name: value for name, value in asdict(grid).items() if name != "where"}
     # The entry must compare equal to one that was read from JSON, where tuples are lists.
@@ -42,14 +42,16 @@ def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) ->
 
 
 def note_input(manifest: dict[str, Any], cell: Cell, keys: Mapping[str, str]) -> None:
-    """Record in a manifest what a cell reads.
+    """Record in a manifest what a cell reads, after everything that was recorded before.
 
     Args:
         manifest: content of the manifest, changed in place.
         cell: the cell.
         keys: digests of everything that the cell reads.
     """
-    manifest["inputs"][input_digest(keys)] = {
+    name = input_digest(keys)
+    manifest["inputs"].pop(name, None)
+    manifest["inputs"][name] = {
         "sequence": Path(cell.sequence).name,
         "frames": cell.frames,
         "silhouettes": msgspec.to_builtins(cell.settings.silhouettes),

@@ -19,9 +19,9 @@ from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
 from psotrack.settings import flatten
 from psotrack.support import Report, drop_programs_if_many, no_progress
-from psotrack.sweep.cells import Cell, cell_key, failure_name, title
-from psotrack.sweep.grid_files import Grid, cameras_label
-from psotrack.sweep.inputs import Input, Inputs, folder_of, input_digest, source_of
+from psotrack.sweep.cells import Cell, cell_key, cell_name, describe, input_digest, title
+from psotrack.sweep.grid_files import Grid
+from psotrack.sweep.inputs import Input, Inputs, folder_of, source_of
 from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
@@ -50,24 +50,44 @@ class Result:
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """Results of all cells, in the grid's order."""
+    """Results of all cells, in the grid's order, and where they are stored."""
 
     results: tuple[Result, ...]
+    store: Store
 
     def count(self, state: str) -> int:
         """Number of cells whose result has a state."""
         return sum(result.state == state for result in self.results)
+
+    def to_dict(self) -> dict[str, int]:
+        """Numbers of cells that were finished, that failed, and that an earlier run had finished."""
+        return {state: self.count(state) for state in ("finished", "failed", "left")}
+
+    def __str__(self) -> str:
+        failed = self.count("failed")
+        said = (
+            f"{self.store.folder}: {self.count('finished')} cells finished now, {self.count('left')} before"
+        )
+        return f"{said}, {failed} failed (see {self.store.folder}/cells/*.error.json)" if failed else said
 
     @property
     def errors(self) -> list[str]:
         """One line per failed cell: the cell's title and why it failed."""
         return [f"{title(result.cell)}: {result.error}" for result in self.results if result.error]
 
-    @property
-    def seeds(self) -> dict[str, range]:
-        """Seeds of the runs of each finished cell, by the cell's key."""
-        finished = [result for result in self.results if result.state in ("finished", "left")]
-        return {result.key: result.cell.seeds for result in finished if result.key is not None}
+    def rows(self) -> pd.DataFrame:
+        """Rows of the grid's cells and seeds only, in the grid's order; `attrs["errors"]` has the failed cells.
+
+        Raises:
+            InputError: every cell failed.
+        """
+        seeds = {each.key: each.cell.seeds for each in self.results if each.key and not each.error}
+        if not seeds:
+            found = f"that all failed: {self.errors[0]}"
+            raise InputError(self.store.folder, expected="a cell that can be run", found=found)
+        rows = self.store.rows(seeds)
+        rows.attrs["errors"] = self.errors
+        return rows
 
 
 def run_in_process(
@@ -90,15 +110,14 @@ def run_in_process(
         data: root folder of the sequences that the grid names.
         cache: folder of the stored silhouettes.
         jobs: number of processes that make silhouettes; None is one per processor.
-        report: progress bar for the cells.
+        report: progress bar for the cells that are not finished.
 
     Raises:
         InputError: a sequence does not exist.
         OutputError: the results cannot be written.
     """
     store, inputs = open_store(grid, out, data, provenance()), Inputs(Path(data), Path(cache), jobs)
-    results: list[Result] = []
-    waiting = sort_by_input(grid.cells())
+    results, waiting = sort_out(grid, inputs, store)
     with report("sweep", len(waiting)) as advance:
         while waiting:
             busy = []
@@ -112,13 +131,13 @@ def run_in_process(
             if len(busy) == len(waiting):
                 time.sleep(POLL_S)
             waiting = busy
-    return outcome(grid, results)
+    return outcome(grid, results, store)
 
 
-def outcome(grid: Grid, results: Iterable[Result]) -> SweepOutcome:
+def outcome(grid: Grid, results: Iterable[Result], store: Store) -> SweepOutcome:
     """Sort results into the order of the grid's cells."""
-    order = {failure_name(cell): number for number, cell in enumerate(grid.cells())}
-    return SweepOutcome(tuple(sorted(results, key=lambda result: order[failure_name(result.cell)])))
+    order = {cell_name(cell): number for number, cell in enumerate(grid.cells())}
+    return SweepOutcome(tuple(sorted(results, key=lambda result: order[cell_name(result.cell)])), store)
 
 
 def open_store(grid: Grid, out: Path | str, data: Path | str, origin: Mapping[str, Any]) -> Store:
@@ -128,7 +147,7 @@ def open_store(grid: Grid, out: Path | str, data: Path | str, origin: Mapping[st
         grid: the grid.
         out: folder of the results.
         data: root folder of the sequences that the grid names.
-        origin: versions, device and commit.
+        origin: versions, device, code and commit.
 
     Raises:
         InputError: a sequence does not exist.
@@ -136,13 +155,40 @@ def open_store(grid: Grid, out: Path | str, data: Path | str, origin: Mapping[st
     """
     for sequence in grid.sequences:
         folder_of(sequence, Path(data))
-    store = Store(Path(out))
+    store = Store(out)
     store.tidy()
     store.change_manifest(lambda manifest: note_run(manifest, grid, origin))
     return store
 
 
-def sort_by_input(cells: Iterable[Cell]) -> list[Cell]:
+def sort_out(grid: Grid, inputs: Inputs, store: Store) -> tuple[list[Result], list[Cell]]:
+    """Results of the cells that are finished or cannot be read, and the other cells, sorted by their input.
+
+    The manifest notes the inputs of all cells, so that results of these inputs are those that count.
+    """
+    results, cells, noted = [], [], {}
+    for cell in _by_input(grid.cells()):
+        try:
+            keys = inputs.keys_of(cell)
+        except PsotrackError as error:
+            results.append(store_failure(cell, None, error, store))
+            continue
+        noted[input_digest(keys)] = cell, keys
+        result = _finished(cell, cell_key(cell, keys), store)
+        if result is None:
+            cells.append(cell)
+        else:
+            results.append(result)
+
+    def note(manifest: dict[str, Any]) -> None:
+        for cell, keys in noted.values():
+            note_input(manifest, cell, keys)
+
+    store.change_manifest(note)
+    return results, cells
+
+
+def _by_input(cells: Iterable[Cell]) -> list[Cell]:
     """Put cells with the same input next to each other; the order stays the grid's otherwise."""
     groups: dict[Any, list[Cell]] = {}
     for cell in cells:
@@ -150,17 +196,12 @@ def sort_by_input(cells: Iterable[Cell]) -> list[Cell]:
     return [cell for group in groups.values() for cell in group]
 
 
-def find_finished(cell: Cell, inputs: Inputs, store: Store) -> Result | None:
-    """Result of a cell that is finished already; None if runs are missing.
-
-    Raises:
-        PsotrackError: the cell's input cannot be read.
-    """
-    key = cell_key(cell, inputs.keys_of(cell))
+def _finished(cell: Cell, key: str, store: Store) -> Result | None:
+    """Result of a cell that is finished already; None if runs are missing."""
     if not set(cell.seeds) <= store.finished_seeds(key):
         return None
     # The runner that finished the cell may have been killed before it removed the record of an earlier failure.
-    store.remove_failure(failure_name(cell))
+    store.remove_failure(cell_name(cell))
     return Result(cell, "left", key)
 
 
@@ -172,20 +213,20 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
     """
     key = None
     try:
-        result = find_finished(cell, inputs, store)
-        if result is not None:
-            return result
         keys = inputs.keys_of(cell)
         key = cell_key(cell, keys)
-        with store.lock(key, title(cell)) as locked:
-            # Another process may have finished the cell just before this process locked it.
-            missing = sorted(set(cell.seeds) - store.finished_seeds(key)) if locked else []
-            given = inputs.read(cell) if missing else None
+        with store.lock(key) as locked:
+            # Another process may have finished the cell meanwhile.
+            result = _finished(cell, key, store)
+            if result is not None:
+                return result
+            given = inputs.read(cell) if locked else None
             if given is None:
                 return Result(cell, "busy", key)
-            store.change_manifest(lambda manifest: note_input(manifest, cell, keys))
-            store.add(key, *_run_seeds(cell, key, missing, given, input_digest(keys)))
-            store.remove_failure(failure_name(cell))
+            missing = sorted(set(cell.seeds) - store.finished_seeds(key))
+            origin = {"cell": key, "input": input_digest(keys)} | dict(flatten(provenance()))
+            store.add(key, *_run_seeds(cell, missing, given, origin))
+            store.remove_failure(cell_name(cell))
         return Result(cell, "finished", key)
     except OutputError:
         raise
@@ -198,27 +239,13 @@ def store_failure(cell: Cell, key: str | None, error: Exception, store: Store) -
     expected = isinstance(error, PsotrackError)
     sentence = f"{error}" if expected else f"{type(error).__name__}: {error}"
     where = {} if expected else {"where": "".join(traceback.format_exception(error))}
-    store.add_failure(failure_name(cell), sentence, describe(cell) | where)
+    store.add_failure(cell_name(cell), sentence, describe(cell) | where)
     logger.error("%s: %s", title(cell), sentence)
     return Result(cell, "failed", key, sentence)
 
 
-def describe(cell: Cell) -> dict[str, Any]:
-    """Description of a cell as a flat table, whose names have dots."""
-    settings = msgspec.to_builtins(msgspec.structs.replace(cell.settings, seed=0))
-    del settings["seed"]
-    return {
-        "sequence": Path(cell.sequence).name,
-        "method": cell.method,
-        "cameras": cameras_label(cell.cameras),
-        "frames": cell.frames,
-        **{f"perturbation.{name}": value for name, value in msgspec.to_builtins(cell.perturbation).items()},
-        **{f"settings.{name}": value for name, value in flatten(settings)},
-    }
-
-
 def _run_seeds(
-    cell: Cell, key: str, seeds: list[int], given: Input, input_name: str
+    cell: Cell, seeds: list[int], given: Input, origin: Mapping[str, Any]
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Track and evaluate with each seed: one row per run, and the errors of every run's frames."""
     # Cells with other shapes need other programs.
@@ -227,46 +254,44 @@ def _run_seeds(
     began = time.perf_counter()
     results = track_runs(given.recording, given.silhouettes, settings)
     total_s = time.perf_counter() - began
+    reference = given.reference(cell.settings.rate_hz)
     of_cell = describe(cell) | {"frames": given.recording.num_frames, "num_cameras": len(given.recording.rig)}
     of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
-    origin = {"cell": key, "input": input_name} | dict(flatten(provenance()))
-    runs = list(zip(seeds, results, strict=True))
-    figures = [_figures(result, given, total_s / len(seeds)) for result in results]
-    rows = [
-        of_cell | {"seed": seed} | of_batch | of_run | origin
-        for seed, of_run in zip(seeds, figures, strict=True)
-    ]
-    return pd.DataFrame(rows), pd.concat([_errors(seed, result, given) for seed, result in runs])
+    rows, errors = [], []
+    for seed, result in zip(seeds, results, strict=True):
+        of_run: dict[str, Any] = dict.fromkeys(_METRICS, np.nan) | {"missed_rate": 1.0}
+        errors_of_run = pd.DataFrame({"seed": pd.Series(dtype=int)})
+        # A run that finds no drones has missed all drones. All runs have the same columns, so that programs can read
+        # all cells as one data set.
+        if isinstance(result, InputError):
+            of_run["note"] = str(result)
+        else:
+            evaluation = evaluate(result.trajectories, reference).to_dict()
+            of_run |= {name: evaluation[name] for name in _METRICS if evaluation[name] is not None}
+            of_run |= {"note": ""} | _times(result, total_s / len(seeds))
+            errors_of_run = errors_over_time(result.trajectories, reference).assign(seed=seed)
+            errors_of_run["error_m"] = errors_of_run["error_m"].astype(np.float32)
+        rows.append(of_cell | {"seed": seed} | of_batch | of_run | dict(origin))
+        errors.append(errors_of_run)
+    return pd.DataFrame(rows), pd.concat(errors)
 
 
-def _figures(result: TrackedRecording | InputError, given: Input, wall_s: float) -> dict[str, Any]:
-    """Evaluation and duration of a run. A run that finds no drones has missed all drones.
+#: Figures of the evaluation that are columns of the rows.
+_METRICS = [each.name for each in fields(Evaluation) if each.name not in ("frames", "per_drone")]
+
+
+def _times(result: TrackedRecording, wall_s: float) -> dict[str, float]:
+    """How long a run took.
 
     Args:
         result: result of the run.
-        given: input of the run.
         wall_s: the run's share of the seconds of wall clock of all runs.
     """
-    # All runs have the same columns, so that programs can read all cells as one data set.
-    if isinstance(result, InputError):
-        metrics = [field.name for field in fields(Evaluation) if field.name not in ("frames", "per_drone")]
-        return dict.fromkeys(metrics, np.nan) | {"missed_rate": 1.0, "note": str(result)}
-    assert given.recording.truth is not None
-    errors = evaluate(result.trajectories, given.recording.truth).to_dict()
-    del errors["per_drone"]
-    figures = {"note": ""} | {name: np.nan if value is None else value for name, value in errors.items()}
     seconds = result.record["seconds"]
-    figures |= {f"seconds.{stage}": value for stage, value in seconds.items()}
     # A sweep reads stored silhouettes and starts once for all cells, so neither is in the seconds of a run.
     timed = with_real_time(result.record, wall_s)
-    figures |= {name: timed[name] for name in ("real_time_factor", "real_time_factor_running")}
-    return figures | {"track_ms_per_frame": 1e3 * seconds["track"] / given.recording.num_frames}
-
-
-def _errors(seed: int, result: TrackedRecording | InputError, given: Input) -> pd.DataFrame:
-    """Errors of a run's frames; no rows for a run that finds no drones."""
-    if isinstance(result, InputError):
-        return pd.DataFrame({"seed": pd.Series(dtype=int)})
-    assert given.recording.truth is not None
-    errors = errors_over_time(result.trajectories, given.recording.truth)
-    return errors.assign(seed=seed, error_m=errors["error_m"].astype(np.float32))
+    return {
+        **{f"seconds.{stage}": value for stage, value in seconds.items()},
+        **{name: timed[name] for name in ("real_time_factor", "real_time_factor_running")},
+        "track_ms_per_frame": 1e3 * seconds["track"] / result.trajectories.num_frames,
+    }

@@ -9,9 +9,9 @@
 Programs that read DIR as one Parquet data set, such as `pandas.read_parquet`, skip names that begin with a dot or an
 underscore, and so read exactly the rows of the finished cells.
 
-A cell's file appears whole or not at all. KEY is made of everything that decides the cell's rows (see
-`cells.cell_key`). NAME is made of the same without the content of the input: a cell whose input cannot be read has no
-KEY.
+A cell's file appears whole or not at all. KEY is NAME-INPUT: NAME is made of the combination of settings, INPUT of
+what the cell reads and of the code (see `cells.cell_key`). Files of one NAME and different INPUT are results of a cell
+from another recording or another version of psotrack: they stay, and only the one that was used last counts.
 """
 
 from __future__ import annotations
@@ -20,19 +20,17 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import LARGEST, MODERATE, convert
 from psotrack.sweep.locks import Locks
 from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
+from psotrack.sweep.tables import DESCRIBING, natural
 
 logger = logging.getLogger(__name__)
 
@@ -41,31 +39,6 @@ _LEFT_BEHIND_S = 3600.0
 
 #: Remedy for a damaged file that a sweep makes anew.
 _RUN_AGAIN = "run the same `psotrack sweep` again"
-
-
-class _Failure(msgspec.Struct, frozen=True):
-    """What must be in the record of a failed cell."""
-
-    sequence: str
-    method: str
-    error: str
-
-
-class _Grid(msgspec.Struct, frozen=True):
-    settings: dict[str, Any]
-    methods: dict[str, dict[str, Any]]
-    axes: dict[str, Any]
-
-
-class _Run(msgspec.Struct, frozen=True):
-    grid: _Grid
-
-
-class _Manifest(msgspec.Struct, frozen=True):
-    """What must be in the manifest."""
-
-    runs: list[_Run]
-    inputs: dict[str, Any]
 
 
 def is_results_folder(path: Path | str) -> bool:
@@ -82,6 +55,7 @@ class Store:
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
+        self._cells = self.folder / "cells"
         self._locks = Locks()
 
     def finished_seeds(self, key: str) -> set[int]:
@@ -89,14 +63,9 @@ class Store:
         rows = self._rows_if_whole(key)
         return set() if rows is None else set(rows["seed"].tolist())
 
-    def lock(self, key: str, work: str = "") -> AbstractContextManager[bool]:
-        """Try to lock a cell until the block ends; yields whether the cell is locked for this process.
-
-        Args:
-            key: the cell's key.
-            work: description of the work, for `status`.
-        """
-        return self._locks.attempt(self.folder / "cells" / f".{key}.lock", work)
+    def lock(self, key: str) -> AbstractContextManager[bool]:
+        """Try to lock a cell until the block ends; yields whether the cell is locked for this process."""
+        return self._locks.attempt(self._cells / f".{key}.lock")
 
     def add(self, key: str, rows: pd.DataFrame, errors: pd.DataFrame) -> None:
         """Store rows of a cell beside the rows of its other seeds. The caller holds the cell's lock.
@@ -123,7 +92,7 @@ class Store:
             write_parquet(path, new.sort_values("seed", kind="stable"))
 
     def add_failure(self, name: str, error: str, cell: Mapping[str, Any]) -> None:
-        """Store why a cell failed, and a description of the cell.
+        """Store why a cell failed, and a description of the cell: at least its sequence and method.
 
         Raises:
             OutputError: the file cannot be written.
@@ -134,27 +103,26 @@ class Store:
         """Remove the record of a cell's earlier failure, because the cell is finished."""
         self._failure_path(name).unlink(missing_ok=True)
 
-    def failure(self, name: str) -> str | None:
-        """Why a cell failed at the last attempt; None if it did not fail."""
-        content = _read_if_present(self._failure_path(name), _Failure)
-        return None if content is None else str(content["error"])
-
     def rows(self, seeds: Mapping[str, Collection[int]] | None = None) -> pd.DataFrame:
         """One row per run of the finished cells.
 
         Args:
-            seeds: keys of the wanted cells, and the wanted seeds of each; None for all cells and seeds.
+            seeds: keys of the wanted cells, and the wanted seeds of each, in this order; None for all cells and seeds,
+                sorted by their settings, without results of other inputs or code than those that were used last.
 
         Raises:
             InputError: there are no results.
         """
-        if seeds is None:
-            parts = _read_cells(self._cell_files("parquet"))
-        else:
-            tables = [(_read_cells([self._rows_path(key)]), wanted) for key, wanted in seeds.items()]
-            parts = [table[table["seed"].isin(list(wanted))] for read, wanted in tables for table in read]
+        wanted = dict.fromkeys(self._last_keys()) if seeds is None else seeds
+        parts = []
+        for key, some in wanted.items():
+            with contextlib.suppress(FileNotFoundError):
+                rows = read_parquet(self._rows_path(key), _RUN_AGAIN)
+                parts.append(rows if some is None else rows[rows["seed"].isin(list(some))])
         if not parts:
             raise InputError(self.folder, expected="results of a sweep", found="no finished cell")
+        if seeds is None:
+            parts.sort(key=_place_of_cell)
         return pd.concat(parts, ignore_index=True)
 
     def errors(self, key: str, seeds: Collection[int]) -> pd.DataFrame:
@@ -167,12 +135,11 @@ class Store:
         Raises:
             InputError: there is no file of the cell's errors, or it has no errors of these runs.
         """
-        errors = self._errors_if_present(key, ("seed", "frame", "drone", "error_m"))
+        errors, path = self._errors_if_present(key), self._errors_path(key)
         if errors is None:
-            raise InputError(self._errors_path(key), expected="errors of a finished cell", found="no file")
+            raise InputError(path, expected="errors of a finished cell", found="no file")
         wanted = errors[errors["seed"].isin(list(seeds))].reset_index(drop=True)
         if wanted.empty and not errors.empty:
-            path = self._errors_path(key)
             expected = f"errors of seeds {', '.join(map(str, seeds))}"
             raise InputError(path, expected=expected, found="none", remedy=_remove(self._rows_path(key)))
         return wanted
@@ -183,26 +150,33 @@ class Store:
         Raises:
             InputError: there are no results.
         """
-        if not (self.folder / "cells").is_dir():
+        if not is_results_folder(self.folder):
             raise InputError(self.folder, expected="results of a sweep", found="none")
-        read = (_read_if_present(path, _Failure) for path in self._cell_files("error.json"))
-        failures = [failure for failure in read if failure is not None]
-        locks = sorted((self.folder / "cells").glob(".*.lock"))
-        at_work = [holder for path in locks if (holder := self._locks.holder(path))]
+        failures = []
+        for path in sorted(self._cells.glob("_*.error.json")):
+            with contextlib.suppress(FileNotFoundError):
+                failures.append(read_json(path, _remove(path)))
+        holders = map(self._locks.holder, sorted(self._cells.glob(".*.lock")))
+        at_work = [holder for holder in holders if holder]
         return {
-            "finished": len(self._cell_files("parquet")),
+            "finished": len(self._last_keys()),
             "failed": len(failures),
             "claimed": len(at_work),
-            "errors": [
-                f"{failure['sequence']} {failure['method']}: {failure['error']}" for failure in failures
-            ],
+            "errors": [f"{each['sequence']} {each['method']}: {each['error']}" for each in failures],
             "at_work": at_work,
         }
 
     def manifest(self) -> dict[str, Any]:
-        """Content of the manifest: runs and inputs; both are empty before the first run."""
-        content = _read_if_present(self.folder / "_manifest.json", _Manifest)
-        return {"runs": [], "inputs": {}} if content is None else content
+        """Content of the manifest: runs and inputs; both are empty before the first run.
+
+        Raises:
+            DamagedError: the file is damaged.
+        """
+        path = self.folder / "_manifest.json"
+        try:
+            return read_json(path, _remove(path))
+        except FileNotFoundError:
+            return {"runs": [], "inputs": {}}
 
     def change_manifest(self, change: Callable[[dict[str, Any]], None]) -> None:
         """Change the manifest while no other runner does.
@@ -211,114 +185,72 @@ class Store:
             change: changes the manifest's content in place.
 
         Raises:
+            DamagedError: the file is damaged.
             OutputError: the file cannot be written.
         """
-        path = self.folder / "_manifest.json"
         with self._locks.wait(self.folder / ".manifest.lock"):
             manifest = self.manifest()
             before = json.dumps(manifest)
             change(manifest)
             if json.dumps(manifest) != before:
-                write_json(path, manifest)
+                write_json(self.folder / "_manifest.json", manifest)
 
     def tidy(self) -> None:
         """Remove half-written files of runners that were killed."""
-        for folder in (self.folder, self.folder / "cells", self.folder / "_errors"):
+        for folder in (self.folder, self._cells, self.folder / "_errors"):
             for path in (*folder.glob(".*.partial.*"), *folder.glob(".*.lock.[br]*")):
                 with contextlib.suppress(OSError):
                     if time.time() - path.stat().st_mtime > _LEFT_BEHIND_S:
                         path.unlink()
 
+    def _last_keys(self) -> list[str]:
+        """Keys of the finished cells; of several with one name the one whose input was used last."""
+        files = [path for path in self._cells.glob("*.parquet") if not path.name.startswith(".")]
+        used = {name: number for number, name in enumerate(self.manifest()["inputs"])}
+        keys = sorted((path.stem for path in files), key=lambda key: (used.get(_input_of(key), -1), key))
+        last = {key.partition("-")[0]: key for key in keys}
+        if len(last) < len(keys):
+            logger.info(
+                "%s: %d cells of older input or code do not count", self.folder, len(keys) - len(last)
+            )
+        return list(last.values())
+
     def _rows_if_whole(self, key: str) -> pd.DataFrame | None:
         """Rows of a cell as they are stored; None without such a file, and with a warning for a damaged file."""
         path = self._rows_path(key)
         try:
-            return _read_table(path, "")
+            return read_parquet(path, "")
         except FileNotFoundError:
             return None
         except DamagedError:
             logger.warning("%s: damaged rows of a cell; a sweep runs the cell again", path)
             return None
 
-    def _errors_if_present(self, key: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame | None:
-        path = self._errors_path(key)
+    def _errors_if_present(self, key: str) -> pd.DataFrame | None:
         try:
-            return _read_table(path, _remove(self._rows_path(key)), columns)
+            return read_parquet(self._errors_path(key), _remove(self._rows_path(key)))
         except FileNotFoundError:
             return None
 
     def _rows_path(self, key: str) -> Path:
-        return self.folder / "cells" / f"{key}.parquet"
+        return self._cells / f"{key}.parquet"
 
     def _errors_path(self, key: str) -> Path:
         return self.folder / "_errors" / f"{key}.parquet"
 
     def _failure_path(self, name: str) -> Path:
-        return self.folder / "cells" / f"_{name}.error.json"
-
-    def _cell_files(self, suffix: str) -> list[Path]:
-        """Files of all cells, without temporary files, whose names begin with a dot."""
-        files = (self.folder / "cells").glob(f"*.{suffix}")
-        return sorted(path for path in files if not path.name.startswith("."))
+        return self._cells / f"_{name}.error.json"
 
 
-def _read_cells(paths: Iterable[Path]) -> list[pd.DataFrame]:
-    """Rows of each cell; files that do not exist are left out."""
-    parts = []
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            parts.append(_read_table(path, _RUN_AGAIN))
-    return parts
+def _input_of(key: str) -> str:
+    """The part of a key that is made of what the cell reads and of the code."""
+    return key.partition("-")[2]
 
 
-def _read_table(path: Path, remedy: str, columns: Collection[str] = ("seed",)) -> pd.DataFrame:
-    """A table of runs or of their errors, which must have some columns: names in `drone`, numbers in the others.
-
-    Raises:
-        DamagedError: the file is damaged, or is another table.
-        FileNotFoundError: the file does not exist.
-    """
-    table = read_parquet(path, remedy)
-    # A run without any drone has no errors, and their table has no columns but the seed.
-    for name in columns if len(table) else ("seed",):
-        if name not in table or not _fits(name, table[name]):
-            found = "others" if name in table else "none"
-            raise DamagedError(path, expected=f"values in the column {name}", found=found, remedy=remedy)
-    size = table.select_dtypes("number").abs().max()
-    for column, largest in size[size > LARGEST].items():
-        found = f"{largest:g} in the column {column}"
-        raise DamagedError(path, expected=MODERATE, found=found, remedy=remedy)
-    return table
-
-
-def _fits(name: str, values: pd.Series) -> bool:
-    """Whether a column has names of drones, or numbers of 0 and more; only the error of a drone may be missing."""
-    if name == "drone":
-        return bool(values.notna().all())
-    if not pd.api.types.is_numeric_dtype(values):
-        return False
-    numbers = (values.dropna() if name == "error_m" else values).to_numpy(np.float64, na_value=np.nan)
-    return bool(((numbers >= 0) & (numbers <= LARGEST)).all())
-
-
-def _read_if_present(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any] | None:
-    """The JSON object in a file, which is checked to be like `kind`; None if the file does not exist.
-
-    Raises:
-        DamagedError: the file is damaged.
-    """
-    try:
-        content = read_json(path, _remove(path))
-    except FileNotFoundError:
-        return None
-
-    def wrong(field: str, expected: str, found: str, remedy: str) -> DamagedError:
-        return DamagedError(
-            f"{path}, {field}", expected=expected, found=found, remedy=remedy or _remove(path)
-        )
-
-    convert(content, kind, wrong)
-    return content
+def _place_of_cell(rows: pd.DataFrame) -> list[Any]:
+    """What cells are sorted by: what describes them, in the order of the columns."""
+    names = [str(name) for name in rows.columns if str(name).startswith(DESCRIBING)]
+    return [natural(value) for value in rows[names].iloc[0]]
 
 
 def _remove(path: Path) -> str:

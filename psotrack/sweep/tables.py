@@ -1,28 +1,34 @@
-"""Tables of results: mean and sample standard deviation over runs."""
+"""Tables of results: mean and sample standard deviation over runs, as text, Markdown, LaTeX or CSV."""
 
 from __future__ import annotations
 
 import logging
 import math
 import re
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from psotrack.errors import SettingsError
-from psotrack.support import nearest, whole_number
+from psotrack.support import nearest
 
 logger = logging.getLogger(__name__)
 
-#: Columns of a table for each combination of labels.
-FIGURES = ("mean", "std", "runs")
+FORMATS = ("text", "markdown", "latex", "csv")
 
-#: Columns that describe a run, besides `settings.*` and `perturbation.*`; then the columns that only choose random
-#: numbers.
-_DESCRIBING = ("sequence", "method", "cameras", "frames", "extrinsics_deg", "clock_frames", "flipped")
+#: Largest width of a table in the format "text", characters.
+WIDTH = 80
+
+#: Columns of a table for each combination of labels.
+FIGURES = ["mean", "std", "runs"]
+
+#: Beginnings of the columns that say what a run is; then the columns that only choose random numbers.
+DESCRIBING = ("sequence", "method", "cameras", "frames", "code", "perturbation.", "settings.")
 _RANDOM = ("settings.seed", "perturbation.draw")
+
+#: Number of significant digits of a usual mean.
+_DIGITS = 3
 
 
 def pivot(
@@ -60,49 +66,68 @@ def pivot(
         numbers = pd.to_numeric(rows[measured]).astype(float)
     except (ValueError, TypeError) as error:
         raise SettingsError("value", expected="a column of numbers", found=measured) from error
-    keys = list(zip(*(_labels(rows[name]) for name in axes), strict=True))
-    _warn_if_mixed(rows, keys, [name for name in names if name not in axes])
-
-    groups: dict[tuple[Any, ...], list[float]] = {key: [] for key in keys}
-    for key, number in zip(keys, numbers, strict=True):
-        if not math.isnan(number):
-            groups[key].append(scale * number)
-    num_rows_by = len(rows_by)
-    down = sorted({key[:num_rows_by] for key in keys}, key=_natural)
-    across = sorted({key[num_rows_by:] for key in keys}, key=_natural)
-    table = [
-        [figure for column in across for figure in _figures(groups.get((*row, *column), []))] for row in down
-    ]
-    result = pd.DataFrame(
-        table,
-        index=_index(down, rows_by),
-        columns=_index([(*column, name) for column in across for name in FIGURES], [*columns_by, "figure"]),
-    )
-    result.attrs["value"] = _scaled(value, scale)
-    return result
+    labels = pd.DataFrame({name: _sorted_labels(rows[name]) for name in axes})
+    _warn_if_mixed(rows, labels, [name for name in names if name not in axes])
+    groups = labels.assign(value=(scale * numbers).to_numpy()).groupby(axes, observed=True)["value"]
+    table = groups.agg(["mean", "std", "count"]).set_axis(FIGURES, axis="columns")
+    if columns_by:
+        names = axes[len(rows_by) :]
+        across = labels[names].drop_duplicates().sort_values(names).itertuples(index=False, name=None)
+        columns = pd.MultiIndex.from_tuples([(figure, *key) for key in across for figure in FIGURES])
+        table = pd.DataFrame(table.unstack(names))[columns]
+        table.columns = columns.reorder_levels([*range(1, columns.nlevels), 0])
+        counts = columns.get_level_values(0) == "runs"
+        table = table.fillna(dict.fromkeys(table.columns[counts], 0))
+        table = table.astype(dict.fromkeys(table.columns[counts], int))
+    table.index, table.columns = _without_categories(table.index), _without_categories(table.columns)
+    table.index.names = rows_by
+    table.columns.names = [*columns_by, "figure"]
+    table.attrs["value"] = _scaled(value, scale)
+    return table
 
 
-def _find_column(where: str, name: str, names: list[str]) -> str:
-    """The column with a name, or the only column whose name ends with it."""
-    ends = [other for other in names if other == name] or [
-        other for other in names if other.endswith(f".{name}")
-    ]
-    if len(ends) == 1:
-        return ends[0]
-    near = nearest(name, names)
-    begin = [other for other in names if name and other.rpartition(".")[2].startswith(name)]
-    if ends:
-        remedy = f"it may be {' or '.join(ends)}"
-    elif near:
-        remedy = f"did you mean {near}?"
-    else:
-        remedy = f"it may be {' or '.join(begin)}" if begin else f"there are {', '.join(names)}"
-    raise SettingsError(where, expected="the name of one column", found=name, remedy=remedy)
+def render_table(table: pd.DataFrame, format: str = "text", *, decimals: int | None = None) -> str:
+    """Text of a table of `pivot`, with a line break at the end.
+
+    Args:
+        table: a table of `pivot`.
+        format: "text", for a terminal: columns beyond 80 characters are continued below; "markdown"; "latex", a tabular
+            for the package booktabs; or "csv", with all digits, and with mean, standard deviation and number of runs in
+            columns of their own.
+        decimals: number of decimals; None gives three significant digits to a usual mean. CSV always has all digits.
+
+    Raises:
+        SettingsError: there is no such format.
+    """
+    if format not in FORMATS:
+        near = nearest(format, FORMATS)
+        remedy = f"did you mean {near}?" if near else ""
+        raise SettingsError("format", expected=f"one of {', '.join(FORMATS)}", found=format, remedy=remedy)
+    if format == "csv":
+        return _csv(table)
+    writer = {"text": _text, "markdown": _markdown, "latex": _latex}[format]
+    return writer(_cells(table, _decimals(table) if decimals is None else decimals), _title(table))
 
 
-def _labels(column: Iterable[Any]) -> list[Any]:
-    """Labels that can be compared and printed: numbers and words, "-" for missing values."""
-    return [_label(value) for value in column]
+def natural(value: Any) -> list[tuple[int, Any]]:
+    """What a label is sorted by: numbers before words, and numbers in words as numbers."""
+    if isinstance(value, int | float):
+        return [(0, value)]
+    parts = re.findall(r"[0-9]+|[^0-9]+", f"{value}")
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
+
+
+def _sorted_labels(column: pd.Series) -> pd.Categorical:
+    """Labels that can be compared and printed: numbers and words, "-" for missing values, in their natural order."""
+    labels = [_label(value) for value in column]
+    return pd.Categorical(labels, categories=sorted(dict.fromkeys(labels), key=natural), ordered=True)
+
+
+def _without_categories(index: pd.Index) -> pd.Index:
+    if not isinstance(index, pd.MultiIndex):
+        return index.astype(object)
+    parts = [index.get_level_values(level).astype(object) for level in range(index.nlevels)]
+    return pd.MultiIndex.from_arrays(parts, names=index.names)
 
 
 def _label(value: Any) -> Any:
@@ -118,48 +143,127 @@ def _label(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _natural(key: tuple[Any, ...]) -> list[Any]:
-    """A key for sorting: numbers before words, and numbers in words as numbers."""
-    return [
-        (0, value, [])
-        if isinstance(value, int | float)
-        else (
-            1,
-            0,
-            [(whole_number(part) is None, whole_number(part) or 0, part) for part in _parts(value)],
-        )
-        for value in key
-    ]
+def _find_column(where: str, name: str, names: list[str]) -> str:
+    """The column with a name, or the only column whose name ends with it."""
+    ends = [name] if name in names else [other for other in names if other.endswith(f".{name}")]
+    if len(ends) == 1:
+        return ends[0]
+    near = nearest(name, names)
+    begin = [other for other in names if name and other.rpartition(".")[2].startswith(name)]
+    if ends:
+        remedy = f"it may be {' or '.join(ends)}"
+    elif near:
+        remedy = f"did you mean {near}?"
+    else:
+        remedy = f"it may be {' or '.join(begin)}" if begin else f"there are {', '.join(names)}"
+    raise SettingsError(where, expected="the name of one column", found=name, remedy=remedy)
 
 
-def _parts(value: Any) -> list[str]:
-    return re.findall(r"[0-9]+|[^0-9]+", f"{value}")
-
-
-def _figures(numbers: list[float]) -> tuple[float, float, int]:
-    mean = float(np.mean(numbers)) if numbers else math.nan
-    return mean, float(np.std(numbers, ddof=1)) if len(numbers) > 1 else math.nan, len(numbers)
-
-
-def _index(keys: list[tuple[Any, ...]], names: list[str]) -> pd.Index:
-    if len(names) == 1:
-        return pd.Index([key[0] for key in keys], name=names[0])
-    return pd.MultiIndex.from_tuples(keys, names=names)
-
-
-def _warn_if_mixed(rows: pd.DataFrame, keys: list[tuple[Any, ...]], others: list[str]) -> None:
+def _warn_if_mixed(rows: pd.DataFrame, labels: pd.DataFrame, others: list[str]) -> None:
     """Log a warning with the columns that describe runs and differ within a figure of the table."""
-    describing = [
+    mixed = [
         name
         for name in others
-        if name in _DESCRIBING or (name.startswith(("settings.", "perturbation.")) and name not in _RANDOM)
-    ]
-    num_groups = len(set(keys))
-    mixed = [
-        name for name in describing if len(set(zip(keys, _labels(rows[name]), strict=True))) > num_groups
+        if name.startswith(DESCRIBING)
+        and name not in _RANDOM
+        and (
+            labels.assign(other=rows[name].map(_label).to_numpy())
+            .groupby(list(labels), observed=True)["other"]
+            .nunique()
+            > 1
+        ).any()
     ]
     if mixed:
         logger.warning("figures are not only over runs: they mix different %s", ", ".join(mixed))
+
+
+def _by_figure(table: pd.DataFrame) -> list[pd.DataFrame]:
+    """Mean, standard deviation and number of runs, each as a table with one column per label."""
+    if table.columns.nlevels > 1:
+        names = table.columns.get_level_values("figure")
+        return [table.loc[:, names == figure].droplevel("figure", axis="columns") for figure in FIGURES]
+    # Without labels, the name of the numbers is the only one.
+    return [table[[figure]].set_axis([table.attrs["value"]], axis="columns") for figure in FIGURES]
+
+
+def _words(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else f"{value}"
+
+
+def _cells(table: pd.DataFrame, decimals: int) -> pd.DataFrame:
+    """The table in words with one column per label: mean ± standard deviation, or "-" where runs are missing."""
+    means, stds = (each.map(f"{{:.{decimals}f}}".format) for each in _by_figure(table)[:2])
+    cells = means.where(stds == "nan", means + " ± " + stds).replace("nan", "-")
+    for axis in ("index", "columns"):
+        cells = cells.rename(_words, axis=axis)
+    return cells
+
+
+def _titles(columns: pd.Index) -> list[str]:
+    """Names and labels of each column in one line, such as "method ours, particles 20"."""
+    keys = [key if isinstance(key, tuple) else (key,) for key in columns]
+    return [
+        ", ".join(
+            f"{name} {label}" if name else label for name, label in zip(columns.names, key, strict=True)
+        )
+        for key in keys
+    ]
+
+
+def _csv(table: pd.DataFrame) -> str:
+    titles = _titles(_cells(table, 0).columns) if table.columns.nlevels > 1 else [""]
+    head = [f"{title} {figure}".strip() for title in titles for figure in FIGURES]
+    return table.set_axis(head, axis="columns").to_csv(lineterminator="\n")
+
+
+def _text(cells: pd.DataFrame, title: str) -> str:
+    text = cells.to_string()
+    if max(map(len, text.splitlines())) > WIDTH:
+        # With `sparsify`, pandas would not repeat the outer labels where columns are continued.
+        text = cells.to_string(sparsify=False, line_width=WIDTH)
+    return "\n".join([title, "", *(line.rstrip() for line in text.splitlines()), ""])
+
+
+def _markdown(cells: pd.DataFrame, title: str) -> str:
+    # pandas' own writer needs another package for this, and does not escape the signs of Markdown.
+    by_words = cells.set_axis(_titles(cells.columns), axis="columns").reset_index()
+    rule = ["---"] * cells.index.nlevels + ["---:"] * len(cells.columns)
+    head, *body = (
+        [re.sub(r"([\\|*`<])", r"\\\1", f"{text}") for text in line]
+        for line in (by_words.columns, *by_words.to_numpy())
+    )
+    lines = [f"| {' | '.join(line)} |" for line in (head, rule, *body)]
+    return "\n".join([title, "", *lines, ""])
+
+
+def _latex(cells: pd.DataFrame, title: str) -> str:
+    cells = cells.replace({r"(.*) ± (.*)": r"$\1 \\pm \2$", "^-$": "--"}, regex=True)
+    # `format_index` escapes the labels, but not the names of their levels.
+    for axis in (cells.index, cells.columns):
+        axis.names = [name and f"{name}".replace("_", r"\_") for name in axis.names]
+    style = cells.style.format_index(escape="latex").format_index(escape="latex", axis="columns")
+    form = "l" * cells.index.nlevels + "r" * len(cells.columns)
+    text = style.to_latex(hrules=True, column_format=form, multirow_align="naive", multicol_align="c")
+    return f"% {title}; \\usepackage{{booktabs}}\n{text}"
+
+
+def _decimals(table: pd.DataFrame) -> int:
+    """Number of decimals that gives the median of the means its digits; 0 for whole numbers without spread."""
+    means, stds, _ = (each.to_numpy(float) for each in _by_figure(table))
+    sizes = np.abs(means[np.isfinite(means) & (means != 0)])
+    if not len(sizes) or (np.all(sizes == np.round(sizes)) and not np.any(stds > 0)):
+        return 0
+    return int(np.clip(_DIGITS - 1 - math.floor(math.log10(float(np.median(sizes)))), 0, 9))
+
+
+def _title(table: pd.DataFrame) -> str:
+    """Name of the numbers, and the number of runs in a cell if it is more than one."""
+    counts = _by_figure(table)[2].to_numpy(int)
+    most, fewest = counts.max(initial=0), counts[counts > 0].min(initial=counts.max(initial=0))
+    if most < 2:
+        return str(table.attrs["value"])
+    runs = f"{most}" if fewest == most else f"{fewest} to {most}"
+    return f"{table.attrs['value']}: mean ± standard deviation over {runs} runs"
 
 
 def _scaled(value: str, scale: float) -> str:

@@ -113,4 +113,4 @@ def _boxes(store: Store, rows: pd.DataFrame, cells: pd.DataFrame) -> Markup:
     for cell in best.head(_MOST_BOXES).to_dict("records"):
         seeds = rows.loc[rows["cell"] == cell["cell"], "seed"].tolist()
         errors.setdefault(cell["sequence"], {})[cell["method"]] = store.errors(cell["cell"], seeds)
-    return figure_svg(error_per_drone(errors)) if errors else Markup("")
+    return figure_svg(error_per_drone(errors, rows["method"])) if errors else Markup("")
