@@ -54,7 +54,8 @@ class OnboardRenderer:
         self.scene = scene
         self.drone_index = drone_index
         self.onboard = camera_record(scene)
-        self.K, (self.width, self.height) = intrinsics(scene)
+        self.K, self.size_wh = intrinsics(scene)
+        self.width, self.height = self.size_wh
         imaging = msgspec.structs.replace(
             scene.scenario.imaging,
             shutter_s=self.onboard.shutter_s,
