@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import logging
 import os
 from collections.abc import Sequence
@@ -18,7 +17,14 @@ from psotrack import __version__
 from psotrack.errors import SettingsError
 from psotrack.geometry import make_rig
 from psotrack.geometry.rig_files import write_calibration, write_rig
-from psotrack.recordings import RECORDING_FILE
+from psotrack.recordings import (
+    RECORDING_FILE,
+    CameraTable,
+    MarkersTable,
+    RecordingFile,
+    ReferenceTable,
+    write_recording_file,
+)
 from psotrack.recordings.datasets import (
     CALIBRATION,
     DETECTIONS,
@@ -211,7 +217,7 @@ def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
     except SettingsError:
         # The dataset's file has no columns for such lenses, but a rig file and a recording file have.
         write_rig(folder / _RIG, scene.rig)
-        _write_recording_file(scene, folder)
+        write_recording_file(folder / RECORDING_FILE, _recording_file(scene))
     position_m, orientation_wxyz = scene.positions_m(num_frames), scene.orientations_wxyz(num_frames)
     markers_m = scene.mocap_markers_m(num_frames)
     for drone in range(len(scene.flights)):
@@ -222,17 +228,20 @@ def _write_tables(scene: Scene, folder: Path, num_frames: int) -> None:
         write_marker_corners(folder / MARKER_CORNERS, scene.room.marker_corners_m)
 
 
-def _write_recording_file(scene: Scene, folder: Path) -> None:
-    """Write the recording file of a sequence whose lenses the dataset's calibration cannot hold."""
-    lines = ["version = 1", f'calibration = "{_RIG}"']
-    for name, stream in zip(scene.rig.names, _streams(scene, onboard=False), strict=True):
-        detections = f"{DETECTIONS}/{stream.name}_s.csv"
-        lines += ["", f"[cameras.{name}]", f'video = "{stream.video_file}"', f'detections = "{detections}"']
-    files = [pose_file(drone + 1, scene.scenario.fps) for drone in range(len(scene.flights))]
-    lines += ["", "[reference]", f"files = {json.dumps(files)}"]
-    if scene.scenario.markers:
-        lines += ["", "[markers]", f'corners = "{MARKER_CORNERS}"']
-    (folder / RECORDING_FILE).write_text("\n".join([*lines, ""]), encoding="utf-8")
+def _recording_file(scene: Scene) -> RecordingFile:
+    """The recording file of a sequence whose lenses the dataset's calibration cannot hold."""
+    cameras = {
+        name: CameraTable(video=stream.video_file, detections=f"{DETECTIONS}/{stream.name}_s.csv")
+        for name, stream in zip(scene.rig.names, _streams(scene, onboard=False), strict=True)
+    }
+    files = tuple(pose_file(drone + 1, scene.scenario.fps) for drone in range(len(scene.flights)))
+    return RecordingFile(
+        version=1,
+        calibration=_RIG,
+        cameras=cameras,
+        reference=ReferenceTable(files=files),
+        markers=MarkersTable(corners=MARKER_CORNERS) if scene.scenario.markers else None,
+    )
 
 
 def _write_onboard_tables(scene: Scene, folder: Path, num_frames: int) -> None:

@@ -191,14 +191,13 @@ def _draw(work: _Work, advance: Advance) -> None:
     scenario = msgspec.structs.replace(work.scene.scenario, fps=one.fps)
     scene = replace(work.scene, scenario=scenario, rig=make_rig({one.name: lens}), start_s=one.start_s)
     renderer = CameraRenderer(scene, 0, stream=work.index)
-    width, height = renderer.cam.width, renderer.cam.height
-    sensor = Sensor(scenario.imaging, scene.seed, _BOARD_STREAM + work.index, (height, width))
-    with VideoWriter(work.folder / "board" / f"{one.name}.avi", BOARD_FPS, (width, height)) as video:
+    sensor = Sensor(scenario.imaging, scene.seed, _BOARD_STREAM + work.index, renderer.size_wh[::-1])
+    with VideoWriter(work.folder / "board" / f"{one.name}.avi", BOARD_FPS, renderer.size_wh) as video:
         for number, board in enumerate(work.places):
             views = [draw_board(view.empty_room(), view.cam, board) for view in renderer.views]
             video.write(sensor.expose(renderer.assemble(views), number, number / BOARD_FPS))
             advance(1)
-    with VideoWriter(work.folder / one.flight, one.fps, (width, height)) as video:
+    with VideoWriter(work.folder / one.flight, one.fps, renderer.size_wh) as video:
         for frame in range(work.num_frames):
             video.write(renderer.frame(frame))
             advance(1)

@@ -16,7 +16,6 @@ import numpy as np
 from psotrack.recordings import Detections, VideoWriter, join_videos, write_detections
 from psotrack.recordings.datasets import DETECTIONS, MASKS, MaskWriter, join_archives
 from psotrack.simulation.imaging.onboard import OnboardRenderer
-from psotrack.simulation.imaging.raster import Pinhole
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.labels.detector import detect
 from psotrack.simulation.labels.masks import Silhouette, lens_silhouettes, silhouettes
@@ -86,10 +85,30 @@ def draw(work: Work, advance: Advance) -> None:
     for frames in work.segments:
         with atomic_write(segment_folder(work.folder, frames)) as temporary:
             temporary.mkdir()
+            _draw_segment(work, artist, temporary, frames, advance)
+
+
+def _draw_segment(
+    work: Work, artist: CameraRenderer | OnboardRenderer, folder: Path, frames: range, advance: Advance
+) -> None:
+    """Write the video of a segment; of a static camera, masks and detections too."""
+    found = []
+    with contextlib.ExitStack() as stack:
+        video = VideoWriter(folder / _VIDEO, work.scene.scenario.fps, artist.size_wh)
+        stack.enter_context(video)
+        masks = None
+        if work.masks and not work.stream.onboard:
+            masks = stack.enter_context(MaskWriter(folder / _MASKS))
+        for frame in frames:
+            video.write(artist.frame(frame))
             if isinstance(artist, CameraRenderer):
-                _draw_static(work, artist, temporary, frames, advance)
-            else:
-                _draw_onboard(work, artist, temporary, frames, advance)
+                drones = _silhouettes(artist, frame)
+                found.append(detect(work.scene, work.stream.index, frame, drones))
+                if masks is not None:
+                    _write_masks(masks, work.stream.name, frame, drones, artist)
+            advance(1)
+    if found:
+        write_detections(folder / _BOXES, _concatenated(found))
 
 
 def join(stream: Stream, parts: Sequence[Path], folder: Path) -> None:
@@ -122,22 +141,6 @@ def join_masks(parts: Sequence[Path], folder: Path) -> None:
     join_archives(folder / MASKS, [part / _MASKS for part in parts])
 
 
-def _draw_static(work: Work, renderer: CameraRenderer, folder: Path, frames: range, advance: Advance) -> None:
-    scene, stream, cam = work.scene, work.stream, renderer.cam
-    found = []
-    with contextlib.ExitStack() as stack:
-        video = stack.enter_context(VideoWriter(folder / _VIDEO, scene.scenario.fps, (cam.width, cam.height)))
-        masks = stack.enter_context(MaskWriter(folder / _MASKS)) if work.masks else None
-        for frame in frames:
-            video.write(renderer.frame(frame))
-            drones = _silhouettes(renderer, frame)
-            found.append(detect(scene, stream.index, frame, drones))
-            if masks is not None:
-                _write_masks(masks, stream.name, frame, drones, scene, cam)
-            advance(1)
-    write_detections(folder / _BOXES, _concatenated(found))
-
-
 def _silhouettes(renderer: CameraRenderer, frame: int) -> list[Silhouette]:
     scene, cam = renderer.scene, renderer.cam
     if renderer.lens is None:
@@ -146,23 +149,13 @@ def _silhouettes(renderer: CameraRenderer, frame: int) -> list[Silhouette]:
     return lens_silhouettes(scene, cam, renderer.lens, depths_m, frame)
 
 
-def _draw_onboard(
-    work: Work, renderer: OnboardRenderer, folder: Path, frames: range, advance: Advance
-) -> None:
-    size_wh = (renderer.width, renderer.height)
-    with VideoWriter(folder / _VIDEO, work.scene.scenario.fps, size_wh) as video:
-        for frame in frames:
-            video.write(renderer.frame(frame))
-            advance(1)
-
-
 def _write_masks(
-    writer: MaskWriter, camera: str, frame: int, drones: Sequence[Silhouette], scene: Scene, cam: Pinhole
+    writer: MaskWriter, camera: str, frame: int, drones: Sequence[Silhouette], artist: CameraRenderer
 ) -> None:
     """Write one mask per drone of the scene; the mask of a drone that the camera does not see is black."""
     in_view = {drone.number: drone.mask() for drone in drones}
-    black = np.zeros((cam.height, cam.width), bool)
-    for number in range(1, len(scene.flights) + 1):
+    black = np.zeros(artist.size_wh[::-1], bool)
+    for number in range(1, len(artist.scene.flights) + 1):
         writer.write(camera, number, frame, in_view.get(number, black))
 
 

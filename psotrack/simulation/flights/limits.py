@@ -53,25 +53,17 @@ def _excess_of_motion(
     flights: tuple[Flight, ...], limits: Limits, time_s: Float[np.ndarray, "times"]
 ) -> Excess | None:
     for name, unit, measure in (
-        ("max_speed_m_s", "m/s", _speed_m_s),
-        ("max_acceleration_m_s2", "m/s2", _acceleration_m_s2),
-        ("max_tilt_deg", "degrees of tilt", _tilt_deg),
+        ("max_speed_m_s", "m/s", lambda flight: np.linalg.norm(flight.velocity_m_s(time_s), axis=-1)),
+        ("max_acceleration_m_s2", "m/s2", lambda one: np.linalg.norm(one.acceleration_m_s2(time_s), axis=-1)),
+        ("max_tilt_deg", "degrees of tilt", lambda flight: _tilt_deg(flight, time_s)),
     ):
-        value = np.stack([measure(flight, time_s) for flight in flights])
+        value = np.stack([measure(flight) for flight in flights])
         most = getattr(limits, name)
         if not value.max() <= most:
             drone, at = _worst(value)
             limit = f"at most {most:g} {unit} (limits.{name})"
             return _excess(drone, limit, f"{value[drone, at]:.4g} {unit}", time_s[at])
     return None
-
-
-def _speed_m_s(flight: Flight, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
-    return np.linalg.norm(flight.velocity_m_s(time_s), axis=-1)
-
-
-def _acceleration_m_s2(flight: Flight, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
-    return np.linalg.norm(flight.acceleration_m_s2(time_s), axis=-1)
 
 
 def _tilt_deg(flight: Flight, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:

@@ -43,12 +43,8 @@ _NEAR_SCENERY_M = 1.5
 _RECURRENCE = np.array([0.7548776662466927, 0.5698402909980532])
 
 
-def _display_table() -> UInt8[np.ndarray, "steps"]:
-    light = np.arange(np.iinfo(np.uint16).max + 1) / LIGHT_UNIT
-    return sensor.develop(np.tile(light[:, None, None], 3)).reshape(-1, 3)[:, 0]
-
-
-_DISPLAY = _display_table()
+#: Grey level of each light in units of 1 / `LIGHT_UNIT`.
+_DISPLAY = sensor.develop(np.repeat(np.arange(1 << 16)[:, None, None], 3, axis=-1) / LIGHT_UNIT)[:, 0, 0]
 
 
 class OnboardRenderer:
@@ -58,7 +54,8 @@ class OnboardRenderer:
         self.scene = scene
         self.drone_index = drone_index
         self.onboard = camera_record(scene)
-        self.K, (self.width, self.height) = intrinsics(scene)
+        self.K, self.size_wh = intrinsics(scene)
+        self.width, self.height = self.size_wh
         imaging = msgspec.structs.replace(
             scene.scenario.imaging,
             shutter_s=self.onboard.shutter_s,

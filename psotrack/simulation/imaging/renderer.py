@@ -35,7 +35,8 @@ class CameraRenderer:
 
     Attributes:
         scene: the scene.
-        cam: the camera without its distortion; its size is that of the images.
+        cam: the camera without its distortion.
+        size_wh: width and height of the images, pixels.
         lens: how the image is put together from several views; None for a lens without distortion.
         views: views without distortion; for a lens without distortion the only view is the image.
         backdrop, mirror, shadows: parts of the first view.
@@ -47,6 +48,7 @@ class CameraRenderer:
         imaging, camera = scene.scenario.imaging, scene.rig.cameras[camera_index]
         self.scene = scene
         self.cam: Pinhole = pinhole(camera)
+        self.size_wh = self.cam.width, self.cam.height
         is_fisheye = camera.fisheye is not None and bool(camera.fisheye)
         self.lens: LensImage | None = lens_image(camera) if is_fisheye or camera.dist.any() else None
         stream, shape = camera_index if stream is None else stream, (self.cam.height, self.cam.width)
