@@ -296,7 +296,8 @@ def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
             result = psotrack(root, *words)
         said = result.stderr
         assert (result.returncode, said.count("\n")) == (2, 1), said
-    assert [path.name for path in disk.place.rglob("*") if path.is_file()] == ["_manifest.json"]
+    # Two workers may have had room for the errors of their cells, but no cell has rows.
+    assert not list(disk.place.glob("results/cells/*"))
     result = psotrack(root, *words)
     assert (result.returncode, result.stderr) == (0, "")
     assert len(stamps(Path("results"))) == 2
