@@ -16,10 +16,12 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import (
     Board,
     calibrate_rig,
+    detect_board,
     find_views,
     instants_of_numbers,
     open_images,
     open_recorded,
+    save_board,
     say_print,
 )
 from psotrack.calibration.board_corners import BoardFinder
@@ -30,7 +32,7 @@ from psotrack.calibration.board_recognition import (
     recognise_board,
 )
 from psotrack.cli.calibrate import calibrate
-from psotrack.errors import InputError, PsotrackError, SettingsError
+from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.geometry import make_camera, make_rig
 from psotrack.geometry.rig_files import read_rig, write_rig
 from psotrack.recordings import VideoWriter
@@ -39,6 +41,7 @@ from psotrack.recordings.datasets import open_recording
 SIZE_WH = (640, 480)
 K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
 BOARD = Board((4, 6), 0.04, 0.03)
+CHESS = Board((6, 5), 0.03, kind="chessboard")
 REAL = Path(os.environ.get("PSOTRACK_REAL_DATA", "absent"))
 
 
@@ -74,6 +77,14 @@ def draw_grid(board, T):
     return cv2.resize(large, SIZE_WH, interpolation=cv2.INTER_AREA)
 
 
+def draw_chess(T):
+    """Image of the chessboard, with a white border."""
+    sheet = np.kron(np.add.outer(np.arange(5), np.arange(6)) % 2, np.ones((75, 75))) * 255
+    sheet = cv2.copyMakeBorder(sheet.astype(np.uint8), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    to_board = np.array([[1 / 2500, 0, -59.5 / 2500], [0, 1 / 2500, -59.5 / 2500], [0, 0, 1]])
+    return cv2.warpPerspective(sheet, K @ T[:3, [0, 1, 3]] @ to_board, SIZE_WH, borderValue=255)
+
+
 def test_corners_of_a_board():
     image = draw_board(BOARD, K, pose(), SIZE_WH)
     found = BoardFinder(BOARD).find(image)
@@ -90,18 +101,48 @@ def test_corners_of_a_grid_and_of_a_chessboard():
     found = BoardFinder(grid).find(draw_grid(grid, pose()))
     assert np.isfinite(found).all()
     assert np.abs(found - projected(grid, pose())).max() < 0.6
-    chess = Board((6, 5), 0.03, kind="chessboard")
-    sheet = np.kron(np.add.outer(np.arange(5), np.arange(6)) % 2, np.ones((75, 75))) * 255
-    sheet = cv2.copyMakeBorder(sheet.astype(np.uint8), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
-    to_board = np.array([[1 / 2500, 0, -59.5 / 2500], [0, 1 / 2500, -59.5 / 2500], [0, 0, 1]])
     # Turned by half a turn, the corners keep their numbers: the square between the first four is dark.
     for turn in (0.0, 180.0):
         T = pose(1)
         T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
         T[:3, 3] = pose(1)[:3, 3] + 0.05 - T[:3, :3] @ [0.09, 0.075, 0] + pose(1)[:3, :3] @ [0.09, 0.075, 0]
-        image = cv2.warpPerspective(sheet, K @ T[:3, [0, 1, 3]] @ to_board, SIZE_WH, borderValue=255)
-        found = BoardFinder(chess).find(image)
-        assert np.abs(found - projected(chess, T)).max() < 0.6
+        found = BoardFinder(CHESS).find(draw_chess(T))
+        assert np.abs(found - projected(CHESS, T)).max() < 0.6
+
+
+@pytest.mark.parametrize(
+    ("printed", "inverted"),
+    [(BOARD, False), (BOARD, True), (Board((5, 4), 0.05, 0.027, "5x5_100"), False), (CHESS, False)],
+    ids=["charuco", "white on black", "small markers", "chessboard"],
+)
+@pytest.mark.slow
+def test_what_a_board_is_follows_from_images_and_the_side_of_a_square(printed: Board, inverted: bool) -> None:
+    draw = draw_chess if printed is CHESS else lambda T: draw_board(printed, K, T, SIZE_WH)
+    images = [255 - draw(pose(seed)) if inverted else draw(pose(seed)) for seed in range(4)]
+    found = detect_board(printed.square_m, images)
+    assert (found.squares_wh, found.kind) == (printed.squares_wh, printed.kind)
+    if printed.marker_m is not None:
+        assert found.marker_m == pytest.approx(printed.marker_m, rel=0.04)
+        assert found.dictionary == ("5x5_50" if "5x5" in printed.dictionary else "4x4_50")
+
+
+def test_images_without_a_board_are_one_line() -> None:
+    with pytest.raises(
+        InputError, match="expected a ChArUco board or a chessboard, found neither in 3 images"
+    ):
+        detect_board(0.04, [np.full((240, 320), 128, np.uint8)] * 3)
+
+
+def test_a_board_is_drawn_in_its_true_size(tmp_path: Path) -> None:
+    """The squares of a page of 300 dots per inch, which a finder of the same board finds."""
+    board = Board((7, 5), 0.035, 0.026)
+    page = cv2.imread(str(save_board(tmp_path / "board.png", board)), cv2.IMREAD_GRAYSCALE)
+    corners = BoardFinder(board).find(page)
+    assert np.isfinite(corners).all()
+    dots = np.diff(corners.reshape(4, 6, 2)[:, :, 0], axis=1)
+    np.testing.assert_allclose(dots, 0.035 / 0.0254 * 300, rtol=2e-3)
+    with pytest.raises(OutputError):
+        save_board(tmp_path / "board.png", board)
 
 
 @pytest.mark.parametrize(("inverted", "legacy"), [(True, False), (False, True)])

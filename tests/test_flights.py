@@ -274,6 +274,16 @@ class TestReading:
         assert split_sequence([path, lab]) == ((path,), lab)
         assert split_sequence([path]) == ((path,), None)
 
+    def test_tracks_in_the_folder_of_their_recording_know_it_where_it_moves(self, tmp_path):
+        sequence = make_sequence(tmp_path / "lab")
+        (sequence / "results").mkdir()
+        tracks = make_tracks_file(sequence / "results" / "tracks.csv")
+        assert (
+            recording_beside(sequence, tracks)
+            == recording_beside(sequence / "recording.toml", tracks)[:2]
+            == ".."
+        )
+
     @pytest.mark.parametrize("folder", ["flight", "../elsewhere/flight"])
     def test_tracks_know_their_recording(self, tmp_path, caplog, folder):
         """A recording in the folder of the tracks is moved with it; another one stays where it is."""

@@ -50,6 +50,8 @@ _FIRST_IMAGES, _FIRST_SIDE_PX, _LEAST_FIRST_IMAGES = 6, 1000, 2
 _MOST_SQUARES = 20
 #: Largest distance, in sides of a marker, up to which markers fit a board.
 _FITS = 0.2
+#: Sides of a marker in sides of a square that are tried: one of them is near enough to any that is printed.
+_SHARES = (0.75, 0.5)
 #: Sides of a chessboard that are tried differ from the stated ones by at most this.
 _OTHER_SIZES = 2
 
@@ -124,7 +126,8 @@ def detect_board(square_m: float, images: Sequence[UInt8[np.ndarray, "height wid
     # Those first that show most of the board.
     order = sorted(range(len(images)), key=lambda index: -len(seen[index]))
     clearest = [images[index] for index in order]
-    size = _size_by_markers(Board((3, 3), square_m, square_m / 2, largest), clearest, inverted)
+    models = (Board((3, 3), square_m, share * square_m, largest) for share in _SHARES)
+    size = next((size for model in models if (size := _size_by_markers(model, clearest, inverted))), None)
     if size is None:
         ids = [marker for of_image in seen for marker in of_image]
         raise InputError(

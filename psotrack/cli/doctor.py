@@ -151,7 +151,7 @@ def _examine(
         bounds_m=None if bounds_m is None else room_bounds(recording.rig, bounds_m),
     )
     output.json(_content(recording.rig, diagnosis))
-    _print(output, recording.rig, diagnosis)
+    _print(output, recording.rig, diagnosis, recording.fps)
     if diagnosis.findings:
         output.say(*map(str, diagnosis.findings), always=True)
         sys.exit(FOUND)
@@ -199,8 +199,8 @@ def _content(rig: Rig, diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _print(output: Output, rig: Rig, diagnosis: Diagnosis) -> None:
-    rows = []
+def _print(output: Output, rig: Rig, diagnosis: Diagnosis, fps: float) -> None:
+    rows, to_ms = [], 1e3 / fps
     for row in _rows(rig, diagnosis):
         late, std = row["late_frames"], row["late_std_frames"]
         rows.append(
@@ -209,10 +209,10 @@ def _print(output: Output, rig: Rig, diagnosis: Diagnosis) -> None:
                 f"{row['detections_per_frame']:.2f}",
                 f"{row['explained']:.0%}",
                 *("" if row[key] is None else f"{row[key]:.1f}" for key in ("residual_px", "residual_std")),
-                "" if late is None else f"{late:+.2f} ± {std:.2f}",
+                "" if late is None else f"{late * to_ms:+.0f} ± {std * to_ms:.0f}",
             )
         )
-    headings = ("camera", "detections/frame", "explained", "median (px)", "(noise)", "late (frames)")
+    headings = ("camera", "detections/frame", "explained", "median (px)", "(noise)", "late (ms)")
     output.table(headings, rows)
     pairs = (
         (name, *("" if np.isnan(value) else f"{value:.1f}" for value in values))

@@ -350,9 +350,8 @@ def sequence_of(tracks: Path, given: Path | None) -> Path:
 
 
 def recording_named(sequence: Path, tracks: Path) -> str:
-    """How the record beside tracks names their recording: an archive by its own path, not by that of its content."""
+    """How the record beside tracks names their recording; empty for an archive, whose content is gone afterwards."""
     from psotrack.cli.archived import archive_of
     from psotrack.show.flights import recording_beside
 
-    archive = archive_of(click.get_current_context())
-    return recording_beside(sequence if archive is None else archive.path, tracks)
+    return "" if archive_of(click.get_current_context()) is not None else recording_beside(sequence, tracks)

@@ -171,6 +171,9 @@ def track(
     seen = f"{tracks.num_drones} drones, {tracks.num_frames} frames, {tracks.seen.mean():.1%} seen"
     output.say(f"{out}: {seen}, {_speed(record)}{sentence}")
     output.drones(tracks, tracked.size_m)
+    for name, clock in record.get("camera_clocks", {}).items():
+        std = "" if clock["offset_std_s"] is None else f" ± {1e3 * clock['offset_std_s']:.1f}"
+        output.say(f"clock of camera {name}: corrected by {1e3 * clock['offset_s']:+.1f}{std} ms")
 
 
 def _speed(record: dict[str, Any]) -> str:

@@ -328,7 +328,7 @@ def _find_gross_faults(
         if won[worst] <= GROSS_GAIN and np.isfinite(views[worst].noise_px).any(axis=1).mean() < 0.5:
             # A camera that seldom has a detection is not known to be wrong.
             break
-        fault = describe_camera_fault(rest, worst, explained[worst])
+        fault = describe_camera_fault(rest, worst, explained[worst], fps)
         findings.append(fault)
         # The other one of two exchanged cameras is wrong for the same reason.
         concerned = [rig.names.index(name) for name in fault.cameras]

@@ -45,7 +45,7 @@ class Finding:
         return f"{self.message}; {self.remedy}"
 
 
-def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) -> Finding:
+def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault], fps: float) -> Finding:
     """Describe the simplest explanation whose gain is almost as large as the largest gain."""
     name, sound = rig.names[index], explained[0]
     best = max(each.gain for each in explained)
@@ -58,8 +58,8 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault]) ->
     numbers = f"(explains {fault.gain:.0%} of the drones that the others see, not {sound.gain:.0%})"
     if fault.kind == "clock":
         late = "late" if fault.amount > 0 else "early"
-        message = f"camera {name}: its video is about {abs(fault.amount):.1f} frames {late} {numbers}"
-        return Finding("clock", (name,), message, "shift its video and detections by this number of frames")
+        message = f"camera {name}: its video is about {1e3 * abs(fault.amount) / fps:.0f} ms {late} {numbers}"
+        return Finding("clock", (name,), message, _clock_remedy(fault.amount / fps))
     if fault.kind == "focal length":
         percent = 100 * (1 / fault.amount - 1)
         how = f"{abs(percent):.0f} % too {'short' if percent < 0 else 'long'}"
@@ -108,6 +108,11 @@ def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
     return Finding(kind, names, f"{words}, {numbers}", remedy, other_kinds)
 
 
+def _clock_remedy(late_s: float) -> str:
+    """What to do about a camera that is late by some seconds."""
+    return f"track with --clocks auto, which finds it to a millisecond or so; or add {-late_s:.4f} to its time_offset_s"
+
+
 def _kind(kind: str) -> str:
     return "moved" if kind == "turned and moved" else kind
 
@@ -124,11 +129,10 @@ def _in_words(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
     step, std = parameters_of(judged.step, camera), parameters_of(judged.std, camera)
     if hypothesis.kind == "clock":
         lag, how = float(step[7]), "late" if step[7] > 0 else "early"
-        words = (
-            f"camera {name}: its video is {abs(lag):.2f} frames {how} (± {std[7]:.2f}), its frame i shows what the "
-            f"others show in frame i {'-' if lag > 0 else '+'} {abs(lag):.2f}"
+        size_ms, std_ms = 1e3 * abs(lag) / fps, 1e3 * float(std[7]) / fps
+        return f"camera {name}: its video is {size_ms:.0f} ms {how} (± {std_ms:.0f} ms)", _clock_remedy(
+            lag / fps
         )
-        return words, f"add {-lag / fps:.4f} to its time_offset_s, or synchronise its video with the others"
     if hypothesis.kind == "focal length":
         scale = float(np.exp(step[6]))
         how = f"{100 * abs(1 / scale - 1):.1f} % too {'short' if scale > 1 else 'long'} (± {100 * std[6]:.1f} %)"

@@ -231,7 +231,7 @@ def _by_board(
         instants = instants_of_numbers(cameras, floor)
     report = output.report
     if board.squares is None:
-        stated = detect_board(board.square_m or 0.0, first_images(cameras))
+        stated = detect_board(board.square_m or 0.0, first_images(cameras, 4))
         output.say(f"the board is {describe_board(stated)}")
     else:
         stated = board.board()

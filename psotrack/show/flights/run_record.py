@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +68,16 @@ class RunRecord(msgspec.Struct, frozen=True):
 def recording_beside(recording: Path | str, tracks: Path | str) -> str:
     """Path of a recording as the record of its tracks holds it, under the key `recording`.
 
-    It is relative where the recording lies in the folder of the tracks, so that both can be moved together, and else
-    absolute.
+    It is relative where the recording lies in the folder of the tracks, or the tracks in the recording's, so that both
+    can be moved together, and else absolute.
 
     Args:
         recording: the recording, as a user names it for `open_recording`.
         tracks: file of the tracks, beside which the record is.
     """
     path, folder = Path(recording).absolute(), Path(tracks).absolute().parent
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
+    together = path.is_relative_to(folder) or folder.is_relative_to(path if path.is_dir() else path.parent)
+    return Path(os.path.relpath(path, folder)).as_posix() if together else str(path)
 
 
 def read_run_record(path: Path | str) -> RunRecord | None:
