@@ -74,8 +74,8 @@ def _strangers(cache: Path) -> list[Path]:
 def test_entries_are_listed_the_oldest_first(run_psotrack: Run, cache: Path) -> None:
     entries = _listed(run_psotrack, cache)
     assert [(entry["kind"], entry["video"]) for entry in entries] == [
-        ("detect", "--silhouettes", "a.avi"),
-        ("detect", "--silhouettes", "b.avi"),
+        ("silhouettes", "a.avi"),
+        ("silhouettes", "b.avi"),
         ("program", ""),
     ]
     ages = [round(float(str(entry["days_unused"]))) for entry in entries]

@@ -356,7 +356,7 @@ def test_missing_and_empty_detections_are_errors(run: Run, sequence: Path, tmp_p
     assert_one_line(nowhere, "nowhere", "cam1.csv", "no such folder")
     shutil.rmtree(sequence / "dl_data")
     assert_one_line(run(*track(sequence, tmp_path / "t.csv", *lines, "--detections", "yolo")), "dl_data")
-    fallen_back = run(*track(sequence, tmp_path / "t.csv", *lines, "--frames", 20))
+    fallen_back = run(*track(sequence, tmp_path / "blobs.csv", *lines, "--frames", 11))
     assert (fallen_back.code, "blobs of its silhouettes take their place" in fallen_back.out) == (0, True)
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "cam1i.csv").touch()

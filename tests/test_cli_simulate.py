@@ -98,11 +98,10 @@ def test_preview_uses_the_given_seed(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "simulate: expected the NAME of a scenario or --scenario FILE.toml, found neither"),
+        (("--seed", "1"), "simulate: expected the NAME of a scenario or --scenario FILE.toml, found neither"),
         (("S01_D2_A", "--scenario", "x.toml"), "found both"),
-        (("S01_D2_A",), "--out: expected the folder to write to, found none"),
         (("S99", "--out", "x"), "scenario: expected one of S01_D2_A"),
-        (("S01_D2_A", "--out", "x", "--set", "imaging"), "--set: expected FIELD=VALUE"),
+        (("S01_D2_A", "--out", "x", "--set", "imaging"), "--set: expected NAME=VALUE"),
         (("S01_D2_A", "--out", "x", "--set", "imaging.noise=1"), "imaging.noise"),
         (("S01_D2_A", "--out", "x", "--set", "drones[0].model=kite"), "drones[0].model"),
         (("S01_D2_A", "--out", "x", "--set", "cameras=[]"), "cameras"),

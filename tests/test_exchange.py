@@ -270,10 +270,10 @@ def test_a_file_of_tum_has_any_name(tmp_path: Path, name: str) -> None:
 def test_all_commands_read_the_same_formats(
     run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
 ) -> None:
-    """JSON as well as CSV; `test_fuse_command` has the same of `fuse`."""
+    """JSON as well as CSV; `test_fuse_command` has the same of `onboard fuse`."""
     export_tracks(small_tracks(), "json", tmp_path / "tracks.json")
     expected, found = (
-        run_psotrack("synchronise", path, flight, "--json", "-")
+        run_psotrack("doctor", flight, "--tracks", path, "--json", "-")
         for path in (flight / "tracks.csv", tmp_path / "tracks.json")
     )
     assert found.code == 0, found

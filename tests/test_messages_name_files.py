@@ -55,7 +55,7 @@ def test_a_setting_of_a_config_names_the_file_and_a_typed_one_does_not(files, fl
     (files / "run.toml").write_text("swarm.particles = -5\n")
     words = ("track", flight, "--config", "run.toml", "--out", "out.csv")
     check_line(run_psotrack(*words), "run.toml, swarm.particles: expected", "found -5")
-    typed = run_psotrack(*words, "--particles", "-6")
+    typed = run_psotrack("track", flight, "--out", "out.csv", "--particles", "-6")
     check_line(typed, "psotrack: swarm.particles: expected", "found -6")
 
 

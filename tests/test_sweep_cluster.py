@@ -109,7 +109,7 @@ def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
     monkeypatch.setattr("distributed.Client", refuse)
     (tmp_path / "Simulated_Data" / "S01_D2_A").mkdir(parents=True)
     grid, cluster = read_grid(grid_file(tmp_path, [2])), Cluster(address)
-    monkeypatch.setattr("psotrack.sweep.cluster._result_without_worker", lambda *_: None)
+    monkeypatch.setattr("psotrack.sweep.cluster.sort_out", lambda grid, *_: ([], grid.cells()))
     with pytest.raises(InputError, match="nobody listens"):
         run_on_cluster(grid, tmp_path / "out", data=tmp_path, cache=tmp_path, cluster=cluster)
     lines = [record.getMessage() for record in caplog.records if "TLS" in record.getMessage()]

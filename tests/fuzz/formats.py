@@ -644,7 +644,7 @@ _OTHERS = {
         _text("sticks.csv", _STICKS),
         "sticks.csv",
         (read_sticks,),
-        "fly --out {out}/flight.csv --device {file}",
+        "simulate fly --out {out}/flight.csv --device {file}",
     ),
     "archive-manifest": Format(
         lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
