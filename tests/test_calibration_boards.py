@@ -439,7 +439,7 @@ def test_the_command(tmp_path):
     )
     other = ["--out", str(tmp_path / "another.toml")]
     for arguments, message in (
-        ([*paths, *other], "expected one of --squares, --points, --pairs, --markers"),
+        ([*paths, *other], "expected one of --square, --squares, --points, --pairs, --markers"),
         ([paths[0], paths[0], *board, *other], "expected each camera once"),
         ([*paths, *board, "--floor", "99", *other], "the nearest one is 7"),
     ):
