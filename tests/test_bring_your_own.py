@@ -408,7 +408,7 @@ def test_parts_without_the_interface_are_one_line():
         f"background: {expected}.BackgroundModel, {function}",
         f"detector: {expected}.Detector, {function}",
         "register_plugin(), kind: expected one of search, score, method, background, detector, found 'searches'",
-        "search own: expected a function of the settings, or a class, found an object of int",
+        "register_plugin(), make: expected a function, found 1",
     ]
 
 

@@ -520,7 +520,7 @@ def test_a_second_run_uses_the_stored_compiled_program(sequence: Path, tmp_path:
             env=environment_without_jax_settings(),
             check=True,
         )
-        compiled = (tmp_path / "cache" / "compiled").glob("*.tracker.track-*.program")
+        compiled = (tmp_path / "cache" / "compiled").glob("jit_track-*-cache")
         # A program that is stored again is another file.
         stored.append({path.name: path.stat().st_ino for path in compiled})
     assert stored[0]

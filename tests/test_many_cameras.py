@@ -40,7 +40,16 @@ def simulated(root: Path) -> Path:
 
 def make_silhouettes(folder: Path, cache: Path, cameras: tuple[str, ...]) -> subprocess.Popen[str]:
     """Start the front end of some cameras in a command of its own."""
-    command = [sys.executable, "-m", "psotrack", "silhouettes", f"{folder}", "--cameras", ",".join(cameras)]
+    command = [
+        sys.executable,
+        "-m",
+        "psotrack",
+        "detect",
+        "--silhouettes",
+        f"{folder}",
+        "--cameras",
+        ",".join(cameras),
+    ]
     return subprocess.Popen([*command, "--cache", f"{cache}", "--jobs", "1", "--quiet"], env=os.environ)
 
 

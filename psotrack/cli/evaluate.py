@@ -93,7 +93,7 @@ def evaluate(
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
         plots.save_overview(picture, estimate, truth, force=output.force)
-        output.say(f"picture: {picture}")
+        output.say(f"{picture}: paths, and errors over time")
 
 
 def _at_rate_of(estimate: Trajectories, recording: Recording) -> Recording:
