@@ -57,7 +57,7 @@ COMMANDS = {
     "rig.toml": "calibrate convert {flight}/flight/rig.toml {out} --force",
     "rig.yaml": "calibrate convert {flight}/flight/rig.toml {out} --force",
     "recording.toml": "init {flight}/flight --out {out} --force --quiet",
-    "info.json": "info {flight}/flight --json {out} --force",
+    "info.json": "init --show {flight}/flight --json {out} --force",
     "errors.json": "evaluate {flight}/tracks.csv {flight}/flight --json {out} --force",
     "errors.png": "evaluate {flight}/tracks.csv {flight}/flight --plot {out} --force",
     "export.csv": "export {flight}/tracks.csv --to csv --out {out} --force",
@@ -66,8 +66,8 @@ COMMANDS = {
     "export.c3d": "export {flight}/tracks.csv --to c3d --out {out} --force",
     "export.mcap": "export {flight}/tracks.csv {flight}/flight --to mcap --images --out {out} --force",
     "page.html": "report {flight}/tracks.csv {flight}/flight --out {out} --force --jobs 1",
-    "masks.mp4": "silhouettes {flight}/flight --cameras c0 --masks {out} --force --jobs 1",
-    "masks.avi": "silhouettes {flight}/flight --cameras c0 --masks {out} --force --jobs 1",
+    "masks.mp4": "detect {flight}/flight --cameras c0 --masks {out} --force --jobs 1",
+    "masks.avi": "detect {flight}/flight --cameras c0 --masks {out} --force --jobs 1",
 }
 #: Commands whose outputs are folders; an earlier folder holds one file.
 FOLDERS = {
@@ -75,9 +75,9 @@ FOLDERS = {
     "kitti": "export {flight}/tracks.csv --to kitti --out {out} --force",
     "mot": "export {flight}/tracks.csv {flight}/flight --to mot --out {out} --force",
     "videos": "overlay {flight}/tracks.csv {flight}/flight --out {out} --force --jobs 1",
-    "masks": "silhouettes {flight}/flight --masks {out} --force --jobs 1",
+    "masks": "detect {flight}/flight --masks {out} --force --jobs 1",
     "boxes": "detect {flight}/flight --blobs --out {out} --force --jobs 1",
-    "yolo": "labels {flight}/flight {flight}/second --drone-size 0.3,0.3,0.15 --out {out} --force --jobs 1",
+    "yolo": "simulate labels {flight}/flight {flight}/second --drone-size 0.3,0.3,0.15 --out {out} --force --jobs 1",
 }
 
 
