@@ -65,10 +65,10 @@ if TYPE_CHECKING:
 def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: Any) -> None:
     """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
 
-    Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to GoPro
-    3. Nothing is guessed: where a name does not say whose a file is, the command asks, or elsewhere than on a terminal
-    wants --match or --leave-out. Detections, frame times (frame,time_s), images of what is ignored (a name with
-    "ignore" or "mask"), references and marker corners are found by name and content.
+    Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to
+    GoPro 3. Nothing is guessed: where a name does not say whose a file is, the command asks for --match or --leave-out.
+    Detections, frame times (frame,time_s), images of what is ignored (a name with "ignore" or "mask"), references and
+    marker corners are found by name and content.
 
     Without a rig file, the cameras have the names of their files, and no place yet.
 
