@@ -26,7 +26,7 @@ def test_one_late_video_is_late_to_the_doctor_and_to_the_clocks_of_tracks(late):
     diagnosis = examine(RIG, sightings, fps=FPS)
     (finding,) = diagnosis.findings
     assert (finding.kind, finding.cameras) == ("clock", (RIG.names[3],))
-    assert f"frames {word} (" in finding.message
+    assert f" ms {word} (" in finding.message
     assert diagnosis.late_frames[3] == pytest.approx(late, abs=0.1)
     added_s = float(finding.remedy.split("add ")[1].split()[0])
     assert added_s == pytest.approx(-late / FPS, abs=0.1 / FPS)
