@@ -442,7 +442,7 @@ def test_rows_of_a_live_session_arrive_in_the_viewer(folder, tmp_path):
     assert words == ["tracked", "coasting", "tracked"]
     # Lines have the colours of the drones.
     for drone in "01":
-        line = entities[f"/plots/score/{drone}"]["SeriesLines:colors"][1]
+        line = entities[f"/plots/deviation_mm/{drone}"]["SeriesLines:colors"][1]
         assert line[0] == entities[f"/world/drones/{drone}/body"]["Boxes3D:colors"][1][0]
     # A lost drone has no ellipsoid.
     frames, half_sizes = entities["/world/drones/0/ellipsoid"]["Ellipsoids3D:half_sizes"]

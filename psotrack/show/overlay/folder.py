@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import tempfile
 from collections.abc import Sequence
@@ -95,6 +94,14 @@ class WrittenOverlays:
     def __str__(self) -> str:
         kept = f", {len(self.kept)} were there already" if self.kept else ""
         return f"{self.folder}: {len(self.written)} videos in {self.codec.name}{kept}"
+
+
+class _Inputs(msgspec.Struct):
+    """Content of `INPUTS_FILE`: digests of the videos by their files' names, and of what they are."""
+
+    videos: dict[str, str]
+    recording: str = ""
+    tracks: list[str] = []
 
 
 def write_overlays(
@@ -220,13 +227,9 @@ def _begin(folder: Path, flight: TrackedFlight, videos: dict[str, str], force: b
         # An old video must not count as one of the new content, if this run is interrupted.
         (folder / name).unlink()
     if len(kept) < len(videos):
-        content = {
-            "recording": flight.name,
-            "tracks": [str(tracks.path) for tracks in flight.tracks],
-            "videos": before | videos,
-        }
+        inputs = _Inputs(before | videos, flight.name, [str(tracks.path) for tracks in flight.tracks])
         with atomic_write(folder / INPUTS_FILE) as temporary:
-            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(inputs)) + b"\n")
     return kept
 
 
@@ -235,12 +238,11 @@ def _digests(path: Path) -> dict[str, str]:
     if not path.exists():
         return {}
     try:
-        videos = json.loads(read_text(path))["videos"]
-        return {str(name): str(digest) for name, digest in videos.items()}
-    except (ValueError, KeyError, TypeError, AttributeError):
+        return msgspec.json.decode(read_text(path), type=_Inputs).videos
+    except msgspec.DecodeError as error:
         raise InputError(
-            path, expected="the list that `psotrack overlay` writes", found="another content"
-        ) from None
+            path, expected="the list that `psotrack overlay` writes", found=f"{error}"
+        ) from error
 
 
 def _digest(video: DrawnVideo) -> str:

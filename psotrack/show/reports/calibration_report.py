@@ -111,7 +111,7 @@ def write_calibration_report(path: Path | str, record_path: Path | str, *, force
     rms_px = [camera.rms_px for camera in cameras]
     text = render(
         "calibration.html",
-        scenes={"scene": Scene3D(np.zeros(1), rig=read_rig(rig_path))},
+        Scene3D(np.zeros(1), rig=read_rig(rig_path)),
         title=f"Calibration {rig_path.name}",
         figures=(
             (f"{len(cameras)}", "cameras"),

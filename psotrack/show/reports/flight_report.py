@@ -125,7 +125,7 @@ def write_flight_report(
     truth = "" if flight.truth is None else ", compared with a reference"
     text = render(
         "flight.html",
-        scenes={"scene": scene},
+        scene,
         title=flight.name,
         lead=f"{span_s:.1f} s, {len(scene.time_s)} frames{cameras}{truth}",
         sections=[_section(flight, tracks, pictures, jobs, report) for tracks in flight.tracks],

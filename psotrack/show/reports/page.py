@@ -35,12 +35,9 @@ def _packed_library() -> str:
     return base64.b64encode(gzip.compress(asset("three.bundle.js").encode(), mtime=0)).decode("ascii")
 
 
-def scene_scripts(scenes: dict[str, Scene3D]) -> Markup:
-    """Scripts that fill the elements with these ids with 3D views."""
-    started = "".join(
-        f"psotrackScene(document.getElementById({json.dumps(name)}), {_script_json(scene.data())});"
-        for name, scene in scenes.items()
-    )
+def _scene_script(scene: Scene3D) -> Markup:
+    """A script that fills the element `scene` with a 3D view."""
+    started = f"psotrackScene(document.getElementById('scene'), {_script_json(scene.data())});"
     # The JavaScript and the base64 come from the package, and the data hold no "<".
     return Markup(
         f"<script>{asset('scene.js')}\npsotrackStart({json.dumps(_packed_library())}, () => {{{started}}});</script>"
@@ -49,19 +46,19 @@ def scene_scripts(scenes: dict[str, Scene3D]) -> Markup:
 
 def scene_frame(scene: Scene3D, *, height_px: int = _CELL_HEIGHT_PX) -> str:
     """A 3D view as an HTML element of its own, for a notebook's cell."""
-    content = render("scene.html", scenes={"scene": scene}, title="3D view")
+    content = render("scene.html", scene, title="3D view")
     return (
         f'<iframe title="3D view" srcdoc="{html.escape(content)}" '
         f'style="width: 100%; height: {height_px}px; border: 0"></iframe>'
     )
 
 
-def render(template: str, *, scenes: dict[str, Scene3D], **values: Any) -> str:
+def render(template: str, scene: Scene3D | None, **values: Any) -> str:
     """The text of a page.
 
     Args:
         template: name of a file in `assets`.
-        scenes: 3D views by the ids of their elements.
+        scene: the 3D view of the page; None: it has none.
         **values: what the template shows; text is escaped.
     """
     import jinja2
@@ -74,7 +71,7 @@ def render(template: str, *, scenes: dict[str, Scene3D], **values: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(
-        scripts=scene_scripts(scenes) if scenes else "",
+        scripts="" if scene is None else _scene_script(scene),
         page_css=Markup(asset("page.css")),
         scene_css=Markup(asset("scene.css")),
         page_js=Markup(asset("page.js")),

@@ -51,7 +51,7 @@ def write_sweep_report(path: Path | str, folder: Path | str, *, force: bool = Fa
     cells = _cells(rows, shown)
     text = render(
         "sweep.html",
-        scenes={},
+        None,
         title=f"Sweep {Path(folder).name}",
         figures=(
             (f"{len(cells)}", "finished cells"),

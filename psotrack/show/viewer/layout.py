@@ -44,9 +44,10 @@ def blueprint_of(flight: TrackedFlight, *, has_images: bool, has_onboard: bool =
 def live_blueprint() -> rrb.Blueprint:
     """The arrangement for tracks that come while cameras film."""
     delay = rrb.TimeSeriesView(origin="/plots/delay_ms", name="delay (ms)")
-    plots = [_plot(key) for key in QUANTITIES if key != "error_mm"]
     space = rrb.Spatial3DView(origin="/world", name="space")
-    return _arranged([space, rrb.Vertical(*plots, delay, _STATES)], [2.0, 1.0], play_state="following")
+    return _arranged(
+        [space, rrb.Vertical(_plot("deviation_mm"), delay, _STATES)], [2.0, 1.0], play_state="following"
+    )
 
 
 def _arranged(

@@ -76,7 +76,7 @@ class LiveView:
         tracks = replace(tracks, colours=tuple(self._colours[name] for name in rows.drones))
         self._now = instants(tracks)
         log_drones(self._log, tracks)
-        log_quantities(self._log, TrackedFlight("", (), None), tracks)
+        log_quantities(self._log, TrackedFlight("", (), None), tracks, ("deviation_mm",))
         log_status(self._log, tracks, self._status)
         self._status |= dict(zip(rows.drones, statuses(rows)[0].tolist(), strict=True))
         self._show_trails(rows, shown_rgb(tracks)[0].tolist())

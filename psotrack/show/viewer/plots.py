@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ import rerun as rr
 from jaxtyping import Float
 
 from psotrack.show.flights import (
+    QUANTITIES,
     EventKind,
     FlightTracks,
     TrackedFlight,
@@ -37,9 +38,11 @@ def log_plots(log: EntityLog, flight: TrackedFlight) -> None:
         _log_events(log, flight)
 
 
-def log_quantities(log: EntityLog, flight: TrackedFlight, tracks: FlightTracks) -> None:
-    """Log a line of each quantity per drone."""
-    for quantity in quantities(flight, tracks):
+def log_quantities(
+    log: EntityLog, flight: TrackedFlight, tracks: FlightTracks, keys: Container[str] = QUANTITIES
+) -> None:
+    """Log a line of each quantity with one of some keys per drone."""
+    for quantity in (each for each in quantities(flight, tracks) if each.key in keys):
         at = Instants(quantity.frame, quantity.time_s)
         for name, colour, values in zip(quantity.names, quantity.colours, quantity.values.T, strict=True):
             path, shown = drone_path(f"plots/{quantity.key}", tracks, name), f"{tracks.group} {name}".strip()
@@ -58,8 +61,10 @@ def log_status(log: EntityLog, tracks: FlightTracks, before: Mapping[str, int] =
     words = [each.label for each in Status]
     for drone, name in enumerate(tracks.trajectories.drones):
         path, status = drone_path("status", tracks, name), statuses(tracks.trajectories)[:, drone]
-        log.static(path, rr.StateConfiguration(values=words, labels=words, colors=_STATUS_RGB))
         changes = np.flatnonzero(np.diff(status, prepend=before.get(name, -1)))
+        if not len(changes):
+            continue
+        log.static(path, rr.StateConfiguration(values=words, labels=words, colors=_STATUS_RGB))
         at = Instants(*(part[changes] for part in instants(tracks)))
         log.rows(path, at, partial(_states, [words[each] for each in status[changes]]))
 

@@ -1,6 +1,6 @@
 // A view of a flight in 3D that turns and plays. psotrackScene(host, data) fills the element `host`.
 //
-// `data` comes from psotrack/reports/scene.py: times, drones, truth, cameras and clouds of points, in metres, z up. Arrays
+// `data` comes from psotrack/show/reports/scene.py: times, drones, truth, cameras and clouds of points, in metres, z up. Arrays
 // of numbers are base64 of little-endian float32; NaN where a position is not known.
 
 function psotrackScene(host, data) {
