@@ -11,9 +11,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
-
-import msgspec
+from typing import Any, Literal
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
@@ -302,10 +300,10 @@ def _table(
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
-    written = {kind: _written(file, base) for kind, file in files.items()}
+    written: dict[str, Any] = {kind: _written(file, base) for kind, file in files.items()}
     if "images" in files:
         written["images"] += _pattern(matching.folder, Path(files["images"]))
-    return msgspec.convert({**written, "size": size, "fps": fps}, CameraTable)
+    return CameraTable(size=size, fps=fps, **written)
 
 
 def _pattern(folder: Path, images: Path) -> str:
