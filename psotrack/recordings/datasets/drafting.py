@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
-
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import camera_key, cameras_of, chosen_camera
 from psotrack.geometry.rig_files import read_cameras
@@ -305,7 +303,7 @@ def _table(
     written: dict[str, Any] = {kind: _written(file, base) for kind, file in files.items()}
     if "images" in files:
         written["images"] += _pattern(matching.folder, Path(files["images"]))
-    return msgspec.convert(written | {"size": size, "fps": fps}, CameraTable)
+    return CameraTable(size=size, fps=fps, **written)
 
 
 def _pattern(folder: Path, images: Path) -> str:
