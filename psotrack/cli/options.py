@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import platformdirs
 
 from psotrack.cli.log_file import LogFile
 from psotrack.cli.output import PROGRESS, Output, current_output
@@ -17,7 +16,7 @@ from psotrack.cli.records import Command, Option
 from psotrack.cli.types import Numbers, SequencePath, names_of
 from psotrack.errors import InputError, SettingsError
 from psotrack.settings import BLOBS, YOLO
-from psotrack.support import refuse_files
+from psotrack.support import refuse_files, user_cache
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -303,8 +302,8 @@ def filmed_recording(source: Path, extent: Extent) -> Recording:
 
 
 def cache_folder(chosen: str | Path | None) -> Path:
-    """Folder of the stored silhouettes: `chosen`, or a folder in the user's cache folder."""
-    return Path(chosen) if chosen else platformdirs.user_cache_path("psotrack") / "silhouettes"
+    """Folder of the stored silhouettes: `chosen`, or the user's."""
+    return Path(chosen) if chosen else user_cache()
 
 
 def compiled_folder(chosen: str | Path | None) -> Path:

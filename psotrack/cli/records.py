@@ -1,7 +1,7 @@
 """Options from records of settings: a field is an option, and its type, default and docstring are the option's.
 
-The record stands where the work is done, so a setting is described once, for Python and for the command line. The first
-sentence of a field's description is the option's help; a last sentence `None: TEXT.` becomes `[default: TEXT]`.
+The record stands where the work is done, so a setting is described once, for Python and for the command line. A field's
+description is the option's help; its end `None: TEXT.` becomes `[default: TEXT]`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ Command = Callable[..., Any]
 
 #: Ends of the names of fields that state a unit; options state it in their help.
 _UNITS = re.compile(r"_(m|s|m_s|hz|deg|px|m_s2|m2_s5)$")
-_NONE = re.compile(r"[.;,] (?:None|\"\"): (.*?)\.?$")
+#: End of a description that says what the default None means.
+_NONE = re.compile(r"[.;,] None: (.*?)\.?$")
 
 
 class Option(click.Option):
@@ -211,7 +212,6 @@ def options_of(
     *,
     names: Mapping[str, str] | None = None,
     heading: str = "Options",
-    rare: bool = False,
 ) -> Callable[[Command], Command]:
     """Add the options of a record, which the command gets as one argument.
 
@@ -220,7 +220,6 @@ def options_of(
         parameter: name of the command's argument that gets the record.
         names: names of options by field, where they are not the field's; "" leaves the field out.
         heading: heading of the options in the help.
-        rare: whether only --help-all shows the options.
     """
     names = names or {}
     fields = [field for field in fields_of(record) if names.get(field.name) != ""]
@@ -233,7 +232,7 @@ def options_of(
 
         decorated: Command = with_record
         for field in reversed(fields):
-            option = option_of(field, flag=names.get(field.name, ""), heading=heading, rare=rare)
+            option = option_of(field, flag=names.get(field.name, ""), heading=heading)
             decorated = option(decorated)
         return decorated
 
@@ -242,8 +241,4 @@ def options_of(
 
 def is_given(context: click.Context, name: str) -> bool:
     """Whether the user, or a variable of the environment, gave the value of a parameter."""
-    return context.get_parameter_source(name) not in (
-        None,
-        ParameterSource.DEFAULT,
-        ParameterSource.DEFAULT_MAP,
-    )
+    return context.get_parameter_source(name) not in (None, ParameterSource.DEFAULT)

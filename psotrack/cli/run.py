@@ -19,10 +19,10 @@ _CLOCK = "clock"
 
 
 class _Step(NamedTuple):
-    """A command of a run: its words, and the file whose presence says that the command was done."""
+    """A command of a run: its words, and the file that says that the command was done; None: it is always run."""
 
     words: tuple[str, ...]
-    made: Path
+    made: Path | None
 
 
 @click.command(cls=HelpfulCommand)
@@ -59,12 +59,19 @@ def run(
       psotrack run my_lab --square 0.035
       psotrack run my_lab --square 0.035 --floor 0 --drones 4
     """
-    from psotrack.recordings.datasets import videos_in
+    from psotrack.recordings.datasets import open_recording, videos_in
 
     if not videos_in(folder):
         raise InputError(folder, expected="a video of each camera", found="none")
     results = folder / "results"
-    _do(output, _first_steps(folder, square_m, floor), again)
+    _do(output, _first_steps(folder, square_m, floor, again), again)
+    if open_recording(folder).unplaced:
+        raise InputError(
+            folder,
+            expected=f"videos of a board in {folder / 'board'}, or a rig file",
+            found="neither",
+            remedy="`psotrack board` draws a board",
+        )
     findings = results / "doctor.json"
     checked = _Step(("doctor", f"{folder}", "--json", f"{findings}"), findings)
     _do(output, iter([checked]), again)
@@ -72,16 +79,18 @@ def run(
     output.say(f"report: {results / 'report.html'}", f"videos: {results / 'overlay'}")
 
 
-def _first_steps(folder: Path, square_m: float | None, floor: int | None) -> Iterator[_Step]:
-    """From videos of a board to a recording."""
+def _first_steps(folder: Path, square_m: float | None, floor: int | None, again: bool) -> Iterator[_Step]:
+    """From videos of a board to a recording whose cameras have places."""
     from psotrack.recordings import RECORDING_FILE
+    from psotrack.recordings.datasets import open_recording
 
-    if (folder / RECORDING_FILE).exists():
+    drafted = (folder / RECORDING_FILE).exists()
+    if drafted and not again and not open_recording(folder).unplaced:
         return
     rig, board = folder / "rig.toml", folder / "board"
     # Another rig file is found by `init`.
     if board.is_dir():
-        if square_m is None and not rig.exists():
+        if square_m is None and (again or not rig.exists()):
             raise SettingsError(
                 "--square", expected="the side of a square of the board, metres", found="none"
             )
@@ -90,7 +99,11 @@ def _first_steps(folder: Path, square_m: float | None, floor: int | None) -> Ite
             ("calibrate", "rig", f"{board}", "--square", f"{square_m}", *placed, "--out", f"{rig}"), rig
         )
     words = ("--calibration", f"{rig}") if rig.exists() else ()
-    yield _Step(("init", f"{folder}", *words), folder / RECORDING_FILE)
+    if drafted:
+        # A recording whose cameras have no places yet; `init` keeps the old file beside the new one.
+        yield _Step(("init", f"{folder}", *words, "--force"), None)
+    else:
+        yield _Step(("init", f"{folder}", *words), folder / RECORDING_FILE)
 
 
 def _last_steps(folder: Path, drones: int | None, clocks: tuple[str, ...]) -> Iterator[_Step]:
@@ -102,8 +115,8 @@ def _last_steps(folder: Path, drones: int | None, clocks: tuple[str, ...]) -> It
     yield _Step(
         ("report", f"{tracks}", f"{folder}", "--out", f"{results / 'report.html'}"), results / "report.html"
     )
-    # Videos that are finished are kept by the command itself.
-    yield _Step(("overlay", f"{tracks}", f"{folder}", "--out", f"{results / 'overlay'}"), results / "none")
+    # The command itself keeps the videos that are finished.
+    yield _Step(("overlay", f"{tracks}", f"{folder}", "--out", f"{results / 'overlay'}"), None)
 
 
 def _clocks(findings: Path) -> tuple[str, ...]:
@@ -119,11 +132,13 @@ def _do(output: Output, steps: Iterator[_Step], again: bool) -> None:
     from psotrack.cli import cli
 
     for step in steps:
-        if step.made.exists() and not again:
+        if step.made is not None and step.made.exists() and not again:
             output.say(f"{step.made}: there already")
             continue
         output.say(f"$ psotrack {shlex.join(step.words)}")
         words = [*step.words, *(["--quiet"] if output.quiet else []), *(["--force"] if again else [])]
+        if step.words[0] != "init":
+            words += ["--progress", output.progress]
         try:
             cli.main(words, standalone_mode=False)
         except SystemExit as ended:

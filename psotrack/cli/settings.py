@@ -35,7 +35,6 @@ _NAMES = {
     "silhouettes.min_blob_px": "min-blob",
     "silhouettes.drone_px": "drone-px",
 }
-_SET, _CONFIG = "set_changes", "config"
 
 
 def settings_options(
@@ -74,7 +73,7 @@ def settings_options(
             decorated = option(decorated)
         sets = click.option(
             "--set",
-            _SET,
+            "set_changes",
             multiple=True,
             metavar="NAME=VALUE",
             help="Change a setting by its name in sweeps, such as swarm.particles=50; may be repeated. --help-all "

@@ -78,11 +78,11 @@ def names_of(option: str, given: str | None) -> list[str] | None:
     return names
 
 
-def change_of(text: str) -> tuple[str, Any]:
+def change_of(text: str, example: str = "swarm.particles=50") -> tuple[str, Any]:
     """Name and value of `NAME=VALUE`; the value is parsed as TOML, and kept as text if it is not valid TOML."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise SettingsError("--set", expected="NAME=VALUE, such as swarm.particles=50", found=text)
+        raise SettingsError("--set", expected=f"NAME=VALUE, such as {example}", found=text)
     try:
         return name.strip(), tomllib.loads(f"value = {value}")["value"]
     except ValueError:

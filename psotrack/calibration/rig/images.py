@@ -234,4 +234,4 @@ def _open(name: str, path: Path) -> CameraImages:
 def first_images(cameras: Sequence[CameraImages], count: int = 10) -> list[UInt8[np.ndarray, "height width"]]:
     """About `count` grey images of each camera, evenly spread over the recording, of the cameras in turn."""
     readers = [camera.read(camera.spread(count)) for camera in cameras]
-    return [grey for round_ in zip_longest(*readers) for one in round_ if one is not None for grey in one[1:]]
+    return [one[1] for of_all in zip_longest(*readers) for one in of_all if one is not None]

@@ -155,8 +155,9 @@ def rig(
         raise SettingsError("rig", expected="--distance and --stick with --points", found=chosen[0])
     if not sources and points.pairs is None:
         raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
-    if len(sources) == 1 and len(found_videos := videos_in(sources[0])) > 1:
-        sources = tuple(found_videos)
+    if len(sources) == 1 and not is_recording(sources[0]):
+        # A folder of videos stands for all of them.
+        sources = tuple(videos_in(sources[0])) or sources
     if chosen[0] in ("--points", "--pairs", "--markers"):
         if floor is not None or plot is not None:
             raise SettingsError("rig", expected="--floor and --plot with --squares", found=chosen[0])

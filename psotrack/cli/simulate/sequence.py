@@ -155,7 +155,7 @@ def sequence(
     out = out or Path("data")
     recipe = load(scenario_file) if scenario_file else scenario(str(name))
     recipe = change_scenario(recipe, RESTLESS if restless else {})
-    recipe = change_scenario(recipe, dict(map(change_of, changes)))
+    recipe = change_scenario(recipe, dict(change_of(change, "imaging.shutter_s=0.01") for change in changes))
     if shown.preview:
         from psotrack.simulation import save_preview
 

@@ -1,0 +1,65 @@
+"""`psotrack run`: from the videos of a rig to a report, and on from where it was stopped."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import Output
+
+from psotrack.recordings import VideoWriter
+
+Run = Callable[..., Output]
+
+
+def write_video(path: Path) -> None:
+    with VideoWriter(path, 25.0, (64, 48)) as video:
+        for _ in range(3):
+            video.write(np.zeros((48, 64, 3), np.uint8))
+
+
+def commands_in(output: Output) -> list[str]:
+    """The commands that a run says that it runs."""
+    return [line.split()[2] for line in output.out.splitlines() if line.startswith("$ psotrack ")]
+
+
+def test_a_rig_without_a_board_is_said_also_the_second_time(run_psotrack: Run, tmp_path: Path) -> None:
+    """The first run drafts a recording without places; the second one does not take it for calibrated."""
+    assert "expected a video of each camera" in run_psotrack("run", tmp_path).err
+    for name in ("left.avi", "right.avi"):
+        write_video(tmp_path / name)
+    for _ in range(2):
+        stopped = run_psotrack("run", tmp_path)
+        assert (stopped.code, stopped.err.count("\n")) == (2, 1)
+        assert (
+            f"expected videos of a board in {tmp_path / 'board'}, or a rig file, found neither" in stopped.err
+        )
+    (tmp_path / "board").mkdir()
+    assert "--square: expected the side of a square" in run_psotrack("run", tmp_path).err
+
+
+@pytest.mark.slow
+def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -> None:
+    lab = tmp_path / "lab"
+    options = ("--as-own-cameras", "--frames", 50, "--scale", 0.5, "--out", lab, "--quiet")
+    assert run_psotrack("simulate", "S02_D4_A", *options).code == 0
+    words = ("run", lab, "--square", 0.25, "--floor", 0)
+    done = run_psotrack(*words)
+    assert done.code == 0, done.err
+    assert "the board is a ChArUco board of 4 x 5 squares of 250 mm" in done.out
+    assert commands_in(done) == ["calibrate", "init", "doctor", "track", "report", "overlay"]
+    results = lab / "results"
+    assert {"report.html", "tracks.csv", "doctor.json", "overlay"} <= {
+        path.name for path in results.iterdir()
+    }
+    assert pd.read_csv(results / "tracks.csv")["drone"].nunique() == 4
+    # A step whose result is gone is done again, the others are not.
+    before = (results / "tracks.csv").stat().st_mtime_ns
+    (results / "report.html").unlink()
+    again = run_psotrack(*words)
+    assert [line.split()[2] for line in again.out.splitlines() if line.startswith("$ psotrack ")] == [
+        "report",
+        "overlay",
+    ]
+    assert (results / "tracks.csv").stat().st_mtime_ns == before
