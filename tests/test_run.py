@@ -39,6 +39,20 @@ def test_a_rig_without_a_board_is_said_also_the_second_time(run_psotrack: Run, t
     assert "--square: expected the side of a square" in run_psotrack("run", tmp_path).err
 
 
+def test_ctrl_c_in_a_step_ends_the_run(
+    run_psotrack: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in every command: the program answers, in one line, and no step follows."""
+
+    def press(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    write_video(tmp_path / "left.avi")
+    monkeypatch.setattr("psotrack.recordings.datasets.draft_recording", press)
+    with pytest.raises(KeyboardInterrupt):
+        run_psotrack("run", tmp_path)
+
+
 @pytest.mark.slow
 def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -> None:
     lab = tmp_path / "lab"

@@ -140,7 +140,9 @@ def _do(output: Output, steps: Iterator[_Step], again: bool) -> None:
         if step.words[0] != "init":
             words += ["--progress", output.progress]
         try:
-            cli.main(words, standalone_mode=False)
+            # `cli.main` would answer Ctrl-C itself.
+            with cli.make_context("psotrack", words) as context:
+                cli.invoke(context)
         except SystemExit as ended:
             # The doctor ends with 1 where it found something, which `track` may answer.
             if ended.code != 1:
