@@ -132,9 +132,10 @@ def test_one_row_per_cell_and_run(swept: Path) -> None:
     assert (rows["frames"] > 0).all()
     assert {"seconds.track", "versions.jax", "device.kind", "device.processor", "commit"} <= set(rows.columns)
     assert {"perturbation.flipped", "runs_in_batch", "seconds.compile"} <= set(rows.columns)
-    # Six frames at 25 frames per second, over the run's share of the seconds of all runs; three decimals are stored.
+    # Six frames at 25 frames per second, over the run's share of the seconds of all runs. The factor is stored with
+    # three significant digits, so half a unit of the third one is at most 0.5 %; 0.1 % is for the rounded seconds.
     share_s = rows["seconds.batch"] / rows["runs_in_batch"]
-    np.testing.assert_allclose(rows["real_time_factor"], 6 / 25 / share_s, atol=0.0006)
+    np.testing.assert_allclose(rows["real_time_factor"], 6 / 25 / share_s, rtol=0.006)
     assert (rows["real_time_factor_running"] > rows["real_time_factor"]).all()
     # The folder is one Parquet data set, with failures, errors and a manifest in it.
     data_set = pd.read_parquet(swept / "results")
