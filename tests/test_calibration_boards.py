@@ -159,9 +159,9 @@ SHOWN = "found a ChArUco board of 4 x 6 squares of 40 mm with markers of"
 @pytest.mark.parametrize(
     ("stated", "words"),
     [
-        (Board((6, 4), 0.04, 0.03), (SHOWN, "pass --squares 4x6 --marker", "or --square alone")),
+        (Board((6, 4), 0.04, 0.03), (SHOWN, "pass --squares 4x6 --dictionary 4x4_50")),
         (Board((4, 6), 0.04, 0.03, "5x5_50"), (SHOWN, "--dictionary 4x4_50")),
-        (Board((4, 6), 0.04, kind="chessboard"), (SHOWN,)),
+        (Board((4, 6), 0.04, kind="chessboard"), (SHOWN, "pass --squares 4x6 --marker 0.0")),
         (Board((4, 3), 0.04, 0.04 * 0.75, kind="grid"), (SHOWN,)),
         (replace(BOARD, dictionary="4x4_100"), ("found too few of its corners",)),
     ],

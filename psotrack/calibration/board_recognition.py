@@ -280,8 +280,9 @@ def missing_board(board: Board, images: Sequence[UInt8[np.ndarray, "height width
             found = describe_board(seen)
             remedy = f"pass --squares {seen.squares_wh[0]}x{seen.squares_wh[1]}"
             if seen.marker_m is not None:
-                remedy += f" --marker {seen.marker_m:g} --dictionary {seen.dictionary}"
-            remedy += ", or --square alone"
+                # A ruler is better than the images.
+                marker = f" --marker {seen.marker_m:g}" if board.marker_m is None else ""
+                remedy += f"{marker} --dictionary {seen.dictionary}"
     return InputError("board", expected=f"a {board}", found=found, remedy=remedy)
 
 
