@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.simulation.flights.checking import flying_order
-from psotrack.simulation.flights.formulas import (
+from psotrack.simulation.flights.motion import (
     DelayedFlight,
+    Flight,
     HarmonicFlight,
+    Heading,
     RelativeFlight,
     WaypointFlight,
 )
-from psotrack.simulation.flights.motion import Flight, Heading
+from psotrack.simulation.flights.planning import flying_order
 from psotrack.simulation.scenarios import (
     Crossing,
     Drone,
