@@ -1,8 +1,8 @@
 """Flights: positions with derivatives at any time, and the attitudes that follow from the acceleration.
 
 The thrust of a multirotor acts along its body's z axis only, so this axis points along a + g (Mellinger and Kumar,
-"Minimum snap trajectory generation and control for quadrotors", 2011; drag is neglected). The heading is free. Flights from formulas (harmonics, relative and delayed flights,
-waypoints) have exact derivatives.
+"Minimum snap trajectory generation and control for quadrotors", 2011; drag is neglected). The heading is free.
+Flights from formulas (harmonics, relative and delayed flights, waypoints) have exact derivatives.
 """
 
 from __future__ import annotations
