@@ -9,8 +9,8 @@
         print(pt.evaluate(tracked.trajectories, recording.truth).mean_error_m)
 
 Recordings and files
-    read_recording, Recording, read_c3d, read_trajectories, write_trajectories, read_tracks, export_tracks, simulate,
-    SimulationSettings
+    read_recording, Recording, CameraRecording, read_c3d, read_trajectories, write_trajectories, read_tracks,
+    export_tracks, simulate, SimulationSettings
 Tracking
     track, track_runs, TrackSettings and its parts (SwarmSettings, ScoreSettings, MotionSettings, DroneSettings,
     StatusSettings, IdentitySettings), TrackedRecording, Trajectories

@@ -7,7 +7,7 @@ from .geometry import Rig, make_camera, make_rig, project, triangulate
 from .geometry.rig_files import read_rig, write_rig
 from .inside_out import MarkerMap, localise_video, read_marker_map
 from .pipeline import Method, MethodInputs, TrackedRecording, track_runs
-from .recordings import Recording
+from .recordings import CameraRecording, Recording
 from .recordings.exchange import export_tracks, read_tracks
 from .recordings.mocap import read_c3d
 from .settings import (
@@ -29,6 +29,7 @@ __version__: str
 
 __all__ = [
     "BackgroundModel",
+    "CameraRecording",
     "Detector",
     "DroneSettings",
     "Evaluation",

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from helpers import LENSES, Output, ring_rig, sphere_points
+from helpers import LENSES, Output, cameras_of, ring_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -137,7 +137,7 @@ def assert_one_line(result: Output, *words: str) -> None:
 def instants(num_frames: int, fps: float = 25.0) -> Recording:
     """A recording that has nothing but instants."""
     rig = ring_rig(1)
-    return Recording("any", Path("any"), rig, {}, frame_times={rig.names[0]: FrameTimes(num_frames, fps)})
+    return Recording("any", Path("any"), cameras_of(rig, times={rig.names[0]: FrameTimes(num_frames, fps)}))
 
 
 # There and back

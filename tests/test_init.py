@@ -210,7 +210,7 @@ def test_without_a_calibration_cameras_have_no_place(folder):
     path = folder("left.avi", "right.avi")
     shown = init(path, "--json", path / "report.json")
     recording = open_recording(path)
-    assert (recording.rig.names, recording.unplaced) == ((), ("left", "right"))
+    assert (recording.placed, tuple(recording.by_name)) == ((), ("left", "right"))
     assert "psotrack calibrate rig" in shown
     report = json.loads((path / "report.json").read_text())
     assert report["cameras"]["left"]["placed"] is False
@@ -231,7 +231,8 @@ def test_matches_by_hand(folder):
 def test_names_by_hand_without_a_calibration(folder):
     path = folder("GX010123.avi", "GX010124.avi")
     init(path, "--match", "left=GX010123.avi", "--match", "right=GX010124.avi")
-    assert open_recording(path).unplaced == ("left", "right")
+    recording = open_recording(path)
+    assert (recording.placed, tuple(recording.by_name)) == ((), ("left", "right"))
 
 
 class TestRefusals:

@@ -18,6 +18,7 @@ from helpers import make_once, ring_rig
 from psotrack.cli import cli
 from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import Reference
 from psotrack.recordings.datasets import open_recording
 from psotrack.show.flights import flight_of, read_flight
 from psotrack.show.reports import (
@@ -161,7 +162,7 @@ class TestFlight:
         else:
             read = read_flight([flight / "tracks.csv"], sequence)
             late = replace(read.truth, frame=read.truth.frame + 1000, time_s=read.truth.time_s + 100)
-            read = replace(read, recording=replace(read.recording, truth=late))
+            read = replace(read, recording=replace(read.recording, reference=Reference(late)))
         write_flight_report(tmp_path / "page.html", read, pictures=False)
         text = (tmp_path / "page.html").read_text(encoding="utf-8")
         assert "psotrackScene(document" in text

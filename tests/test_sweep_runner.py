@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import with_cameras
 from sweeps import SETTINGS, all_rows, grid_file, psotrack, small_sequence, stamps
 
 from psotrack.cli import main
@@ -421,22 +422,22 @@ def test_everything_that_a_cell_reads_changes_its_key(root: Path, tmp_path: Path
 
     def slower(recording):
         videos = {name: replace(video, fps=20.0) for name, video in recording.videos.items()}
-        return replace(recording, videos=videos, frame_times={})
+        return with_cameras(recording, video=videos, times=dict.fromkeys(videos))
 
     def with_lens(recording, *, fisheye):
         cameras = recording.rig.cameras
         count = len(recording.rig)
         # Without distortion, pinholes and fisheyes have the same coefficients.
         changed = replace(cameras, dist=np.zeros((count, 4)), fisheye=fisheye and np.ones(count, bool))
-        return replace(recording, rig=replace(recording.rig, cameras=changed))
+        return recording.with_rig(replace(recording.rig, cameras=changed))
 
     changes = [
         lambda recording: recording,
         slower,
         partial(with_lens, fisheye=None),
         partial(with_lens, fisheye=True),
-        lambda recording: replace(recording, line_time_s=dict.fromkeys(recording.rig.names, 1e-5)),
-        lambda recording: replace(recording, line_time_s=dict.fromkeys(recording.rig.names, 2e-5)),
+        lambda recording: with_cameras(recording, line_time_s=dict.fromkeys(recording.rig.names, 1e-5)),
+        lambda recording: with_cameras(recording, line_time_s=dict.fromkeys(recording.rig.names, 2e-5)),
         lambda recording: replace(recording, bounds_m=(-1.0, 1.0, -1.0, 1.0, 0.0, 2.0)),
     ]
     keys = [key(change) for change in changes]

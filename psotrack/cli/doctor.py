@@ -139,7 +139,7 @@ def _examine(
         files = detection_files_of(recording, detections)
         recording.check_detections(files)
         boxes = {name: read_detections(path) for name, path in files.items()}
-        longest = max((each.num_frames for each in recording.frame_times.values()), default=0)
+        longest = max((each.times.num_frames for each in recording.cameras if each.times), default=0)
         sightings = from_detections(boxes, recording.rig, longest)
     sightings = sightings.at_instants(recording.timeline())
     bounds_m = recording.bounds_m if bounds_m is None else bounds_m

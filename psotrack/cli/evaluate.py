@@ -100,14 +100,15 @@ def _at_rate_of(estimate: Trajectories, recording: Recording) -> Recording:
     """The recording, with its reference at the instants of tracks that have a rate of their own (`track --rate`)."""
     from psotrack.trajectories import resample
 
-    if estimate.num_frames < 2 or recording.truth is None:
+    if estimate.num_frames < 2 or recording.reference is None:
         return recording
     rate_hz = float(np.ptp(estimate.frame) / max(np.ptp(estimate.time_s), 1e-9))
     if abs(rate_hz / recording.fps - 1) < RATE_TOLERANCE:
         return recording
-    timed = replace(recording, rate_hz=rate_hz)
+    timed = replace(recording, timing=replace(recording.timing, rate_hz=rate_hz))
     time_s = timed.timeline().time_s
-    return replace(timed, truth=resample(recording.truth, np.arange(len(time_s)), time_s))
+    truth = resample(recording.reference.truth, np.arange(len(time_s)), time_s)
+    return replace(timed, reference=replace(recording.reference, truth=truth))
 
 
 def _shifted_reference(

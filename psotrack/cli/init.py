@@ -98,7 +98,7 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
     recording = open_recording(sequence, bodies=bodies)
     for video in recording.videos.values():
         check_end(video)
-    recording.check_detections(recording.detections or {})
+    recording.check_detections(recording.detections)
     if recording.marker_corners is not None:
         from psotrack.inside_out import read_marker_table
 
@@ -183,7 +183,7 @@ def _lines(path: Path, draft: Draft) -> list[str]:
         lines.append(f"cameras without any file, left out: {', '.join(draft.without_files)}")
     if draft.unused:
         lines.append(f"files that are not used: {', '.join(file.name for file in draft.unused)}")
-    unplaced = draft.recording.unplaced
+    unplaced = [each.name for each in draft.recording.cameras if each.camera is None]
     if unplaced:
         lines.append(
             f"cameras without place: {', '.join(unplaced)}; `psotrack calibrate rig` makes the rig file, then "

@@ -65,7 +65,7 @@ def run(
         raise InputError(folder, expected="a video of each camera", found="none")
     results = folder / "results"
     _do(output, _first_steps(folder, square_m, floor, again), again)
-    if open_recording(folder).unplaced:
+    if not open_recording(folder).is_placed:
         raise InputError(
             folder,
             expected=f"videos of a board in {folder / 'board'}, or a rig file",
@@ -85,7 +85,7 @@ def _first_steps(folder: Path, square_m: float | None, floor: int | None, again:
     from psotrack.recordings.datasets import open_recording
 
     drafted = (folder / RECORDING_FILE).exists()
-    if drafted and not again and not open_recording(folder).unplaced:
+    if drafted and not again and open_recording(folder).is_placed:
         return
     rig, board = folder / "rig.toml", folder / "board"
     # Another rig file is found by `init`.

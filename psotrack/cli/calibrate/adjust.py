@@ -122,7 +122,7 @@ def adjust(
 
 def _is_synchronous(recording: Recording) -> bool:
     """Whether frames of equal number were exposed together, to a tenth of a frame."""
-    times = [each for name, each in recording.frame_times.items() if name in (recording.detections or {})]
+    times = [each.times for each in recording.cameras if each.detections and each.times]
     longest = max(times, key=lambda each: each.num_frames)
     return all(
         np.abs(each.time_s - longest.time_s[: each.num_frames]).max(initial=0.0) <= 0.1 / longest.fps

@@ -255,8 +255,7 @@ def _read_views(sources: tuple[Path, ...]) -> PointViews:
     if not recording.detections:
         raise InputError(sources[0], expected="detections of a moving point", found="none")
     boxes = {name: read_detections(path) for name, path in recording.detections.items()}
+    times = {each.name: each.times for each in recording.cameras if each.times}
+    line_time_s = {each.name: each.line_time_s for each in recording.cameras}
     with errors_name(sources[0]):
-        if not any(name in recording.frame_times for name in boxes):
-            # Detections without any times, as in a folder of the dataset without videos.
-            return views_of_detections(boxes)
-        return views_of_detections(boxes, recording.frame_times, recording.line_time_s)
+        return views_of_detections(boxes, times, line_time_s)

@@ -108,7 +108,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, 
     from psotrack.inside_out import lens_from_matrix
     from psotrack.recordings.datasets import open_recording
 
-    onboard = open_recording(folder).onboard or {}
+    onboard = open_recording(folder).onboard
     if not onboard:
         raise InputError(
             folder, expected="videos of drones' own cameras, such as dron1_cam_s.avi", found="none"

@@ -17,10 +17,9 @@ from ._onboard import (
     write_onboard_calibration,
 )
 from ._poses import pose_file, read_poses, unit_quaternion, write_poses
-from ._reference import read_own_reference
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
 from .drafting import Draft, DraftOptions, draft_recording
-from .opening import find_marker_corners, is_recording, open_recording, reference_files, videos_in
+from .opening import find_marker_corners, is_recording, open_recording, videos_in
 
 __all__ = [
     "CALIBRATION",
@@ -50,10 +49,8 @@ __all__ = [
     "read_mocap_markers",
     "read_onboard",
     "read_onboard_calibration",
-    "read_own_reference",
     "read_poses",
     "read_sequence",
-    "reference_files",
     "split_label",
     "unit_quaternion",
     "videos_in",

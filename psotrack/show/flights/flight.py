@@ -214,13 +214,12 @@ def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
     end_s = float(recording.timeline().time_s[-1]) + 0.5 / recording.fps
     onboard = {
         name: replace(camera, video=replace(camera.video, num_frames=_count_until(camera.video, end_s)))
-        for name, camera in (recording.onboard or {}).items()
+        for name, camera in recording.onboard.items()
     }
-    recording = replace(
-        recording,
-        onboard=onboard or None,
-        truth=None if recording.truth is None else _cut(recording.truth, end_s),
-    )
+    reference = recording.reference
+    if reference is not None:
+        reference = replace(reference, truth=_cut(reference.truth, end_s))
+    recording = replace(recording, onboard=onboard, reference=reference)
     return replace(flight, recording=recording, tracks=tuple(_until(each, end_s) for each in flight.tracks))
 
 

@@ -265,7 +265,7 @@ def _digest(video: DrawnVideo) -> str:
 def _filmed(flight: TrackedFlight) -> tuple[Recording, list[str]]:
     """The recording of a flight, and its cameras that have a video."""
     recording = flight.recording
-    cameras = [] if recording is None else [name for name in recording.rig.names if name in recording.videos]
+    cameras = [] if recording is None else [each.name for each in recording.placed if each.video]
     if recording is None or not cameras:
         where = "overlay" if recording is None else recording.folder
         raise InputError(where, expected="a recording with videos", found="none")
