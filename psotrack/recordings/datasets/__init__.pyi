@@ -19,7 +19,12 @@ from ._onboard import (
 from ._poses import pose_file, read_poses, unit_quaternion, write_poses
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
 from .drafting import Draft, DraftOptions, draft_recording
-from .opening import find_marker_corners, is_recording, open_recording, videos_in
+from .opening import (
+    find_marker_corners,
+    is_recording,
+    open_recording,
+    videos_in,
+)
 
 __all__ = [
     "CALIBRATION",
