@@ -3,19 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.foreground.silhouettes import ForegroundSettings, Living
+from psotrack.calibration import (
+    PlacedCameras,
+    RigCalibration,
+    RigSettings,
+    calibrate_by_board,
+    calibrate_by_known_points,
+    calibrate_by_moving_point,
+    save_coverage,
+)
+from psotrack.calibration.doctor import Diagnosis, examine
+from psotrack.errors import SettingsError
+from psotrack.foreground.silhouettes import ForegroundSettings, Living, SilhouetteSettings, compute
+from psotrack.geometry.rig_files import write_rig
+from psotrack.inside_out import read_marker_map
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
-from psotrack.pipeline import Parts, TrackedRecording, check_detections, track_recording
-from psotrack.recordings import Recording
-from psotrack.recordings.datasets import open_recording
-from psotrack.settings import TrackSettings, full_name
-from psotrack.support import no_progress, progress_bar, user_cache
+from psotrack.pipeline import (
+    Parts,
+    TrackedRecording,
+    check_detections,
+    detection_files_of,
+    track_recording,
+)
+from psotrack.recordings import Recording, read_detections
+from psotrack.recordings.datasets import holds_recording, open_recording, videos_in
+from psotrack.settings import BLOBS, YOLO, TrackSettings, full_name
+from psotrack.support import Report, no_progress, progress_bar, refuse_files, user_cache
+from psotrack.tracking.births import room_bounds
+from psotrack.tracking.matching import from_detections, from_silhouettes
 
 
 def read_recording(
@@ -41,7 +63,7 @@ def track(
     *,
     cache: Path | str | None = None,
     jobs: int | None = None,
-    progress: bool = False,
+    progress: bool | Report = False,
     **more: Any,
 ) -> TrackedRecording:
     """Track the drones of a recording.
@@ -53,7 +75,7 @@ def track(
         settings: settings, or names and values such as {"swarm.particles": 50}; None takes the defaults.
         cache: folder of stored silhouettes and detections; None takes the user's cache folder.
         jobs: number of processes for the silhouettes; None is one per processor.
-        progress: whether to show progress bars.
+        progress: whether to show progress bars; or a function that shows the progress (see `support.Report`).
         **more: single settings by the last part of their names, such as `particles=50`; and parts that the caller
             brings: `search`, `score`, `method`, `background`, `detector` (see `Parts`).
 
@@ -80,8 +102,114 @@ def track(
         settings,
         cache=user_cache() if cache is None else cache,
         jobs=jobs,
-        report=progress_bar if progress else no_progress,
+        report=_report(progress),
         **cast(Parts, parts),
+    )
+
+
+def calibrate_rig(
+    sources: Path | str | Sequence[Path | str] = (),
+    *,
+    out: Path | str | None = None,
+    plot: Path | str | None = None,
+    force: bool = False,
+    progress: bool | Report = False,
+    **more: Any,
+) -> RigCalibration | PlacedCameras:
+    """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
+
+        calibrated = pt.calibrate_rig("my_lab/board", square_m=0.04, floor=0)
+        pt.write_rig("my_lab/rig.toml", calibrated.rig)
+
+    The result's text is what `psotrack calibrate rig` prints.
+
+    Args:
+        sources: for each camera a video, a folder of images or a pattern of their names; or a folder of videos, or a
+            recording.
+        out: file of the rig to write; None writes none.
+        plot: picture to write of where each camera saw the board; None writes none.
+        force: replace existing files.
+        progress: as in `track`.
+        **more: what is known, at least `square_m`, the side of a square of the board: fields of `RigSettings`.
+
+    Raises:
+        InputError: a file cannot be used, or what it shows does not determine the rig.
+        SettingsError: a value does not exist, or does not fit the others.
+        OutputError: a file exists and `force` is not set.
+    """
+    settings = RigSettings(**more)
+    paths = [Path(path) for path in ([sources] if isinstance(sources, Path | str) else sources)]
+    if not paths and settings.pairs is None:
+        raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
+    if len(paths) == 1 and not holds_recording(paths[0]):
+        # A folder of videos stands for all of them.
+        paths = videos_in(paths[0]) or paths
+    if plot is not None and not settings.by_board:
+        raise SettingsError("rig", expected="--plot with --squares", found="points")
+    refuse_files(*(Path(path) for path in (out, plot) if path is not None), force=force)
+    found: RigCalibration | PlacedCameras
+    if settings.points:
+        found = calibrate_by_moving_point(paths, settings)
+    elif settings.by_board:
+        found = calibrate_by_board(paths, settings, _report(progress))
+        if plot is not None:
+            save_coverage(Path(plot), found.calibrated, force=force)
+    else:
+        corners_m = None if settings.markers is None else read_marker_map(settings.markers).corners_m
+        found = calibrate_by_known_points(paths, settings, corners_m)
+    if out is not None:
+        write_rig(out, found.rig, force=force)
+        found = replace(found, path=Path(out))
+    return found
+
+
+def doctor(
+    recording: Recording | Path | str,
+    *,
+    detections: str | None = None,
+    bounds_m: Sequence[float] | None = None,
+    cache: Path | str | None = None,
+    jobs: int | None = None,
+    progress: bool | Report = False,
+) -> Diagnosis:
+    """Check the calibration of a recording against the detections of its cameras, before tracking.
+
+    The result's text is what `psotrack doctor` prints: which camera, pair of cameras or file disagrees, by how much,
+    and what to do.
+
+    Args:
+        recording: recording, or its `recording.toml` or folder.
+        detections: "yolo" for the recording's own, "blobs" for those of its silhouettes, or a folder of files; None:
+            the recording's own, or else blobs.
+        bounds_m: bounds of the room (x0, x1, y0, y1, z0, z1), metres; None: far around the cameras.
+        cache: folder of stored silhouettes; None takes the user's cache folder.
+        jobs: number of processes for the silhouettes; None is one per processor.
+        progress: as in `track`.
+
+    Raises:
+        InputError: a file cannot be used, or there are no detections.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording)
+    source = detections or (YOLO if recording.detections else BLOBS)
+    if source == BLOBS:
+        recording = recording.usable(silhouettes=True)
+        stored, report = user_cache() if cache is None else cache, _report(progress)
+        made = compute(recording, SilhouetteSettings(), cache=stored, jobs=jobs, report=report)
+        sightings = from_silhouettes(made, report)
+    else:
+        files = detection_files_of(recording, source)
+        recording.check_detections(files)
+        boxes = {name: read_detections(path) for name, path in files.items()}
+        longest = max((each.num_frames for each in recording.frame_times.values()), default=0)
+        sightings = from_detections(boxes, recording.rig, longest)
+    room_m = recording.bounds_m if bounds_m is None else cast(Any, tuple(bounds_m))
+    return examine(
+        recording.rig,
+        sightings.at_instants(recording.timeline()),
+        fps=recording.fps,
+        reference=recording.truth,
+        bounds_m=None if room_m is None else room_bounds(recording.rig, room_m),
     )
 
 
@@ -104,6 +232,10 @@ def detect_markers(
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return MarkerDetector(dictionary, thorough=True).detect(np.asarray(grey, np.uint8))
+
+
+def _report(progress: bool | Report) -> Report:
+    return progress if callable(progress) else progress_bar if progress else no_progress
 
 
 def background_model(settings: ForegroundSettings | None = None) -> Living:

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import click
 
@@ -28,6 +28,7 @@ from psotrack.support import (
     progress_lines,
     refuse_files,
     terminal_bar,
+    text_table,
 )
 
 if TYPE_CHECKING:
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
 
     from psotrack.trajectories import Trajectories
 
-#: Heading of a column of positions; `Output.table` keeps each of its cells on one line.
-POSITION = "centre (m)"
 #: Width of a wide table in a file or a pipe, characters.
 _WIDE = 200
 #: Values of --progress.
@@ -47,6 +46,14 @@ PROGRESS: dict[str, Report] = {
     "none": no_progress,
 }
 _STDOUT = Path("-")
+
+
+@runtime_checkable
+class _Shown(Protocol):
+    """What a function of the public face returns: its text is what the command prints."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of --json."""
 
 
 class Output:
@@ -114,15 +121,13 @@ class Output:
 
     def table(self, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]], title: str = "") -> None:
         """Print a table, names in the first column and numbers in the others."""
-        from rich import box
-        from rich.table import Table
+        if self.shows:
+            click.echo(text_table(headings, rows, title))
 
-        table = Table(box=box.HORIZONTALS, show_edge=False, title=title or None)
-        for index, heading in enumerate(headings):
-            table.add_column(heading, justify="right" if index else "left", no_wrap=heading == POSITION)
-        for row in rows:
-            table.add_row(*row)
-        self.show(table)
+    def result(self, result: _Shown) -> None:
+        """Write a result as --json says, and print it."""
+        self.json(result.to_dict())
+        self.say(*f"{result}".splitlines())
 
     def drones(self, tracks: Trajectories, size_m: np.ndarray | None = None) -> None:
         """Print a table of the drones, at most 80 characters wide.
@@ -175,16 +180,6 @@ def pass_output(command: Callable[..., None]) -> Callable[..., None]:
         command(current_output(), *args, **options)
 
     return with_output
-
-
-def finite_or_none(value: float) -> float | None:
-    """The number, or None (null in JSON) for NaN and infinities."""
-    return float(value) if math.isfinite(value) else None
-
-
-def format_numbers(values: Iterable[float], digits: int) -> str:
-    """Numbers with `digits` decimals and spaces between them."""
-    return " ".join(f"{value:.{digits}f}" for value in values)
 
 
 def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:

@@ -26,6 +26,7 @@ from msgspec.inspect import (
     LiteralType,
     Metadata,
     NoneType,
+    StrType,
     StructType,
     TupleType,
     UnionType,
@@ -33,7 +34,7 @@ from msgspec.inspect import (
     type_info,
 )
 
-from psotrack.cli.types import Numbers
+from psotrack.cli.types import Distance, Numbers, Size
 
 Command = Callable[..., Any]
 
@@ -160,7 +161,7 @@ def option_of(
     elif isinstance(kind, LiteralType):
         value = click.Choice(list(kind.values))
     elif isinstance(kind, TupleType | VarTupleType):
-        value = Numbers(len(kind.item_types) if isinstance(kind, TupleType) else 0)
+        value = _tuple_type(kind)
     elif isinstance(kind, CustomType) and issubclass(kind.cls, Path):
         value = click.Path(path_type=Path)
     return click.option(
@@ -178,6 +179,14 @@ def option_of(
 
 
 _TYPES: dict[type, Any] = {IntType: int, FloatType: float}
+
+
+def _tuple_type(kind: TupleType | VarTupleType) -> click.ParamType:
+    """Type of an option whose value is a tuple: numbers, a size in whole numbers, or two names and a distance."""
+    if isinstance(kind, VarTupleType):
+        return Numbers(0)
+    items = {type(_plain_kind(each)[0]) for each in kind.item_types}
+    return Size() if items == {IntType} else Distance() if StrType in items else Numbers(len(kind.item_types))
 
 
 def _plain_kind(kind: Any) -> tuple[Any, dict[str, Any]]:

@@ -50,6 +50,28 @@ class Size(click.ParamType):
         return tuple(numbers)
 
 
+class Distance(click.ParamType):
+    """Two cameras and the distance between their centres, such as left,right=4.20."""
+
+    name = "NAME,NAME=METRES"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Names and metres from a string; a value that is not a string is returned as it is."""
+        if not isinstance(value, str):
+            return value
+        names, _, length = value.partition("=")
+        cameras = tuple(names.split(","))
+        try:
+            metres = float(length)
+        except ValueError:
+            metres = 0.0
+        if len(cameras) != 2 or not 0 < metres < float("inf"):
+            self.fail(
+                f"expected two cameras and metres, such as left,right=4.20, found {value!r}", param, ctx
+            )
+        return *cameras, metres
+
+
 class SequencePath(click.Path):
     """Path of a sequence. An archive is unpacked, and its folder is the path until the command ends."""
 

@@ -49,6 +49,7 @@ from .schema import (
     toml_value,
 )
 from .standard_errors import standard_error
+from .text_tables import POSITION, finite_or_none, format_numbers, text_table
 from .times import LEAST_STEP_S, first_repeat
 
 __all__ = [
@@ -57,6 +58,7 @@ __all__ = [
     "LARGEST",
     "LEAST_STEP_S",
     "MODERATE",
+    "POSITION",
     "Advance",
     "Column",
     "Device",
@@ -83,7 +85,9 @@ __all__ = [
     "drone_colour",
     "drop_programs_if_many",
     "end_of_links",
+    "finite_or_none",
     "first_repeat",
+    "format_numbers",
     "has_negative_eigenvalue",
     "html_block",
     "html_lines",
@@ -119,6 +123,7 @@ __all__ = [
     "short_text",
     "standard_error",
     "terminal_bar",
+    "text_table",
     "toml_key",
     "toml_text",
     "toml_value",

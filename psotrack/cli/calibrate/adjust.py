@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psotrack.cli.calibrate.options import OUT
-from psotrack.cli.calibrate.shown import row_of, show_cameras
 from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand
@@ -77,7 +76,7 @@ def adjust(
     Example:
       psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
     """
-    from psotrack.calibration import find_drones_in_boxes
+    from psotrack.calibration import PlacedCameras, find_drones_in_boxes
     from psotrack.calibration.doctor import improve_with_check
     from psotrack.geometry.rig_files import write_rig
     from psotrack.recordings import read_detections
@@ -107,7 +106,7 @@ def adjust(
     improved = checked.improved
     write_rig(out, improved.rig, force=output.force)
     rows = _rows(recording.rig, improved, views, held)
-    show_cameras(output, rows, out)
+    output.result(PlacedCameras(improved.rig, rows, path=out))
     if checked.all_off:
         output.say(ALL_OFF)
     elif checked.better:
@@ -134,6 +133,8 @@ def _rows(
     rig: Rig, improved: Improved, views: DroneViews, held: tuple[str, ...]
 ) -> dict[str, dict[str, Any]]:
     """Results of each camera, by name."""
+    from psotrack.calibration import row_of
+
     shown = improved.everything if improved.final is None else improved.final
     T, T_before = (np.asarray(one.cameras.T_cam_world) for one in (improved.rig, rig))
     turns = Rotation.from_matrix(T[:, :3, :3] @ T_before[:, :3, :3].swapaxes(-1, -2))

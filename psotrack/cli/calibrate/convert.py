@@ -10,9 +10,10 @@ import click
 
 from psotrack.cli.calibrate.options import SIZE
 from psotrack.cli.options import FORCE, JSON, QUIET
-from psotrack.cli.output import POSITION, Output, format_numbers, pass_output
+from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import SettingsError
+from psotrack.support import POSITION, format_numbers
 
 if TYPE_CHECKING:
     from psotrack.geometry import Rig

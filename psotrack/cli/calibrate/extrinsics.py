@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.calibrate.located import locate_cameras
 from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
-from psotrack.cli.calibrate.shown import show_cameras
 from psotrack.cli.options import FORCE, FOV, JSON, QUIET, dictionary_option
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand
@@ -83,7 +82,7 @@ def extrinsics(
       psotrack calibrate extrinsics --pairs pairs.csv --points points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
-    from psotrack.calibration import read_image_points
+    from psotrack.calibration import place_cameras, read_image_points
     from psotrack.geometry.rig_files import write_rig
 
     if (pairs is None) == (markers is None):
@@ -93,9 +92,9 @@ def extrinsics(
     marks = read_image_points(pairs, points) if pairs else _find_markers(Path(str(markers)), dictionary)
     lenses = _lenses(list(marks), **lens)
     with errors_name(pairs or markers):
-        rig, rows = locate_cameras(marks, lenses, noise_px)
-    write_rig(out, rig, force=output.force)
-    show_cameras(output, rows, out)
+        placed = place_cameras(marks, lenses, noise_px)
+    write_rig(out, placed.rig, force=output.force)
+    output.result(replace(placed, path=out))
 
 
 def _lenses(

@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from psotrack.cli.calibrate.options import BOARD_NAMES, LENS, OUT, BoardOptions
+from psotrack.calibration.rig.settings import BoardSettings
+from psotrack.cli.calibrate.options import BOARD_NAMES, LENS, OUT
 from psotrack.cli.options import FORCE, JSON, reporting
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand, options_of
@@ -20,7 +21,7 @@ _FISHEYE = ("k1", "k2", "k3", "k4")
 
 @click.command(cls=HelpfulCommand)
 @click.argument("video", type=click.Path(path_type=Path))
-@options_of(BoardOptions, "board", names=BOARD_NAMES)
+@options_of(BoardSettings, "board", names=BOARD_NAMES)
 @LENS
 @click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
@@ -29,7 +30,7 @@ _FISHEYE = ("k1", "k2", "k3", "k4")
 @JSON
 @pass_output
 def intrinsics(
-    output: Output, video: Path, board: BoardOptions, lens: str, name: str | None, out: Path
+    output: Output, video: Path, board: BoardSettings, lens: str, name: str | None, out: Path
 ) -> None:
     """Estimate a camera's lens from VIDEO, in which a board is moved.
 
@@ -42,6 +43,7 @@ def intrinsics(
       psotrack calibrate intrinsics photos --squares 10x7 --square 0.025 --lens fisheye --out lens.toml
     """
     from psotrack.calibration import (
+        Board,
         lens_of_board,
         open_images,
         parse_lens_model,
@@ -55,7 +57,7 @@ def intrinsics(
     (images,) = open_images([video], [name] if name else None)
     model = parse_lens_model(lens)
     with errors_name(video):
-        found = lens_of_board(images, board.board(), model, output.report)
+        found = lens_of_board(images, Board.of(board), model, output.report)
     # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.
     write = write_lenses if out.suffix.lower() == ".toml" else write_rig
     write(out, make_rig({images.name: found.camera}), force=output.force)

@@ -20,7 +20,14 @@ from ._poses import pose_file, read_poses, unit_quaternion, write_poses
 from ._reference import read_own_reference
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
 from .drafting import Draft, DraftOptions, Unclear, Unmatched, draft_recording, unclear_files
-from .opening import find_marker_corners, is_recording, open_recording, reference_files, videos_in
+from .opening import (
+    find_marker_corners,
+    holds_recording,
+    is_recording,
+    open_recording,
+    reference_files,
+    videos_in,
+)
 
 __all__ = [
     "CALIBRATION",
@@ -38,6 +45,7 @@ __all__ = [
     "detection_files",
     "draft_recording",
     "find_marker_corners",
+    "holds_recording",
     "is_recording",
     "join_archives",
     "mocap_markers_file",

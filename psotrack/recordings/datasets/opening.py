@@ -46,6 +46,13 @@ def is_recording(path: Path | str) -> bool:
     return path.is_dir() and not is_picture_folder(path)
 
 
+def holds_recording(path: Path | str) -> bool:
+    """Whether a path is a TOML file, or a folder that says by its content that it is a recording."""
+    path = Path(path)
+    names = (RECORDING_FILE, CALIBRATION)
+    return path.suffix.lower() == ".toml" or any((path / name).exists() for name in names)
+
+
 def videos_in(folder: Path | str) -> list[Path]:
     """The videos of a folder, in the order of their names; none where the path is no folder."""
     folder = Path(folder)
