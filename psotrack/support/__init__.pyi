@@ -21,6 +21,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_table
+from .number_lines import are_numbers, first_line, first_repeated, first_true, number_words, read_numbers
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,
@@ -69,6 +70,7 @@ __all__ = [
     "Share",
     "Table",
     "TextRow",
+    "are_numbers",
     "assign",
     "atomic_write",
     "atomic_write_all",
@@ -86,7 +88,10 @@ __all__ = [
     "drop_programs_if_many",
     "end_of_links",
     "finite_or_none",
+    "first_line",
     "first_repeat",
+    "first_repeated",
+    "first_true",
     "format_numbers",
     "has_negative_eigenvalue",
     "html_block",
@@ -103,6 +108,7 @@ __all__ = [
     "measured_compiling",
     "nearest",
     "no_progress",
+    "number_words",
     "plain",
     "plugin_names",
     "plugin_source",
@@ -110,6 +116,7 @@ __all__ = [
     "progress_bar",
     "progress_lines",
     "read_json",
+    "read_numbers",
     "read_rows",
     "read_table",
     "read_text",
