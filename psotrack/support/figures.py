@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from psotrack.errors import OutputError
 from psotrack.support.files import atomic_write, refuse_to_overwrite
@@ -32,7 +32,7 @@ _DPI = 150
 #: Colours of text, of what is faint, and of lines.
 INK, FAINT, LINE = "#2b313a", "#9aa3ad", "#e3e6ea"
 #: How figures look, as Matplotlib's settings: for `matplotlib.rc_context`.
-STYLE = {
+STYLE: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
     "figure.dpi": _DPI,
     "font.family": "sans-serif",

@@ -98,8 +98,8 @@ def error_against_work(
         _draw_front(axes, here.iloc[pareto_front(here["work"].to_numpy(), here["error"].to_numpy())])
         for number, (method, colour) in enumerate(colours.items()):
             points = here.loc[here["method"] == method, ["work", "error", "std"]].to_numpy().T
-            form = {"fmt": _MARKERS[number % len(_MARKERS)], "markersize": 5, "linewidth": 0.8}
-            axes.errorbar(*points, color=colour, label=method, **form)
+            marker = _MARKERS[number % len(_MARKERS)]
+            axes.errorbar(*points, fmt=marker, color=colour, markersize=5, linewidth=0.8, label=method)
         _make_logarithmic(axes, "xy")
         axes.set(title=sequence, xlabel="track stage (ms per frame)")
     panels[0].set_ylabel("mean error (mm)")
@@ -190,16 +190,27 @@ def error_per_drone(
 
 def _draw_front(axes: Axes, front: pd.DataFrame) -> None:
     """Draw the Pareto front as a line, with the particles and iterations of its points."""
-    line = {"color": INK, "linewidth": 0.9, "drawstyle": "steps-post"}
-    axes.plot(front["work"], front["error"], label="Pareto front", zorder=1, **line)
+    axes.plot(
+        front["work"],
+        front["error"],
+        color=INK,
+        linewidth=0.9,
+        drawstyle="steps-post",
+        label="Pareto front",
+        zorder=1,
+    )
     labelled = np.inf
-    for point in front.itertuples():
-        if point.error <= _HEIGHT * labelled:
-            labelled = point.error
-            words, place = f"{point.particles:.0f} x {point.iterations:.0f}", (point.work, point.error)
-            turned = {"rotation": 40, "rotation_mode": "anchor", "verticalalignment": "bottom"}
+    turned: dict[str, Any] = {"rotation": 40, "rotation_mode": "anchor", "verticalalignment": "bottom"}
+    for work, error, *size in front[["work", "error", "particles", "iterations"]].to_numpy(float).tolist():
+        if error <= _HEIGHT * labelled:
+            labelled = error
             axes.annotate(
-                words, place, xytext=(3, 3), textcoords="offset points", fontsize=7, zorder=3, **turned
+                "{:.0f} x {:.0f}".format(*size),
+                (work, error),
+                xytext=(3, 3),
+                textcoords="offset points",
+                fontsize=7,
+                **turned,
             )
 
 

@@ -19,8 +19,8 @@ _OF_PAGE = {INK: "currentColor", FAINT: "var(--faint)", LINE: "var(--line)"}
 @rc_context(STYLE)
 def figure_svg(figure: Figure) -> Markup:
     """An SVG element of a figure whose dark text and lines get the colour of the page's text."""
-    for part in (figure, *figure.axes):
-        part.patch.set_alpha(0)
+    for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
+        patch.set_alpha(0)
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     content = text.getvalue()
