@@ -27,7 +27,7 @@ from psotrack.cli import main
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
 from psotrack.support import compiled, register_plugin
-from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, sweep
+from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, run_grid, runner, sweep
 from psotrack.sweep import grid as grid_of
 from psotrack.sweep import inputs as inputs_of_cells
 from psotrack.sweep.locks import Locks
@@ -313,7 +313,7 @@ def test_a_runner_waits_for_locked_cells_and_runs_them_when_they_are_unlocked(
     # If an assertion fails, the lock is released before the pool waits for its thread.
     with ThreadPoolExecutor(1) as threads:
         with Store(out).lock(cell_key(first, inputs.keys_of(first))):
-            waiting = threads.submit(runner.run_in_process, grid, out, data=root, cache=root / "cache")
+            waiting = threads.submit(run_grid, grid, out, data=root, cache=root / "cache")
             while not tracker.runs:
                 assert not waiting.done(), waiting.result()
                 time.sleep(0.05)
@@ -391,7 +391,7 @@ def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path,
     program = "import sys; from psotrack.sweep import runner, perturbations; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     names = [name.replace(".", "/") for name in done.stdout.split() if name.startswith("psotrack.")]
-    needless = ("sweep/grid_files", "sweep/locks", "sweep/tables")
+    needless = ("sweep/locks", "sweep/tables")
     left_out = tuple(f"psotrack/{name}" for name in machine.COMPUTES_NO_ROW if name not in needless)
     assert [name for name in names if f"{name}/".startswith(left_out)] == []
 

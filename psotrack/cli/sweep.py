@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -133,13 +134,13 @@ def _run_here(
 ) -> SweepOutcome:
     """Run the cells in this process."""
     from psotrack.support import keep_compiled, share_processors, use_device
-    from psotrack.sweep import run_in_process
+    from psotrack.sweep import run_grid
 
     share_processors()
     if device is not None:
         use_device(device)
     keep_compiled(compiled_folder(cache))
-    return run_in_process(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
+    return run_grid(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
 
 
 def _run_on_cluster(
@@ -147,7 +148,7 @@ def _run_on_cluster(
 ) -> SweepOutcome:
     """Run the cells as tasks of a cluster's workers."""
     from psotrack.support import use_device
-    from psotrack.sweep import run_on_cluster
+    from psotrack.sweep import run_grid
 
     use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
 
@@ -155,9 +156,8 @@ def _run_on_cluster(
         if not output.quiet:
             click.echo(f"the cluster listens at {address}, for programs on this computer only", err=True)
 
-    return run_on_cluster(
-        grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=output.report, say=say
-    )
+    cluster = replace(cluster, say=say)
+    return run_grid(grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=output.report)
 
 
 def _show(output: Output, grid: Grid, inputs: Inputs, store: Store | None) -> None:

@@ -4,7 +4,7 @@ from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
-from .figures import COLOURS, drone_colour, save_figure
+from .figures import COLOURS, FAINT, INK, LINE, STYLE, drone_colour, save_figure
 from .files import (
     ARCHIVE_SUFFIX,
     atomic_write,
@@ -56,10 +56,14 @@ from .times import LEAST_STEP_S, first_repeat
 __all__ = [
     "ARCHIVE_SUFFIX",
     "COLOURS",
+    "FAINT",
+    "INK",
     "LARGEST",
     "LEAST_STEP_S",
+    "LINE",
     "MODERATE",
     "POSITION",
+    "STYLE",
     "Advance",
     "Column",
     "Device",

@@ -1,12 +1,11 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
-from .cluster import Cluster, run_on_cluster
+from .cluster import Cluster
 from .estimates import Estimate, estimate
-from .frames import sweep
 from .grid_files import Grid, grid, read_grid
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
-from .runner import SweepOutcome, run_in_process
 from .store import Store, is_results_folder
+from .sweeps import SweepOutcome, run_grid, sweep
 from .tables import pivot, render_table
 
 __all__ = [
@@ -28,7 +27,6 @@ __all__ = [
     "pivot",
     "read_grid",
     "render_table",
-    "run_in_process",
-    "run_on_cluster",
+    "run_grid",
     "sweep",
 ]

@@ -17,7 +17,7 @@ COMPUTES_NO_ROW = (
     *("__main__", "api", "cli/", "demo", "inside_out/", "live/", "show/", "simulation/"),
     *(
         f"sweep/{name}"
-        for name in ("cluster", "estimates", "figures", "frames", "grid_files", "locks", "tables")
+        for name in ("cluster", "estimates", "figures", "grid_files", "locks", "sweeps", "tables")
     ),
 )
 

@@ -13,7 +13,7 @@ from .flight import (
     split_sequence,
 )
 from .image_views import ImageViews, ellipse_outlines_px, view_in_images
-from .quality import QUANTITIES, Quantity, camera_quality, drone_quality, quantities
+from .quality import QUANTITIES, Quantity, camera_quality, deviations_mm, drone_quality, quantities
 from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record, recording_beside
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "TrackedFlight",
     "camera_quality",
     "colour_rgb",
+    "deviations_mm",
     "drone_quality",
     "ellipse_outlines_px",
     "ellipsoids_90",

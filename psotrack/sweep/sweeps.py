@@ -1,0 +1,219 @@
+"""Run the unfinished cells of a grid, in this process or on a cluster: for programs, notebooks and the command line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from psotrack.errors import InputError, PsotrackError
+from psotrack.support import Report, no_progress
+from psotrack.sweep.cells import Cell, cell_key, cell_name, input_digest, title
+from psotrack.sweep.cluster import Cluster, run_on_cluster
+from psotrack.sweep.grid_files import Grid, read_grid
+from psotrack.sweep.grid_files import grid as grid_of
+from psotrack.sweep.inputs import Inputs, folder_of, source_of
+from psotrack.sweep.locks import POLL_S
+from psotrack.sweep.machine import provenance
+from psotrack.sweep.manifest import note_input, note_run
+from psotrack.sweep.runner import Result, finished_before, run_cell, store_failure
+from psotrack.sweep.store import Store
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """Results of all cells, in the grid's order, and where they are stored."""
+
+    results: tuple[Result, ...]
+    store: Store
+
+    def count(self, state: str) -> int:
+        """Number of cells whose result has a state."""
+        return sum(result.state == state for result in self.results)
+
+    def to_dict(self) -> dict[str, int]:
+        """Numbers of cells that were finished, that failed, and that an earlier run had finished."""
+        return {state: self.count(state) for state in ("finished", "failed", "left")}
+
+    def __str__(self) -> str:
+        failed = self.count("failed")
+        said = (
+            f"{self.store.folder}: {self.count('finished')} cells finished now, {self.count('left')} before"
+        )
+        return f"{said}, {failed} failed (see {self.store.folder}/cells/*.error.json)" if failed else said
+
+    @property
+    def errors(self) -> list[str]:
+        """One line per failed cell: the cell's title and why it failed."""
+        return [f"{title(result.cell)}: {result.error}" for result in self.results if result.error]
+
+    def rows(self) -> pd.DataFrame:
+        """Rows of the grid's cells and seeds only, in the grid's order; `attrs["errors"]` has the failed cells.
+
+        Raises:
+            InputError: every cell failed.
+        """
+        seeds = {each.key: each.cell.seeds for each in self.results if each.key and not each.error}
+        if not seeds:
+            found = f"that all failed: {self.errors[0]}"
+            raise InputError(self.store.folder, expected="a cell that can be run", found=found)
+        rows = self.store.rows(seeds)
+        rows.attrs["errors"] = self.errors
+        return rows
+
+
+def sweep(
+    grid: Grid | Path | str | Mapping[str, Any],
+    out: Path | str,
+    *,
+    data: Path | str = "data",
+    cache: Path | str,
+    jobs: int | None = None,
+    cluster: Cluster | str | None = None,
+    report: Report = no_progress,
+) -> pd.DataFrame:
+    """Track with every combination of a grid's settings; returns one row per cell and run, as `psotrack sweep` stores.
+
+    Finished cells in `out` are not run again: the same call takes seconds the second time, and a call with a larger
+    grid runs only the new cells. Other programs may work on the same folder at the same time.
+
+    Args:
+        grid: a grid, its TOML file, or a mapping with the same content.
+        out: folder of the results.
+        data: root folder of the sequences that the grid names.
+        cache: folder of the stored silhouettes.
+        jobs: number of processes that make silhouettes; None is one per processor.
+        cluster: a `Cluster`, "local" for a cluster on this machine, the address of a Dask scheduler, or None for this
+            process. With a local cluster, scripts must make this call below `if __name__ == "__main__":`.
+        report: progress bar for the cells.
+
+    Returns:
+        Rows of the grid's cells and seeds only, in the grid's order. Settings are columns with dots
+        (`settings.swarm.particles`), and metrics have units in their names. `seconds.*`, `device.*`, `versions.*` and
+        `commit` record the time and the origin of a row. `real_time_factor` is seconds of video per second of wall
+        clock of a run's share of its batch, with stored silhouettes; `real_time_factor_running` is the same without
+        compilation. `attrs["errors"]` lists failed cells by title.
+
+    Raises:
+        InputError: a sequence does not exist, or every cell failed.
+        SettingsError: a value of the grid is wrong.
+        OutputError: the results cannot be written.
+
+    Example:
+        How the error falls with the number of particles:
+
+            rows = sweep(
+                {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"swarm.particles": [20, 50, 100]}},
+                out="results", data="data", cache="cache", report=psotrack.support.progress_bar,
+            )
+            rows.groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
+    """
+    if not isinstance(grid, Grid):
+        grid = read_grid(Path(grid)) if isinstance(grid, Path | str) else grid_of(grid)
+    cluster = Cluster(cluster) if isinstance(cluster, str) else cluster
+    return run_grid(grid, out, data=data, cache=cache, jobs=jobs, cluster=cluster, report=report).rows()
+
+
+def run_grid(
+    grid: Grid,
+    out: Path | str,
+    *,
+    data: Path | str,
+    cache: Path | str,
+    jobs: int | None = None,
+    cluster: Cluster | None = None,
+    report: Report = no_progress,
+) -> SweepOutcome:
+    """Run the unfinished cells of a grid. Several runners on one folder share the work.
+
+    The function returns when every cell is finished or has failed. It waits for cells that other runners work on, and
+    runs these cells when the other runners were killed.
+
+    Args:
+        grid: the cells to run.
+        out: folder of the results (see `Store`).
+        data: root folder of the sequences that the grid names.
+        cache: folder of the stored silhouettes, and of a cluster's compiled programs.
+        jobs: number of processes that make silhouettes; None is one per processor.
+        cluster: where the cells run; None runs them in this process, one after the other. All workers of a cluster must
+            see `out`, `data` and `cache` under the same paths.
+        report: progress bar for the cells that are not finished.
+
+    Raises:
+        InputError: a sequence does not exist, or there is no cluster at the address.
+        OutputError: the results cannot be written.
+    """
+    for sequence in grid.sequences:
+        folder_of(sequence, Path(data))
+    origin = provenance()
+    if cluster is not None:
+        # Each row names the device on which it was made, which may differ from this one.
+        origin = {name: value for name, value in origin.items() if name != "device"} | {"cluster": True}
+    store, inputs = Store(out), Inputs(Path(data), Path(cache), jobs)
+    store.tidy()
+    store.change_manifest(lambda manifest: note_run(manifest, grid, origin))
+    results, cells = _sort_out(grid, inputs, store)
+    if cluster is None:
+        more = _run_here(cells, inputs, store)
+    else:
+        more = run_on_cluster(cluster, cells, inputs, store)
+    with report("sweep", len(cells)) as advance:
+        for result in more:
+            results.append(result)
+            advance(1)
+    order = {cell_name(cell): number for number, cell in enumerate(grid.cells())}
+    return SweepOutcome(tuple(sorted(results, key=lambda result: order[cell_name(result.cell)])), store)
+
+
+def _run_here(cells: list[Cell], inputs: Inputs, store: Store) -> Iterator[Result]:
+    """Yield the result of each cell when it ends."""
+    while cells:
+        busy = []
+        for cell in cells:
+            result = run_cell(cell, inputs, store)
+            if result.state == "busy":
+                busy.append(cell)
+            else:
+                yield result
+        if len(busy) == len(cells):
+            time.sleep(POLL_S)
+        cells = busy
+
+
+def _sort_out(grid: Grid, inputs: Inputs, store: Store) -> tuple[list[Result], list[Cell]]:
+    """Results of the cells that are finished or cannot be read, and the other cells, sorted by their input.
+
+    The manifest notes the inputs of all cells, so that results of these inputs are those that count.
+    """
+    results, cells, noted = [], [], {}
+    for cell in _by_input(grid.cells()):
+        try:
+            keys = inputs.keys_of(cell)
+        except PsotrackError as error:
+            results.append(store_failure(cell, None, error, store))
+            continue
+        noted[input_digest(keys)] = cell, keys
+        result = finished_before(cell, cell_key(cell, keys), store)
+        if result is None:
+            cells.append(cell)
+        else:
+            results.append(result)
+
+    def note(manifest: dict[str, Any]) -> None:
+        for cell, keys in noted.values():
+            note_input(manifest, cell, keys)
+
+    store.change_manifest(note)
+    return results, cells
+
+
+def _by_input(cells: Iterable[Cell]) -> list[Cell]:
+    """Put cells with the same input next to each other; the order stays the grid's otherwise."""
+    groups: dict[Any, list[Cell]] = {}
+    for cell in cells:
+        groups.setdefault((source_of(cell), cell.cameras, cell.perturbation), []).append(cell)
+    return [cell for group in groups.values() for cell in group]
