@@ -45,8 +45,8 @@ _BISECTIONS = 12
 
 
 @runtime_checkable
-class Lens(Protocol):
-    """One lens, or several along leading axes."""
+class Distortion(Protocol):
+    """The distortion of one lens, or of several along leading axes."""
 
     @property
     def dist(self) -> Float[Array, "*lenses coefficients"]:
@@ -65,7 +65,7 @@ class _Lens(NamedTuple):
 
 
 def distort(
-    lens: Lens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+    lens: Distortion, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
     """Distorted normalised image coordinates. Arguments: see the module."""
     distorted_x, distorted_y = _by_model(lens, x, y, _pinhole, _fisheye)
@@ -73,14 +73,14 @@ def distort(
 
 
 def lens_derivative(
-    lens: Lens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+    lens: Distortion, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], ...]:
     """Derivatives of the distorted coordinates: x by x, x by y, y by x, y by y. Arguments: see the module."""
     return _by_model(lens, x, y, _pinhole_derivative, _fisheye_derivative)
 
 
 def _by_model(
-    lens: Lens, x: Array, y: Array, pinhole: Callable[..., Any], fisheye: Callable[..., Any]
+    lens: Distortion, x: Array, y: Array, pinhole: Callable[..., Any], fisheye: Callable[..., Any]
 ) -> tuple[Array, ...]:
     """What the function of each lens's model says."""
     xp = _numbers(x)
@@ -92,7 +92,7 @@ def _by_model(
 
 
 def undistort_normalised(
-    lens: Lens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+    lens: Distortion, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
     """Inverse of `distort` in float64, by Newton's method; NaN where no point has this image.
 
@@ -124,7 +124,7 @@ def undistort_normalised(
 
 
 def is_one_to_one(
-    lens: Lens,
+    lens: Distortion,
     x: Float[Array, "*#points"],
     y: Float[Array, "*#points"],
     beyond: Float[Array, "*lenses"] | None = None,
@@ -140,7 +140,7 @@ def is_one_to_one(
     return _rises(_numbers(x), lens, x, y) & (x * x + y * y < beyond * beyond)
 
 
-def second_sheet(lens: Lens) -> Float[Array, "*lenses"]:
+def second_sheet(lens: Distortion) -> Float[Array, "*lenses"]:
     """Radius r = hypot(x, y) below which every point with a positive determinant is before the fold; or infinity.
 
     Beyond the first fold the determinant is negative. Further away it may become positive again, on the second sheet
@@ -163,7 +163,7 @@ def _second_sheet_of(dist: bytes, fisheye: bool) -> float:
     return float(_second_sheet(np, _Lens(row, np.array(True) if fisheye else None)))
 
 
-def _second_sheet(xp: Any, lens: Lens) -> Array:
+def _second_sheet(xp: Any, lens: Distortion) -> Array:
     dist, fisheye = lens.dist, lens.fisheye
     radius = np.tan(_ANGLES)
     grid = radius[:, None] * np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])[:, None]
@@ -176,7 +176,7 @@ def _second_sheet(xp: Any, lens: Lens) -> Array:
     return xp.where(again.any(axis=-1), xp.asarray(radius, dist.dtype)[xp.maximum(first - 1, 0)], xp.inf)
 
 
-def _rises(xp: Any, lens: Lens, x: Array, y: Array) -> Array:
+def _rises(xp: Any, lens: Distortion, x: Array, y: Array) -> Array:
     """True where the determinant of the derivative is positive, and the model has no pole before the point."""
     coefficients = lens.dist.shape[-1]
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -196,7 +196,7 @@ def _numbers(array: Any) -> Any:
     return np if isinstance(array, np.ndarray | np.generic) else jnp
 
 
-def _parted(xp: Any, lens: Lens) -> tuple[Array, Array]:
+def _parted(xp: Any, lens: Distortion) -> tuple[Array, Array]:
     """Which lenses are fisheyes, and the coefficients with 0 for fisheyes: the pinhole model of such a lens is unused,
     but must be finite.
     """
