@@ -323,7 +323,7 @@ def test_a_person_who_stands_still_is_no_drone():
 
 
 def test_evaluate_says_a_warning_of_the_reference_once(tmp_path):
-    """With `--offset`, the reference is read twice."""
+    """Found: with `--offset`, the reference was read twice."""
     markers, _ = make_markers(200, drones=("cf1", "cf2"))
     write_c3d(tmp_path / "flight.c3d", markers)
     (tmp_path / "recording.toml").write_text(
