@@ -420,7 +420,7 @@ def test_files_are_converted(tmp_path):
     np.testing.assert_allclose(
         read_rig(tmp_path / "d.toml").cameras.T_cam_world, rig.cameras.T_cam_world, atol=1e-14
     )
-    run("convert", tmp_path / "a.toml", tmp_path / "mm.toml", "--unit", "mm", "-q")
+    run("convert", tmp_path / "a.toml", tmp_path / "mm.toml", "--units", "mm", "-q")
     np.testing.assert_allclose(centres(read_rig(tmp_path / "mm.toml")), 1e-3 * centres(rig), atol=1e-15)
     assert "--force" in refused("convert", tmp_path / "a.toml", tmp_path / "b.yml")
     run("convert", tmp_path / "a.toml", tmp_path / "lens.toml", "--lenses", "--undistorted", "-q")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, out_option, positive
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.options import BODIES, out_option, positive, running
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand
 from psotrack.cli.types import SequencePath, Size
 from psotrack.errors import SettingsError
@@ -38,7 +38,6 @@ def _pairs(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> lis
 )
 @click.option(
     "--units",
-    "--unit",
     "unit",
     type=click.Choice(["m", "cm", "mm"]),
     help="Unit of the lengths in the rig file; needed if the format leaves the unit open.",
@@ -74,10 +73,7 @@ def _pairs(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> lis
     help="Show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.",
 )
 @BODIES
-@FORCE
-@QUIET
-@JSON
-@pass_output
+@running(progress=False)
 def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: Any) -> None:
     """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 
 from psotrack.cli.archived import chosen_extent, with_comparison
 from psotrack.cli.options import (
     DETECTOR_SIZE,
-    FORCE,
-    JSON,
-    MOST_DRONES,
     SEQUENCE,
     Extent,
     beside,
@@ -23,10 +21,10 @@ from psotrack.cli.options import (
     extent_options,
     out_option,
     recording_named,
-    reporting,
+    running,
 )
-from psotrack.cli.output import Output, check_suffix, pass_output, write_json
-from psotrack.cli.records import HelpfulCommand, Option
+from psotrack.cli.output import Output, check_suffix, write_json
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.settings import chosen_settings, config_options, settings_options
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
@@ -34,6 +32,24 @@ from psotrack.support import atomic_write_all
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
+
+
+@dataclass(frozen=True)
+class How:
+    """How a recording is tracked, apart from the settings.
+
+    Attributes:
+        detector: detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a
+            detector NAME that an installed package adds. Its detections are stored.
+        detector_size: side of the network's square input, in pixels.
+        causal: track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.
+        most_drones: largest number of drones at one time with --causal.
+    """
+
+    detector: Annotated[str, Meta(extra={"metavar": "MODEL.onnx|NAME"})] | None = None
+    detector_size: int = DETECTOR_SIZE
+    causal: bool = False
+    most_drones: Annotated[int, Meta(ge=1, le=1000)] = 16
 
 
 @dataclass(frozen=True)
@@ -62,44 +78,12 @@ class _Run:
     "swarm.iterations",
     "seed",
 )
-@click.option(
-    "--detector",
-    metavar="MODEL.onnx|NAME",
-    help="Detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a detector NAME "
-    "that an installed package adds. Its detections are stored.",
-)
-@click.option(
-    "--detector-size",
-    type=int,
-    default=DETECTOR_SIZE,
-    show_default=True,
-    cls=Option,
-    rare=True,
-    heading="Drones",
-    help="Side of the network's square input, in pixels.",
-)
-@click.option(
-    "--causal",
-    is_flag=True,
-    help="Track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.",
-)
-@MOST_DRONES
+@options_of(How, "how", rare=("detector_size", "most_drones"))
 @extent_options
 @config_options
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def track(
-    output: Output,
-    sequence: Path,
-    out: Path | None,
-    settings: dict[str, Any],
-    detector: str | None,
-    detector_size: int,
-    causal: bool,
-    most_drones: int,
-    extent: Extent,
+    output: Output, sequence: Path, out: Path | None, settings: dict[str, Any], how: How, extent: Extent
 ) -> None:
     """Track the drones of SEQ from its videos, or from detections in them.
 
@@ -132,17 +116,18 @@ def track(
     from psotrack.support import keep_compiled
     from psotrack.trajectories import write_ambiguity, write_trajectories
 
+    detector = how.detector
     out = out or beside(sequence, "tracks.csv")
     check_suffix("--out", out, ".csv", ".parquet")
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
-    output.refuse(out, record_path, *([] if causal else [ambiguity_path]))
+    output.refuse(out, record_path, *([] if how.causal else [ambiguity_path]))
     chosen = chosen_settings(settings)
-    num_frames, causal, most_drones = chosen_extent(extent.num_frames, causal, most_drones)
+    num_frames, causal, most_drones = chosen_extent(extent.num_frames, how.causal, how.most_drones)
     parts = Parts()
     if detector is not None:
         if causal:
             raise SettingsError("--detector", expected="none with --causal", found=detector)
-        parts["detector"] = find_detector(detector, DetectorSettings(size=detector_size))
+        parts["detector"] = find_detector(detector, DetectorSettings(size=how.detector_size))
     keep_compiled(compiled_folder(extent.cache))
     start_s = time.perf_counter() - output.started_s
     opened = open_recording(sequence)

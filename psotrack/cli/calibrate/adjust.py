@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psotrack.cli.calibrate.options import OUT
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.options import SEQUENCE, running
+from psotrack.cli.output import Output
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,35 +30,33 @@ ALL_OFF = (
 )
 
 
+@dataclass(frozen=True)
+class Adjusting:
+    """By what a rig is adjusted.
+
+    Attributes:
+        tracks: tracks of SEQ's drones, a file of `track`.
+        fixed: cameras that are not moved.
+        refine_focal_length: scale all focal lengths by a common factor, too.
+        noise_px: standard deviation of the middle of a box from frame to frame, along x and along y, in pixels; None:
+            1, plus 5 % of the box's mean side.
+    """
+
+    tracks: Path
+    fixed: tuple[str, ...] = ()
+    refine_focal_length: bool = False
+    noise_px: float | None = None
+
+
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
-@click.option(
-    "--tracks",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="Tracks of SEQ's drones, a file of `track`.",
-)
-@click.option("--fixed", default="", metavar="NAME,NAME...", help="Cameras that are not moved.")
-@click.option("--refine-focal-length", is_flag=True, help="Scale all focal lengths by a common factor, too.")
-@click.option(
-    "--noise",
-    "noise_px",
-    type=float,
-    help="Standard deviation of the middle of a box from frame to frame, along x and along y, in pixels.  "
-    "[default: 1, plus 5 % of the box's mean side]",
-)
+@options_of(Adjusting, "how")
 @OUT
-@FORCE
-@QUIET
-@JSON
-@pass_output
+@running(progress=False)
 def adjust(
     output: Output,
     sequence: Path,
-    tracks: Path,
-    fixed: str,
-    refine_focal_length: bool,
-    noise_px: float | None,
+    how: Adjusting,
     out: Path,
 ) -> None:
     """Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.
@@ -94,14 +93,14 @@ def adjust(
         )
     recording.check_detections(recording.detections)
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
-    flown = read_tracks(tracks, recording=recording if recording.videos else None)
+    flown = read_tracks(how.tracks, recording=recording if recording.videos else None)
     frame_times = None
     if not _is_synchronous(recording):
         frame_times = {name: times for name, times in recording.exposed.items() if name in detections}
     views = find_drones_in_boxes(recording.rig, detections, flown, frame_times=frame_times)
-    held = tuple(name for name in fixed.split(",") if name)
+    held = how.fixed
     checked = improve_with_check(
-        recording.rig, views, noise_px, fixed=held, refine_focal_length=refine_focal_length
+        recording.rig, views, how.noise_px, fixed=held, refine_focal_length=how.refine_focal_length
     )
     improved = checked.improved
     write_rig(out, improved.rig, force=output.force)
@@ -113,7 +112,7 @@ def adjust(
         output.say(_in_words(improved, rows))
     for line in _check_in_words(checked):
         output.say(line)
-    if refine_focal_length:
+    if how.refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
         output.say(f"focal lengths x {scale:.5f} ± {std:.5f}{done}")

@@ -12,16 +12,14 @@ from psotrack.cli.calibrate.options import BOARD_NAMES, OUT
 from psotrack.cli.options import FORCE, JSON, plot_option, reporting
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.cli.types import names_of
+from psotrack.cli.types import Names
 
 
 @click.command(cls=HelpfulCommand)
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
 @options_of(BoardSettings, "board", names=BOARD_NAMES, heading="Board")
 @options_of(LensSettings, "lens", heading="Lenses")
-@click.option(
-    "--names", metavar="NAME,NAME...", help="Names of the cameras.  [default: from the files' names]"
-)
+@click.option("--names", type=Names(), help="Names of the cameras.  [default: from the files' names]")
 @click.option(
     "--floor",
     type=int,
@@ -46,7 +44,7 @@ from psotrack.cli.types import names_of
 def rig(
     output: Output,
     sources: tuple[Path, ...],
-    names: str | None,
+    names: tuple[str, ...] | None,
     plot: Path | None,
     out: Path,
     **known: Any,
@@ -82,7 +80,7 @@ def rig(
         plot=plot,
         force=output.force,
         progress=output.report,
-        names=names_of("--names", names),
+        names=names,
         **settings,
     )
     output.result(found)
