@@ -26,10 +26,10 @@ Recordings and tracks
     simulate, SimulationSettings: a recording with its truth
 Settings of tracking
     TrackSettings, and its parts SwarmSettings, ScoreSettings, MotionSettings, DroneSettings, StatusSettings,
-    IdentitySettings, SilhouetteSettings
+    IdentitySettings
 Judging
     Evaluation, evaluate: errors, scores and identities against a reference
-    find_offset: the offset between the clocks of a reference and of the videos
+    reference_offset: the offset between the clocks of a reference and of the videos
 Cameras
     Rig, make_rig, make_camera: cameras that are calibrated
     read_rig, write_rig: files of many programs
@@ -53,6 +53,7 @@ JAX is changed. Every part of the package is a room with its own documentation: 
 import inspect as _inspect
 from dataclasses import is_dataclass as _is_dataclass
 from importlib.metadata import version as _version
+from sys import modules as _modules
 from typing import Any as _Any
 
 import lazy_loader
@@ -66,7 +67,10 @@ _load, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> _Any:
     """A public name; calls of functions and of records are checked (`psotrack.support.calls`)."""
     value = _load(name)
-    if name in globals():
+    if room := _modules.get(f"{__name__}.{name}"):
+        # The room `sweep` may be called like its function, which must not stand in the room's place.
+        value = globals()[name] = room
+    elif name in globals():
         from psotrack.support import check_records, checked
 
         if _inspect.isfunction(value):

@@ -1,5 +1,15 @@
-from .api import background_model, detect_markers, read_recording, track
-from .calibration.clocks import find_offset
+from .api import (
+    background_model,
+    calibrate_rig,
+    detect_markers,
+    doctor,
+    overlay,
+    read_recording,
+    report,
+    track,
+)
+from .calibration.clocks import reference_offset
+from .calibration.rig.settings import RigSettings
 from .evaluation import Evaluation, evaluate
 from .foreground.detection import Detector
 from .foreground.silhouettes import BackgroundModel
@@ -22,6 +32,7 @@ from .settings import (
 from .show.reports import view_3d
 from .simulation import SimulationSettings, simulate
 from .support import register_plugin
+from .sweep import sweep
 from .tracking.swarm import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
 
@@ -39,6 +50,7 @@ __all__ = [
     "MotionSettings",
     "Recording",
     "Rig",
+    "RigSettings",
     "Score",
     "ScoreInputs",
     "ScoreSettings",
@@ -51,13 +63,15 @@ __all__ = [
     "TrackedRecording",
     "Trajectories",
     "background_model",
+    "calibrate_rig",
     "detect_markers",
+    "doctor",
     "evaluate",
     "export_tracks",
-    "find_offset",
     "localise_video",
     "make_camera",
     "make_rig",
+    "overlay",
     "project",
     "read_c3d",
     "read_marker_map",
@@ -65,8 +79,11 @@ __all__ = [
     "read_rig",
     "read_tracks",
     "read_trajectories",
+    "reference_offset",
     "register_plugin",
+    "report",
     "simulate",
+    "sweep",
     "track",
     "track_runs",
     "triangulate",

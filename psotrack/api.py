@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,9 +36,16 @@ from psotrack.pipeline import (
 from psotrack.recordings import Recording, read_detections
 from psotrack.recordings.datasets import holds_recording, open_recording, videos_in
 from psotrack.settings import BLOBS, YOLO, TrackSettings, full_name
-from psotrack.support import Report, no_progress, progress_bar, refuse_files, user_cache
+from psotrack.show.flights import TrackedFlight, first_instants, flight_of, read_flight
+from psotrack.show.overlay import OverlayOptions, WrittenOverlays, write_overlays
+from psotrack.show.reports import WrittenPage, write_report
+from psotrack.support import Report, bind, refuse_files, report_of, short_text, user_cache
 from psotrack.tracking.births import room_bounds
 from psotrack.tracking.matching import from_detections, from_silhouettes
+from psotrack.trajectories import Trajectories
+
+#: Tracks in memory.
+Tracks = TrackedRecording | Trajectories
 
 
 def read_recording(
@@ -102,7 +110,7 @@ def track(
         settings,
         cache=user_cache() if cache is None else cache,
         jobs=jobs,
-        report=_report(progress),
+        report=report_of(progress),
         **cast(Parts, parts),
     )
 
@@ -137,8 +145,9 @@ def calibrate_rig(
         SettingsError: a value does not exist, or does not fit the others.
         OutputError: a file exists and `force` is not set.
     """
+    bind("calibrate_rig()", inspect.signature(RigSettings), (), more)
     settings = RigSettings(**more)
-    paths = [Path(path) for path in ([sources] if isinstance(sources, Path | str) else sources)]
+    paths = _paths(sources) if sources else []
     if not paths and settings.pairs is None:
         raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
     if len(paths) == 1 and not holds_recording(paths[0]):
@@ -151,7 +160,7 @@ def calibrate_rig(
     if settings.points:
         found = calibrate_by_moving_point(paths, settings)
     elif settings.by_board:
-        found = calibrate_by_board(paths, settings, _report(progress))
+        found = calibrate_by_board(paths, settings, report_of(progress))
         if plot is not None:
             save_coverage(Path(plot), found.calibrated, force=force)
     else:
@@ -194,7 +203,7 @@ def doctor(
     source = detections or (YOLO if recording.detections else BLOBS)
     if source == BLOBS:
         recording = recording.usable(silhouettes=True)
-        stored, report = user_cache() if cache is None else cache, _report(progress)
+        stored, report = user_cache() if cache is None else cache, report_of(progress)
         made = compute(recording, SilhouetteSettings(), cache=stored, jobs=jobs, report=report)
         sightings = from_silhouettes(made, report)
     else:
@@ -211,6 +220,106 @@ def doctor(
         reference=recording.truth,
         bounds_m=None if room_m is None else room_bounds(recording.rig, room_m),
     )
+
+
+def report(
+    source: Tracks | Path | str | Sequence[Path | str],
+    out: Path | str | None = None,
+    *,
+    recording: Recording | Path | str | None = None,
+    pictures: bool = True,
+    jobs: int | None = None,
+    force: bool = False,
+    progress: bool | Report = False,
+) -> WrittenPage:
+    """Write one HTML page about tracks, the results of a sweep, or a calibration.
+
+    Args:
+        source: the result of `track`, or trajectories; or files of tracks of one flight; or the folder of a sweep's
+            results, or the JSON file of `psotrack calibrate rig --json`.
+        out: file that ends in .html; None: beside the source, with the same name.
+        recording: the recording of the tracks; None: the one that their record names.
+        pictures: whether events are shown with a picture, where there are videos.
+        jobs: largest number of videos that are read at the same time; None is one per processor.
+        force: replace an existing file.
+        progress: as in `track`.
+
+    Raises:
+        InputError: a file cannot be used.
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    return write_report(
+        _flight(source, recording) if isinstance(source, Tracks) else _paths(source),
+        None if out is None else Path(out),
+        recording=recording,
+        pictures=pictures,
+        jobs=jobs,
+        force=force,
+        report=report_of(progress),
+    )
+
+
+def overlay(
+    tracks: Tracks | Path | str | Sequence[Path | str],
+    out: Path | str | None = None,
+    *,
+    recording: Recording | Path | str | None = None,
+    cameras: Sequence[str] | None = None,
+    num_frames: int | None = None,
+    jobs: int | None = None,
+    progress: bool | Report = False,
+    **more: Any,
+) -> WrittenOverlays:
+    """Draw tracks into the videos of their recording: boxes, names, trails, 90 % ellipses and time.
+
+    Finished videos of the same tracks are kept.
+
+    Args:
+        tracks: the result of `track`, or trajectories; or files of tracks of one flight.
+        out: folder of the videos; None: `overlay` beside the tracks.
+        recording: the recording of the tracks; None: the one that their record names.
+        cameras: names of the cameras to draw into; None uses all.
+        num_frames: number of first frames; None is all.
+        jobs: largest number of processes; None is one per processor.
+        progress: as in `track`.
+        **more: `mosaic`, `scale` and `force`, fields of `OverlayOptions`.
+
+    Raises:
+        InputError: a file cannot be used, or the recording has no video.
+        SettingsError: a value is wrong.
+        OutputError: the folder has other videos and `force` is not set, or a video cannot be written.
+    """
+    bind("overlay()", inspect.signature(OverlayOptions), (), more)
+    if out is None and isinstance(tracks, Tracks):
+        raise SettingsError("overlay, out", expected="a folder", found="none")
+    flight = _flight(tracks, recording, cameras)
+    if num_frames is not None:
+        flight = first_instants(flight, num_frames)
+    folder = flight.tracks[0].path.parent / "overlay" if out is None else Path(out)
+    return write_overlays(folder, flight, OverlayOptions(**more), jobs=jobs, report=report_of(progress))
+
+
+def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
+    """One path, or several."""
+    paths = [given] if isinstance(given, Path | str) else list(given)
+    if not paths or not all(isinstance(path, Path | str) for path in paths):
+        raise SettingsError("files", expected="one or more paths", found=short_text(given))
+    return [Path(path) for path in paths]
+
+
+def _flight(
+    tracks: Tracks | Path | str | Sequence[Path | str],
+    recording: Recording | Path | str | None,
+    cameras: Sequence[str] | None = None,
+) -> TrackedFlight:
+    """Tracks in memory or in files, with their recording."""
+    if isinstance(tracks, Tracks):
+        if not isinstance(recording, Recording | None):
+            recording = open_recording(recording)
+        if recording is not None and cameras is not None:
+            recording = recording.usable(cameras, videos=False)
+        return flight_of(tracks, recording)
+    return read_flight(_paths(tracks), recording, cameras=cameras)
 
 
 def detect_markers(
@@ -232,10 +341,6 @@ def detect_markers(
 
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return MarkerDetector(dictionary, thorough=True).detect(np.asarray(grey, np.uint8))
-
-
-def _report(progress: bool | Report) -> Report:
-    return progress if callable(progress) else progress_bar if progress else no_progress
 
 
 def background_model(settings: ForegroundSettings | None = None) -> Living:

@@ -115,6 +115,9 @@ def _fits(value: Any, annotation: Any, shapes: bool) -> bool:
         if not shapes or not hasattr(value, "shape"):
             return hasattr(value, "shape")
         return isinstance(value, _shaped(typing.cast(Hashable, type(value)), origin.dim_str))
+    if origin is collections.abc.Sequence and isinstance(value, str | bytes):
+        # A text where several are expected would be taken for its letters.
+        return False
     return isinstance(value, (origin, *_AS_GOOD.get(origin, ())))
 
 

@@ -1,6 +1,6 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
 from .cluster import Cluster, run_on_cluster
-from .estimates import Estimate, estimate
+from .estimates import Estimate, SweepPlan, estimate, plan
 from .frames import sweep
 from .grid_files import Grid, grid, read_grid
 from .inputs import Inputs
@@ -18,6 +18,7 @@ __all__ = [
     "Perturbation",
     "Store",
     "SweepOutcome",
+    "SweepPlan",
     "cameras_label",
     "cell_key",
     "delays_frames",
@@ -26,6 +27,7 @@ __all__ = [
     "is_results_folder",
     "perturb",
     "pivot",
+    "plan",
     "read_grid",
     "render_table",
     "run_in_process",

@@ -63,6 +63,7 @@ class Cluster:
         address: address of the cluster's scheduler; "local" starts a cluster on this machine for each call.
         workers: number of processes of the local cluster; None is one per processor, or one if `device` is "gpu".
         device: device on which the workers compute; None leaves the choice to JAX.
+        say: receives the address at which the scheduler of a local cluster listens.
 
     Raises:
         SettingsError: `workers` is given for a cluster that is not local.
@@ -71,6 +72,7 @@ class Cluster:
     address: str = "local"
     workers: int | None = None
     device: Device | None = None
+    say: Callable[[str], object] = lambda address: None
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.address != "local":
@@ -104,7 +106,6 @@ def run_on_cluster(
     cache: Path | str,
     cluster: Cluster = Cluster(),
     report: Report = no_progress,
-    say: Callable[[str], object] = lambda address: None,
 ) -> SweepOutcome:
     """Run the unfinished cells of a grid as tasks of a cluster; see `runner.run_in_process` for runs without a cluster.
 
@@ -115,7 +116,6 @@ def run_on_cluster(
         cache: folder of the stored silhouettes and of compiled programs.
         cluster: the cluster.
         report: progress bar for the cells that are not finished.
-        say: receives the address at which the scheduler of a local cluster listens.
 
     Raises:
         InputError: a sequence does not exist, or there is no cluster at the address.
@@ -133,7 +133,7 @@ def run_on_cluster(
     job = _Job(out, data, cache, cluster.device, devices, secrets.token_hex(8))
     with report("sweep", len(cells)) as advance, contextlib.ExitStack() as stack:
         if cells:
-            client = stack.enter_context(_client(dask, cluster.address, workers, say))
+            client = stack.enter_context(_client(dask, cluster, workers))
             for result in _results(dask, client, cells, job, inputs, store):
                 results.append(result)
                 advance(1)
@@ -155,7 +155,8 @@ def _distributed() -> Any:
 
 
 @contextlib.contextmanager
-def _client(dask: Any, address: str, workers: int, say: Callable[[str], object]) -> Iterator[Client]:
+def _client(dask: Any, where: Cluster, workers: int) -> Iterator[Client]:
+    address = where.address
     if address == "local":
         with (
             dask.LocalCluster(
@@ -171,7 +172,7 @@ def _client(dask: Any, address: str, workers: int, say: Callable[[str], object])
             ) as cluster,
             dask.Client(cluster) as client,
         ):
-            say(cluster.scheduler_address)
+            where.say(cluster.scheduler_address)
             yield client
         return
     if not _SAFE.fullmatch(address):

@@ -18,7 +18,7 @@ from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
 from psotrack.settings import flatten
-from psotrack.support import Report, drop_programs_if_many, no_progress
+from psotrack.support import Report, drop_programs_if_many, html_block, html_table, no_progress
 from psotrack.sweep.cells import Cell, cell_key, cell_name, describe, input_digest, title
 from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import Input, Inputs, folder_of, source_of
@@ -26,6 +26,7 @@ from psotrack.sweep.locks import POLL_S
 from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.store import Store
+from psotrack.sweep.tables import DESCRIBING
 
 logger = logging.getLogger(__name__)
 
@@ -69,6 +70,14 @@ class SweepOutcome:
             f"{self.store.folder}: {self.count('finished')} cells finished now, {self.count('left')} before"
         )
         return f"{said}, {failed} failed (see {self.store.folder}/cells/*.error.json)" if failed else said
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: what differs between the rows, and their mean errors."""
+        rows = self.rows()
+        described = [name for name in map(str, rows) if name.startswith(DESCRIBING)]
+        names = [name for name in described if rows[name].astype(str).nunique() > 1]
+        names += ["seed", "mean_error_m", "missed_rate"]
+        return html_block(f"{self}", html_table(names, rows[names].astype(str).to_numpy().tolist()))
 
     @property
     def errors(self) -> list[str]:
