@@ -14,7 +14,7 @@ from psotrack.cli.log_file import LogFile
 from psotrack.cli.output import PROGRESS, Output, current_output
 from psotrack.cli.records import Command, Option
 from psotrack.cli.types import Numbers, SequencePath, names_of
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.settings import BLOBS, YOLO
 from psotrack.support import refuse_files, user_cache
 
@@ -134,6 +134,13 @@ JOBS = click.option(
 def reporting(command: Command) -> Command:
     """Options of commands with long work: --quiet, --progress and --log."""
     return QUIET(_PROGRESS(LOG(command)))
+
+
+def positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """Callback of an option whose value is a number above 0."""
+    if value is not None:
+        check_positive(parameter.opts[0], value)
+    return value
 
 
 def out_option(words: str, **attributes: Any) -> Callable[[Command], Command]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -75,6 +76,11 @@ class Output:
     def shows(self) -> bool:
         """Whether people get sentences and tables on stdout."""
         return not self.quiet and self.json_path != _STDOUT
+
+    @property
+    def can_ask(self) -> bool:
+        """Whether somebody at a terminal reads questions and answers them."""
+        return self.shows and sys.stdin.isatty() and sys.stdout.isatty()
 
     @property
     def report(self) -> Report:
