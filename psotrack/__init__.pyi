@@ -6,6 +6,7 @@ from .api import (
     overlay,
     read_recording,
     report,
+    run,
     track,
 )
 from .calibration.clocks import reference_offset
@@ -82,6 +83,7 @@ __all__ = [
     "reference_offset",
     "register_plugin",
     "report",
+    "run",
     "simulate",
     "sweep",
     "track",

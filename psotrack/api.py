@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+import shlex
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +23,7 @@ from psotrack.calibration import (
     save_coverage,
 )
 from psotrack.calibration.doctor import Diagnosis, examine
-from psotrack.errors import SettingsError
+from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes import ForegroundSettings, Living, SilhouetteSettings, compute
 from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import read_marker_map
@@ -32,14 +34,40 @@ from psotrack.pipeline import (
     check_detections,
     detection_files_of,
     track_recording,
+    with_real_time,
 )
-from psotrack.recordings import Recording, read_detections
-from psotrack.recordings.datasets import holds_recording, open_recording, videos_in
+from psotrack.recordings import RECORDING_FILE, Recording, read_detections
+from psotrack.recordings.datasets import (
+    Draft,
+    DraftOptions,
+    draft_recording,
+    holds_recording,
+    open_recording,
+    videos_in,
+)
 from psotrack.settings import BLOBS, YOLO, TrackSettings, full_name
-from psotrack.show.flights import TrackedFlight, first_instants, flight_of, read_flight
+from psotrack.show.flights import (
+    RunSummary,
+    TrackedFlight,
+    first_instants,
+    flight_of,
+    read_flight,
+    run_summary,
+    write_tracked,
+)
 from psotrack.show.overlay import OverlayOptions, WrittenOverlays, write_overlays
 from psotrack.show.reports import WrittenPage, write_report
-from psotrack.support import Report, bind, refuse_files, report_of, short_text, user_cache
+from psotrack.support import (
+    Report,
+    atomic_write,
+    bind,
+    json_text,
+    read_json,
+    refuse_files,
+    report_of,
+    short_text,
+    user_cache,
+)
 from psotrack.tracking.births import room_bounds
 from psotrack.tracking.matching import from_detections, from_silhouettes
 from psotrack.trajectories import Trajectories
@@ -320,6 +348,139 @@ def _flight(
             recording = recording.usable(cameras, videos=False)
         return flight_of(tracks, recording)
     return read_flight(_paths(tracks), recording, cameras=cameras)
+
+
+def run(
+    folder: Path | str,
+    *,
+    square_m: float | None = None,
+    floor: int | None = None,
+    drones: int | None = None,
+    again: bool = False,
+    progress: bool | Report = True,
+    say: Callable[[str], object] = print,
+    **more: Any,
+) -> RunSummary:
+    """Calibrate, check, track and show the videos of a rig, from board to report.
+
+    The folder has a video of each camera, and a folder `board` with videos of the same cameras in which a board is
+    moved, or a rig file. The results are in the folder `results` in it. A run that was stopped goes on where it was;
+    to repeat a step, remove what it made.
+
+    Args:
+        folder: the folder.
+        square_m: side of a square of the board, metres; needed where the folder has no rig file.
+        floor: frame of the board's videos in which the board lies on the floor, which becomes the world's origin.
+        drones: number of drones; None: all that are found.
+        again: whether all steps are done again, also those that are done.
+        progress: as in `track`.
+        say: receives the command that does the same as each step, and what the step found.
+        **more: what is said of files whose names do not say whose they are: fields of `DraftOptions`, such
+            as `match=[("left", "GX010123.MP4")]`.
+
+    Raises:
+        InputError: a file is missing, cannot be used, or does not show what it has to.
+        SettingsError: a value is wrong, or the side of a square is missing.
+    """
+    bind("run()", inspect.signature(DraftOptions), (), more)
+    folder = Path(folder)
+    if not videos_in(folder):
+        raise InputError(folder, expected="a video of each camera", found="none")
+    results, rig, board = folder / "results", folder / "rig.toml", folder / "board"
+    tracks, page, found = results / "tracks.csv", results / "report.html", results / "doctor.json"
+    common: dict[str, Any] = {"progress": progress}
+
+    def step(words: Sequence[object], made: Path | None, do: Callable[[], object]) -> None:
+        if made is not None and made.exists() and not again:
+            say(f"{made}: there already")
+            return
+        say(f"$ psotrack {shlex.join(map(str, words))}")
+        done = do()
+        if done is not None:
+            say(f"{done}")
+
+    is_drafted = (folder / RECORDING_FILE).exists()
+    if not is_drafted or again or open_recording(folder).unplaced:
+        if board.is_dir():
+            if square_m is None and (again or not rig.exists()):
+                raise SettingsError(
+                    "--square", expected="the side of a square of the board, metres", found="none"
+                )
+            words = [
+                "calibrate",
+                "rig",
+                board,
+                "--square",
+                square_m,
+                *_option("--floor", floor),
+                "--out",
+                rig,
+            ]
+            known: dict[str, Any] = {"square_m": square_m, "floor": floor, "out": rig, "force": again}
+            step(words, rig, lambda: calibrate_rig(board, **known, **common))
+        # Another rig file is found by itself.
+        if rig.exists():
+            more = {"calibration": rig, **more}
+        words = ["init", folder, *_option("--calibration", more.get("calibration"))]
+        # A recording whose cameras have no places yet is drafted anew; the old file is kept beside the new one.
+        step(words + ["--force"] * is_drafted, None, lambda: _drafted(folder, DraftOptions(**more)))
+    if open_recording(folder).unplaced:
+        raise InputError(
+            folder,
+            expected=f"videos of a board in {board}, or a rig file",
+            found="neither",
+            remedy="`psotrack board` draws a board",
+        )
+    step(["doctor", folder, "--json", found], found, lambda: _written(found, doctor(folder, **common)))
+    is_late = any(each["kind"] == "clock" for each in read_json(found)["findings"])
+    chosen = {"clocks": "auto"} if is_late else {}
+    words = [
+        "track",
+        folder,
+        *_option("--clocks", chosen.get("clocks")),
+        *_option("--drones", drones),
+        "--out",
+        tracks,
+    ]
+    settings = {**chosen, "drones.count": drones}
+    step(words, tracks, lambda: _tracked(folder, tracks, settings, again, **common))
+    shown: dict[str, Any] = {"recording": folder, "force": again, **common}
+    step(["report", tracks, folder, "--out", page], page, lambda: report(tracks, page, **shown))
+    # Finished videos are kept.
+    videos = results / "overlay"
+    step(["overlay", tracks, folder, "--out", videos], None, lambda: overlay(tracks, videos, **shown))
+    return run_summary(folder)
+
+
+def _option(name: str, value: object) -> tuple[object, ...]:
+    """Words of a command for an option; none for None."""
+    return () if value is None else (name, value)
+
+
+def _drafted(folder: Path, options: DraftOptions) -> Draft:
+    draft = draft_recording(folder, folder / RECORDING_FILE, options)
+    draft.write()
+    return draft
+
+
+def _written(path: Path, diagnosis: Diagnosis) -> Diagnosis:
+    with atomic_write(path) as temporary:
+        temporary.write_text(json_text(diagnosis.to_dict()) + "\n", encoding="utf-8")
+    return diagnosis
+
+
+def _tracked(
+    folder: Path, path: Path, settings: Mapping[str, Any], force: bool, progress: bool | Report
+) -> str:
+    """Track a recording and write the tracks; returns what `psotrack track` prints."""
+    began = time.perf_counter()
+    recording = read_recording(folder)
+    if not recording.detections:
+        settings = {"detections": BLOBS, **settings}
+    tracked = track(recording, settings, progress=progress)
+    record = with_real_time(tracked.record, time.perf_counter() - began)
+    write_tracked(path, replace(tracked, record=record), folder, force=force)
+    return f"{path}: {tracked!r}"
 
 
 def detect_markers(

@@ -14,7 +14,15 @@ from .flight import (
 )
 from .image_views import ImageViews, ellipse_outlines_px, view_in_images
 from .quality import QUANTITIES, Quantity, camera_quality, drone_quality, quantities
-from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record, recording_beside
+from .run_record import (
+    LearnedDrone,
+    MeetingRecord,
+    RunRecord,
+    read_run_record,
+    recording_beside,
+    write_tracked,
+)
+from .run_summary import RunSummary, run_summary
 
 __all__ = [
     "QUANTITIES",
@@ -28,6 +36,7 @@ __all__ = [
     "MeetingRecord",
     "Quantity",
     "RunRecord",
+    "RunSummary",
     "TrackedFlight",
     "camera_quality",
     "colour_rgb",
@@ -45,8 +54,10 @@ __all__ = [
     "read_tracks_file",
     "recording_beside",
     "rows_at",
+    "run_summary",
     "split_sequence",
     "status_rgb",
     "statuses",
     "view_in_images",
+    "write_tracked",
 ]
