@@ -16,6 +16,7 @@ Own cameras, step by step or in one call
     track, track_runs: the drones of a recording, once or with several seeds; return a `TrackedRecording` per run
     report: one HTML page about tracks, a sweep or a calibration
     overlay: videos with the tracks drawn into them
+    save_picture: the middle moment of a flight in its cameras, with a map
     view_3d: the flight in 3D, in a notebook
     sweep: track with every combination of a grid of settings; returns a `SweepOutcome`
 Recordings and tracks
@@ -29,6 +30,7 @@ Settings of tracking
     IdentitySettings
 Judging
     Evaluation, evaluate: errors, scores and identities against a reference
+    errors_over_time: the error of each drone in each frame
     reference_offset: the offset between the clocks of a reference and of the videos
 Cameras
     Rig, make_rig, make_camera: cameras that are calibrated

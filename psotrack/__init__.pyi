@@ -7,11 +7,12 @@ from .api import (
     read_recording,
     report,
     run,
+    save_picture,
     track,
 )
 from .calibration.clocks import reference_offset
 from .calibration.rig.settings import RigSettings
-from .evaluation import Evaluation, evaluate
+from .evaluation import Evaluation, errors_over_time, evaluate
 from .foreground.detection import Detector
 from .foreground.silhouettes import BackgroundModel
 from .geometry import Rig, make_camera, make_rig, project, triangulate
@@ -67,6 +68,7 @@ __all__ = [
     "calibrate_rig",
     "detect_markers",
     "doctor",
+    "errors_over_time",
     "evaluate",
     "export_tracks",
     "localise_video",
@@ -84,6 +86,7 @@ __all__ = [
     "register_plugin",
     "report",
     "run",
+    "save_picture",
     "simulate",
     "sweep",
     "track",

@@ -56,6 +56,7 @@ from psotrack.show.flights import (
     write_tracked,
 )
 from psotrack.show.overlay import OverlayOptions, WrittenOverlays, write_overlays
+from psotrack.show.overlay import save_picture as draw_picture
 from psotrack.show.reports import WrittenPage, write_report
 from psotrack.support import (
     Report,
@@ -72,6 +73,8 @@ from psotrack.tracking.births import room_bounds
 from psotrack.tracking.matching import from_detections, from_silhouettes
 from psotrack.trajectories import Trajectories
 
+#: Fields of `RigSettings` that are files.
+_RIG_FILES = ("lenses", "pairs", "markers", "world")
 #: Tracks in memory.
 Tracks = TrackedRecording | Trajectories
 
@@ -174,7 +177,8 @@ def calibrate_rig(
         OutputError: a file exists and `force` is not set.
     """
     bind("calibrate_rig()", inspect.signature(RigSettings), (), more)
-    settings = RigSettings(**more)
+    files = {name: Path(more[name]) for name in _RIG_FILES if isinstance(more.get(name), str)}
+    settings = RigSettings(**{**more, **files})
     paths = _paths(sources) if sources else []
     if not paths and settings.pairs is None:
         raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
@@ -325,6 +329,30 @@ def overlay(
         flight = first_instants(flight, num_frames)
     folder = flight.tracks[0].path.parent / "overlay" if out is None else Path(out)
     return write_overlays(folder, flight, OverlayOptions(**more), jobs=jobs, report=report_of(progress))
+
+
+def save_picture(
+    path: Path | str,
+    tracks: Tracks | Path | str | Sequence[Path | str],
+    *,
+    recording: Recording | Path | str | None = None,
+    most_cameras: int = 5,
+    force: bool = False,
+) -> None:
+    """Save the middle moment of a flight as a picture: its first cameras with the tracks, and a map from above.
+
+    Args:
+        path: PNG file.
+        tracks: the result of `track`, or trajectories; or files of tracks of one flight.
+        recording: the recording of the tracks; None: the one that their record names.
+        most_cameras: largest number of cameras.
+        force: replace an existing file.
+
+    Raises:
+        InputError: a file cannot be used, or the recording has no video.
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    draw_picture(Path(path), _flight(tracks, recording), most_cameras=most_cameras, force=force)
 
 
 def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:

@@ -12,7 +12,7 @@ from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.pipeline import track_recording, with_real_time
 from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.show.flights import flight_of, write_tracked
+from psotrack.show.flights import flight_of, record_files, write_tracked
 from psotrack.show.overlay import save_picture
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import Report, atomic_write, no_progress, refuse_files
@@ -48,7 +48,7 @@ def run(
         OutputError: there are results in `out`, or a sequence with another seed, and `force` is not set.
     """
     tracks, picture = out / "tracks.csv", out / "demo.png"
-    refuse_files(tracks, picture, force=force)
+    refuse_files(tracks, *record_files(tracks), picture, force=force)
     began = time.perf_counter()
     folder = simulate(
         NAME,

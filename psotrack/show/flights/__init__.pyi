@@ -19,6 +19,7 @@ from .run_record import (
     MeetingRecord,
     RunRecord,
     read_run_record,
+    record_files,
     recording_beside,
     write_tracked,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "read_flight",
     "read_run_record",
     "read_tracks_file",
+    "record_files",
     "recording_beside",
     "rows_at",
     "run_summary",

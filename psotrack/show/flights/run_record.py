@@ -82,6 +82,11 @@ def recording_beside(recording: Path | str, tracks: Path | str) -> str:
     return Path(os.path.relpath(path, folder)).as_posix() if together else str(path)
 
 
+def record_files(tracks: Path) -> tuple[Path, Path]:
+    """Paths of the record of a run, and of which drones may be confused, beside a file of tracks."""
+    return tracks.with_suffix(".json"), tracks.with_suffix(".ambiguity.csv")
+
+
 def write_tracked(
     path: Path | str, tracked: TrackedRecording, recording: Path | str | None = None, *, force: bool = False
 ) -> None:
@@ -97,7 +102,7 @@ def write_tracked(
         OutputError: a file exists and `force` is not set, or it cannot be written.
     """
     path = Path(path)
-    files = path.with_suffix(".json"), path.with_suffix(".ambiguity.csv"), path
+    files = *record_files(path), path
     refuse_files(*files, force=force)
     named = {} if recording is None else {"recording": recording_beside(recording, path)}
     tracks, identities = tracked.trajectories, tracked.identities
