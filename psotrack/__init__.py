@@ -16,6 +16,7 @@ Own cameras, step by step or in one call
     track, track_runs: the drones of a recording, once or with several seeds; return a `TrackedRecording` per run
     report: one HTML page about tracks, a sweep or a calibration
     overlay: videos with the tracks drawn into them
+    save_picture: the middle moment of a flight in its cameras, with a map
     view_3d: the flight in 3D, in a notebook
     sweep: track with every combination of a grid of settings; returns a `SweepOutcome`
 Recordings and tracks
@@ -26,10 +27,11 @@ Recordings and tracks
     simulate, SimulationSettings: a recording with its truth
 Settings of tracking
     TrackSettings, and its parts SwarmSettings, ScoreSettings, MotionSettings, DroneSettings, StatusSettings,
-    IdentitySettings, SilhouetteSettings
+    IdentitySettings
 Judging
     Evaluation, evaluate: errors, scores and identities against a reference
-    find_offset: the offset between the clocks of a reference and of the videos
+    errors_over_time: the error of each drone in each frame
+    reference_offset: the offset between the clocks of a reference and of the videos
 Cameras
     Rig, make_rig, make_camera: cameras that are calibrated
     read_rig, write_rig: files of many programs
@@ -53,6 +55,7 @@ JAX is changed. Every part of the package is a room with its own documentation: 
 import inspect as _inspect
 from dataclasses import is_dataclass as _is_dataclass
 from importlib.metadata import version as _version
+from sys import modules as _modules
 from typing import Any as _Any
 
 import lazy_loader
@@ -66,7 +69,10 @@ _load, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> _Any:
     """A public name; calls of functions and of records are checked (`psotrack.support.calls`)."""
     value = _load(name)
-    if name in globals():
+    if room := _modules.get(f"{__name__}.{name}"):
+        # The room `sweep` may be called like its function, which must not stand in the room's place.
+        value = globals()[name] = room
+    elif name in globals():
         from psotrack.support import check_records, checked
 
         if _inspect.isfunction(value):

@@ -13,6 +13,7 @@ from board_rigs import draw_board
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
+import psotrack as pt
 from psotrack.calibration import (
     Board,
     calibrate_rig,
@@ -402,6 +403,10 @@ def test_the_command(tmp_path):
     assert result.exit_code == 0, result.output
     content = json.loads(result.stdout)
     assert content["print"] == ["the board is printed white on black"]
+    known = {"squares": (4, 6), "square_m": 0.04, "marker_m": 0.03, "dictionary": "4x4_50", "lens": "0"}
+    found = pt.calibrate_rig(paths, **known, out=out, force=True)
+    assert json.loads(json.dumps(found.to_dict())) == content
+    assert "the world is camera left" in str(found)
     rig = read_rig(out)
     assert rig.names == ("left", "right")
     np.testing.assert_allclose(rig.cameras.centre_world, [[0, 0, 0], [0.1, 0, 0]], atol=0.005)

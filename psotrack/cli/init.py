@@ -105,7 +105,7 @@ def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: 
     check_suffix("--out", out, ".toml")
     output.refuse(out)
     options = DraftOptions(**chosen)
-    draft = draft_recording(folder, out, _asked(folder, out, options) if output.can_ask else options)
+    draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
     older = draft.write()
     content = draft.to_dict()
     output.json(content)
@@ -133,7 +133,7 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
     output.show(inventory_table(content), wide=True)
 
 
-def _asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
+def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
     """The options with what the user answers of the files whose names do not say whose they are.
 
     Raises:

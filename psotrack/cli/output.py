@@ -7,8 +7,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import math
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -23,6 +21,7 @@ from psotrack.support import (
     Report,
     atomic_write,
     joined,
+    json_text,
     no_progress,
     progress_bar,
     progress_lines,
@@ -160,7 +159,7 @@ class Output:
     def json(self, content: Any) -> None:
         """Write the results for programs, as --json says; a missing number, NaN, is written as null."""
         if self.json_path == _STDOUT:
-            click.echo(_json_text(content))
+            click.echo(json_text(content))
         elif self.json_path is not None:
             refuse_files(self.json_path, force=self.force)
             write_json(self.json_path, content)
@@ -191,17 +190,4 @@ def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
 def write_json(path: str | Path, content: Any) -> None:
     """Write a JSON file, NaN as null; an interruption leaves no partial file."""
     with atomic_write(Path(path)) as temporary:
-        temporary.write_text(_json_text(content) + "\n", encoding="utf-8")
-
-
-def _json_text(content: Any) -> str:
-    """The content as JSON. JSON has no NaN: a missing number is null. Infinite numbers are an error of the caller."""
-    return json.dumps(_with_null(content), indent=2, allow_nan=False)
-
-
-def _with_null(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {key: _with_null(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_with_null(value) for value in content]
-    return None if isinstance(content, float) and math.isnan(content) else content
+        temporary.write_text(json_text(content) + "\n", encoding="utf-8")

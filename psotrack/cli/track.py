@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,7 +28,6 @@ from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.settings import chosen_settings, config_options, settings_options
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
-from psotrack.support import atomic_write_all
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
@@ -113,8 +112,8 @@ def track(
         with_real_time,
     )
     from psotrack.recordings.datasets import open_recording
+    from psotrack.show.flights import write_tracked
     from psotrack.support import keep_compiled
-    from psotrack.trajectories import write_ambiguity, write_trajectories
 
     detector = how.detector
     out = out or beside(sequence, "tracks.csv")
@@ -144,14 +143,13 @@ def track(
     tracked = track_recording(
         recording, chosen, cache=extent.silhouettes, jobs=extent.jobs, report=output.report, **parts
     )
-    identities, tracks = tracked.identities, tracked.trajectories
+    tracks = tracked.trajectories
     record = with_real_time(tracked.record, time.perf_counter() - output.started_s, start_s=start_s)
     record = {**record, "recording": recording_named(sequence, out)}
-    with atomic_write_all(record_path, ambiguity_path, out) as (record_file, ambiguity_file, tracks_file):
-        write_trajectories(tracks_file, tracks)
-        write_ambiguity(ambiguity_file, tracks.time_s, identities.pairs, identities.ambiguity)
-        record, sentence = with_comparison(record, tracks_file, chosen)
-        write_json(record_file, record)
+    write_tracked(out, replace(tracked, record=record), force=output.force)
+    record, sentence = with_comparison(record, out, chosen)
+    if sentence:
+        write_json(record_path, record)
     output.json(record)
     seen = f"{tracks.num_drones} drones, {tracks.num_frames} frames, {tracks.seen.mean():.1%} seen"
     output.say(f"{out}: {seen}, {_speed(record)}{sentence}")

@@ -34,13 +34,23 @@ from .plugins import (
     register_plugin,
 )
 from .processes import map_in_processes, with_traceback, worker_processes
-from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
+from .progress import (
+    Advance,
+    Report,
+    joined,
+    no_progress,
+    progress_bar,
+    progress_lines,
+    report_of,
+    terminal_bar,
+)
 from .representation import short_repr, short_text
 from .schema import (
     assign,
     bind,
     check_types,
     convert,
+    json_text,
     nearest,
     plain,
     read_json,
@@ -104,6 +114,7 @@ __all__ = [
     "identify",
     "is_moderate",
     "joined",
+    "json_text",
     "keep_compiled",
     "lasting_name",
     "left_over",
@@ -128,6 +139,7 @@ __all__ = [
     "refuse_files",
     "refuse_to_overwrite",
     "register_plugin",
+    "report_of",
     "save_figure",
     "share_processors",
     "short_repr",

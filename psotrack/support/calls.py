@@ -40,7 +40,6 @@ _AS_GOOD: dict[Any, tuple[type, ...]] = {
     tuple: (list, np.ndarray),
     list: (tuple, np.ndarray),
     collections.abc.Sequence: (np.ndarray,),
-    Path: (str,),
 }
 
 
@@ -84,7 +83,10 @@ def checked(function: _Called) -> _Called:
 
 @functools.cache
 def _annotations(function: Callable[..., Any]) -> dict[str, Any]:
-    return typing.get_type_hints(function)
+    """Annotations of the arguments; that of the result may name what only a checker of types imports."""
+    original: Any = inspect.unwrap(function)
+    named = {name: each for name, each in original.__annotations__.items() if name != "return"}
+    return typing.get_type_hints(types.SimpleNamespace(__annotations__=named), original.__globals__)
 
 
 def _check(name: str, values: Mapping[str, Any], annotations: Mapping[str, Any], *, shapes: bool) -> None:
@@ -115,6 +117,9 @@ def _fits(value: Any, annotation: Any, shapes: bool) -> bool:
         if not shapes or not hasattr(value, "shape"):
             return hasattr(value, "shape")
         return isinstance(value, _shaped(typing.cast(Hashable, type(value)), origin.dim_str))
+    if origin is collections.abc.Sequence and isinstance(value, str | bytes):
+        # A text where several are expected would be taken for its letters.
+        return False
     return isinstance(value, (origin, *_AS_GOOD.get(origin, ())))
 
 

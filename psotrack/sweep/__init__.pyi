@@ -1,11 +1,11 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
 from .cluster import Cluster
-from .estimates import Estimate, estimate
+from .estimates import Estimate, SweepPlan, estimate, plan
 from .grid_files import Grid, grid, read_grid
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
 from .store import Store, is_results_folder
-from .sweeps import SweepOutcome, run_grid, sweep
+from .sweeps import SweepOutcome, sweep
 from .tables import pivot, render_table
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Perturbation",
     "Store",
     "SweepOutcome",
+    "SweepPlan",
     "cameras_label",
     "cell_key",
     "delays_frames",
@@ -25,8 +26,8 @@ __all__ = [
     "is_results_folder",
     "perturb",
     "pivot",
+    "plan",
     "read_grid",
     "render_table",
-    "run_grid",
     "sweep",
 ]

@@ -9,7 +9,8 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.sweep.cells import Cell, cell_key
+from psotrack.sweep.cells import Cell, cameras_label, cell_key
+from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import Inputs
 from psotrack.sweep.store import Store
 
@@ -53,6 +54,53 @@ class Estimate:
         if self.total_s is None:
             return f"{said}; how long they take is known when a cell is finished"
         return f"{said}, about {_in_words(self.total_s)} at {self.run_s:.2g} s per run, as the finished runs"
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """The cells of a grid, and what a sweep would run of them; its text is what `psotrack sweep --dry-run` prints.
+
+    Attributes:
+        cells: what describes each cell.
+        estimate: what is still to run.
+    """
+
+    cells: tuple[dict[str, Any], ...]
+    estimate: Estimate
+
+    def to_dict(self) -> dict[str, Any]:
+        """The cells and the estimate, fit for JSON."""
+        return {"cells": list(self.cells), "estimate": self.estimate.to_dict()}
+
+    def __str__(self) -> str:
+        cells = (
+            f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items())
+            for number, cell in enumerate(self.cells)
+        )
+        faults = (f"cannot be read: {fault}" for fault in self.estimate.faults)
+        return "\n".join([*cells, *faults, f"{self.estimate}"])
+
+
+def plan(grid: Grid, inputs: Inputs, store: Store | None) -> SweepPlan:
+    """What a sweep would run, without running a cell.
+
+    Args:
+        grid: the grid.
+        inputs: inputs of the cells.
+        store: stored results; None for no results.
+    """
+    cells = grid.cells()
+    listed = (
+        {
+            "sequence": cell.sequence,
+            "method": cell.method,
+            "cameras": cameras_label(cell.cameras),
+            "runs": cell.runs,
+            **cell.axes,
+        }
+        for cell in cells
+    )
+    return SweepPlan(tuple(listed), estimate(cells, inputs, store))
 
 
 def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Estimate:

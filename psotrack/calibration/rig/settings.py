@@ -97,9 +97,6 @@ class RigSettings(PointSettings, LensSettings, BoardSettings):
     world: Path | None = None
 
     def __post_init__(self) -> None:
-        for name in ("lenses", "pairs", "markers", "world"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, Path(getattr(self, name)))
         chosen = {
             "--squares": self.squares is not None,
             "--points": self.points,
