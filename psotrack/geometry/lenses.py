@@ -59,9 +59,11 @@ class Lens(Protocol):
         """(...), which lenses are fisheyes; None: no lens is one."""
 
 
-class _Lens(NamedTuple):
+class LensModel(NamedTuple):
+    """A lens without a camera; see `Lens`."""
+
     dist: Any
-    fisheye: Any
+    fisheye: Any = None
 
 
 def distort(
@@ -107,7 +109,7 @@ def undistort_normalised(
     problem = _Inverse(
         np.broadcast_to(dist, (*shape, dist.shape[-1])).reshape(-1, dist.shape[-1]),
         None if lens.fisheye is None else np.broadcast_to(lens.fisheye, shape).ravel(),
-        np.broadcast_to(second_sheet(_Lens(dist, lens.fisheye)), shape).ravel(),
+        np.broadcast_to(second_sheet(LensModel(dist, lens.fisheye)), shape).ravel(),
         np.stack([np.broadcast_to(part, shape).ravel() for part in (x, y)]).astype(np.float64),
     )
     found = np.full(problem.target.shape, np.nan)
@@ -160,7 +162,7 @@ def second_sheet(lens: Lens) -> Float[Array, "*lenses"]:
 def _second_sheet_of(dist: bytes, fisheye: bool) -> float:
     """The same for one lens; calibration and triangulation ask again and again for the same few lenses."""
     row = np.frombuffer(dist, np.float64)
-    return float(_second_sheet(np, _Lens(row, np.array(True) if fisheye else None)))
+    return float(_second_sheet(np, LensModel(row, np.array(True) if fisheye else None)))
 
 
 def _second_sheet(xp: Any, lens: Lens) -> Array:
@@ -168,7 +170,7 @@ def _second_sheet(xp: Any, lens: Lens) -> Array:
     radius = np.tan(_ANGLES)
     grid = radius[:, None] * np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])[:, None]
     x, y = (xp.asarray(part, dist.dtype) for part in grid)
-    everywhere = _Lens(dist[..., None, None, :], None if fisheye is None else fisheye[..., None, None])
+    everywhere = LensModel(dist[..., None, None, :], None if fisheye is None else fisheye[..., None, None])
     rises = _rises(xp, everywhere, x, y)
     folded = xp.cumsum(~rises, axis=-2) > 0
     again = (folded & rises).any(axis=-1)
@@ -362,7 +364,7 @@ class _Inverse:
         wanted = np.hypot(*flat)
         direction = flat / np.maximum(wanted, 1e-300)
         # Only the radial part of the lens: the tangential one and the prism's are small.
-        radial = _Lens(self.dist.copy(), self.fisheye)
+        radial = LensModel(self.dist.copy(), self.fisheye)
         across = [column for column in range(radial.dist.shape[-1]) if column in (2, 3) or column >= 8]
         radial.dist[:, across] *= 0 if self.fisheye is None else self.fisheye[:, None]
         low, high = np.zeros(len(wanted)), np.full(len(wanted), np.pi / 2)

@@ -48,6 +48,7 @@ from .schema import (
     toml_key,
     toml_text,
     toml_value,
+    write_toml,
 )
 from .standard_errors import standard_error
 from .times import LEAST_STEP_S, first_repeat
@@ -135,4 +136,5 @@ __all__ = [
     "with_traceback",
     "worker_processes",
     "write_rows",
+    "write_toml",
 ]
