@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from helpers import LENSES, assert_same, ring_rig
 
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, make_rig, project
 from psotrack.geometry.rig_files import KEYS, read_lenses, read_rig, write_lenses, write_rig
 from psotrack.recordings import CameraTable
@@ -283,18 +283,6 @@ def test_opencv_reads_a_written_rig(tmp_path):
     assert second.getNode("name").string() == "c1"
     np.testing.assert_array_equal(second.getNode("K").mat(), rig.cameras.K[1])
     np.testing.assert_array_equal(second.getNode("t").mat().ravel(), rig.cameras.T_cam_world[1, :3, 3])
-
-
-def test_an_existing_file_is_overwritten_only_by_force(tmp_path):
-    path = tmp_path / "rig.toml"
-    write_rig(path, ring_rig(2))
-    before = path.read_bytes()
-    with pytest.raises(OutputError, match="--force"):
-        write_rig(path, ring_rig(3))
-    assert path.read_bytes() == before
-    write_rig(path, ring_rig(3), force=True)
-    assert len(read_rig(path)) == 3
-    assert [file.name for file in tmp_path.iterdir()] == ["rig.toml"]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from .cameras import (
 )
 from .image_fit import project_with_jacobian, to_pixels_with_jacobian
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
-from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, LensModel, distort
+from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, LensNumbers, distort
 from .reprojection import reconstruct, triangulate
 from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
@@ -36,7 +36,7 @@ __all__ = [
     "Boxes",
     "Camera",
     "Extents",
-    "LensModel",
+    "LensNumbers",
     "Rig",
     "boxes_at",
     "camera_key",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry import LensModel, distort
+from psotrack.geometry import LensNumbers, distort
 
 #: Points of the grid along each side of the image.
 _GRID = 41
@@ -77,5 +77,5 @@ def _fitted(
     except np.linalg.LinAlgError:
         # No distortion, whose error is large.
         dist = np.zeros(8 if rational else 5)
-    off = np.stack(distort(LensModel(dist), x, y), axis=-1) - distorted
+    off = np.stack(distort(LensNumbers(dist), x, y), axis=-1) - distorted
     return dist, float(np.linalg.norm(off * K[[0, 1], [0, 1]], axis=-1).max())
