@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -161,7 +162,7 @@ def run_grid(
         more = _run_here(cells, inputs, store)
     else:
         more = run_on_cluster(cluster, cells, inputs, store)
-    with report("sweep", len(cells)) as advance:
+    with report("sweep", len(cells)) as advance, contextlib.closing(more):
         for result in more:
             results.append(result)
             advance(1)
@@ -169,7 +170,7 @@ def run_grid(
     return SweepOutcome(tuple(sorted(results, key=lambda result: order[cell_name(result.cell)])), store)
 
 
-def _run_here(cells: list[Cell], inputs: Inputs, store: Store) -> Iterator[Result]:
+def _run_here(cells: list[Cell], inputs: Inputs, store: Store) -> Generator[Result, None, None]:
     """Yield the result of each cell when it ends."""
     while cells:
         busy = []
