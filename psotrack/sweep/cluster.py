@@ -12,7 +12,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import lru_cache
@@ -81,7 +81,9 @@ class _Job:
     token: str
 
 
-def run_on_cluster(cluster: Cluster, cells: list[Cell], inputs: Inputs, store: Store) -> Iterator[Result]:
+def run_on_cluster(
+    cluster: Cluster, cells: list[Cell], inputs: Inputs, store: Store
+) -> Generator[Result, None, None]:
     """Yield the result of each cell when it ends. Each cell waits for its silhouettes, one task per camera.
 
     Args:
