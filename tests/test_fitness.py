@@ -338,19 +338,6 @@ def numpy_fitness(rig, images, middle_m, size_m, settings):
     return np.average(scores, weights=weights)
 
 
-@jax.jit
-def _gradients(cameras, images, position_m, size_m, offset_m):
-    """(drones,) fitness, and the gradients of the drones' total fitness with respect to position, size and offset."""
-
-    def each(position_m, size_m, offset_m):
-        view = score_inputs(cameras, size_m, summed_area_table(images), SOFT, reduction=2, offset_m=offset_m)
-        fitness = drone_fitness(view, position_m)
-        return fitness.sum(), fitness
-
-    gradients, fitness = jax.grad(each, (0, 1, 2), has_aux=True)(position_m, size_m, offset_m)
-    return fitness, gradients
-
-
 BINARY = np.where(IMAGES > 127, 255, 0).astype(np.uint8)
 #: Silhouettes blurred so much that neighbouring pixels differ little.
 SMOOTH = scipy.ndimage.gaussian_filter(IMAGES.astype(float), (0, 2.5, 2.5)).round().astype(np.uint8)
@@ -358,65 +345,17 @@ SMOOTH = scipy.ndimage.gaussian_filter(IMAGES.astype(float), (0, 2.5, 2.5)).roun
 
 @pytest.mark.parametrize("images", [BINARY, SMOOTH], ids=["binary", "smooth"])
 @pytest.mark.parametrize("shift_m", [(0.07, 0.07, 0.07), (-0.05, 0.03, -0.02), (1.9, -1.1, 0.3)])
-def test_gradients_equal_those_of_the_oracle(images, shift_m):
-    """Gradients in position, size and offset, with windows inside the images and across their borders."""
+def test_fitness_equals_that_of_the_oracle(images, shift_m):
+    """With windows inside the images and across their borders, and middles beside the drones' positions."""
     place_m, offset_m = TRUTH_M + shift_m, np.array([[0.01, 0.02, -0.03], [0.0, -0.02, 0.04]])
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        value, gradients = _gradients(RIG.cameras, images, place_m, SIZES_M, offset_m)
-    of_place, of_size, of_offset = (np.asarray(gradient) for gradient in gradients)
-    # A drone whose windows are outside the images has a gradient of zero: what float64 leaves of it, far below 1 / m.
-    np.testing.assert_allclose(of_offset, of_place, rtol=1e-9, atol=1e-15)
+        tables = summed_area_table(images)
+        view = score_inputs(RIG.cameras, SIZES_M, tables, SOFT, reduction=2, offset_m=offset_m)
+        found = np.asarray(drone_fitness(view, place_m))
     for drone in range(2):
-
-        def oracle(off, larger, drone=drone):
-            middle_m = place_m[drone] + offset_m[drone] + off
-            return numpy_fitness(RIG, images, middle_m, SIZES_M[drone] + larger, SOFT)
-
-        assert value[drone] == pytest.approx(oracle(0, 0), abs=1e-9)
-        # Fitness is smooth, except for kinks where an edge is on a pixel's border. Borders are 2 cm apart, so that a
-        # step of a micrometre crosses none here. Curvature costs the square of the step, 1e-12, and rounding 1e-16 /
-        # 1e-6.
-        steps = 1e-6 * np.eye(3)
-        np.testing.assert_allclose(
-            of_place[drone], [(oracle(s, 0) - oracle(-s, 0)) / 2e-6 for s in steps], atol=1e-6
-        )
-        np.testing.assert_allclose(
-            of_size[drone], [(oracle(0, s) - oracle(0, -s)) / 2e-6 for s in steps], atol=1e-6
-        )
-        assert np.abs(of_place).max() > 0.05
-
-
-@jax.jit
-def _gradients_at(images, cameras, places_m, size_m, offset_m):
-    def value_and_gradients(position_m):
-        def total(position_m, size_m, offset_m):
-            view = score_inputs(
-                cameras, size_m, summed_area_table(images), SOFT, reduction=2, offset_m=offset_m
-            )
-            return joint_fitness(view, position_m)
-
-        return jax.value_and_grad(total, (0, 1, 2))(position_m, size_m, offset_m)
-
-    return jax.vmap(value_and_gradients)(places_m)
-
-
-@pytest.mark.parametrize("images", [IMAGES, 0 * IMAGES, 0 * IMAGES + 255], ids=["drones", "nothing", "all"])
-@pytest.mark.slow
-def test_gradients_are_finite_everywhere(images):
-    """Also where fitness is undefined: at a camera, behind a camera, at borders and outside all images."""
-    centre = RIG.cameras.centre_world[:4].reshape(2, 2, 3)
-    # A point on the right border of the first camera's image, at a depth of 3 m.
-    camera = RIG.cameras[0]
-    R, t_m = camera.T_cam_world[:3, :3], camera.T_cam_world[:3, 3]
-    edge = R.T @ (np.linalg.inv(camera.K) @ [319.5, 120, 1] * 3 - t_m)
-    places = [TRUTH_M[None], centre, centre * 1.5, particles(5, spread_m=2), np.zeros((1, 2, 3))]
-    places = np.concatenate([*places, np.stack([edge, edge + 0.1])[None]])
-    for size_m in (SIZES_M, 1e-3 * SIZES_M):
-        _, gradients = _gradients_at(images, *float32((RIG.cameras, places, size_m, 0 * size_m)))
-        assert all(np.isfinite(gradient).all() for gradient in gradients)
-    if images is IMAGES:
-        _, gradients = _gradients_at(images, *float32((RIG.cameras, places, SIZES_M, 0 * SIZES_M)))
-        assert min(np.abs(gradient[0]).max() for gradient in gradients) > 0
+        middle_m = place_m[drone] + offset_m[drone]
+        expected = numpy_fitness(RIG, images, middle_m, SIZES_M[drone], SOFT)
+        assert found[drone] == pytest.approx(expected, abs=1e-9)
 
 
 @settings(max_examples=15)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -164,17 +163,7 @@ def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxe
     Returns:
         Boxes with axes (..., cameras).
     """
-    x, y, z = (position_m[..., i : i + 1] for i in range(3))
-    return boxes_at(seen, x, y, z)
-
-
-def boxes_at(
-    seen: Extents,
-    x_m: Float[Array, "*#drones 1"],
-    y_m: Float[Array, "*#drones 1"],
-    z_m: Float[Array, "*#drones 1"],
-) -> Boxes:
-    """`project_boxes` for the coordinates of the positions one by one: a kernel cannot take columns of an array."""
+    x_m, y_m, z_m = (position_m[..., i : i + 1] for i in range(3))
     x, y, z = (
         seen.rotation[3 * i] * x_m
         + seen.rotation[3 * i + 1] * y_m
@@ -207,14 +196,14 @@ def _distorted_boxes(
     xx, xy, yx, yy = lens_derivative(seen.cameras.dist, seen.cameras.fisheye, x / z, y / z)
     slopes = (seen.f_x * xx + seen.skew * yx, seen.f_x * xy + seen.skew * yy), (yx, yy)
     # Without the barriers, XLA computes the derivative again for each side, and the sides for each number of a box.
-    slopes = _computed_once(seen, slopes)
+    slopes = jax.lax.optimization_barrier(slopes)
     columns, rows = (
         [distort(seen.cameras, *point) for point in _outermost(seen, middle, in_front, tangents, slope)]
         for slope in slopes
     )
     left, right = (seen.f_x * u + seen.skew * v + seen.c_x for u, v in columns)
     top, bottom = (seen.f_y * v + seen.c_y for _, v in rows)
-    left, right, top, bottom = _computed_once(seen, (left, right, top, bottom))
+    left, right, top, bottom = jax.lax.optimization_barrier((left, right, top, bottom))
     return Boxes(
         (left + right) / 2,
         (top + bottom) / 2,
@@ -222,12 +211,6 @@ def _distorted_boxes(
         (bottom - top) / 2,
         in_front & _is_shown(seen, middle, tangents),
     )
-
-
-def _computed_once(seen: Extents, values: Any) -> Any:
-    """The values behind a barrier; in a kernel, which has no barriers, as they are."""
-    in_kernel = isinstance(seen.cameras.dist, jax.Ref)
-    return values if in_kernel else jax.lax.optimization_barrier(values)
 
 
 def _outermost(

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     Array = np.ndarray | jax.Array
 else:
     # NumPy turns arrays without axes into scalars. Static type checkers do not get them: scalars cannot be indexed.
-    # A kernel (`psotrack.tracking.swarm.kernel`) reads its arrays through references.
-    Array = np.ndarray | np.generic | jax.Array | jax.Ref
+    Array = np.ndarray | np.generic | jax.Array
 
 Key = PRNGKeyArray
 Coverage = UInt8[Array, "cameras height width"]

@@ -4,12 +4,12 @@ from .births import (
     WINDOW_FRAMES,
     BirthRules,
     Births,
+    FlightLimits,
     KnownDrones,
     TrackCandidate,
     state_at,
 )
-from .common_sightings import CommonSightings, count_common
-from .cut_off import find_cut_off, find_outside
+from .cut_off import count_common, find_cut_off, find_outside
 from .initial_state import (
     InitialState,
     StartSource,
@@ -41,7 +41,7 @@ __all__ = [
     "WINDOW_FRAMES",
     "BirthRules",
     "Births",
-    "CommonSightings",
+    "FlightLimits",
     "FlightVolume",
     "FrameBlobs",
     "InitialState",

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, viewpoints
 from psotrack.settings import USUAL_SPEED_M_S
-from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, TrackCandidate
+from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, FlightLimits, TrackCandidate
 from psotrack.tracking.births.initial_state import room_bounds
 from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
 
@@ -114,10 +114,8 @@ def flight_volume(
         max_speed_m_s: given speed limit, m/s.
     """
     found = points if points is not None and len(points) else None
-    room_m, bounds_from = room_bounds(rig), "cameras"
-    if bounds_m is not None:
-        room_m, bounds_from = np.array(bounds_m, np.float64).reshape(3, 2).T, "given"
-    elif found is not None:
+    room_m, bounds_from = room_bounds(rig, bounds_m), "cameras" if bounds_m is None else "given"
+    if bounds_m is None and found is not None:
         extended_m = _extended(rig, room_m, found)
         if (extended_m != room_m).any():
             room_m, bounds_from = extended_m, "cameras and moving points"
@@ -207,16 +205,10 @@ def _find(
     last = 0 if not len(frames) else int(frames[-1])
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
     chosen = np.linspace(0, len(starts) - 1, min(WINDOWS, len(starts))).round().astype(int)
-    points = []
+    points, limits = [], FlightLimits(fps / step, wide_bounds(rig), FASTEST_M_S)
     for first in starts[np.unique(chosen)].tolist():
         sightings = read(np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step))
-        births = Births(
-            rig.cameras,
-            rules,
-            fps=fps / step,
-            bounds_m=wide_bounds(rig),
-            max_speed_m_s=FASTEST_M_S,
-        )
+        births = Births(rig.cameras, limits, rules)
         for number in range(sightings.num_frames):
             births.step(number, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
         points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]

@@ -13,6 +13,7 @@ any frame of a block (`TrackStarts`), which fills a slot.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,7 +25,6 @@ from psotrack.geometry import Camera, Extents, make_extents, project_boxes
 from psotrack.support.array_types import Array, Key, Positions
 from psotrack.tracking.motion import MotionParams, MotionState, kalman
 from psotrack.tracking.swarm.fitness import (
-    DroneFitness,
     Score,
     ScoreInputs,
     SoftIoU,
@@ -223,12 +223,6 @@ def empty_slots(key: Key, count: int, params: TrackerParams) -> Slots:
         first_size_m=size_m,
         size_frames=jnp.zeros((count, 3), jnp.int32),
     )
-
-
-def no_track_starts(count: int) -> TrackStarts:
-    """No track starts."""
-    zero = jnp.zeros((count, 3), jnp.float32)
-    return TrackStarts(jnp.full(count, -1, jnp.int32), zero, zero, zero)
 
 
 def step(
@@ -483,8 +477,7 @@ def _search(
     def together(position: Array) -> Array:
         return joint_fitness(inputs, position.reshape(first.shape), slots.present)[:, None]
 
-    objective = together if program.joint else DroneFitness(inputs)
-
+    objective = together if program.joint else partial(drone_fitness, inputs)
     of_groups = SearchRegion(
         low=region.low.reshape(groups),
         high=region.high.reshape(groups),
