@@ -494,7 +494,7 @@ class TestFilteredVariance:
         measured[90:, 2] = np.nan
         errors = only_noise(np.ones((4, 2)), Fading(0.3, 0.7, 0.0, 0.4))
         ratio, filtered = noise_ratios(
-            measured, noise, errors, MotionSettings(error_share=0.7, error_time_s=0.4), 25
+            measured, noise, errors, MotionSettings(error_share=0.7, error_time_s=0.4), 25.0
         )
         np.testing.assert_allclose(ratio[:, :2], np.tile([0.25, 1.0], (100, 1)))
         np.testing.assert_allclose(ratio[[0, 30, 70, 89, 99], 2], [0.25, 0.25, 1.0, 1.0, 1.0])

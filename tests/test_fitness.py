@@ -240,16 +240,6 @@ def particles(count, seed=0, spread_m=0.2):
 
 
 @SETTINGS
-def test_permuting_particles_permutes_fitness(settings):
-    position_m = particles(11)
-    order = np.random.default_rng(1).permutation(11)
-    fitness = evaluate(drone_fitness, RIG, IMAGES, position_m, SIZES_M, settings)
-    permuted = evaluate(drone_fitness, RIG, IMAGES, position_m[order], SIZES_M, settings)
-    assert len(np.unique(fitness)) > 11
-    np.testing.assert_array_equal(permuted, fitness[order])
-
-
-@SETTINGS
 def test_particles_and_drones_do_not_interact(settings):
     position_m = particles(11)
     fitness = evaluate(drone_fitness, RIG, IMAGES, position_m, SIZES_M, settings)

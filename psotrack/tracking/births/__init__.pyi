@@ -20,7 +20,7 @@ from .initial_state import (
     start_source,
     state_at_first_frame,
 )
-from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
+from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_points
 from .reidentification import (
     NEW,
     NO_DRONE,
@@ -59,8 +59,7 @@ __all__ = [
     "flight_volume",
     "given_state",
     "known_motion",
-    "moving_blobs",
-    "moving_detections",
+    "moving_points",
     "reidentify",
     "room_bounds",
     "start_source",

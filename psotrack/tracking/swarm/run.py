@@ -342,7 +342,8 @@ class SwarmRun:
 
     def forget(self, oldest: int) -> None:
         """Empty the slots of drones that were not seen since an instant, and of tracks that follow no drone."""
-        present, now = np.asarray(self.slots.present), int(self._memory[-1].instant[-1])
+        present = np.asarray(self.slots.present)
+        now = int(self._memory[-1].instant[-1]) if self._memory else -1
         for slot in self.known:
             # A track that is to begin is not there yet, and may stand in a slot that the next block will add.
             last = self._past[slot].last
