@@ -121,7 +121,7 @@ axes.legend(ncols=4, frameon=False)
 plt.show()
 
 # %% [markdown]
-# *What to see: each drone's distance from the ground truth, frame by frame. Each curve keeps a constant height: the
+# *What to see: each drone's distance from the ground truth, frame by frame. Each curve stays near one height: the
 # offset between the body's origin, which the ground truth describes, and the silhouette's middle, which cameras show.
 # The offset is constant in each drone's body, and the setting `drones.body_offset_m` removes it; the column "centred" of
 # the table is the error without it. Gaps would be frames in which a drone is missed.*

@@ -65,9 +65,8 @@ def report(
     out: Path | None,
     compare: tuple[Path, ...],
     no_pictures: bool,
-    layout: str | None,
     jobs: int | None,
-    **labels: str | float | None,
+    **table: Any,
 ) -> None:
     """Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.
 
@@ -88,8 +87,8 @@ def report(
     """
     from psotrack import api
 
-    if layout is not None:
-        click.echo(_table(source, layout, **labels))  # type: ignore[arg-type]
+    if table["layout"] is not None:
+        click.echo(_table(source, **table))
         return
     written = api.report(
         [source, *compare],

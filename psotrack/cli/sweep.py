@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import click
+from msgspec import Meta
 
 from psotrack.cli.options import (
     CACHE,
@@ -18,9 +21,24 @@ from psotrack.cli.options import (
     reporting,
 )
 from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import SettingsError
-from psotrack.support import Device
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where the cells run.
+
+    Attributes:
+        cluster: run the cells on a Dask cluster: local starts a cluster on this machine; ADDRESS names a running
+            scheduler.
+        workers: number of processes of --cluster local; None: one per processor; one with --device gpu.
+        device: device that computes; None: JAX's choice.
+    """
+
+    cluster: Annotated[str, Meta(extra={"metavar": "local|ADDRESS"})] | None = None
+    workers: Annotated[int, Meta(ge=1)] | None = None
+    device: Literal["cpu", "gpu"] | None = None
 
 
 @click.command(cls=HelpfulCommand)
@@ -44,19 +62,7 @@ from psotrack.support import Device
     metavar="DIR",
     help="Print the numbers of finished, failed and locked cells in DIR and the processes at work; run nothing.",
 )
-@click.option(
-    "--cluster",
-    metavar="local|ADDRESS",
-    help="Run the cells on a Dask cluster: local starts a cluster on this machine; ADDRESS names a running scheduler.",
-)
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Number of processes of --cluster local.  [default: one per processor; one with --device gpu]",
-)
-@click.option(
-    "--device", type=click.Choice(["cpu", "gpu"]), help="Device that computes.  [default: JAX's choice]"
-)
+@options_of(Where, "where")
 @CACHE
 @JOBS
 @reporting
@@ -70,11 +76,8 @@ def sweep(
     data: Path,
     dry_run: bool,
     status: Path | None,
-    cluster: str | None,
-    workers: int | None,
-    device: Device | None,
-    cache: Path | None,
-    jobs: int | None,
+    where: Where,
+    **running: Any,
 ) -> None:
     """Track with every combination of a grid's settings, and keep one row per run.
 
@@ -95,7 +98,7 @@ def sweep(
         return
     if grid_file is None:
         raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
-    if workers is not None and cluster is None:
+    if where.workers is not None and where.cluster is None:
         raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
     from psotrack.support import keep_compiled, share_processors, use_device
     from psotrack.sweep import Cluster, Inputs, Store, plan, read_grid
@@ -105,22 +108,24 @@ def sweep(
         if not output.quiet:
             click.echo(f"the cluster listens at {address}, for programs on this computer only", err=True)
 
-    where = None if cluster is None else Cluster(cluster, workers, device, say)
+    cluster, cache = None, cache_folder(running["cache"])
+    if where.cluster is not None:
+        cluster = Cluster(where.cluster, where.workers, where.device, say)
     grid = read_grid(grid_file)
     out = out or grid_file.with_name(f"{grid_file.stem}_results")
     if dry_run:
-        inputs = Inputs(data, cache_folder(cache), jobs)
+        inputs = Inputs(data, cache, running["jobs"])
         output.result(plan(grid, inputs, Store(out) if out.is_dir() else None))
         return
-    if where is not None:
+    if cluster is not None:
         use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
     else:
         share_processors()
-        if device is not None:
-            use_device(device)
+        if where.device is not None:
+            use_device(where.device)
         keep_compiled(compiled_folder(cache))
     outcome = run(
-        grid, out, data=data, cache=cache_folder(cache), jobs=jobs, cluster=where, progress=output.report
+        grid, out, data=data, cache=cache, jobs=running["jobs"], cluster=cluster, progress=output.report
     )
     output.result(outcome)
     if outcome.count("failed"):
