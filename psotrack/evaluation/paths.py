@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack.evaluation.records import PathErrors
-from psotrack.geometry import similarity
+from psotrack.support import similarity
 
 #: Time between the two poses of a relative pose error, seconds.
 RPE_SPAN_S = 1.0

@@ -18,7 +18,7 @@ from .image_fit import project_with_jacobian, to_pixels_with_jacobian
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
 from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, LensNumbers, distort
 from .reprojection import reconstruct, triangulate
-from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices, similarity
+from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
 from .triangulation import (
     MAX_CONDITION,
@@ -61,7 +61,6 @@ __all__ = [
     "projection_equations",
     "reconstruct",
     "rotation_matrices",
-    "similarity",
     "sizes_m",
     "sizes_px",
     "to_camera",

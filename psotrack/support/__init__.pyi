@@ -50,6 +50,7 @@ from .schema import (
     toml_value,
     write_toml,
 )
+from .similarity import similarity
 from .standard_errors import standard_error
 from .times import LEAST_STEP_S, first_repeat
 
@@ -125,6 +126,7 @@ __all__ = [
     "share_processors",
     "short_repr",
     "short_text",
+    "similarity",
     "standard_error",
     "terminal_bar",
     "toml_key",

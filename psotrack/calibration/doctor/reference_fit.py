@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import similarity
+from psotrack.support import similarity
 from psotrack.trajectories import Trajectories
 
 #: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to

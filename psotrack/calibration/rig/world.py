@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import InputError
-from psotrack.geometry import Rig, similarity
+from psotrack.geometry import Rig
+from psotrack.support import similarity
 
 #: Points are on a line if their second extent is below this share of the first one.
 _FLAT = 0.01
@@ -58,7 +59,7 @@ def world_of_camera(rig: Rig, index: int, factor: float = 1.0) -> Similarity:
 def align(
     found_m: Float[np.ndarray, "points 3"], given_m: Float[np.ndarray, "points 3"], *, with_scale: bool
 ) -> tuple[Similarity, Float[np.ndarray, " points"]]:
-    """The change of the world that brings points nearest to where they are (see `geometry.similarity`).
+    """The change of the world that brings points nearest to where they are (see `support.similarity`).
 
     Args:
         found_m: (points, 3), points in the rig's world.
