@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 from psotrack.geometry.estimation import (
     Damping,
     NormalEquations,
-    Step,
     backward_step,
     cauchy_loss,
     cauchy_weight,
@@ -203,14 +202,6 @@ def test_steps_with_changing_weights_converge():
     assert found.std == pytest.approx(0.2, rel=0.2)
     once = gauss_newton(Scale(values, 0.0, 100.0), max_steps=1)
     assert once.mean == pytest.approx(values.mean())
-
-
-def test_a_step_has_the_shape_of_its_equations():
-    equations, _, _ = coupled_equations(8)
-    step = equations.solved()
-    assert isinstance(step, Step)
-    assert step.shared.shape == (4,)
-    assert step.blocks.shape == (5, 3)
 
 
 @pytest.mark.parametrize("xp", [np, jnp])

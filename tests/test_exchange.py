@@ -695,6 +695,11 @@ def test_tracks_without_a_rate_need_a_recording(tmp_path):
     export_tracks(small_tracks(), "mot", tmp_path / "mot.txt")
     with pytest.raises(InputError, match="name SEQ, too"):
         read_tracks(tmp_path / "mot.txt")
+    (tmp_path / "seqinfo.ini").write_text("[Sequence]\nframeRate=10\n")
+    (tmp_path / "mot.txt").write_text("1,12,-1,-1,-1,-1,1,1,2,3\n4,7,-1,-1,-1,-1,1,4,5,6\n")
+    read = read_tracks(tmp_path / "mot.txt")
+    assert (read.drones, read.frame.tolist(), read.time_s.tolist()) == (("7", "12"), [0, 3], [0.0, 0.3])
+    assert read.position_m[1, 0].tolist() == [4, 5, 6]
     shutil.rmtree(tmp_path, ignore_errors=True)
     export_tracks(small_tracks(), "kitti", tmp_path / "kitti")
     shutil.rmtree(tmp_path / "kitti" / "sequences")

@@ -1,5 +1,6 @@
 """Files of other programs, made after the documents of their formats; each is projected by a formula of its own."""
 
+import json
 import re
 
 import cv2
@@ -149,29 +150,35 @@ def test_lenses_of_a_stereo_pair_need_no_second_file(tmp_path):
         read_rig(tmp_path / "intrinsics.yml", SIZE_WH)
 
 
+def json_file(folder):
+    """Cameras by name, as multiview_calib writes them."""
+    fields = [
+        {"K": K.tolist(), "dist": [*RADTAN], "image_shape": [720, 1280], "R": R.tolist(), "t": t.tolist()}
+        for R, t in poses()
+    ]
+    (folder / "rig.json").write_text(json.dumps(dict(zip(("6-0", "left"), fields, strict=True)), indent=1))
+
+
 def test_cameras_by_name_in_json(tmp_path):
-    path = tmp_path / "rig.json"
-    rows = []
-    for name, (R, t) in zip(("6-0", "left"), poses(), strict=True):
-        rows.append(
-            f'"{name}": {{"K": {lists(K)}, "dist": {lists(RADTAN)}, "image_shape": [720, 1280], "R": {lists(R)},'
-            f' "t": {lists(t)}}}'
-        )
-    path.write_text("{" + ",".join(rows) + "}")
-    rig = read_rig(path, metres_per_unit=1.0)
+    json_file(tmp_path)
+    rig = read_rig(tmp_path / "rig.json", metres_per_unit=1.0)
     assert rig.names == ("6-0", "left")
     assert rig.cameras.image_size_wh.tolist() == [[1280, 720]] * 2
     assert_projects(rig, [by_opencv(R, t, K, RADTAN) for R, t in poses()])
 
 
+def ros_text(model="plumb_bob"):
+    return (
+        "image_width: 1280\nimage_height: 720\ncamera_name: head_camera\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        f"  data: [{numbers(K)}]\ndistortion_model: {model}\ndistortion_coefficients:\n  rows: 1\n  cols: 4\n"
+        f"  data: [{numbers(RADTAN)}]\nrectification_matrix:\n  rows: 3\n  cols: 3\n  data: [{numbers(np.eye(3))}]\n"
+    )
+
+
 @pytest.mark.parametrize(("model", "fisheye"), [("plumb_bob", False), ("equidistant", True)])
 def test_the_camera_info_of_ros(tmp_path, model, fisheye):
     path = tmp_path / "head.yaml"
-    path.write_text(
-        f"image_width: 1280\nimage_height: 720\ncamera_name: head_camera\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-        f"  data: [{numbers(K)}]\ndistortion_model: {model}\ndistortion_coefficients:\n  rows: 1\n  cols: 4\n"
-        f"  data: [{numbers(RADTAN)}]\n"
-    )
+    path.write_text(ros_text(model))
     lenses = read_lenses(path)
     assert lenses.names == ("head_camera",)
     np.testing.assert_array_equal(lenses.cameras.K[0], K)
@@ -485,12 +492,16 @@ def dlt_columns(*, upwards, skew=0.0):
     return np.array(columns)
 
 
+def dlt_file(path, columns, separator=","):
+    path.write_text("\n".join(separator.join(map(repr, row)) for row in np.array(columns).T.tolist()))
+
+
 @pytest.mark.parametrize("upwards", [False, True])
 @pytest.mark.parametrize("separator", [",", "\t", "  "])
 def test_dlt_coefficients(tmp_path, upwards, separator):
     columns = dlt_columns(upwards=upwards, skew=0.5)
     path = tmp_path / "dltcoefs.csv"
-    path.write_text("\n".join(separator.join(map(repr, row)) for row in columns.T.tolist()))
+    dlt_file(path, columns, separator)
     with pytest.raises(InputError, match="pass --size"):
         read_rig(path)
     with pytest.raises(InputError, match=r"because the file leaves it open; state m or cm or mm"):
@@ -513,7 +524,8 @@ def test_a_camera_with_the_origin_behind_it_is_turned_round(tmp_path):
     P = K @ np.column_stack([R, t])
     columns.append((P / P[2, 3]).ravel()[:11])
     path = tmp_path / "dlt.csv"
-    path.write_text("a,b,c\n" + "\n".join(",".join(map(repr, row)) for row in np.array(columns).T.tolist()))
+    dlt_file(path, columns)
+    path.write_text("a,b,c\n" + path.read_text())
     rig = read_rig(path, SIZE_WH, metres_per_unit=1.0)
     assert rig.names == ("a", "b", "c")
     np.testing.assert_allclose(rig.cameras.T_cam_world[2, :3], np.column_stack([R, t]), atol=1e-9)
@@ -553,14 +565,17 @@ def test_the_lenses_of_argus(tmp_path):
 # --------------------------------------------------------------------------------------------------- handpose3d
 
 
-def test_text_blocks_of_handpose3d(tmp_path):
+def handpose_files(folder):
     for index, (R, t) in enumerate(poses()):
         rows = ["intrinsic:", *(" ".join(map(repr, row)) for row in K.tolist()), "distortion:"]
-        (tmp_path / f"c{index}.dat").write_text("\n".join([*rows, " ".join(map(repr, RADTAN)) + " 0.0"]))
+        (folder / f"c{index}.dat").write_text("\n".join([*rows, " ".join(map(repr, RADTAN)) + " 0.0"]))
         rows = ["R:", *(" ".join(map(repr, row)) for row in R.tolist()), "T:", *map(repr, t.tolist())]
-        (tmp_path / f"rot_trans_c{index}.dat").write_text(
-            "\n".join([*rows, "", "#below is another", "R:", "1 0 0"])
-        )
+        another = ["", "#below is another", "R:", "1 0 0"]
+        (folder / f"rot_trans_c{index}.dat").write_text("\n".join([*rows, *another]))
+
+
+def test_text_blocks_of_handpose3d(tmp_path):
+    handpose_files(tmp_path)
     for name in ("c0.dat", "rot_trans_c1.dat"):
         rig = read_rig(tmp_path / name, SIZE_WH, metres_per_unit=1.0)
         assert rig.names == ("cam0", "cam1")

@@ -1,10 +1,7 @@
 """Errors of whole paths, as in benchmarks of SLAM: absolute trajectory error (ATE) and relative pose error (RPE).
 
-References:
-    J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, A Benchmark for the Evaluation of RGB-D SLAM
-    Systems, IROS 2012 (ATE, RPE).
-    S. Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns, IEEE Transactions
-    on Pattern Analysis and Machine Intelligence 13 (4), 1991 (the alignment).
+J. Sturm, N. Engelhard, F. Endres, W. Burgard, D. Cremers, A Benchmark for the Evaluation of RGB-D SLAM Systems,
+IROS 2012.
 """
 
 from __future__ import annotations
@@ -14,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from psotrack.evaluation.records import PathErrors
+from psotrack.support import similarity
 
 #: Time between the two poses of a relative pose error, seconds.
 RPE_SPAN_S = 1.0
@@ -46,10 +44,13 @@ def path_errors(
     residual_m = est_m - ref_m
     known = np.isfinite(residual_m).all(axis=-1)
     first, second = later
-    aligned_m = align_rigidly(est_m[known], ref_m[known])
+    off_m = np.empty((0, 3))
+    if known.any():
+        _, R, shift_m = similarity(est_m[known], ref_m[known], with_scale=False)
+        off_m = est_m[known] @ R.T + shift_m - ref_m[known]
     return PathErrors(
         ate_rmse_m=_rmse(np.linalg.norm(residual_m, axis=-1)),
-        ate_aligned_rmse_m=_rmse(np.linalg.norm(aligned_m - ref_m[known], axis=-1)),
+        ate_aligned_rmse_m=_rmse(np.linalg.norm(off_m, axis=-1)),
         # The difference of two displacements is the displacement of the residual.
         rpe_1s_rmse_m=_rmse(np.linalg.norm(residual_m[second] - residual_m[first], axis=-1)),
         rpe_1s_rotation_rmse_deg=_rmse(_turn_errors_deg(orientation_est_wxyz, orientation_wxyz, later)),
@@ -70,20 +71,6 @@ def rows_apart(
     row = np.minimum(np.searchsorted(frame, wanted), len(frame) - 1)
     first = np.flatnonzero(frame[row] == wanted)
     return np.stack([first, row[first]])
-
-
-def align_rigidly(
-    from_m: Float[np.ndarray, "points 3"], to_m: Float[np.ndarray, "points 3"]
-) -> Float[np.ndarray, "points 3"]:
-    """Apply to `from_m` the rigid motion that aligns it best with `to_m` (Umeyama 1991, without scale)."""
-    if not len(from_m):
-        return from_m
-    from_middle_m, to_middle_m = from_m.mean(axis=0), to_m.mean(axis=0)
-    # Equations 38 to 43.
-    U, _, Vt = np.linalg.svd((to_m - to_middle_m).T @ (from_m - from_middle_m))
-    no_reflection = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = U @ no_reflection @ Vt
-    return (from_m - from_middle_m) @ R.T + to_middle_m
 
 
 def _turn_errors_deg(

@@ -60,6 +60,7 @@ from .schema import (
     toml_value,
     write_toml,
 )
+from .similarity import similarity
 from .standard_errors import standard_error
 from .text_tables import POSITION, finite_or_none, format_numbers, text_table
 from .times import LEAST_STEP_S, first_repeat
@@ -145,6 +146,7 @@ __all__ = [
     "share_processors",
     "short_repr",
     "short_text",
+    "similarity",
     "standard_error",
     "terminal_bar",
     "text_table",

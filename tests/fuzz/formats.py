@@ -104,39 +104,6 @@ def _text(file: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / file).write_text(text, encoding="utf-8")
 
 
-def _named_json(folder: Path) -> None:
-    fields = [
-        {
-            "K": rigs.K.tolist(),
-            "dist": [*rigs.RADTAN],
-            "image_shape": [720, 1280],
-            "R": R.tolist(),
-            "t": t.tolist(),
-        }
-        for R, t in rigs.poses()
-    ]
-    (folder / "rig.json").write_text(json.dumps(dict(zip(("6-0", "left"), fields, strict=True)), indent=1))
-
-
-def _dlt(folder: Path) -> None:
-    rows = rigs.dlt_columns(upwards=True).T.tolist()
-    (folder / "dlt.csv").write_text("\n".join(",".join(map(repr, row)) for row in rows))
-
-
-def _handpose(folder: Path) -> None:
-    for index, (R, t) in enumerate(rigs.poses()):
-        rows = ["intrinsic:", *(" ".join(map(repr, row)) for row in rigs.K.tolist()), "distortion:"]
-        (folder / f"c{index}.dat").write_text("\n".join([*rows, " ".join(map(repr, rigs.RADTAN)) + " 0.0"]))
-        rows = ["R:", *(" ".join(map(repr, row)) for row in R.tolist()), "T:", *map(repr, t.tolist())]
-        (folder / f"rot_trans_c{index}.dat").write_text("\n".join(rows))
-
-
-_ROS = (
-    "image_width: 1280\nimage_height: 720\ncamera_name: head_camera\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-    f"  data: [{rigs.numbers(rigs.K)}]\ndistortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n"
-    f"  cols: 4\n  data: [{rigs.numbers(rigs.RADTAN)}]\nrectification_matrix:\n  rows: 3\n  cols: 3\n"
-    f"  data: [{rigs.numbers(np.eye(3))}]\n"
-)
 _VICON = 'VICON_RADIAL2="ViconRadial2 650.5 350.25 0.06 -0.01"'
 _CALIBRATIONS = {
     "rig.toml": _written("rig.toml"),
@@ -151,19 +118,21 @@ _CALIBRATIONS = {
         ),
         "cameras.csv",
     ),
-    "opencv-json": _calibration(_named_json, "rig.json", "m"),
+    "opencv-json": _calibration(rigs.json_file, "rig.json", "m"),
     "opencv-stereo-yaml": _calibration(rigs.storage_files, "extrinsics.yml", "m"),
     "opencv-stereo-xml": _calibration(rigs.storage_files, "intrinsics.xml", "m"),
-    "ros": _only_lenses("head.yaml", _ROS),
+    "ros": _only_lenses("head.yaml", rigs.ros_text()),
     "pose2sim": _calibration(lambda folder: rigs.pose2sim_file(folder / "calib.toml"), "calib.toml"),
     "qualisys": _calibration(lambda folder: rigs.qualisys_file(folder / "a.qca.txt"), "a.qca.txt"),
     "vicon": _calibration(lambda folder: rigs.vicon_file(folder / "a.xcp", _VICON), "a.xcp"),
     "easymocap-lenses": _calibration(rigs.easymocap_files, "intri.yml"),
     "easymocap-poses": _calibration(rigs.easymocap_files, "extri.yml"),
     "kalibr": _calibration(lambda folder: rigs.kalibr_file(folder / "camchain.yaml"), "camchain.yaml"),
-    "dlt": _calibration(_dlt, "dlt.csv", "m"),
-    "handpose-lenses": _calibration(_handpose, "c0.dat", "m"),
-    "handpose-poses": _calibration(_handpose, "rot_trans_c1.dat", "m"),
+    "dlt": _calibration(
+        lambda folder: rigs.dlt_file(folder / "dlt.csv", rigs.dlt_columns(upwards=True)), "dlt.csv", "m"
+    ),
+    "handpose-lenses": _calibration(rigs.handpose_files, "c0.dat", "m"),
+    "handpose-poses": _calibration(rigs.handpose_files, "rot_trans_c1.dat", "m"),
     "argus": _only_lenses(
         "profile.txt",
         "1 1165.5 1920 1080 960 540 1 -0.2 0.05 0.001 0.002 0.01\n2 800 1280 720 640 360 1 0 0 0 0 0\n",

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from psotrack.support import similarity
 from psotrack.trajectories import Trajectories
 
 #: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to
@@ -130,18 +131,7 @@ def _iterated(
         kept = distance <= 2 * np.median(distance)
         if not np.isfinite(distance[kept]).all() or kept.sum() < 4:
             break
-        scale, R, shift_m = _similarity(point_m[kept], nearest_m[kept], np.sign(np.linalg.det(start)))
+        mirrored = bool(np.linalg.det(start) < 0)
+        scale, R, shift_m = similarity(point_m[kept], nearest_m[kept], mirrored=mirrored)
     distance = _nearest(scale * point_m @ R.T + shift_m, reference_m)[1]
     return float(np.median(distance)) / max(scale, 1e-9), scale, R, shift_m
-
-
-def _similarity(
-    from_m: np.ndarray, to_m: np.ndarray, handedness: float
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Fit a similarity of the given handedness by least squares (S. Umeyama, PAMI 1991)."""
-    a, b = from_m - from_m.mean(axis=0), to_m - to_m.mean(axis=0)
-    U, singular, Vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, handedness * np.linalg.det(U @ Vt)])
-    R = U @ np.diag(signs) @ Vt
-    scale = float((singular * signs).sum() / max((a**2).sum(), 1e-300))
-    return scale, R, to_m.mean(axis=0) - scale * R @ from_m.mean(axis=0)

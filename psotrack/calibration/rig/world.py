@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.geometry import Rig
+from psotrack.support import similarity
 
 #: Points are on a line if their second extent is below this share of the first one.
 _FLAT = 0.01
@@ -58,7 +59,7 @@ def world_of_camera(rig: Rig, index: int, factor: float = 1.0) -> Similarity:
 def align(
     found_m: Float[np.ndarray, "points 3"], given_m: Float[np.ndarray, "points 3"], *, with_scale: bool
 ) -> tuple[Similarity, Float[np.ndarray, " points"]]:
-    """The change of the world that brings points nearest to where they are (Umeyama, PAMI 13(4), 1991).
+    """The change of the world that brings points nearest to where they are (see `support.similarity`).
 
     Args:
         found_m: (points, 3), points in the rig's world.
@@ -73,8 +74,7 @@ def align(
     """
     if len(found_m) < LEAST_POINTS:
         raise InputError("world", expected="three or more points that the rig knows", found=f"{len(found_m)}")
-    middles = found_m.mean(axis=0), given_m.mean(axis=0)
-    first, second = found_m - middles[0], given_m - middles[1]
+    first, second = found_m - found_m.mean(axis=0), given_m - given_m.mean(axis=0)
     causes = (
         (second, "", ""),
         (
@@ -92,9 +92,6 @@ def align(
                 found=f"{len(found_m)} on a line{as_known}",
                 remedy=remedy,
             )
-    U, strength, V = np.linalg.svd(second.T @ first)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ V))])
-    R = U * sign @ V
-    scale = float(strength @ sign / np.sum(first**2)) if with_scale else 1.0
-    change = Similarity(R, middles[1] - scale * R @ middles[0], scale)
+    scale, R, shift_m = similarity(found_m, given_m, with_scale=with_scale)
+    change = Similarity(R, shift_m, scale)
     return change, np.linalg.norm(change.points(found_m) - given_m, axis=-1)

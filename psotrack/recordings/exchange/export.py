@@ -10,7 +10,7 @@ import numpy as np
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.exchange.camera_boxes import Footage
-from psotrack.recordings.exchange.formats import FORMATS, NAMES, QUANTITIES, STATUS, TIMES, TrackFormat
+from psotrack.recordings.exchange.formats import FORMATS, NAMES, PHRASES, STATUS, TIMES, TrackFormat
 from psotrack.recordings.exchange.timed_paths import interval_s
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 from psotrack.trajectories import Status, Trajectories
@@ -74,7 +74,7 @@ def _lost_quantities(trajectories: Trajectories, form: TrackFormat) -> list[str]
         NAMES: trajectories.drones != tuple(str(k + 1) for k in range(trajectories.num_drones)),
         # Frame numbers and a rate say the same as times of equal distance.
         TIMES: len(frame) > 0 and np.abs(time_s - frame * interval_s(trajectories)).max() > 1e-6,
-        **{name: bool(np.isfinite(values.get(key, np.nan)).any()) for name, key in QUANTITIES.items()},
+        **{name: bool(np.isfinite(values.get(key, np.nan)).any()) for name, key in PHRASES.items()},
         STATUS: bool((values.get("status", np.array(Status.LOST)) == Status.COASTING).any()),
     }
     lost = [name for name, is_known in known.items() if is_known and name not in form.holds]

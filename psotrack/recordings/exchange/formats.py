@@ -20,7 +20,7 @@ from psotrack.trajectories import Trajectories, read_trajectories, write_traject
 from psotrack.trajectories.tum import read_tum, tum_text, write_tum
 
 #: What some formats cannot hold, as messages name it: quantities of `Trajectories`, and what is no such quantity.
-QUANTITIES = {
+PHRASES = {
     "orientations": "orientation_wxyz",
     "covariances": "covariance_m2",
     "covariances without constant errors": "relative_covariance_m2",
@@ -30,7 +30,7 @@ QUANTITIES = {
 }
 NAMES, TIMES, STATUS = "names of drones", "times", "status"
 _POSES = frozenset({NAMES, TIMES, "orientations"})
-_ALL = frozenset({NAMES, TIMES, *QUANTITIES, STATUS})
+_ALL = frozenset({NAMES, TIMES, *PHRASES, STATUS})
 #: Numbers per line of a TUM file and of a KITTI file; more than 6 with commas are MOT.
 _TUM, _KITTI = 8, 12
 #: Writes tracks to a path, and returns what is missing in it as noun phrases.

@@ -12,20 +12,20 @@ from psotrack.errors import InputError, PsotrackError
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.support import Report, read_json
-from psotrack.trajectories import Status, Trajectories, check_cells
+from psotrack.trajectories import QUANTITIES, Status, Trajectories, check_cells
 
 #: Value of the key `format`, and version of the keys' meaning.
 NAME, VERSION = "psotrack tracks", 1
-#: Quantities of a drone with one value per frame: unit, and shape of a value.
-QUANTITIES: dict[str, tuple[str, tuple[int, ...]]] = {
-    "position_m": ("m", (3,)),
-    "velocity_m_s": ("m/s", (3,)),
-    "orientation_wxyz": ("unit quaternion, body to world", (4,)),
-    "fitness": ("1", ()),
-    "num_cameras": ("1", ()),
-    "status": ("tracked, coasting or lost", ()),
-    "covariance_m2": ("m2", (3, 3)),
-    "relative_covariance_m2": ("m2", (3, 3)),
+#: Units of the quantities of a drone.
+UNITS = {
+    "position_m": "m",
+    "velocity_m_s": "m/s",
+    "orientation_wxyz": "unit quaternion, body to world",
+    "fitness": "1",
+    "num_cameras": "1",
+    "status": "tracked, coasting or lost",
+    "covariance_m2": "m2",
+    "relative_covariance_m2": "m2",
 }
 _STATUS = {status.label: int(status) for status in Status}
 
@@ -34,14 +34,12 @@ def write_json_tracks(
     path: Path, trajectories: Trajectories, footage: Footage | None, report: Report
 ) -> list[str]:
     """Write all quantities of trajectories; numbers have all digits."""
-    known = {
-        name: getattr(trajectories, name) for name in QUANTITIES if getattr(trajectories, name) is not None
-    }
+    known = trajectories.quantities()
     content = {
         "format": NAME,
         "version": VERSION,
         "axes": "world of the calibration, z up",
-        "units": {"frame": "1", "time_s": "s"} | {name: QUANTITIES[name][0] for name in known},
+        "units": {"frame": "1", "time_s": "s"} | {name: UNITS[name] for name in known},
         "frame": trajectories.frame.tolist(),
         "time_s": trajectories.time_s.tolist(),
         "drones": [
@@ -96,13 +94,14 @@ def _plain(name: str, values: np.ndarray) -> list[Any]:
 
 def _stacked(name: str, drones: list[dict[str, Any]], frames: int) -> np.ndarray | None:
     """(frames, drones, ...), values of all drones; None if no drone has the quantity."""
-    shape = QUANTITIES[name][1]
     if not any(name in drone for drone in drones):
         if name == "position_m":
             raise KeyError(name)
         return None
     whole = name in ("status", "num_cameras")
-    stacked = np.full((frames, len(drones), *shape), -1 if whole else np.nan, np.int64 if whole else float)
+    stacked = np.full(
+        (frames, len(drones), *QUANTITIES[name]), -1 if whole else np.nan, np.int64 if whole else float
+    )
     for index, drone in enumerate(drones):
         values = drone[name]
         if len(values) != frames:

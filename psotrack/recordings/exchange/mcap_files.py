@@ -216,20 +216,19 @@ def _check_different(names: Sequence[str]) -> None:
 
 def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advance) -> Iterator[_Message]:
     """A pose for each drone that is seen at a time, and one message of transforms for all."""
-    seen, orientation = trajectories.seen, trajectories.orientation_wxyz
-    covariance = trajectories.covariance_m2
+    seen, values = trajectories.seen, trajectories.quantities()
+    orientation_wxyz = values.get("orientation_wxyz", np.full((*seen.shape, 4), np.nan))
+    covariance_m2 = values.get("covariance_m2", np.full((*seen.shape, 3, 3), np.nan))
     times_ns = np.round(trajectories.time_s.astype(float) * 1e9).astype(np.int64).tolist()
     for row, time_ns in enumerate(times_ns):
         head = ros.header(time_ns, WORLD)
         transforms = []
         advance(1)
         for drone in np.flatnonzero(seen[row]).tolist():
-            position_m = trajectories.position_m[row, drone]
-            turned = None if orientation is None else orientation[row, drone]
-            spread = None if covariance is None else covariance[row, drone]
-            message = ros.pose_message(head, position_m, turned, spread)
+            pose = trajectories.position_m[row, drone], orientation_wxyz[row, drone]
+            message = ros.pose_message(head, *pose, covariance_m2[row, drone])
             yield time_ns, f"/{names[drone]}/pose", ros.POSE, message
-            transforms.append(ros.transform(head, names[drone], position_m, turned))
+            transforms.append(ros.transform(head, names[drone], *pose))
         if transforms:
             yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": transforms}
 

@@ -117,14 +117,16 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
     wrong = (number[:, 0] < 1) | ((number != np.floor(number)) | (np.abs(number) > _LARGEST)).any(axis=1)
     if (row := first_true(wrong)) is not None:
         raise read.error(row, expected="whole frame numbers from 1", found=f"{number[row, 0]:g}")
-    frame = number[:, 0] - 1
+    # Drones have the order of their first rows: here that of their numbers.
+    order = np.argsort(number[:, 1], kind="stable")
+    frame, identity = number[order, 0] - 1, number[order, 1].astype(int)
     columns = {
         "frame": frame,
         "time_s": _times(path, frame, recording),
-        "drone": number[:, 1].astype(int).astype(str).astype(object),
-        **dict(zip(("x_m", "y_m", "z_m"), _positions(path).T, strict=True)),
+        "drone": identity.astype(str).astype(object),
+        **dict(zip(("x_m", "y_m", "z_m"), _positions(path)[order].T, strict=True)),
     }
-    return from_rows(path, DroneRows(columns, lambda row: f"{path}, line {read.lines[row]}"))
+    return from_rows(path, DroneRows(columns, lambda row: f"{path}, line {read.lines[order[row]]}"))
 
 
 def _positions(path: Path) -> Float[np.ndarray, "rows 3"]:

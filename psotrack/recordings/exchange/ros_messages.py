@@ -71,14 +71,17 @@ def header(time_ns: int, frame: str) -> dict[str, Any]:
 def pose_message(
     head: dict[str, Any],
     position_m: Float[np.ndarray, "3"],
-    orientation_wxyz: Float[np.ndarray, "4"] | None,
-    covariance_m2: Float[np.ndarray, "3 3"] | None,
+    orientation_wxyz: Float[np.ndarray, "4"],
+    covariance_m2: Float[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
-    """A pose. A covariance of zeros is an unknown covariance, as in ROS; see `UNKNOWN_RAD2` for the orientation."""
+    """A pose; orientation and covariance are NaN where they are not known.
+
+    A covariance of zeros is an unknown covariance, as in ROS; see `UNKNOWN_RAD2` for the orientation.
+    """
     covariance = np.zeros((6, 6))
-    if covariance_m2 is not None and np.isfinite(covariance_m2).all():
+    if np.isfinite(covariance_m2).all():
         covariance[:3, :3] = covariance_m2
-    if not _is_known(orientation_wxyz):
+    if not np.isfinite(orientation_wxyz).all():
         covariance[[3, 4, 5], [3, 4, 5]] = UNKNOWN_RAD2
     pose = {"position": _vector(position_m), "orientation": _quaternion(orientation_wxyz)}
     return {"header": head, "pose": {"pose": pose, "covariance": covariance.ravel().tolist()}}
@@ -88,9 +91,9 @@ def transform(
     head: dict[str, Any],
     child: str,
     position_m: Float[np.ndarray, "3"],
-    orientation_wxyz: Float[np.ndarray, "4"] | None,
+    orientation_wxyz: Float[np.ndarray, "4"],
 ) -> dict[str, Any]:
-    """Where the coordinate frame `child` is; an unknown orientation is the identity."""
+    """Where the coordinate frame `child` is; an unknown orientation, NaN, is the identity."""
     place = {"translation": _vector(position_m), "rotation": _quaternion(orientation_wxyz)}
     return {"header": head, "child_frame_id": child, "transform": place}
 
@@ -134,18 +137,10 @@ def camera_message(head: dict[str, Any], camera: Camera) -> dict[str, Any] | Non
     }
 
 
-def _is_known(orientation_wxyz: Float[np.ndarray, "4"] | None) -> bool:
-    return orientation_wxyz is not None and bool(np.isfinite(orientation_wxyz).all())
-
-
 def _vector(values: Float[np.ndarray, "3"]) -> dict[str, float]:
     return dict(zip("xyz", map(float, values), strict=True))
 
 
-def _quaternion(orientation_wxyz: Float[np.ndarray, "4"] | None) -> dict[str, float]:
-    wxyz = (
-        orientation_wxyz
-        if orientation_wxyz is not None and _is_known(orientation_wxyz)
-        else (1.0, 0.0, 0.0, 0.0)
-    )
+def _quaternion(orientation_wxyz: Float[np.ndarray, "4"]) -> dict[str, float]:
+    wxyz = orientation_wxyz if np.isfinite(orientation_wxyz).all() else (1.0, 0.0, 0.0, 0.0)
     return dict(zip("wxyz", map(float, wxyz), strict=True))
