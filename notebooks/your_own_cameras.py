@@ -149,7 +149,7 @@ recording = pt.read_recording(DATA)
 sizes_m = jnp.asarray([drone["size_m"] for drone in record["drones"]], jnp.float32)
 figure, panels = plt.subplots(1, 4, figsize=(13, 2.7), layout="constrained")
 for number, (panel, name) in enumerate(zip(panels, recording.rig.names, strict=True)):
-    time_s = recording.frame_times[name].time_s[FRAME] + clocks.offset_s[name]
+    time_s = recording.by_name[name].times.time_s[FRAME] + clocks.offset_s[name]
     position_m = np.stack(
         [
             [np.interp(time_s, tracks.time_s, axis) for axis in drone.T]

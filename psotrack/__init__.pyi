@@ -1,13 +1,25 @@
-from .api import background_model, detect_markers, read_recording, track
-from .calibration.clocks import find_offset
-from .evaluation import Evaluation, evaluate
+from .api import (
+    background_model,
+    calibrate_rig,
+    detect_markers,
+    doctor,
+    overlay,
+    read_recording,
+    report,
+    run,
+    save_picture,
+    track,
+)
+from .calibration.clocks import reference_offset
+from .calibration.rig.settings import RigSettings
+from .evaluation import Evaluation, errors_over_time, evaluate
 from .foreground.detection import Detector
 from .foreground.silhouettes import BackgroundModel
 from .geometry import Rig, make_camera, make_rig, project, triangulate
 from .geometry.rig_files import read_rig, write_rig
 from .inside_out import MarkerMap, localise_video, read_marker_map
 from .pipeline import Method, MethodInputs, TrackedRecording, track_runs
-from .recordings import Recording
+from .recordings import CameraRecording, Recording
 from .recordings.exchange import export_tracks, read_tracks
 from .recordings.mocap import read_c3d
 from .settings import (
@@ -22,6 +34,7 @@ from .settings import (
 from .show.reports import view_3d
 from .simulation import SimulationSettings, simulate
 from .support import register_plugin
+from .sweep import sweep
 from .tracking.swarm import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
 
@@ -29,6 +42,7 @@ __version__: str
 
 __all__ = [
     "BackgroundModel",
+    "CameraRecording",
     "Detector",
     "DroneSettings",
     "Evaluation",
@@ -39,6 +53,7 @@ __all__ = [
     "MotionSettings",
     "Recording",
     "Rig",
+    "RigSettings",
     "Score",
     "ScoreInputs",
     "ScoreSettings",
@@ -51,13 +66,16 @@ __all__ = [
     "TrackedRecording",
     "Trajectories",
     "background_model",
+    "calibrate_rig",
     "detect_markers",
+    "doctor",
+    "errors_over_time",
     "evaluate",
     "export_tracks",
-    "find_offset",
     "localise_video",
     "make_camera",
     "make_rig",
+    "overlay",
     "project",
     "read_c3d",
     "read_marker_map",
@@ -65,8 +83,13 @@ __all__ = [
     "read_rig",
     "read_tracks",
     "read_trajectories",
+    "reference_offset",
     "register_plugin",
+    "report",
+    "run",
+    "save_picture",
     "simulate",
+    "sweep",
     "track",
     "track_runs",
     "triangulate",

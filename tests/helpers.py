@@ -14,6 +14,7 @@ from filelock import FileLock
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
+from psotrack.recordings import CameraRecording, Recording
 from psotrack.settings import TrackSettings, setting_names
 
 #: Number of distortion coefficients -> coefficients in OpenCV's order, as strong as the distortion of action cameras.
@@ -55,6 +56,24 @@ def far_camera(*, image_size_wh, pixels_per_m, distance_m=1000.0):
     focal = pixels_per_m * distance_m
     K = np.array([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]])
     return make_camera(R=R, t_m=t_m, K=K, image_size_wh=image_size_wh)
+
+
+def cameras_of(rig, **fields):
+    """What a recording has of the cameras of a rig; a field of `CameraRecording` has values by camera name."""
+    return tuple(
+        CameraRecording(name, rig.cameras[index], **_of_camera(name, fields))
+        for index, name in enumerate(rig.names)
+    )
+
+
+def with_cameras(recording, **fields) -> Recording:
+    """The recording with other values of fields of its cameras, by camera name."""
+    cameras = tuple(replace(each, **_of_camera(each.name, fields)) for each in recording.cameras)
+    return replace(recording, cameras=cameras)
+
+
+def _of_camera(name, fields):
+    return {field: values[name] for field, values in fields.items() if name in values}
 
 
 def make_unnamed_rig(*cameras):

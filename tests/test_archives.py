@@ -107,7 +107,7 @@ class TestOldArchives:
         assert recording.rig.names == tuple(f"cam{number}" for number in range(1, 9))
         assert recording.num_frames == 10
         assert not recording.videos
-        assert set(recording.silhouettes) == set(recording.detections or ()) == set(recording.rig.names)
+        assert all(each.silhouettes and each.detections for each in recording.placed)
         assert recording.truth is not None
         assert recording.truth.drones == ("dron1", "dron2", "dron3", "dron4")
         assert {video.frames for video in manifest.videos.values()} == {10}
@@ -313,7 +313,8 @@ class TestPacking:
         dist[3, 4:] = 0
         cameras = replace(cams, T_cam_world=T, dist=dist, fisheye=fisheye)
         turned = replace(
-            recording, rig=replace(recording.rig, cameras=cameras), bounds_m=(-1.0, 2.0, 0.0, 1.0, 0.0, 1 / 3)
+            recording.with_rig(replace(recording.rig, cameras=cameras)),
+            bounds_m=(-1.0, 2.0, 0.0, 1.0, 0.0, 1 / 3),
         )
         pack_tracks(own_flight / "tracks.csv", turned, tmp_path / "a.psotrack", cache=tmp_path)
         unpack(tmp_path / "a.psotrack", tmp_path / "out")
@@ -321,7 +322,7 @@ class TestPacking:
         for name in ("T_cam_world", "K", "dist", "image_size_wh", "fisheye"):
             np.testing.assert_array_equal(getattr(packed.rig.cameras, name), getattr(cameras, name), name)
         assert packed.bounds_m == turned.bounds_m
-        assert dict(packed.frame_times) == dict(recording.frame_times)
+        assert packed.exposed == recording.exposed
 
     def test_listed_times_keep_every_bit(self, own_flight: Path, tmp_path: Path) -> None:
         """The record is not that of this recording: its rate differs by less than a record can show."""
@@ -333,8 +334,8 @@ class TestPacking:
         recording = open_recording(own_flight)
         pack_tracks(own_flight / "tracks.csv", recording, tmp_path / "a.psotrack", cache=tmp_path)
         unpack(tmp_path / "a.psotrack", tmp_path / "out")
-        assert dict(open_recording(tmp_path / "out").frame_times) == dict(recording.frame_times)
-        assert recording.frame_times["cam1"].listed_s == tuple(time_s.tolist())
+        assert open_recording(tmp_path / "out").exposed == recording.exposed
+        assert recording.exposed["cam1"].listed_s == tuple(time_s.tolist())
 
     @pytest.mark.parametrize(
         ("change", "words"),
@@ -441,7 +442,7 @@ class TestStoredSilhouettes:
         recording = open_recording(flight)
         with pytest.raises(SettingsError, match=words) as error:
             compute(recording, SilhouetteSettings(**settings), cache=flight / "none")
-        stored = recording.silhouettes["cam1"].path
+        stored = recording.by_name["cam1"].silhouettes.path
         assert f"as in {stored}" in str(error.value)
         assert "other silhouettes need the video of camera cam1" in str(error.value)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import Output
+from helpers import Output, cameras_of
 
 from psotrack.foreground.silhouettes import Silhouettes, SilhouetteSettings, compute
 from psotrack.geometry import look_at, make_camera, make_rig
@@ -37,7 +37,12 @@ def _compute(tmp_path: Path) -> Silhouettes:
                 writer.write(image)
     videos = {name: probe(tmp_path / f"{name}.avi") for name in rig.names}
     settings = SilhouetteSettings(background="mog2", reduction=2, working_reduction=1, min_blob_px=9)
-    return compute(Recording("flight", tmp_path, rig, videos), settings, cache=tmp_path / "cache", jobs=1)
+    return compute(
+        Recording("flight", tmp_path, cameras_of(rig, video=videos)),
+        settings,
+        cache=tmp_path / "cache",
+        jobs=1,
+    )
 
 
 @pytest.fixture

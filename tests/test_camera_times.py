@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import ROOM_M, ring_rig, track_settings
+from helpers import ROOM_M, cameras_of, ring_rig, track_settings, with_cameras
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -310,14 +310,14 @@ def test_detections_are_moved_to_the_instant():
 
 def test_a_rolling_shutter_has_the_time_of_its_middle_row():
     videos = {name: VideoInfo(Path(f"{name}.avi"), 20, FPS, (1920, 1080)) for name in RIG.names}
-    recording = Recording("r", Path("r"), RIG, videos)
+    recording = Recording("r", Path("r"), cameras_of(RIG, video=videos))
     assert recording.timeline().is_synchronous
-    rolling = replace(recording, line_time_s={RIG.names[1]: 2e-5}).timeline()
+    rolling = with_cameras(recording, line_time_s={RIG.names[1]: 2e-5}).timeline()
     assert not rolling.is_synchronous
     assert rolling.line_time_s.tolist() == [0, 2e-5, 0, 0, 0]
     np.testing.assert_allclose(rolling.offset_s[:20], np.tile([0, 0.0108, 0, 0, 0], (20, 1)), atol=1e-9)
     assert recording.timeline(50.0).rate_hz == 50.0
-    assert replace(recording, rate_hz=12.5).num_frames == 10
+    assert recording.at_rate(12.5).num_frames == 10
 
 
 @pytest.mark.parametrize(

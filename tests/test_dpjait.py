@@ -103,7 +103,7 @@ def test_the_simulated_half(simulated_folder):
     np.testing.assert_allclose(truth.position_m[1:, 1, 0], [1.1, 1.2, 1.3, 1.4], rtol=0, atol=1e-12)
     assert truth.orientation_wxyz[4, 0].tolist() == [0, 0, 0, 1]
     assert truth.time_s.tolist() == [0, 0.04, 0.08, 0.12, 0.16]
-    assert recording.detections is None
+    assert not recording.detections
     assert recording.usable().num_frames == 5
 
 

@@ -115,7 +115,7 @@ def test_a_sequence_without_onboard_videos(folder):
     # Intrinsics without videos are ignored.
     assert read_onboard(folder) == {}
     recording = read_sequence(folder)
-    assert recording.onboard is None
+    assert not recording.onboard
     assert recording.to_dict()["onboard"] is None
 
 
@@ -199,7 +199,7 @@ def test_a_sequence_is_read_without_broken_onboard_files(folder, caplog):
     replace_in_file(folder / "dron1_cam_25.csv", "1.5", "?")
     with caplog.at_level(logging.WARNING):
         recording = read_sequence(folder)
-    assert recording.onboard is None
+    assert not recording.onboard
     assert "dron1_cam_25.csv, line 3" in caplog.text
     assert recording.truth is not None
 

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from helpers import LENSES, Output, ring_rig, sphere_points
+from helpers import LENSES, Output, cameras_of, ring_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -137,7 +137,7 @@ def assert_one_line(result: Output, *words: str) -> None:
 def instants(num_frames: int, fps: float = 25.0) -> Recording:
     """A recording that has nothing but instants."""
     rig = ring_rig(1)
-    return Recording("any", Path("any"), rig, {}, frame_times={rig.names[0]: FrameTimes(num_frames, fps)})
+    return Recording("any", Path("any"), cameras_of(rig, times={rig.names[0]: FrameTimes(num_frames, fps)}))
 
 
 # There and back
@@ -679,12 +679,12 @@ BAD = {
     "a file of boxes alone": ("boxes.txt", "1,1,10,10,5,5,1,-1,-1,-1\n", "positions in MOT15's 3D columns"),
     "a file of few columns": ("boxes.txt", "1,1,10,10,5,5,1\n", "positions in MOT15's 3D columns"),
     "MOT counts from 1": ("mot.txt", "0,1,-1,-1,-1,-1,1,1,2,3\n", "whole frame numbers from 1"),
-    "MOT twice": ("mot.csv", "1,1,-1,-1,-1,-1,1,1,2,3\n" * 2, "one row per frame and identity"),
+    "MOT twice": ("mot.csv", "1,1,-1,-1,-1,-1,1,1,2,3\n" * 2, "line 2: expected one row per frame and drone"),
     "KITTI of another length": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 3\n" * 3, "50 poses, one for each instant"),
     "no rotation": ("k.txt", "1 0 0 1 0 2 0 2 0 0 1 3\n", "a rotation matrix"),
     "KITTI with words": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 x\n", "line 1: expected 12 finite numbers"),
     "an empty file": ("empty.txt", "", "an empty file"),
-    "comments alone": ("empty.tum", "# timestamp\n", "at least one pose"),
+    "comments alone": ("empty.tum", "# timestamp\n", "at least one line with numbers"),
     "5 numbers": ("five.txt", "1 2 3 4 5\n", "8 numbers per line (TUM), 12 (KITTI)"),
     "an unknown ending": ("tracks.xyz", "1 2 3\n", "tracks as .csv, .parquet"),
     "the record": ("record.json", '{"drones": []}', "the record of a run has no positions"),

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from flight_files import make_sequence, make_tracks_file
-from helpers import ring_rig
+from helpers import cameras_of, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
@@ -35,8 +35,8 @@ SIZE_M = np.array([[0.4, 0.4, 0.2], [0.3, 0.3, 0.1]])
 
 
 def recording_of(rig, num_frames=20, **fields) -> Recording:
-    times = {name: FrameTimes(num_frames, RATE_HZ) for name in rig.names}
-    return Recording("lab", Path("lab"), rig, {}, frame_times=times | fields.pop("frame_times", {}), **fields)
+    times = dict.fromkeys(rig.names, FrameTimes(num_frames, RATE_HZ)) | fields.pop("times", {})
+    return Recording("lab", Path("lab"), cameras_of(rig, times=times, **fields))
 
 
 def straight_tracks(num_frames=20, speed_m_s=2.0) -> Trajectories:
@@ -103,7 +103,7 @@ class TestImages:
 
     def test_a_late_camera_shows_drones_where_they_are_then(self):
         rig, tracks = ring_rig(3), straight_tracks()
-        late = recording_of(rig, frame_times={"c1": FrameTimes(20, RATE_HZ, time_offset_s=0.03)})
+        late = recording_of(rig, times={"c1": FrameTimes(20, RATE_HZ, time_offset_s=0.03)})
         boxes_px = view_in_images(late, tracks, SIZE_M).boxes_px
         moved = replace(tracks, position_m=tracks.position_m + 0.03 * tracks.velocity_m_s)
         expected = view_in_images(recording_of(rig), moved, SIZE_M).boxes_px
@@ -127,7 +127,7 @@ class TestImages:
         rig, tracks = ring_rig(3), straight_tracks()
         tracks = with_status(tracks, 1, slice(3, 5), Status.LOST)
         tracks.position_m[8, 0] = 30.0, 0.0, 1.2
-        short = recording_of(rig, frame_times={"c2": FrameTimes(6, RATE_HZ)})
+        short = recording_of(rig, times={"c2": FrameTimes(6, RATE_HZ)})
         boxes_px = view_in_images(short, tracks, SIZE_M).boxes_px
         shown = np.isfinite(boxes_px).all(axis=-1)
         assert not shown[3:5, 1].any()
@@ -207,7 +207,7 @@ class TestEvents:
     def test_left_out_frames_of_a_late_slow_camera_are_shown_at_their_times(self, tmp_path, monkeypatch):
         """Frames 4 and 5 of a camera of 5 Hz that begins 0.2 s late are exposed from 1.0 s on: instant 10 of 10 Hz."""
         path = write_flight(tmp_path, straight_tracks(), {"sequence": "lab", "left_out": {"c1": [[4, 6]]}})
-        slow = recording_of(ring_rig(2), frame_times={"c1": FrameTimes(9, 5.0, time_offset_s=0.2)})
+        slow = recording_of(ring_rig(2), times={"c1": FrameTimes(9, 5.0, time_offset_s=0.2)})
         monkeypatch.setattr("psotrack.show.flights.flight.open_recording", lambda _: slow)
         (event,) = find_events(read_flight([path], "lab"))
         assert (event.frame, event.kind) == (10, EventKind.LEFT_OUT)
@@ -236,7 +236,7 @@ class TestQuality:
             "left_out": {"c2": [[0, 4], [6, 7]]},
         }
         (read,) = read_flight([write_flight(tmp_path, straight_tracks(), record)]).tracks
-        short = recording_of(ring_rig(3), frame_times={"c2": FrameTimes(10, RATE_HZ)})
+        short = recording_of(ring_rig(3), times={"c2": FrameTimes(10, RATE_HZ)})
         rows = camera_quality(read, short).set_index("camera")
         assert rows["frames"].tolist() == [1.0, 1.0, 0.5]
         assert rows.loc["c1", "noise_px"] == pytest.approx(np.sqrt(12.5))

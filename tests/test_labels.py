@@ -13,7 +13,7 @@ import pytest
 import trimesh
 import yaml
 from click.testing import CliRunner
-from helpers import far_camera, ring_rig
+from helpers import far_camera, ring_rig, with_cameras
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -23,7 +23,7 @@ from psotrack.errors import InputError, OutputError, PsotrackError, SettingsErro
 from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_rig
-from psotrack.recordings import VideoWriter, read_frames
+from psotrack.recordings import Reference, VideoWriter, read_frames
 from psotrack.recordings.datasets import open_recording, read_masks, read_sequence
 from psotrack.simulation import SimulationSettings, scenario, simulate
 from psotrack.simulation.scenarios import Mesh
@@ -375,7 +375,7 @@ def test_a_broken_video_leaves_nothing_behind(data, tmp_path):
     longer_reference = Trajectories(
         np.arange(9), np.arange(9) / 25, truth.drones, np.broadcast_to(truth.position_m[1], (9, 2, 3))
     )
-    with_wrong_length = replace(first, videos=short, truth=longer_reference)
+    with_wrong_length = replace(with_cameras(first, video=short), reference=Reference(longer_reference))
     with pytest.raises(InputError, match="only 4 can be decoded"):
         write_data_set([with_wrong_length, second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
     assert list(tmp_path.iterdir()) == []

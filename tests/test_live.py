@@ -185,7 +185,7 @@ def test_a_session_that_is_recorded_is_tracked_again(sequence: Path, cache: Path
         assert kept.videos[name].num_frames == counts["frames"]
         # A busy machine leaves frames out; the others have the times at which they were filmed.
         assert counts["frames"] >= 0.8 * NUM_FRAMES
-        assert set(kept.frame_times[name].time_s) <= set(source.frame_times[name].time_s)
+        assert set(kept.by_name[name].times.time_s) <= set(source.by_name[name].times.time_s)
     again = psotrack("track", tmp_path / "kept", "--out", tmp_path / "again.csv", "--cache", cache, *EFFORT)
     assert again.returncode == 0, again.stderr
     distance_m = _distances_m(

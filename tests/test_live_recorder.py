@@ -6,13 +6,12 @@ import subprocess
 import sys
 import textwrap
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers import ring_rig
+from helpers import cameras_of, ring_rig
 
 from psotrack.errors import OutputError, SettingsError
 from psotrack.live import CameraRecorder, recording_folder
@@ -31,11 +30,12 @@ def laboratory(tmp_path: Path) -> Recording:
     return Recording(
         "laboratory",
         tmp_path / "laboratory",
-        RIG,
-        {},
-        streams={name: f"rtsp://camera/{name}" for name in RIG.names},
-        ignore={RIG.names[0]: ignore},
-        line_time_s={RIG.names[1]: 1e-5},
+        cameras_of(
+            RIG,
+            stream={name: f"rtsp://camera/{name}" for name in RIG.names},
+            ignore={RIG.names[0]: ignore},
+            line_time_s={RIG.names[1]: 1e-5},
+        ),
         bounds_m=(-1.0, 1.0, -2.0, 2.0, 0.0, 3.0),
     )
 
@@ -74,11 +74,11 @@ def test_what_was_filmed_is_a_recording(laboratory: Recording, tmp_path: Path) -
     assert found.rig.names == RIG.names[:2]
     assert np.allclose(found.rig.cameras.T_cam_world, RIG.cameras.T_cam_world[:2], atol=1e-6)
     assert found.bounds_m == laboratory.bounds_m
-    assert found.line_time_s == laboratory.line_time_s
-    assert set(found.ignore) == {RIG.names[0]}
+    assert [each.line_time_s for each in found.cameras] == [0.0, 1e-5]
+    assert [each.ignore is not None for each in found.cameras] == [True, False]
     for name, first, count in ((RIG.names[0], 0, 30), (RIG.names[1], 5, 20)):
         # Not rounded: what meets live shall meet again.
-        assert found.frame_times[name].time_s.tolist() == [(first + i) / 25 for i in range(count)]
+        assert found.by_name[name].times.time_s.tolist() == [(first + i) / 25 for i in range(count)]
         levels = [frame.mean() for frame in read_frames(found.videos[name])]
         # The codec changes the level of flat frames by up to 3.7 of 255, as tests/test_video.py says.
         assert levels == pytest.approx([2 * (first + index) for index in range(count)], abs=3.7)
@@ -142,7 +142,7 @@ def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path)
     for name in RIG.names:
         # 32 KiB and the last frame are lost: these frames of noise take 20 KiB and more.
         assert 55 <= found.videos[name].num_frames < 60
-        assert len(list(read_frames(found.videos[name]))) == found.frame_times[name].num_frames
+        assert len(list(read_frames(found.videos[name]))) == found.by_name[name].times.num_frames
 
 
 def test_a_disk_that_is_nearly_full_ends_the_recording_in_time(
@@ -182,7 +182,7 @@ class TestFolder:
         check_refused(SettingsError, "--record: expected another folder", laboratory, laboratory.folder)
 
     def test_odd_sizes_are_refused(self, laboratory: Recording, tmp_path: Path) -> None:
-        odd = replace(laboratory, rig=ring_rig(3, image_size_wh=(321, 240)))
+        odd = laboratory.with_rig(ring_rig(3, image_size_wh=(321, 240)))
         expected = r"even numbers of pixels, .* found 321 x 240 of camera"
         check_refused(SettingsError, expected, odd, tmp_path / "flight")
 

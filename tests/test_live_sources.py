@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import ring_rig
+from helpers import cameras_of, ring_rig
 
 from psotrack.live import CameraStream, SourceFrame, StreamClock, live_cameras
 from psotrack.recordings import Recording
@@ -23,7 +23,7 @@ FPS = 25.0
 def test_cameras_have_the_short_names_of_other_commands() -> None:
     rig = ring_rig(3, image_size_wh=SIZE_WH)
     streams = {name: f"rtsp://camera/{name}" for name in rig.names}
-    recording = Recording("laboratory", Path("laboratory"), rig, {}, streams=streams)
+    recording = Recording("laboratory", Path("laboratory"), cameras_of(rig, stream=streams))
     cameras = live_cameras(recording, ["0", "2"], replay=False)
     assert [camera.name for camera in cameras] == [rig.names[0], rig.names[2]]
     assert cameras[1].source == CameraStream(streams[rig.names[2]], SIZE_WH)

@@ -96,18 +96,8 @@ def evil_recording(tmp_path):
 
 
 def _renamed(recording: Recording, name: str) -> Recording:
-    old = recording.rig.names[0]
-    names = tuple(name if each == old else each for each in recording.rig.names)
-
-    def with_name(values):
-        return {name if key == old else key: value for key, value in values.items()}
-
-    return replace(
-        recording,
-        rig=replace(recording.rig, names=names),
-        videos=with_name(recording.videos),
-        frame_times=with_name(recording.frame_times),
-    )
+    first, *others = recording.cameras
+    return replace(recording, cameras=(replace(first, name=name), *others))
 
 
 def test_names_of_cameras_in_overlays(evil_recording, tmp_path):

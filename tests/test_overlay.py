@@ -23,6 +23,7 @@ from flight_files import (
     make_tracks,
     make_tracks_file,
 )
+from helpers import with_cameras
 
 from psotrack import cli
 from psotrack.errors import OutputError
@@ -141,8 +142,8 @@ def test_cameras_of_another_shape_keep_their_aspect_ratio_in_the_mosaic(folder, 
     sizes_wh = recording.rig.cameras.image_size_wh.copy()
     sizes_wh[index] = 200, 240
     rig = replace(recording.rig, cameras=replace(recording.rig.cameras, image_size_wh=sizes_wh))
-    videos = {**recording.videos, "c1": probe(tmp_path / "narrow.avi")}
-    flight = replace(flight, recording=replace(recording, rig=rig, videos=videos))
+    narrow = with_cameras(recording.with_rig(rig), video={"c1": probe(tmp_path / "narrow.avi")})
+    flight = replace(flight, recording=narrow)
     write_overlays(tmp_path / "out", flight, OverlayOptions(mosaic=True), jobs=1)
     tile = next(read_frames(probe(tmp_path / "out" / "mosaic.mp4")))[:720, 960:]
     # 200 x 240 pixels in a place of 960 x 720 are three times as large, with 180 black columns at both sides.
@@ -161,16 +162,16 @@ def test_a_video_of_other_inputs_is_not_kept(folder, tmp_path, change):
     flight = read_flight([folder / "tracks.csv"], folder / "flight", cameras=["c0"])
     video = tmp_path / "c0.avi"
     video.write_bytes((folder / "flight" / "c0.avi").read_bytes())
-    flight = replace(flight, recording=replace(flight.recording, videos={"c0": probe(video)}))
+    flight = replace(flight, recording=with_cameras(flight.recording, video={"c0": probe(video)}))
     assert len(write_overlays(tmp_path / "out", flight, jobs=1).written) == 1
     assert len(write_overlays(tmp_path / "out", flight, jobs=1).kept) == 1
     recording = flight.recording
     if change == "lens":
         cameras = replace(recording.rig.cameras, dist=np.zeros((1, 4)), fisheye=np.array([True]))
-        flight = replace(flight, recording=replace(recording, rig=replace(recording.rig, cameras=cameras)))
+        flight = replace(flight, recording=recording.with_rig(replace(recording.rig, cameras=cameras)))
     elif change == "times":
-        late = {"c0": replace(recording.frame_times["c0"], time_offset_s=0.01)}
-        flight = replace(flight, recording=replace(recording, frame_times=late))
+        late = {"c0": replace(recording.exposed["c0"], time_offset_s=0.01)}
+        flight = replace(flight, recording=with_cameras(recording, times=late))
     else:
         video.write_bytes((folder / "flight" / "c1.avi").read_bytes())
     with pytest.raises(OutputError, match=r"one of other inputs.*--force"):

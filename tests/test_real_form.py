@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.geometry import project
 from psotrack.recordings import read_detections
 from psotrack.recordings.datasets import read_mocap_markers, read_poses, read_sequence
-from psotrack.recordings.mocap import body_trajectories, read_c3d
+from psotrack.recordings.mocap import marker_bodies, read_c3d
 from psotrack.simulation import (
     SimulationSettings,
     change_scenario,
@@ -85,7 +85,7 @@ def test_the_reference_follows_the_drones_with_its_clock_offset(real_folder, sim
         "Dron2:Dron21",
     )
     assert mocap.labels[-1] == "*1"
-    truth = body_trajectories(mocap, fps=25.0, num_frames=NUM_FRAMES, where=real_folder, offset_s=OFFSET_S)
+    truth = marker_bodies(mocap, real_folder).at_frames(25.0, NUM_FRAMES, OFFSET_S)
     assert (truth.status == Status.TRACKED).mean() > 0.9
     for drone in range(4):
         position_m, orientation_wxyz = read_poses(simulated_folder / f"dron{drone + 1}_pos_25.csv")
@@ -104,7 +104,7 @@ def test_the_reference_follows_the_drones_with_its_clock_offset(real_folder, sim
         assert (
             np.degrees((fixed * fixed[0].inv()).magnitude()).max() < 0.7
         )  # errors of 0.3 mm in arms of 5 cm, in two frames
-    late = body_trajectories(mocap, fps=25.0, num_frames=NUM_FRAMES, where=real_folder)
+    late = marker_bodies(mocap, real_folder).at_frames(25.0, NUM_FRAMES)
     off_m = np.linalg.norm(late.position_m - truth.position_m, axis=-1)
     assert np.nanmedian(off_m) > 0.05
 
@@ -115,7 +115,7 @@ def test_the_mocap_recording_begins_at_the_offset(simulated_folder, tmp_path, of
     mocap = read_c3d(folder / "R02_D4.c3d")
     # The last frame of the videos is at 0.96 s.
     assert len(mocap.position_m) == round((0.96 + offset_s) * 120 - 0.25) + 1
-    truth = body_trajectories(mocap, fps=25.0, num_frames=NUM_FRAMES, where=folder, offset_s=offset_s)
+    truth = marker_bodies(mocap, folder).at_frames(25.0, NUM_FRAMES, offset_s)
     first = next(frame for frame in range(NUM_FRAMES) if frame / 25 + offset_s >= 0)
     assert not truth.seen[:first].any()
     assert truth.seen[first:].mean() > 0.9

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import cameras_of, with_cameras
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import make_camera, make_rig
@@ -31,7 +32,7 @@ def make_recording(**changes) -> Recording:
         else:
             videos[name] = replace(videos[name], **change)
     rig = make_rig({name: make_test_camera() for name in NAMES})
-    return Recording(name="S01", folder=Path("S01"), rig=rig, videos=videos)
+    return Recording("S01", Path("S01"), cameras_of(rig, video=videos))
 
 
 def test_consistent_videos_are_kept():
@@ -64,7 +65,7 @@ def test_a_camera_without_video_that_is_asked_for_is_an_error():
 
 
 def test_a_camera_with_times_alone_counts_where_no_videos_are_needed():
-    recording = replace(make_recording(b=None, d=None), frame_times={"b": FrameTimes(30, 25.0)})
+    recording = with_cameras(make_recording(b=None, d=None), times={"b": FrameTimes(30, 25.0)})
     assert recording.usable(videos=False).rig.names == ("a", "b", "c", "e")
     assert recording.usable(videos=False).num_frames == 250
     assert recording.usable(["b"], videos=False).num_frames == 30
@@ -107,7 +108,7 @@ def test_cameras_may_differ_in_size_rate_and_length():
         b={"fps": 50.0, "num_frames": 400},
         c={"image_size_wh": (1280, 720)},
     )
-    recording.rig.cameras.image_size_wh[2] = (1280, 720)
+    recording.cameras[2].camera.image_size_wh[:] = (1280, 720)
     usable = recording.usable()
     assert (usable.rig.names, usable.fps) == (NAMES, 50.0)
     # The cameras at 25 frames per second last 10 s, the fast one 8 s.
@@ -127,14 +128,14 @@ def test_leading_frames():
 
 
 def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
-    recording = replace(
+    recording = with_cameras(
         make_recording(b={"fps": 50.0}),
-        frame_times={"c": FrameTimes(250, 25.0, 0.8), "d": FrameTimes(250, 25.0, 3.0)},
+        times={"c": FrameTimes(250, 25.0, 0.8), "d": FrameTimes(250, 25.0, 3.0)},
     ).usable(num_frames=100)
     # 100 instants at 50 Hz are 2 s.
     counts = {name: video.num_frames for name, video in recording.videos.items()}
     assert counts == {"a": 50, "b": 100, "c": 30, "e": 50}
-    assert {name: times.num_frames for name, times in recording.frame_times.items()} == counts
+    assert {each.name: each.times.num_frames for each in recording.cameras} == counts
     assert recording.num_frames == 100
     assert "camera d is left out: it has no frame before instant 100" in caplog.text
 

@@ -99,12 +99,13 @@ def test_the_keys_of_a_camera(folder):
     recording = open_recording(path)
     assert recording.name == "flight"
     assert recording.rig.names == tuple(recording.videos) == ("left", "right")
-    assert recording.ignore == {"left": folder / "ignore.png"}
+    left, right = recording.cameras
+    assert (left.ignore, right.ignore) == (folder / "ignore.png", None)
     assert recording.detections == {"left": folder / "left.csv"}
-    assert recording.videos["left"].fps == recording.frame_times["left"].fps == 24.5
-    assert recording.frame_times["left"].time_s[[0, 5]].tolist() == [0.5, 0.5 + 5 / 24.5]
-    assert recording.frame_times["right"].time_s[[0, 5]].tolist() == [0.0, 0.2]
-    assert recording.line_time_s == {"left": 1e-5}
+    assert left.video.fps == left.times.fps == 24.5
+    assert left.times.time_s[[0, 5]].tolist() == [0.5, 0.5 + 5 / 24.5]
+    assert right.times.time_s[[0, 5]].tolist() == [0.0, 0.2]
+    assert (left.line_time_s, right.line_time_s) == (1e-5, 0.0)
     assert recording.bounds_m == (-4, 4, -3, 3, 0, 2.5)
     assert recording.marker_corners == find_marker_corners(path) == folder / "corners.csv"
     left = recording.rig.cameras[0]
@@ -202,7 +203,7 @@ def test_timestamps(folder):
     times = [0.0, 0.04, 0.09, 0.12, 0.16, 0.21]
     (folder / "times.csv").write_text("frame,time_s\n" + "".join(f"{i},{t}\n" for i, t in enumerate(times)))
     path = write(folder, camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE), RIGHT)
-    assert open_recording(path).frame_times["left"].time_s.tolist() == times
+    assert open_recording(path).by_name["left"].times.time_s.tolist() == times
 
 
 def unfinished(path: Path, num_frames: int) -> None:
@@ -228,7 +229,7 @@ def test_video_and_times_of_a_program_that_was_stopped(folder, num_times, caplog
     path = write(folder, camera("left", 'video = "left.avi"', 'timestamps = "times.csv"', PLACE), RIGHT)
     recording = open_recording(path)
     used = min(num_times, 9)
-    assert recording.videos["left"].num_frames == recording.frame_times["left"].num_frames == used
+    assert recording.videos["left"].num_frames == recording.by_name["left"].times.num_frames == used
     assert f"the video was not finished; its first {used} frames are used" in caplog.text
     assert len(list(read_frames(recording.videos["left"]))) == used
 
@@ -289,7 +290,7 @@ class TestCalibration:
     def test_cameras_without_place_are_left_out(self, folder, caplog):
         path = write(folder, LEFT, camera("right", 'video = "right.avi"'))
         recording = open_recording(path)
-        assert (recording.rig.names, recording.unplaced) == (("left",), ("right",))
+        assert (recording.rig.names, tuple(recording.by_name)) == (("left",), ("left", "right"))
         assert tuple(recording.videos) == ("left", "right")
         assert recording.usable().rig.names == ("left",)
         assert "camera right is left out: it has no place in the world" in caplog.text
@@ -521,16 +522,16 @@ class TestFaults:
     def test_streams_wait_for_live_tracking(self, folder):
         path = write(folder, camera("left", 'video = "rtsp://left/1"', PLACE, "size = [64, 48]"), RIGHT)
         recording = open_recording(path)
-        assert recording.streams == {"left": "rtsp://left/1"}
+        assert [each.stream for each in recording.cameras] == ["rtsp://left/1", None]
         with pytest.raises(
             InputError, match="camera left: expected a video file, found the stream rtsp://left/1"
         ):
             recording.usable()
         assert recording.usable(["right"]).rig.names == ("right",)
         path = write(folder, camera("left", "video = 0"), RIGHT)
-        assert open_recording(path).streams == {"left": "device 0"}
+        assert open_recording(path).cameras[0].stream == "device 0"
         path = write(folder, camera("left", 'video = "/dev/v4l/by-id/left"'), RIGHT)
-        assert open_recording(path).streams == {"left": "device /dev/v4l/by-id/left"}
+        assert open_recording(path).cameras[0].stream == "device /dev/v4l/by-id/left"
 
     @pytest.mark.parametrize(
         ("video", "words"),
@@ -557,7 +558,7 @@ class TestFaults:
     )
     def test_addresses_without_the_name_of_a_host(self, folder, video):
         path = write(folder, camera("left", f'video = "{video}"', PLACE, "size = [64, 48]"), RIGHT)
-        assert open_recording(path).streams == {"left": video}
+        assert open_recording(path).cameras[0].stream == video
 
     def test_what_is_no_recording(self, folder, tmp_path):
         (tmp_path / "S01.zip").write_bytes(b"PK")

@@ -15,9 +15,11 @@ from click.testing import CliRunner
 from evaluation_flights import on_x_axis
 from helpers import make_once, ring_rig
 
+import psotrack as pt
 from psotrack.cli import cli
 from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import Reference
 from psotrack.recordings.datasets import open_recording
 from psotrack.show.flights import flight_of, read_flight
 from psotrack.show.reports import (
@@ -161,7 +163,7 @@ class TestFlight:
         else:
             read = read_flight([flight / "tracks.csv"], sequence)
             late = replace(read.truth, frame=read.truth.frame + 1000, time_s=read.truth.time_s + 100)
-            read = replace(read, recording=replace(read.recording, truth=late))
+            read = replace(read, recording=replace(read.recording, reference=Reference(late)))
         write_flight_report(tmp_path / "page.html", read, pictures=False)
         text = (tmp_path / "page.html").read_text(encoding="utf-8")
         assert "psotrackScene(document" in text
@@ -196,6 +198,8 @@ class TestFlight:
 
     def test_without_a_recording(self, flight, tmp_path):
         out = run("report", flight / "tracks.csv", "--out", tmp_path / "alone.html")
+        again = pt.report(flight / "tracks.csv", tmp_path / "alone.html", force=True)
+        assert f"{again}\n" == out
         assert re.fullmatch(r".*alone\.html: 0\.\d MB\n", out)
         text = (tmp_path / "alone.html").read_text(encoding="utf-8")
         assert "<h2>Cameras</h2>" not in text

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from helpers import ring_rig
+from helpers import cameras_of, ring_rig
 from test_evaluation_shown import flights
 
 from psotrack.evaluation import evaluate, tables
@@ -146,9 +146,8 @@ def test_an_evaluation_shows_the_numbers_of_the_terminal() -> None:
 
 def test_a_recording_shows_its_cameras(tmp_path: Path) -> None:
     rig = ring_rig(3)
-    recording = Recording(
-        "<script>lab", tmp_path, rig, {}, frame_times={name: FrameTimes(10, 25.0) for name in rig.names}
-    )
+    times = dict.fromkeys(rig.names, FrameTimes(10, 25.0))
+    recording = Recording("<script>lab", tmp_path, cameras_of(rig, times=times))
     page = Page(recording._repr_html_())
     assert [row[0] for row in page.rows] == ["camera", *rig.names]
     assert "script" not in page.tags

@@ -7,10 +7,10 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from helpers import ROOM_M, drawn_silhouettes, ring_rig, track_settings
+from helpers import ROOM_M, cameras_of, drawn_silhouettes, ring_rig, track_settings
 
 from psotrack.pipeline import track_runs
-from psotrack.recordings import FrameTimes, Recording
+from psotrack.recordings import FrameTimes, Recording, Reference
 from psotrack.tracking.births import InitialState
 from psotrack.tracking.identity import postprocess
 from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
@@ -129,7 +129,9 @@ def test_runs_together_have_the_covariances_and_camera_errors_of_each_run_alone(
     truth = Trajectories(frame, frame / FPS, ("first", "second"), TRUTH_M)
     times = {name: FrameTimes(NUM_FRAMES, FPS) for name in RIG.names}
     bounds_m = tuple(ROOM_M.T.ravel().tolist())
-    recording = Recording("drawn", tmp_path, RIG, {}, truth, frame_times=times, bounds_m=bounds_m)
+    recording = Recording(
+        "drawn", tmp_path, cameras_of(RIG, times=times), Reference(truth), bounds_m=bounds_m
+    )
     size_m = {"drones.size_m": tuple(SIZE_M[0].tolist())}
     settings = [track_settings(**EFFORT, seed=seed, init="truth", **size_m) for seed in (0, 5)]
     together = track_runs(recording, silhouettes, settings)

@@ -14,7 +14,6 @@ import textwrap
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from helpers import cameras_of, with_cameras
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,7 +80,7 @@ def _make_recording(folder: Path) -> Recording:
     K = np.array([[100.0, 0, 81], [0, 100, 59], [0, 0, 1]])
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
     rig = make_rig({name: make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH) for name in videos})
-    return Recording(folder.name, folder, rig, videos)
+    return Recording(folder.name, folder, cameras_of(rig, video=videos))
 
 
 @pytest.fixture(scope="session")
@@ -369,7 +369,7 @@ def test_damaged_silhouettes_beside_a_video_are_named_and_made_from_it(
     first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     brought = tmp_path / "brought"
     (tmp_path / "cache" / first.keys["cam2"]).rename(brought)
-    recording = replace(recording, silhouettes={"cam2": probe_silhouettes(brought)})
+    recording = with_cameras(recording, silhouettes={"cam2": probe_silhouettes(brought)})
     compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert not (tmp_path / "cache" / first.keys["cam2"]).exists()
     if is_missing:
@@ -419,8 +419,7 @@ def test_a_truncated_video_is_named_and_the_other_videos_are_kept(
 def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(folder: Path, tmp_path: Path) -> None:
     """`--frames` counts instants at the rate of the fastest camera, not frames of the truncated video."""
     recording = _make_recording(folder)
-    slow = {"cam3": FrameTimes(NUM_FRAMES, fps=12.5)}
-    recording = replace(recording, frame_times=slow)
+    recording = with_cameras(recording, times={"cam3": FrameTimes(NUM_FRAMES, fps=12.5)})
     video = folder / "cam3.avi"
     content = video.read_bytes()
     video.write_bytes(content[: len(content) * 2 // 3])
@@ -437,8 +436,8 @@ def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(folder: Path,
 
 def test_a_camera_without_video_sees_nothing_where_not_all_need_one(folder: Path, tmp_path: Path) -> None:
     recording = _make_recording(folder)
-    videos = {name: video for name, video in recording.videos.items() if name != "cam2"}
-    made = compute(replace(recording, videos=videos), SETTINGS, cache=tmp_path / "cache", all_videos=False)
+    two = with_cameras(recording, video={"cam2": None})
+    made = compute(two, SETTINGS, cache=tmp_path / "cache", all_videos=False)
     assert made.cameras == ("cam1", "cam2", "cam3")
     assert set(made.keys) == {"cam1", "cam3"}
     shown = made.at_instants(recording.timeline())
@@ -449,7 +448,12 @@ def test_a_camera_without_video_sees_nothing_where_not_all_need_one(folder: Path
     np.testing.assert_array_equal(_read_all(shown)[:, [0, 2]], _read_all(both)[:, [0, 2]])
     assert not _read_all(shown)[:, 1].any()
     with pytest.raises(InputError, match="expected at least one video, found none"):
-        compute(replace(recording, videos={}), SETTINGS, cache=tmp_path / "cache", all_videos=False)
+        compute(
+            with_cameras(recording, video=dict.fromkeys(recording.videos)),
+            SETTINGS,
+            cache=tmp_path / "cache",
+            all_videos=False,
+        )
 
 
 def test_cameras_of_different_size_and_length_are_filled_up_with_background(
@@ -459,13 +463,13 @@ def test_cameras_of_different_size_and_length_are_filled_up_with_background(
         for frame in itertools.islice(read_frames(probe(folder / "cam1.avi")), 20):
             writer.write(cv2.copyMakeBorder(frame[20:], 0, 0, 0, 40, cv2.BORDER_REPLICATE))
     recording = _make_recording(folder)
-    recording.rig.cameras.image_size_wh[1] = (202, 98)
+    recording.by_name["cam2"].camera.image_size_wh[:] = (202, 98)
     silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
     assert silhouettes.shape == (30, 51)
     frames = _read_all(silhouettes)
     assert frames.shape == (NUM_FRAMES, 3, 30, 51)
     for index, name in enumerate(recording.rig.names):
-        alone = _expected(replace(recording, videos={name: recording.videos[name]}, frame_times={}))[:, 0]
+        alone = _expected(recording.usable([name]))[:, 0]
         num_frames, height, width = alone.shape
         np.testing.assert_array_equal(frames[:num_frames, index, :height, :width], alone)
         assert alone.any()
@@ -479,7 +483,7 @@ def test_what_is_ignored_is_background_and_belongs_to_the_key(folder: Path, tmp_
     white = np.zeros(SIZE_WH[::-1], np.uint8)
     white[:, :81] = 255
     cv2.imwrite(str(tmp_path / "left.png"), white)
-    masked = replace(recording, ignore={"cam1": tmp_path / "left.png"})
+    masked = with_cameras(recording, ignore={"cam1": tmp_path / "left.png"})
     plain, without = (
         compute(each, SETTINGS, cache=tmp_path / "cache", jobs=1) for each in (recording, masked)
     )
@@ -505,17 +509,19 @@ def test_what_is_missing_or_wrong_is_named(folder: Path, tmp_path: Path) -> None
         compute(recording, SETTINGS, cache=cache, jobs=0)
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
     with pytest.raises(InputError, match=r"small\.png: expected 162 x 118 .* as in cam1\.avi, found 10 x 10"):
-        compute(replace(recording, ignore={"cam1": tmp_path / "small.png"}), SETTINGS, cache=cache, jobs=1)
-    videos = {name: video for name, video in recording.videos.items() if name != "cam2"}
+        compute(
+            with_cameras(recording, ignore={"cam1": tmp_path / "small.png"}), SETTINGS, cache=cache, jobs=1
+        )
+    two = with_cameras(recording, video={"cam2": None})
     with pytest.raises(InputError, match=r"expected a video for each of the cameras .* found none for cam2"):
-        compute(replace(recording, videos=videos), SETTINGS, cache=cache)
+        compute(two, SETTINGS, cache=cache)
     (folder / "cam2.avi").unlink()
     with pytest.raises(InputError, match=r"cam2\.avi: expected a readable video, found No such file"):
         compute(recording, SETTINGS, cache=cache)
     shutil.rmtree(cache, ignore_errors=True)
     cache.write_text("mine")
     with pytest.raises(OutputError, match=r"cache/.*: expected a path that can be written, found "):
-        compute(replace(recording, videos=videos), SETTINGS, cache=cache, jobs=1, all_videos=False)
+        compute(two, SETTINGS, cache=cache, jobs=1, all_videos=False)
     assert cache.read_text() == "mine"
 
 

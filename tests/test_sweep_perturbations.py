@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ring_rig
+from helpers import cameras_of, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -38,7 +38,7 @@ def flown(num_cameras=5, frames=None):
         seconds={},
         arrays=tuple(frames + np.uint8(camera) for camera in range(num_cameras)),
     )
-    return Recording(name="S", folder=Path("S"), rig=rig, videos=videos), silhouettes
+    return Recording("S", Path("S"), cameras_of(rig, video=videos)), silhouettes
 
 
 def frames_of(silhouettes):

@@ -403,7 +403,7 @@ class TestTum:
     def test_a_drone_that_was_never_seen_has_a_file_too(self, tmp_path):
         never = two_drones()
         never.status[:, 1] = Status.LOST
-        with pytest.raises(InputError, match="at least one pose"):
+        with pytest.raises(InputError, match="at least one line with numbers"):
             read_tum(write_tum(tmp_path, never)[1])
 
     def test_existing_files_are_replaced_only_by_force(self, tmp_path):

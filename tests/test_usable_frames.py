@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import cameras_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -85,7 +86,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
                 writer.write(np.clip(image, 0, 255).astype(np.uint8))
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
     rig = make_rig({name: make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH) for name in videos})
-    return Recording("usable", folder, rig, videos)
+    return Recording("usable", folder, cameras_of(rig, video=videos))
 
 
 @pytest.fixture

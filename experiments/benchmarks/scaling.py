@@ -55,7 +55,7 @@ from psotrack.evaluation import evaluate
 from psotrack.foreground.silhouettes import Silhouettes, compute
 from psotrack.live import Meeting
 from psotrack.pipeline import TrackedRecording, prepare, track_runs
-from psotrack.recordings import Recording, VideoWriter, probe
+from psotrack.recordings import CameraRecording, Recording, Reference, VideoWriter, probe
 from psotrack.settings import TrackSettings
 from psotrack.support import COLOURS, processors, save_figure
 from psotrack.trajectories import Trajectories
@@ -288,7 +288,11 @@ def write_recording(scene: _scene.Scene, shape: Shape, folder: Path) -> Recordin
     )
     videos = {name: probe(path) for name, path in zip(scene.rig.names, paths, strict=True)}
     bounds_m = tuple(float(side) for side in _scene.BOUNDS_M.T.ravel())
-    recording = Recording("scaling", folder, scene.rig, videos, truth, bounds_m=bounds_m)
+    cameras = tuple(
+        CameraRecording(name, scene.rig.cameras[index], video)
+        for index, (name, video) in enumerate(videos.items())
+    )
+    recording = Recording("scaling", folder, cameras, Reference(truth), bounds_m=bounds_m)
     return recording.usable(num_frames=None)
 
 

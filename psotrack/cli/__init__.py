@@ -18,7 +18,6 @@ import click
 
 from psotrack import __version__
 from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
-from psotrack.cli.log_file import FirstOnly
 from psotrack.errors import PsotrackError, SettingsError, one_short_line
 
 __all__ = ["cli", "main"]
@@ -167,7 +166,6 @@ def cli(verbose: bool) -> None:
     """
     logging.addLevelName(logging.WARNING, "warning")
     handler = logging.StreamHandler(sys.stderr)
-    handler.addFilter(FirstOnly())
     level = logging.INFO if verbose else logging.WARNING
     # A log file takes more than stderr.
     handler.setLevel(level)

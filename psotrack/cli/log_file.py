@@ -23,21 +23,6 @@ said.propagate = False
 _TIME = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]")
 
 
-class FirstOnly(logging.Filter):
-    """Lets a warning pass once: `evaluate --offset`, for one, reads the reference twice."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._said: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is the first one with its text, or no warning."""
-        message = record.getMessage()
-        new = record.levelno < logging.WARNING or message not in self._said
-        self._said.add(message)
-        return new
-
-
 class LogFile:
     """A file that gets warnings, steps of the work, stages of the progress, printed sentences and the error.
 
@@ -65,7 +50,6 @@ class LogFile:
             found = error.strerror or f"{error}"
             raise OutputError(path, expected="a log file that can be written", found=found) from error
         self._handler.setLevel(logging.INFO)
-        self._handler.addFilter(FirstOnly())
         self._handler.setFormatter(_Formatter())
         self._steps = logging.getLogger("psotrack")
         self._level = self._steps.level

@@ -4,7 +4,6 @@ from .cameras import (
     NEAR_M,
     Camera,
     Rig,
-    distort,
     has_image,
     look_at,
     make_camera,
@@ -16,7 +15,7 @@ from .cameras import (
     undistort,
 )
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
-from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
+from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, distort
 from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
 from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
@@ -68,7 +67,6 @@ __all__ = [
     "triangulate",
     "triangulate_linearly",
     "undistort",
-    "undistort_approximately",
     "undistortion_stretch",
     "viewpoints",
     "views_meet",

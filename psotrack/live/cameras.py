@@ -61,17 +61,17 @@ def live_cameras(
     rig = recording.rig if names is None else recording.rig.select(chosen_cameras(names, recording.rig.names))
     found = []
     for name, (width, height) in zip(rig.names, rig.cameras.image_size_wh.astype(int).tolist(), strict=True):
-        times = recording.frame_times.get(name)
+        camera = recording.by_name[name]
+        video, times = camera.video, camera.times
         source: LiveSource
-        if replay and times is not None and name in recording.videos:
-            source = ReplayedVideo(recording.videos[name], times.time_s, speed, loops)
-        elif not replay and name in recording.streams:
-            source = CameraStream(recording.streams[name], (width, height))
+        if replay and video is not None and times is not None:
+            source = ReplayedVideo(video, times.time_s, speed, loops)
+        elif not replay and camera.stream is not None:
+            source = CameraStream(camera.stream, (width, height))
         else:
             continue
-        line_time_s, ignore = recording.line_time_s.get(name, 0.0), recording.ignore.get(name)
         fps = times.fps if times is not None else _USUAL_HZ
-        found.append(LiveCamera(name, source, fps, line_time_s, ignore))
+        found.append(LiveCamera(name, source, fps, camera.line_time_s, camera.ignore))
     if len(found) < 2:
         what = "videos" if replay else "the address of a stream or the number of a device as `video`"
         expected, there = f"at least two cameras of the rig with {what}", [each.name for each in found]

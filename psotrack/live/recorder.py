@@ -26,6 +26,7 @@ from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import (
     RECORDING_FILE,
+    CameraRecording,
     CameraTable,
     Recording,
     RecordingFile,
@@ -186,14 +187,15 @@ def recording_folder(
         if width % 2 or height % 2:
             expected = "images with even numbers of pixels, as the codec halves the resolution of colours"
             raise SettingsError("--record", expected=expected, found=f"{width} x {height} of camera {name}")
-    tables = {name: _table(recording, name) for name in names}
+    tables = {name: _table(recording.by_name[name]) for name in names}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # Otherwise the files of an earlier recording would be taken for those of a camera that stays silent.
         _remove_files(folder, tables)
         for name, table in tables.items():
-            if table.ignore is not None:
-                shutil.copyfile(recording.ignore[name], folder / table.ignore)
+            ignore = recording.by_name[name].ignore
+            if ignore is not None:
+                shutil.copyfile(ignore, folder / f"{table.ignore}")
     except OSError as error:
         expected, found = "a folder that can be written", error.strerror or f"{error}"
         raise OutputError(folder, expected=expected, found=found) from error
@@ -221,11 +223,10 @@ def _check_folder(folder: Path, recording: Recording, force: bool) -> None:
         raise OutputError(folder, expected=expected, found=found, remedy=remedy)
 
 
-def _table(recording: Recording, name: str) -> CameraTable:
-    video, times = _files_of(name)
-    ignore, line_time_s = recording.ignore.get(name), recording.line_time_s.get(name, 0.0)
-    copied = None if ignore is None else f"{name}_ignore{ignore.suffix}"
-    return CameraTable(video=video, timestamps=times, ignore=copied, line_time_s=line_time_s)
+def _table(camera: CameraRecording) -> CameraTable:
+    video, times = _files_of(camera.name)
+    copied = None if camera.ignore is None else f"{camera.name}_ignore{camera.ignore.suffix}"
+    return CameraTable(video=video, timestamps=times, ignore=copied, line_time_s=camera.line_time_s)
 
 
 def _remove_files(folder: Path, tables: Mapping[str, CameraTable]) -> None:

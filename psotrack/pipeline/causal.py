@@ -127,7 +127,7 @@ def track_causally(
     record |= {
         "sequence": recording.name,
         "frames": timeline.num_instants,
-        "frames_asked": recording.num_instants,
+        "frames_asked": recording.timing.num_instants,
         "input_keys": dict(made.keys),
     }
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from psotrack.calibration.clocks import CameraClocks, clocks_of_tracks
 from psotrack.pipeline.inputs import Run
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, Timing
 from psotrack.settings import BLOBS
 from psotrack.tracking.matching import from_silhouettes
 from psotrack.trajectories import Tracks
@@ -66,5 +66,10 @@ def advise_on_clocks(run: Run, tracks: Tracks) -> None:
 
 def with_clocks(recording: Recording, clocks: CameraClocks) -> Recording:
     """The recording with corrected times of the frames, and with as many instants as before."""
-    times = clocks.corrected(recording.frame_times, recording.rig.names)
-    return replace(recording, frame_times=times, rate_hz=recording.fps, num_instants=recording.num_frames)
+    given = {each.name: each.times for each in recording.placed if each.times is not None}
+    times = clocks.corrected(given, recording.rig.names)
+    return replace(
+        recording,
+        cameras=tuple(replace(each, times=times.get(each.name)) for each in recording.cameras),
+        timing=Timing(recording.fps, recording.num_frames),
+    )

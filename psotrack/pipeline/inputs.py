@@ -71,7 +71,7 @@ def usable_for(
             found=f"that no views of {', '.join(names)} meet",
             remedy="check the places and directions of the cameras in the calibration",
         )
-    shown = [name for name in names if name in usable.videos or name in usable.silhouettes]
+    shown = [each.name for each in usable.cameras if each.video or each.silhouettes]
     if settings.needs_silhouettes and len(shown) < 2:
         raise InputError(
             recording.folder,
@@ -90,7 +90,7 @@ def detection_files_of(recording: Recording, source: str) -> Mapping[str, Path]:
     """
     if source != YOLO:
         return detection_files(Path(source), recording.rig.names)
-    if recording.detections is None:
+    if not recording.detections:
         raise InputError(
             recording.folder,
             expected="detections in dl_data or in recording.toml",

@@ -152,9 +152,13 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         "cameras": list(recording.rig.names),
         "rate_hz": timeline.rate_hz,
         "camera_times": {
-            name: {"fps": times.fps, "time_offset_s": times.time_offset_s, "frames": times.num_frames}
-            for name, times in recording.frame_times.items()
-            if name in recording.rig.names
+            each.name: {
+                "fps": each.times.fps,
+                "time_offset_s": each.times.time_offset_s,
+                "frames": each.times.num_frames,
+            }
+            for each in recording.placed
+            if each.times is not None
         },
         **({} if run.clocks is None else {"camera_clocks": run.clocks.record(recording.rig.names)}),
         "settings": msgspec.to_builtins(settings),

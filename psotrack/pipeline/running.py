@@ -112,7 +112,7 @@ def track_recording(
         raise tracked
     if run.clocks is None and len(recording.rig) > 2:
         advise_on_clocks(run, result.tracks)
-    record = {**tracked.record, "frames_asked": recording.num_instants}
+    record = {**tracked.record, "frames_asked": recording.timing.num_instants}
     return replace(tracked, record=with_real_time(record, time.perf_counter() - began))
 
 

@@ -1,3 +1,4 @@
+from .camera_recording import CameraRecording
 from .detections import Detections, read_detections, write_detections
 from .filmed import recording_of_video, with_all_videos
 from .image_files import (
@@ -14,7 +15,7 @@ from .image_files import (
 from .inventory import inventory_table
 from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
-from .recording import OnboardVideo, Recording
+from .recording import OnboardVideo, Recording, Reference, Timing
 from .recording_file import (
     RECORDING_FILE,
     CameraTable,
@@ -49,6 +50,7 @@ __all__ = [
     "MOST_INSTANTS",
     "REACH",
     "RECORDING_FILE",
+    "CameraRecording",
     "CameraTable",
     "Detections",
     "FrameTimes",
@@ -56,9 +58,11 @@ __all__ = [
     "OnboardVideo",
     "Recording",
     "RecordingFile",
+    "Reference",
     "ReferenceTable",
     "StoredSilhouettes",
     "Timeline",
+    "Timing",
     "TruncatedVideoError",
     "VideoEncoder",
     "VideoInfo",

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from psotrack.geometry import Camera, make_camera, make_rig
+from psotrack.geometry import Camera, make_camera
+from psotrack.recordings.camera_recording import CameraRecording
 from psotrack.recordings.recording import Recording
 from psotrack.recordings.video import VideoInfo
 
@@ -19,18 +20,18 @@ def recording_of_video(video: VideoInfo) -> Recording:
     """A recording of one camera with the name of the video's file, without its ending, or of the pictures' folder."""
     path = video.path.resolve()
     name = path.name if video.images else path.stem
-    return Recording(name, path.parent, make_rig({name: _stand_in(video)}), {name: video})
+    return Recording(name, path.parent, (CameraRecording(name, _stand_in(video), video),))
 
 
 def with_all_videos(recording: Recording) -> Recording:
     """The recording with a lens and a place for each camera that has a video; never to be used for positions."""
-    names = [name for name in recording.unplaced if name in recording.videos]
-    if not names:
-        return recording
-    placed = {name: recording.rig.cameras[index] for index, name in enumerate(recording.rig.names)}
-    others = {name: _stand_in(recording.videos[name]) for name in names}
-    unplaced = tuple(name for name in recording.unplaced if name not in names)
-    return replace(recording, rig=make_rig(placed | others), unplaced=unplaced)
+    cameras = (
+        replace(each, camera=_stand_in(each.video))
+        if each.camera is None and each.video is not None
+        else each
+        for each in recording.cameras
+    )
+    return replace(recording, cameras=tuple(cameras))
 
 
 def _stand_in(video: VideoInfo) -> Camera:

@@ -135,6 +135,11 @@ def read_json(path: Path | str, expected: str = "a JSON object", remedy: str = "
     return content
 
 
+def json_text(content: Any) -> str:
+    """The content as JSON. JSON has no NaN: a missing number is null. Infinite numbers are an error of the caller."""
+    return json.dumps(_with_null(content), indent=2, allow_nan=False)
+
+
 def toml_key(name: str) -> str:
     """A name as key of a TOML file, in quotes where it needs them."""
     return name if _BARE_KEY.fullmatch(name) else toml_value(name)
@@ -223,6 +228,14 @@ def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str,
             found=f"{unknown}" if unknown else f"{error}",
             remedy=f"did you mean {near}?" if near else "",
         ) from None
+
+
+def _with_null(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _with_null(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_with_null(value) for value in content]
+    return None if isinstance(content, float) and math.isnan(content) else content
 
 
 def _can_hold(container: Any, token: str | int) -> bool:

@@ -1,7 +1,8 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
 from .cluster import Cluster
+from .estimates import Estimate, SweepPlan, estimate, plan
 from .grid_files import Grid, grid, read_grid
-from .grid_runs import Estimate, SweepOutcome, estimate, run_grid, sweep
+from .grid_runs import SweepOutcome, sweep
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
 from .store import Store, is_results_folder
@@ -16,6 +17,7 @@ __all__ = [
     "Perturbation",
     "Store",
     "SweepOutcome",
+    "SweepPlan",
     "cameras_label",
     "cell_key",
     "delays_frames",
@@ -24,8 +26,8 @@ __all__ = [
     "is_results_folder",
     "perturb",
     "pivot",
+    "plan",
     "read_grid",
     "render_table",
-    "run_grid",
     "sweep",
 ]

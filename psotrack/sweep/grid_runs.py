@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Generator, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, html_block, html_table, report_of, user_cache
 from psotrack.sweep.cells import Cell, cell_key, cell_name, input_digest, title
 from psotrack.sweep.cluster import Cluster, run_on_cluster
 from psotrack.sweep.grid_files import Grid, read_grid
@@ -23,6 +23,7 @@ from psotrack.sweep.machine import provenance
 from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.runner import Result, finished_before, run_cell, store_failure
 from psotrack.sweep.store import Store
+from psotrack.sweep.tables import DESCRIBING
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,14 @@ class SweepOutcome:
             f"{self.store.folder}: {self.count('finished')} cells finished now, {self.count('left')} before"
         )
         return f"{said}, {failed} failed (see {self.store.folder}/cells/*.error.json)" if failed else said
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: what differs between the rows, and their mean errors."""
+        rows = self.rows()
+        described = [name for name in map(str, rows) if name.startswith(DESCRIBING)]
+        names = [name for name in described if rows[name].astype(str).nunique() > 1]
+        names += ["seed", "mean_error_m", "missed_rate"]
+        return html_block(f"{self}", html_table(names, rows[names].astype(str).to_numpy().tolist()))
 
     @property
     def errors(self) -> list[str]:
@@ -72,82 +81,54 @@ def sweep(
     out: Path | str,
     *,
     data: Path | str = "data",
-    cache: Path | str,
+    cache: Path | str | None = None,
     jobs: int | None = None,
     cluster: Cluster | str | None = None,
-    report: Report = no_progress,
-) -> pd.DataFrame:
-    """Track with every combination of a grid's settings; returns one row per cell and run, as `psotrack sweep` stores.
+    progress: bool | Report = False,
+) -> SweepOutcome:
+    """Track with every combination of a grid's settings, and keep one row per run.
 
     Finished cells in `out` are not run again: the same call takes seconds the second time, and a call with a larger
-    grid runs only the new cells. Other programs may work on the same folder at the same time.
+    grid runs only the new cells. Several programs may work on one folder at the same time: the function waits for cells
+    that other programs work on, and runs these cells when the other programs were killed.
 
     Args:
         grid: a grid, its TOML file, or a mapping with the same content.
-        out: folder of the results.
+        out: folder of the results (see `Store`).
         data: root folder of the sequences that the grid names.
-        cache: folder of the stored silhouettes.
+        cache: folder of the stored silhouettes, and of a cluster's compiled programs; None takes the user's cache
+            folder.
         jobs: number of processes that make silhouettes; None is one per processor.
         cluster: a `Cluster`, "local" for a cluster on this machine, the address of a Dask scheduler, or None for this
-            process. With a local cluster, scripts must make this call below `if __name__ == "__main__":`.
-        report: progress bar for the cells.
+            process. All workers must see `out`, `data` and `cache` under the same paths. With a local cluster, scripts
+            must make this call below `if __name__ == "__main__":`.
+        progress: whether to show a progress bar for the cells; or a function that shows the progress.
 
     Returns:
-        Rows of the grid's cells and seeds only, in the grid's order. Settings are columns with dots
-        (`settings.swarm.particles`), and metrics have units in their names. `seconds.*`, `device.*`, `versions.*` and
-        `commit` record the time and the origin of a row. `real_time_factor` is seconds of video per second of wall
-        clock of a run's share of its batch, with stored silhouettes; `real_time_factor_running` is the same without
-        compilation. `attrs["errors"]` lists failed cells by title.
+        The outcome; its `rows()` are a pandas frame with the grid's cells and seeds, in the grid's order. Settings are
+        columns with dots (`settings.swarm.particles`), and metrics have units in their names. `seconds.*`, `device.*`,
+        `versions.*` and `commit` record the time and the origin of a row. `real_time_factor` is seconds of video per
+        second of wall clock of a run's share of its batch, with stored silhouettes; `real_time_factor_running` is the
+        same without compilation. `attrs["errors"]` lists failed cells by title.
 
     Raises:
-        InputError: a sequence does not exist, or every cell failed.
+        InputError: a sequence does not exist, or there is no cluster at the address.
         SettingsError: a value of the grid is wrong.
         OutputError: the results cannot be written.
 
     Example:
         How the error falls with the number of particles:
 
-            rows = sweep(
+            outcome = sweep(
                 {"sequences": ["S02_D4_A"], "runs": 5, "grid": {"swarm.particles": [20, 50, 100]}},
-                out="results", data="data", cache="cache", report=psotrack.support.progress_bar,
+                out="results", data="data", progress=True,
             )
-            rows.groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
+            outcome.rows().groupby("settings.swarm.particles")["mean_error_m"].agg(["mean", "std"])
     """
     if not isinstance(grid, Grid):
         grid = read_grid(Path(grid)) if isinstance(grid, Path | str) else grid_of(grid)
     cluster = Cluster(cluster) if isinstance(cluster, str) else cluster
-    return run_grid(grid, out, data=data, cache=cache, jobs=jobs, cluster=cluster, report=report).rows()
-
-
-def run_grid(
-    grid: Grid,
-    out: Path | str,
-    *,
-    data: Path | str,
-    cache: Path | str,
-    jobs: int | None = None,
-    cluster: Cluster | None = None,
-    report: Report = no_progress,
-) -> SweepOutcome:
-    """Run the unfinished cells of a grid. Several runners on one folder share the work.
-
-    The function returns when every cell is finished or has failed. It waits for cells that other runners work on, and
-    runs these cells when the other runners were killed.
-
-    Args:
-        grid: the cells to run.
-        out: folder of the results (see `Store`).
-        data: root folder of the sequences that the grid names.
-        cache: folder of the stored silhouettes, and of a cluster's compiled programs.
-        jobs: number of processes that make silhouettes; None is one per processor.
-        cluster: where the cells run; None runs them in this process, one after the other. All workers of a cluster must
-            see `out`, `data` and `cache` under the same paths.
-        report: progress bar for the cells that are not finished.
-
-    Raises:
-        InputError: a sequence does not exist, or there is no cluster at the address.
-        OutputError: the results cannot be written.
-    """
+    cache = user_cache() if cache is None else cache
     for sequence in grid.sequences:
         folder_of(sequence, Path(data))
     origin = provenance()
@@ -162,7 +143,7 @@ def run_grid(
         more = _run_here(cells, inputs, store)
     else:
         more = run_on_cluster(cluster, cells, inputs, store)
-    with report("sweep", len(cells)) as advance, contextlib.closing(more):
+    with report_of(progress)("sweep", len(cells)) as advance, contextlib.closing(more):
         for result in more:
             results.append(result)
             advance(1)
@@ -218,87 +199,3 @@ def _by_input(cells: Iterable[Cell]) -> list[Cell]:
     for cell in cells:
         groups.setdefault((source_of(cell), cell.cameras, cell.perturbation), []).append(cell)
     return [cell for group in groups.values() for cell in group]
-
-
-# What is still to run
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a sweep would run.
-
-    Attributes:
-        cells: number of cells of the grid.
-        finished: number of cells that are finished.
-        unread: number of cells whose input cannot be read.
-        runs: number of runs of the other cells that are not finished.
-        run_s: median time of a finished run in the folder of results, without compiling, seconds; None if there is
-            none.
-        faults: why inputs cannot be read, each reason once.
-    """
-
-    cells: int
-    finished: int
-    unread: int
-    runs: int
-    run_s: float | None
-    faults: tuple[str, ...]
-
-    @property
-    def total_s(self) -> float | None:
-        """Time of all runs, if each takes as long as a finished one, seconds; None if that is not known."""
-        return None if self.run_s is None else self.runs * self.run_s
-
-    def to_dict(self) -> dict[str, Any]:
-        """All numbers, fit for JSON."""
-        return asdict(self) | {"total_s": self.total_s}
-
-    def __str__(self) -> str:
-        unread = f", {self.unread} cannot be read" if self.unread else ""
-        to_run = self.cells - self.finished - self.unread
-        said = f"{self.cells} cells: {self.finished} finished{unread}, {to_run} to run ({self.runs} runs)"
-        if not self.runs:
-            return said
-        if self.total_s is None:
-            return f"{said}; how long they take is known when a cell is finished"
-        return f"{said}, about {_in_words(self.total_s)} at {self.run_s:.2g} s per run, as the finished runs"
-
-
-def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Estimate:
-    """Count the cells that are not finished.
-
-    Args:
-        cells: cells of a grid.
-        inputs: inputs of the cells.
-        store: stored results; None for no results.
-    """
-    missing, faults = [], []
-    for cell in cells:
-        try:
-            key = cell_key(cell, inputs.keys_of(cell))
-        except PsotrackError as error:
-            faults.append(f"{error}")
-        else:
-            missing.append(len(set(cell.seeds) - (store.finished_seeds(key) if store else set())))
-    count, reasons = len(missing) + len(faults), tuple(dict.fromkeys(faults))
-    return Estimate(count, missing.count(0), len(faults), sum(missing), _run_s(store), reasons)
-
-
-def _run_s(store: Store | None) -> float | None:
-    """Median time of a finished run, seconds; the times of compiling and of silhouettes are not in it."""
-    try:
-        rows = store.rows() if store else pd.DataFrame()
-    except InputError:
-        return None
-    if "seconds.batch" not in rows:
-        return None
-    per_run_s = rows["seconds.batch"] / rows["runs_in_batch"] - rows["seconds.compile"].fillna(0)
-    return float(per_run_s.median())
-
-
-def _in_words(seconds: float) -> str:
-    """A time with few digits, because the estimate is rough."""
-    for limit, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172800, 3600, "h")):
-        if seconds < limit:
-            return f"{seconds / unit_s:.0f} {unit}"
-    return f"{seconds / 86400:.0f} days"

@@ -61,7 +61,7 @@ def perturb(
     index = [every.index(name) for name in kept]
     if perturbation.extrinsics_deg:
         rngs = [_rng(_EXTRINSICS, perturbation.draw, camera) for camera in index]
-        recording = replace(recording, rig=_turn_cameras(recording.rig, perturbation.extrinsics_deg, rngs))
+        recording = recording.with_rig(_turn_cameras(recording.rig, perturbation.extrinsics_deg, rngs))
     if silhouettes is not None and perturbation.clock_frames:
         arrays = [
             _delay(stored, late)

@@ -22,8 +22,6 @@ from psotrack.calibration.clocks.camera_clocks import CameraOffsets, camera_offs
 from psotrack.calibration.clocks.time_shift import ShiftedPair, refused, shifted
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Recording
-from psotrack.recordings.datasets import read_own_reference
-from psotrack.recordings.mocap import body_trajectories, read_c3d
 from psotrack.support import COLOURS, save_figure, standard_error
 from psotrack.trajectories import Trajectories
 
@@ -153,28 +151,15 @@ def find_offset(
 
 
 def own_reference(recording: Recording) -> Trajectories:
-    """The reference of a recording at its own rate and with its own clock: the .c3d file, or else the pose files.
-
-    The clock of a reference that `recording.toml` names is shifted by the offset that is stated there.
-
-    Orientations are returned only if every position has an orientation.
+    """The reference of a recording at its own rate, with orientations only if every position has one.
 
     Raises:
-        InputError: the sequence has no reference, or the .c3d file cannot be used.
+        InputError: the recording has no reference.
     """
-    reference = recording.truth
-    if recording.reference_files:
-        own = read_own_reference(recording.reference_files, recording.fps, recording.bodies)
-        reference = replace(own, time_s=own.time_s + recording.reference_offset_s)
-    for path in () if recording.reference_files else recording.folder.iterdir():
-        if path.suffix.lower() == ".c3d":
-            markers = read_c3d(path)
-            num_frames = len(markers.position_m)
-            reference = body_trajectories(
-                markers, fps=markers.rate_hz, num_frames=num_frames, where=path, named=recording.bodies
-            )
-    if reference is None:
+    known = recording.reference
+    if known is None:
         raise InputError(recording.folder, expected="a reference to synchronise with", found="none")
+    reference = known.truth if known.own is None else known.own
     if reference.orientation_wxyz is not None:
         turned = np.isfinite(reference.orientation_wxyz).all(axis=-1)
         if not turned[reference.seen].all():

@@ -143,15 +143,17 @@ def open_recorded(
     Raises:
         InputError: no camera has a video.
     """
-    names = list(recording.videos)
-    if not names:
+    if not recording.videos:
         raise InputError(recording.folder, expected="videos or images of a board", found="none")
     cameras = tuple(
         CameraImages(name, video.path, video.image_size_wh, np.arange(video.num_frames), video)
-        for name, video in ((name, recording.videos[name]) for name in names)
+        for name, video in recording.videos.items()
     )
     # Not the timeline of the recording, which has only the cameras that are placed.
-    timeline = make_timeline({name: recording.frame_times[name] for name in names}, recording.rate_hz)
+    timeline = make_timeline(
+        {each.name: each.times for each in recording.cameras if each.video and each.times},
+        recording.timing.rate_hz,
+    )
     number = _spread(np.arange(timeline.num_instants), floor)
     return cameras, (number, timeline.frame[number].astype(np.int64))
 
@@ -209,7 +211,7 @@ def _open(name: str, path: Path) -> CameraImages:
     elif path.is_dir():
         files = image_files(path)
         if not files:
-            raise InputError(path, expected="a folder of images", found="none in it")
+            raise InputError(path, expected="a folder with videos or images", found="neither in it")
     else:
         video = probe(path)
         return CameraImages(name, path, video.image_size_wh, np.arange(video.num_frames), video)

@@ -132,19 +132,20 @@ def _tasks(recording: Recording, part: str, settings: LabelSettings, out: Path) 
     truth = recording.truth
     if truth is None:
         raise InputError(recording.folder, expected="a reference with the drones' positions", found="none")
-    filmed = [name for name in recording.rig.names if name in recording.videos]
+    filmed = [each.name for each in recording.placed if each.video is not None]
     recording = recording.usable(filmed, recording.num_frames)
     tasks = []
-    for index, name in enumerate(recording.rig.names):
-        times = recording.frame_times[name]
+    for index, (name, video) in enumerate(recording.videos.items()):
+        times = recording.by_name[name].times
+        assert times is not None, "a video has times"
         frame = np.arange(0, times.num_frames, settings.every)
         corners_m = box_corners(resample(truth, frame, times.time_s[frame]), settings)
         known = np.isfinite(corners_m).all(axis=(1, 2, 3))
         if known.any():
             xyxy = label_boxes(recording.rig.cameras[index], corners_m[known], settings)
-            labels = [_lines(boxes, recording.videos[name].image_size_wh) for boxes in xyxy]
+            labels = [_lines(boxes, video.image_size_wh) for boxes in xyxy]
             stem = check_file_name(f"{recording.name}_{name}", recording.folder)
-            tasks.append(_Task(out, part, stem, recording.videos[name], frame[known].tolist(), labels))
+            tasks.append(_Task(out, part, stem, video, frame[known].tolist(), labels))
     if not tasks:
         expected = f"a frame in which the poses of all drones are known, with a step of {settings.every}"
         raise InputError(recording.folder, expected=expected, found="none")

@@ -76,7 +76,7 @@ def compute(
     """
     jobs = num_processes(jobs)
     recording = recording.usable(recording.rig.names, videos=all_videos, silhouettes=True)
-    if not recording.videos and not recording.silhouettes:
+    if not any(each.video or each.silhouettes for each in recording.cameras):
         raise InputError(recording.folder, expected="at least one video", found="none")
     scaled = scaled_settings(settings, recording)
     model = find_background(settings.background, scaled) if background is None else background
@@ -108,7 +108,8 @@ def compute(
             )
         arrays[name] = array
         # Without the future, whoever reads a frame decides about this frame.
-        if scaled.first_look and (intervals := _left_out(name, array, recording.frame_times[name])):
+        times = recording.by_name[name].times
+        if scaled.first_look and times and (intervals := _left_out(name, array, times)):
             arrays[name], left_out[name] = _without(array, intervals), intervals
     shape = tuple(np.max([array.shape[1:] for array in arrays.values()], axis=0).tolist())
     nothing = np.zeros((0, *shape), np.uint8)
@@ -189,10 +190,11 @@ def scaled_settings(settings: SilhouetteSettings, recording: Recording) -> Foreg
         InputError: this version does not know the settings with which these silhouettes were made.
     """
     rig = recording.rig
-    alone = [name for name in rig.names if name in recording.silhouettes.keys() - recording.videos]
+    stored = {each.name: each.silhouettes for each in recording.cameras if each.silhouettes}
+    alone = [name for name in stored if name not in recording.videos]
     sizes_wh = [_size_wh(rig, name) for name in [*recording.videos, *alone]]
     if alone and settings.drone_px is None:
-        made_with = _made_with(recording.silhouettes[alone[0]])
+        made_with = _made_with(stored[alone[0]])
         still_open = {name: getattr(made_with, name) for name in _OPEN if getattr(settings, name) is None}
         settings = msgspec.structs.replace(settings, **still_open)
     return settings.scaled(sizes_wh, usual_drone_px(rig))
@@ -212,24 +214,23 @@ def usual_drone_px(rig: Rig) -> float | None:
 def _tasks(
     recording: Recording, scaled: ForegroundSettings, model: BackgroundModel, cache: Path
 ) -> dict[str, Task]:
-    names = [name for name in recording.rig.names if name in recording.videos]
-
     def task(name: str) -> Task:
-        return task_of(recording.videos[name], scaled, model, recording.ignore.get(name), cache)
+        return task_of(recording.videos[name], scaled, model, recording.by_name[name].ignore, cache)
 
     with ThreadPoolExecutor() as threads:  # digests of files
-        return dict(zip(names, threads.map(task, names), strict=True))
+        return dict(zip(recording.videos, threads.map(task, recording.videos), strict=True))
 
 
 def _places(recording: Recording, tasks: Mapping[str, Task]) -> dict[str, StoredSilhouettes]:
     """Where each camera's silhouettes are: the recording's own are used where they are those that the task makes."""
-    places = {name: task.stored for name, task in tasks.items()}
-    places |= {
-        name: stored
-        for name, stored in recording.silhouettes.items()
-        if name not in tasks or stored.key == tasks[name].stored.key
-    }
-    return {name: places[name] for name in recording.rig.names if name in places}
+    places = {}
+    for each in recording.cameras:
+        made, brought = tasks.get(each.name), each.silhouettes
+        if brought is not None and (made is None or brought.key == made.stored.key):
+            places[each.name] = brought
+        elif made is not None:
+            places[each.name] = made.stored
+    return places
 
 
 def _check_made_with(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from psotrack.pipeline.archives.zip_file import Source, write_archive
 from psotrack.recordings import (
     ARRAY_FILE,
     RECORDING_FILE,
+    CameraRecording,
     CameraTable,
     FrameTimes,
     MarkersTable,
@@ -33,7 +34,6 @@ from psotrack.recordings import (
     digest_video,
     recording_file_text,
 )
-from psotrack.recordings.datasets import reference_files
 from psotrack.settings import YOLO
 from psotrack.support import Report, digest_file, no_progress, refuse_to_overwrite
 from psotrack.trajectories import read_trajectories
@@ -83,7 +83,7 @@ def pack_tracks(
     settings = record.settings
     used = _recording_of(tracks, record, recording)
     silhouettes = stored_silhouettes(used, settings.silhouettes, cache) if settings.needs_silhouettes else {}
-    detections: Mapping[str, Path] = used.detections or {}
+    detections: Mapping[str, Path] = used.detections
     keys = {name: stored.key for name, stored in silhouettes.items()}
     if settings.reads_detections:
         detections = detection_files_of(used, settings.detections)
@@ -109,8 +109,17 @@ def pack_tracks(
     if settings.reads_detections:
         changes["detections"] = YOLO
 
-    shown = _Shown(silhouettes, detections, videos)
-    content, packed_videos, more = _recording_file(recording, used, shown)
+    cameras = [
+        replace(
+            recording.by_name[each.name],
+            silhouettes=silhouettes.get(each.name),
+            detections=detections.get(each.name),
+        )
+        for each in used.cameras
+    ]
+    filmed = [each for each in used.cameras if each.video is not None]
+    packed_videos = {each.name: _packed_video(each, silhouettes.get(each.name), videos) for each in filmed}
+    content, more = _recording_file(replace(recording, cameras=tuple(cameras)), packed_videos)
     manifest = Manifest(
         psotrack=version("psotrack"),
         sequence=record.sequence,
@@ -125,81 +134,75 @@ def pack_tracks(
     return write_archive(out, manifest, files, force=force, report=report)
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """What an archive holds of what the cameras show.
-
-    Attributes:
-        silhouettes: stored silhouettes by camera name.
-        detections: files of detections by camera name.
-        with_videos: whether the videos are packed.
-    """
-
-    silhouettes: Mapping[str, StoredSilhouettes]
-    detections: Mapping[str, Path]
-    with_videos: bool
+def _packed_video(camera: CameraRecording, stored: StoredSilhouettes | None, with_video: bool) -> PackedVideo:
+    """What the manifest says of the video of a camera."""
+    video = camera.video
+    assert video is not None
+    return PackedVideo(
+        name=video.path.name,
+        frames=video.num_frames,
+        digest=digest_video(video) if stored is None else stored.made_of["content"],
+        packed_as=f"videos/{camera.name}{'' if video.images else video.path.suffix}" if with_video else None,
+    )
 
 
 def _recording_file(
-    recording: Recording, used: Recording, shown: _Shown
-) -> tuple[RecordingFile, dict[str, PackedVideo], _Files]:
-    """The content of `recording.toml`, what the manifest says of each video, and the files that both name.
-
-    Args:
-        recording: the recording as it was opened.
-        used: the recording with the cameras and frames of the run.
-        shown: what the archive holds of what the cameras show.
-    """
+    recording: Recording, packed_videos: Mapping[str, PackedVideo]
+) -> tuple[RecordingFile, _Files]:
+    """The content of `recording.toml`, and the files that it names."""
     files: _Files = {}
-    tables, packed_videos = {}, {}
-    for index, name in enumerate(used.rig.names):
-        table = _lens_and_place(used.rig.cameras[index])
-        table["line_time_s"] = recording.line_time_s.get(name, 0.0)
-        video, stored = used.videos.get(name), shown.silhouettes.get(name)
-        if video is not None:
-            digest = digest_video(video) if stored is None else stored.made_of["content"]
-            path = f"videos/{name}{'' if video.images else video.path.suffix}" if shown.with_videos else None
-            packed_videos[name] = PackedVideo(
-                name=video.path.name, frames=video.num_frames, digest=digest, packed_as=path
-            )
-            if path is not None:
-                table["video"] = path
-                files |= _video_files(path, recording.videos[name])
-        if stored is not None:
-            table["silhouettes"] = f"silhouettes/{name}"
-            files |= _array_files(table["silhouettes"], stored.path)
-        for key, path_of in (("ignore", recording.ignore), ("detections", shown.detections)):
-            if name in path_of:
-                table[key] = f"{key}/{name}{path_of[name].suffix}"
-                files[table[key]] = path_of[name]
-        times = recording.frame_times[name]
-        if times.listed_s is not None:
-            table["timestamps"] = f"timestamps/{name}.csv"
-            files[table["timestamps"]] = _timestamps(times)
-        else:
-            table |= {"fps": times.fps, "time_offset_s": times.time_offset_s or None}
-            if stored is None and "video" not in table:
-                table["frames"] = times.num_frames
-        tables[name] = CameraTable(**table)
-
+    tables = {}
+    for each in recording.cameras:
+        packed = packed_videos.get(each.name)
+        tables[each.name], named = _camera_table(each, None if packed is None else packed.packed_as)
+        files |= named
     reference = markers = None
-    if references := reference_files(recording):
-        names = [f"reference/{index}/{path.name}" for index, path in enumerate(references)]
-        files |= dict(zip(names, references, strict=True))
-        reference = ReferenceTable(
-            files=tuple(names),
-            time_offset_s=recording.reference_offset_s,
-            bodies={name: tuple(labels) for name, labels in recording.bodies.items()},
-        )
+    if recording.reference is not None:
+        known = recording.reference
+        names = [f"reference/{index}/{path.name}" for index, path in enumerate(known.files)]
+        files |= dict(zip(names, known.files, strict=True))
+        bodies = {name: tuple(labels) for name, labels in known.bodies.items()}
+        reference = ReferenceTable(files=tuple(names), time_offset_s=known.offset_s, bodies=bodies)
     if recording.marker_corners is not None:
         markers = MarkersTable(corners="marker_corners.csv")
         files["marker_corners.csv"] = recording.marker_corners
-    world = WorldTable()
-    if used.bounds_m is not None:
-        x0, x1, y0, y1, z0, z1 = used.bounds_m
-        world = WorldTable(bounds_m=((x0, y0, z0), (x1, y1, z1)))
+    world, bounds_m = WorldTable(), recording.bounds_m
+    if bounds_m is not None:
+        world = WorldTable(bounds_m=(bounds_m[0::2], bounds_m[1::2]))
     content = RecordingFile(version=1, cameras=tables, world=world, reference=reference, markers=markers)
-    return content, packed_videos, files
+    return content, files
+
+
+def _camera_table(camera: CameraRecording, video_path: str | None) -> tuple[CameraTable, _Files]:
+    """The table of a camera, and the files that it names.
+
+    Args:
+        camera: a camera with lens, place and times.
+        video_path: path of its video in the archive; None where the archive does not hold it.
+    """
+    video, stored, times = camera.video, camera.silhouettes, camera.times
+    assert camera.camera is not None
+    assert times is not None
+    table = {**_lens_and_place(camera.camera), "line_time_s": camera.line_time_s}
+    files: _Files = {}
+    if video is not None and video_path is not None:
+        table["video"] = video_path
+        files |= _video_files(video_path, video)
+    if stored is not None:
+        table["silhouettes"] = f"silhouettes/{camera.name}"
+        files |= _array_files(table["silhouettes"], stored.path)
+    for key, path in (("ignore", camera.ignore), ("detections", camera.detections)):
+        if path is not None:
+            table[key] = f"{key}/{camera.name}{path.suffix}"
+            files[table[key]] = path
+    if times.listed_s is not None:
+        table["timestamps"] = f"timestamps/{camera.name}.csv"
+        files[table["timestamps"]] = _timestamps(times)
+    else:
+        table |= {"fps": times.fps, "time_offset_s": times.time_offset_s or None}
+        if stored is None and video_path is None:
+            table["frames"] = times.num_frames
+    return CameraTable(**table), files
 
 
 def _recording_of(tracks: Path, record: TrackRecord, opened: Recording) -> Recording:

@@ -17,10 +17,14 @@ from ._onboard import (
     write_onboard_calibration,
 )
 from ._poses import pose_file, read_poses, unit_quaternion, write_poses
-from ._reference import read_own_reference
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
-from .drafting import Draft, DraftOptions, draft_recording
-from .opening import find_marker_corners, is_recording, open_recording, reference_files, videos_in
+from .drafting import Draft, DraftOptions, Unclear, Unmatched, draft_recording, unclear_files
+from .opening import (
+    find_marker_corners,
+    is_recording,
+    open_recording,
+    videos_in,
+)
 
 __all__ = [
     "CALIBRATION",
@@ -33,6 +37,8 @@ __all__ = [
     "MarkerRow",
     "MaskWriter",
     "Masks",
+    "Unclear",
+    "Unmatched",
     "detection_files",
     "draft_recording",
     "find_marker_corners",
@@ -50,11 +56,10 @@ __all__ = [
     "read_mocap_markers",
     "read_onboard",
     "read_onboard_calibration",
-    "read_own_reference",
     "read_poses",
     "read_sequence",
-    "reference_files",
     "split_label",
+    "unclear_files",
     "unit_quaternion",
     "videos_in",
     "write_marker_corners",

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
+from psotrack.recordings import Reference, Timeline
 from psotrack.recordings.datasets._poses import read_poses
-from psotrack.recordings.mocap import body_trajectories, read_c3d
+from psotrack.recordings.mocap import marker_bodies, read_c3d
 from psotrack.support import read_text
 from psotrack.trajectories import Trajectories, read_trajectories, resample
 from psotrack.trajectories.tum import read_tum
@@ -28,18 +29,41 @@ _SUFFIXES = (".csv", ".parquet", ".tum", ".txt", ".c3d")
 Bodies = Mapping[str, Sequence[str]]
 
 
-def read_reference(paths: Sequence[Path], fps: float, bodies: Bodies | None = None) -> list[Trajectories]:
-    """The reference of each file, at its own rate and with its own clock.
+def read_reference(
+    files: Sequence[Path], timeline: Timeline, bodies: Bodies | None = None, offset_s: float = 0.0
+) -> Reference:
+    """The reference that is in some files; each file is read once.
 
     Args:
-        paths: C3D files, TUM files, pose files of the dataset, or files of tracks.
-        fps: rate of pose files whose name does not end in the rate, such as `dron1_pos_25.csv`, and of tracks without
-            times; hertz.
+        files: C3D files, TUM files, pose files of the dataset, or files of tracks.
+        timeline: the recording's instants. Their rate is that of pose files whose name does not end in the rate, such
+            as `dron1_pos_25.csv`, and of tracks without times.
         bodies: labels of the markers of each drone in the C3D file; None or empty: by the labels.
+        offset_s: time on the recording's clock at which the files' clock shows 0, seconds.
 
     Raises:
         InputError: a file cannot be read, or a drone has two files.
     """
+    time_s = timeline.time_s
+    found = _read_files(files, timeline.rate_hz, bodies)
+    truth = _at_times(found, np.arange(len(time_s)), time_s, later_s=-offset_s)
+    if not truth.seen.any():
+        begin_s = min(each.time_s[0] for each in found) + offset_s
+        end_s = max(each.time_s[-1] for each in found) + offset_s
+        _logger.warning(
+            "the reference says nothing about the recording, which lasts from %.3f to %.3f s: it lasts from %.3f to "
+            "%.3f s on the recording's clock; see [reference] time_offset_s",
+            time_s[0], time_s[-1], begin_s, end_s,
+        )  # fmt: skip
+    own = finest = max(found, key=lambda each: each.num_frames)
+    if len(found) > 1:
+        own = _at_times(found, finest.frame, finest.time_s, later_s=0.0)
+    own = replace(own, time_s=own.time_s + offset_s)
+    return Reference(truth, own, tuple(files), bodies or {}, offset_s)
+
+
+def _read_files(paths: Sequence[Path], fps: float, bodies: Bodies | None) -> list[Trajectories]:
+    """The reference of each file, at its own rate and with its own clock."""
     recorded = [path for path in paths if path.suffix.lower() == ".c3d"]
     if bodies and len(recorded) != 1:
         found_files = ", ".join(path.name for path in recorded) or "none"
@@ -58,7 +82,7 @@ def read_reference(paths: Sequence[Path], fps: float, bodies: Bodies | None = No
     return found
 
 
-def reference_at(
+def _at_times(
     references: Sequence[Trajectories],
     frame: Int[np.ndarray, "frames"],
     time_s: Float[np.ndarray, "frames"],
@@ -96,25 +120,10 @@ def reference_at(
     )
 
 
-def read_own_reference(paths: Sequence[Path], fps: float, bodies: Bodies | None = None) -> Trajectories:
-    """One reference of all drones at the times of the file with most samples, with the references' own clock.
-
-    Arguments and errors: see `read_reference`.
-    """
-    references = read_reference(paths, fps, bodies)
-    finest = max(references, key=lambda reference: reference.num_frames)
-    if len(references) == 1:
-        return finest
-    return reference_at(references, finest.frame, finest.time_s, later_s=0.0)
-
-
 def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
     suffix = path.suffix.lower()
     if suffix == ".c3d":
-        markers = read_c3d(path)
-        return body_trajectories(
-            markers, fps=markers.rate_hz, num_frames=len(markers.position_m), where=path, named=bodies
-        )
+        return marker_bodies(read_c3d(path), path, bodies).at_own_frames()
     if suffix in (".tum", ".txt"):
         return read_tum(path)
     if suffix == ".parquet" or (suffix == ".csv" and "x_m" in _header(path)):

@@ -19,10 +19,18 @@ import numpy as np
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, files_by_camera
 from psotrack.geometry.rig_files import read_cameras, read_rig
-from psotrack.recordings import FrameTimes, OnboardVideo, Recording, VideoInfo, probe
+from psotrack.recordings import (
+    CameraRecording,
+    FrameTimes,
+    OnboardVideo,
+    Recording,
+    Reference,
+    VideoInfo,
+    probe,
+)
 from psotrack.recordings.datasets._onboard import check_rate, is_onboard_video, numbered_files, read_onboard
 from psotrack.recordings.datasets._poses import poses_of_frames
-from psotrack.recordings.mocap import NoDronesError, body_trajectories, read_c3d
+from psotrack.recordings.mocap import NoDronesError, marker_bodies, read_c3d
 from psotrack.trajectories import Trajectories
 
 CALIBRATION = "cameras_calibration.csv"
@@ -61,18 +69,24 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     rig = read_rig(calibration, _image_sizes(names, videos), file_format="dpjait")
     _check_principal_points(rig, videos)
     detections = files_by_camera(_detection_files(folder / DETECTIONS), names)
+    times = _frame_times(videos, detections)
     corners = folder / MARKER_CORNERS
     return Recording(
         name=folder.resolve().name,
         folder=folder,
-        rig=rig,
-        videos=videos,
-        truth=_truth(files, videos, bodies),
-        detections=detections or None,
+        cameras=tuple(
+            CameraRecording(
+                name,
+                rig.cameras[index],
+                videos.get(name),
+                times=times.get(name),
+                detections=detections.get(name),
+            )
+            for index, name in enumerate(names)
+        ),
+        reference=_reference(files, videos, bodies),
         onboard=_onboard(folder),
-        frame_times=_frame_times(videos, detections),
         marker_corners=corners if corners.exists() else None,
-        bodies=bodies or {},
     )
 
 
@@ -129,12 +143,12 @@ def _check_folder(folder: Path) -> None:
         raise InputError(folder, expected=f"the file {CALIBRATION} in it", found="none", remedy=remedy)
 
 
-def _onboard(folder: Path) -> Mapping[str, OnboardVideo] | None:
+def _onboard(folder: Path) -> Mapping[str, OnboardVideo]:
     try:
-        return read_onboard(folder) or None
+        return read_onboard(folder)
     except InputError as error:
         _logger.warning("cameras on drones are left out: %s", error)
-        return None
+        return {}
 
 
 def _videos(folder: Path, files: Sequence[Path], names: Sequence[str]) -> dict[str, VideoInfo]:
@@ -192,49 +206,35 @@ def _check_principal_points(rig: Rig, videos: Mapping[str, VideoInfo]) -> None:
             )
 
 
-def _truth(
+def _reference(
     files: Sequence[Path], videos: Mapping[str, VideoInfo], bodies: Mapping[str, Sequence[str]] | None
-) -> Trajectories | None:
+) -> Reference | None:
     """The reference at the frames of the longest video, or None."""
-    first = next(iter(videos.values()))
+    fps = next(iter(videos.values())).fps
     num_frames = max(video.num_frames for video in videos.values())
-    poses = _pose_files(files, first)
-    recordings = [path for path in files if path.suffix.lower() == ".c3d"]
-    if bodies and (poses or not recordings):
+    poses = numbered_files(files, _POSE_FILE)
+    recorded = [path for path in files if path.suffix.lower() == ".c3d"]
+    if bodies and (poses or not recorded):
         raise InputError(
             f"bodies {', '.join(bodies)}",
             expected="a .c3d file that holds their markers",
             found="pose files" if poses else "none",
         )
     if poses:
-        return _simulated_truth(poses, first.fps, num_frames)
-    if len(recordings) > 1:
-        names = ", ".join(path.name for path in recordings)
-        raise InputError(recordings[0].parent, expected="one .c3d file", found=names)
-    if recordings:
-        markers = read_c3d(recordings[0])
-        try:
-            return body_trajectories(
-                markers, fps=first.fps, num_frames=num_frames, where=recordings[0], named=bodies
-            )
-        except NoDronesError as error:
-            _logger.warning("no reference: %s", error)
-    return None
-
-
-def reference_files_in(folder: Path) -> tuple[Path, ...]:
-    """The pose files of a sequence's reference by the number of the drone, or else its .c3d file."""
-    files = sorted(folder.iterdir())
-    poses = tuple(numbered_files(files, _POSE_FILE).values())
-    return poses or tuple(path for path in files if path.suffix.lower() == ".c3d")
-
-
-def _pose_files(files: Sequence[Path], video: VideoInfo) -> dict[int, Path]:
-    """Pose files by the number of the drone."""
-    found = numbered_files(files, _POSE_FILE)
-    for path in found.values():
-        check_rate(path, _POSE_FILE, video.fps)
-    return found
+        for path in poses.values():
+            check_rate(path, _POSE_FILE, fps)
+        return Reference(_simulated_truth(poses, fps, num_frames), files=tuple(poses.values()))
+    if len(recorded) > 1:
+        names = ", ".join(path.name for path in recorded)
+        raise InputError(recorded[0].parent, expected="one .c3d file", found=names)
+    if not recorded:
+        return None
+    try:
+        found = marker_bodies(read_c3d(recorded[0]), recorded[0], bodies)
+    except NoDronesError as error:
+        _logger.warning("no reference: %s", error)
+        return None
+    return Reference(found.at_frames(fps, num_frames), found.at_own_frames(), tuple(recorded), bodies or {})
 
 
 def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from psotrack.errors import InputError
-from psotrack.recordings import RECORDING_FILE, Recording, is_picture_folder, natural_key, read_recording_file
+from psotrack.recordings import RECORDING_FILE, Recording, natural_key, read_recording_file
 from psotrack.recordings.datasets._folder_content import VIDEO_SUFFIXES
-from psotrack.recordings.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence, reference_files_in
+from psotrack.recordings.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.recordings.datasets.recording_files import read_recording_toml
 from psotrack.support import ARCHIVE_SUFFIX
 
@@ -37,13 +37,11 @@ def open_recording(path: Path | str, *, bodies: Mapping[str, Sequence[str]] | No
 
 
 def is_recording(path: Path | str) -> bool:
-    """Whether a path is that of a recording, and not of a video or of a folder of pictures."""
+    """Whether a path is that of a recording: a file that ends in .toml, or a folder that `open_recording` opens."""
     path = Path(path)
-    if path.is_file():
-        return path.suffix.lower() == ".toml"
-    if any((path / name).exists() for name in (RECORDING_FILE, CALIBRATION)):
-        return True
-    return path.is_dir() and not is_picture_folder(path)
+    return path.suffix.lower() == ".toml" or any(
+        (path / name).is_file() for name in (RECORDING_FILE, CALIBRATION)
+    )
 
 
 def videos_in(folder: Path | str) -> list[Path]:
@@ -73,13 +71,6 @@ def find_marker_corners(path: Path | str) -> Path:
     if markers is None:
         raise InputError(f"{file}, markers.corners", expected="a table of marker corners", found="none")
     return file.parent / markers.corners
-
-
-def reference_files(recording: Recording) -> tuple[Path, ...]:
-    """The files of a recording's reference, as its `recording.toml` or the dataset names them; empty without one."""
-    if recording.truth is None:
-        return ()
-    return recording.reference_files or reference_files_in(recording.folder)
 
 
 def _no_recording(path: Path) -> InputError:

@@ -10,10 +10,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
-import numpy as np
 
 from psotrack.errors import InputError
-from psotrack.geometry import Camera, Rig, chosen_camera, make_rig
+from psotrack.geometry import Camera, chosen_camera
 from psotrack.geometry.rig_files import (
     KEYS,
     UNITS_M,
@@ -26,6 +25,7 @@ from psotrack.geometry.rig_files import (
 from psotrack.recordings import (
     MOST_INSTANTS,
     RECORDING_FILE,
+    CameraRecording,
     CameraTable,
     FrameTimes,
     Recording,
@@ -44,7 +44,7 @@ from psotrack.recordings import (
     read_timestamps,
     warn_of_missing_numbers,
 )
-from psotrack.recordings.datasets._reference import read_reference, reference_at
+from psotrack.recordings.datasets._reference import read_reference
 
 _logger = logging.getLogger(__name__)
 #: Rate of pictures until their timestamps are read.
@@ -86,58 +86,29 @@ def recording_of(path: Path, content: RecordingFile) -> Recording:
         InputError: one of the files that the content names cannot be used; the message names it.
     """
     folder = path.parent
-    tables = {name: _Named(path, name, table) for name, table in content.cameras.items()}
-    opened = {name: table.open() for name, table in tables.items()}
+    named = [_Named(path, name, table) for name, table in content.cameras.items()]
+    opened = [table.open() for table in named]
     _check_videos(path, opened)
-    calibrated = _calibrated(path, content, opened)
-    cameras = {name: _camera(table, opened[name], calibrated.get(name)) for name, table in tables.items()}
-    placed = {name: camera for name, camera in cameras.items() if camera is not None}
-    frame_times = {name: each.times for name, each in opened.items() if each.times is not None}
+    sizes_wh = {table.name: table.size_wh(each.video) for table, each in zip(named, opened, strict=True)}
+    calibrated = _calibrated(path, content, sizes_wh)
+    corners = None if content.markers is None else content.markers.corners
     recording = Recording(
         name=path.resolve().parent.name if path.name == RECORDING_FILE else path.stem,
         folder=folder,
-        rig=make_rig(placed) if placed else _no_rig(),
-        videos={name: each.video for name, each in opened.items() if each.video is not None},
-        silhouettes={name: each.silhouettes for name, each in opened.items() if each.silhouettes is not None},
-        detections={name: each.detections for name, each in opened.items() if each.detections is not None}
-        or None,
-        frame_times=frame_times,
-        unplaced=tuple(name for name in cameras if name not in placed),
-        streams={name: each.stream for name, each in opened.items() if each.stream},
-        ignore={name: each.ignore for name, each in opened.items() if each.ignore is not None},
-        line_time_s={name: table.line_time_s for name, table in content.cameras.items() if table.line_time_s},
+        cameras=tuple(
+            replace(each, camera=_camera(table, each, sizes_wh[table.name], calibrated.get(table.name)))
+            for table, each in zip(named, opened, strict=True)
+        ),
         bounds_m=_bounds(content),
-        marker_corners=None
-        if content.markers is None
-        else _existing(folder, content.markers.corners, path, "markers.corners"),
-        reference_files=_reference_files(path, content),
-        bodies={} if content.reference is None else content.reference.bodies,
-        reference_offset_s=0.0 if content.reference is None else content.reference.time_offset_s,
+        marker_corners=None if corners is None else _existing(folder, corners, path, "markers.corners"),
     )
-    return _with_reference(recording)
-
-
-@dataclass(frozen=True)
-class _Opened:
-    """The opened files of one camera.
-
-    Attributes:
-        size_wh: width and height of the images, pixels; None where only the calibration may know it.
-        video: its video, or None.
-        silhouettes: its stored silhouettes, or None.
-        stream: address of its stream, or "device" and number or path of its device; empty where it has none.
-        times: times of its frames; None for a stream.
-        ignore: image of what is ignored, or None.
-        detections: file of its detections, or None.
-    """
-
-    size_wh: tuple[int, int] | None
-    video: VideoInfo | None
-    silhouettes: StoredSilhouettes | None
-    stream: str
-    times: FrameTimes | None
-    ignore: Path | None
-    detections: Path | None
+    if content.reference is None:
+        return recording
+    files = [_existing(folder, file, path, "reference.files") for file in content.reference.files]
+    reference = read_reference(
+        files, recording.timeline(), content.reference.bodies, content.reference.time_offset_s
+    )
+    return replace(recording, reference=reference)
 
 
 @dataclass(frozen=True)
@@ -164,21 +135,24 @@ class _Named:
         place = f"cameras.{self.name}.{key}"
         return None if written is None else _existing(self.path.parent, str(written), self.path, place)
 
-    def open(self) -> _Opened:
-        """Open the files of the camera."""
+    def size_wh(self, video: VideoInfo | None) -> tuple[int, int] | None:
+        """Width and height of the images, pixels; None where only the calibration may know it."""
+        return self.table.size if video is None else video.image_size_wh
+
+    def open(self) -> CameraRecording:
+        """Open the files of the camera, whose lens and place are not looked for."""
         table = self.table
         stream = self._stream()
-        video = None if stream else self._video()
-        size_wh = table.size if video is None else video.image_size_wh
+        video = self._video() if stream is None else None
+        size_wh = self.size_wh(video)
         if table.size not in (None, size_wh):
             raise self.error("size", f"{_size_text(size_wh)} as in the video", _size_text(table.size))
         detections, stored = self.file("detections"), self.file("silhouettes")
         silhouettes = None if stored is None else probe_silhouettes(stored)
-        times = None if stream else self._times(video, silhouettes, detections)
+        times = self._times(video, silhouettes, detections) if stream is None else None
         if video is not None and times is not None and not video.is_finished:
             # The program that wrote video and times was stopped: the one that is longer is cut.
             video = replace(video, num_frames=min(video.num_frames, times.num_frames))
-            times = times.cut(video.num_frames)
             _logger.warning(
                 "%s: the video was not finished; its first %d frames are used", video.path, video.num_frames
             )
@@ -188,33 +162,30 @@ class _Named:
             if size_wh not in (None, (width, height)):
                 expected = f"{_size_text(size_wh)} as camera {self.name}"
                 raise InputError(ignore, expected=expected, found=_size_text((width, height)))
-        opened = _Opened(size_wh, video, silhouettes, stream, times, ignore, detections)
-        self._check_shutter(opened)
-        return opened
+        if size_wh is not None and times is not None:
+            # The rows of an image cannot take longer than the time from frame to frame.
+            longest_s = 1 / (times.fps * size_wh[1])
+            if abs(table.line_time_s) > longest_s:
+                expected = f"at most {longest_s:.2g} s, a frame's time for {size_wh[1]} rows"
+                raise self.error("line_time_s", expected, f"{table.line_time_s:g}")
+        return CameraRecording(
+            self.name, None, video, stream, times, table.line_time_s, detections, silhouettes, ignore
+        )
 
-    def _check_shutter(self, opened: _Opened) -> None:
-        """Raise `InputError` where the rows of an image would take longer than the time from frame to frame."""
-        if opened.size_wh is None or opened.times is None:
-            return
-        longest_s = 1 / (opened.times.fps * opened.size_wh[1])
-        if abs(self.table.line_time_s) > longest_s:
-            expected = f"at most {longest_s:.2g} s, a frame's time for {opened.size_wh[1]} rows"
-            raise self.error("line_time_s", expected, f"{self.table.line_time_s:g}")
-
-    def _stream(self) -> str:
-        """Address of a stream, or "device" and number or path of a device; empty for a file."""
+    def _stream(self) -> str | None:
+        """Address of a stream, or "device" and number or path of a device; None for a file."""
         video = self.table.video
         if isinstance(video, int):
             if video < 0:
                 raise self.error("video", "the number of a device, from 0", f"{video}")
             return f"device {video}"
         if video is None:
-            return ""
+            return None
         if video.startswith("/dev/"):
             return f"device {video}"
         scheme, separator, rest = video.partition("://")
         if not separator:
-            return ""
+            return None
         if scheme not in _SCHEMES:
             schemes = "://, ".join(_SCHEMES)
             expected = f"a file, the number of a device, or an address that begins with {schemes}://"
@@ -298,22 +269,19 @@ def _listed_times(file: Path, video: VideoInfo | None, silhouettes: StoredSilhou
     return times
 
 
-def _check_videos(path: Path, opened: Mapping[str, _Opened]) -> None:
+def _check_videos(path: Path, cameras: Sequence[CameraRecording]) -> None:
     """Raise `InputError` for a video of two cameras, and warn of a camera that films alone."""
     owners: dict[Path, str] = {}
-    for name, each in opened.items():
+    for each in cameras:
         if each.video is None:
             continue
         file = (each.video.images[0] if each.video.images else each.video.path).resolve()
         if file in owners:
-            raise _error(
-                path, f"cameras.{name}", "a video of its own", f"that of {owners[file]}, {file.name}"
-            )
-        owners[file] = name
+            found = f"that of {owners[file]}, {file.name}"
+            raise _error(path, f"cameras.{each.name}", "a video of its own", found)
+        owners[file] = each.name
     spans = {
-        name: each.times.time_s[[0, -1]]
-        for name, each in opened.items()
-        if each.times and each.times.num_frames
+        each.name: each.times.time_s[[0, -1]] for each in cameras if each.times and each.times.num_frames
     }
     for name, (begin_s, end_s) in spans.items():
         others = [span for other, span in spans.items() if other != name]
@@ -336,14 +304,16 @@ def _check_seconds(file: Path, times: FrameTimes, video: VideoInfo) -> None:
         )
 
 
-def _calibrated(path: Path, content: RecordingFile, opened: Mapping[str, _Opened]) -> dict[str, Entry]:
+def _calibrated(
+    path: Path, content: RecordingFile, sizes_wh: Mapping[str, tuple[int, int] | None]
+) -> dict[str, Entry]:
     """The cameras of the rig file whose image size is known, by their names in the recording."""
     if content.calibration is None:
         return {}
     stated = read_cameras(_existing(path.parent, content.calibration, path, "calibration"))
     known = {name: chosen_camera(name, tuple(stated)) for name in content.cameras}
     _check_one_each(path, known)
-    sizes = {own: opened[name].size_wh or stated[own].size_wh for name, own in known.items() if own}
+    sizes = {own: sizes_wh[name] or stated[own].size_wh for name, own in known.items() if own}
     entries = entries_of(
         {own: stated[own] for own, size_wh in sizes.items() if size_wh},
         {own: size_wh for own, size_wh in sizes.items() if size_wh},
@@ -363,14 +333,16 @@ def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
             taken[entry] = name
 
 
-def _camera(named: _Named, opened: _Opened, calibrated: Entry | None) -> Camera | None:
+def _camera(
+    named: _Named, opened: CameraRecording, own_wh: tuple[int, int] | None, calibrated: Entry | None
+) -> Camera | None:
     """A camera from its own keys and, where it has none, from the rig file; None where its place is not known."""
     known: dict[str, Any] = {}
     if calibrated is not None and calibrated.camera is not None:
         known = camera_values(calibrated.camera, placed=calibrated.placed)
     # A size of the rig file that differs from the video's is an error of `Recording.usable`.
-    size_wh = known.get("size") or opened.size_wh
-    if size_wh is None and not opened.stream:
+    size_wh = known.get("size") or own_wh
+    if size_wh is None and opened.stream is None:
         expected = "width and height of the images, because the camera has no video"
         raise named.error("size", expected, "none")
     own = msgspec.json.decode(msgspec.json.encode(named.table))
@@ -383,21 +355,11 @@ def _camera(named: _Named, opened: _Opened, calibrated: Entry | None) -> Camera 
     return entry.camera if entry.placed else None
 
 
-def _no_rig() -> Rig:
-    return Rig((), Camera(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), np.zeros((0, 0)), np.zeros((0, 2))))
-
-
 def _bounds(content: RecordingFile) -> tuple[float, float, float, float, float, float] | None:
     if content.world.bounds_m is None:
         return None
     (x0, y0, z0), (x1, y1, z1) = content.world.bounds_m
     return x0, x1, y0, y1, z0, z1
-
-
-def _reference_files(path: Path, content: RecordingFile) -> tuple[Path, ...]:
-    if content.reference is None:
-        return ()
-    return tuple(_existing(path.parent, file, path, "reference.files") for file in content.reference.files)
 
 
 def _existing(folder: Path, written: str, path: Path, place: str) -> Path:
@@ -414,24 +376,3 @@ def _size_text(size_wh: tuple[int, int] | None) -> str:
 
 def _error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
     return InputError(f"{path}, {place}", expected=expected, found=found, remedy=remedy)
-
-
-def _with_reference(recording: Recording) -> Recording:
-    """The recording with its reference at its instants."""
-    if not recording.reference_files:
-        return recording
-    references = read_reference(recording.reference_files, recording.fps, recording.bodies)
-    time_s = recording.timeline().time_s
-    later_s = -recording.reference_offset_s
-    truth = reference_at(references, np.arange(len(time_s)), time_s, later_s=later_s)
-    if not truth.seen.any():
-        begin_s, end_s = (
-            edge(reference.time_s[index] for reference in references) - later_s
-            for edge, index in ((min, 0), (max, -1))
-        )
-        _logger.warning(
-            "the reference says nothing about the recording, which lasts from %.3f to %.3f s: it lasts from %.3f to "
-            "%.3f s on the recording's clock; see [reference] time_offset_s",
-            time_s[0], time_s[-1], begin_s, end_s,
-        )  # fmt: skip
-    return replace(recording, truth=truth)

@@ -94,7 +94,7 @@ def boxes_in_camera(
         recording.rig.cameras[np.array([camera.index])],
     )
     seen = make_extents(cameras, jnp.asarray(size_m, jnp.float32))
-    line_time_s = recording.line_time_s.get(camera.name, 0.0)
+    line_time_s = recording.by_name[camera.name].line_time_s
     width, height = camera.image_size_wh
     time_s = np.repeat(camera.time_s[:, None], trajectories.num_drones, axis=1)
     xyxy, shown = _project(seen, _positions_at(trajectories, time_s))

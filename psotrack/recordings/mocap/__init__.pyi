@@ -1,11 +1,12 @@
 from .c3d import Markers, read_c3d, write_c3d
-from .marker_bodies import body_trajectories
+from .marker_bodies import MarkerBodies, marker_bodies
 from .marker_groups import NoDronesError
 
 __all__ = [
+    "MarkerBodies",
     "Markers",
     "NoDronesError",
-    "body_trajectories",
+    "marker_bodies",
     "read_c3d",
     "write_c3d",
 ]

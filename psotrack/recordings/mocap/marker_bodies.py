@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +24,66 @@ from psotrack.trajectories import Status, Trajectories
 _logger = logging.getLogger(__name__)
 
 
-def body_trajectories(
-    markers: Markers,
-    *,
-    fps: float,
-    num_frames: int,
-    where: Path | str,
-    offset_s: float = 0.0,
-    named: Mapping[str, Sequence[str]] | None = None,
-) -> Trajectories:
-    """Trajectories of the bodies at the frames of a video.
+@dataclass(frozen=True)
+class MarkerBodies:
+    """Drones of a motion-capture recording, and their poses in each of its frames.
+
+    Attributes:
+        where: path of the recording, for messages.
+        rate_hz: frames per second of the recording.
+        num_frames: number of its frames.
+        poses: poses of each drone by name; None where the shape of its cross cannot be learned.
+    """
+
+    where: Path
+    rate_hz: float
+    num_frames: int
+    poses: Mapping[str, CrossPoses | None]
+
+    def at_own_frames(self) -> Trajectories:
+        """Trajectories at the frames of the recording (see `at_frames`)."""
+        return self.at_frames(self.rate_hz, self.num_frames)
+
+    def at_frames(self, fps: float, num_frames: int, offset_s: float = 0.0) -> Trajectories:
+        """Trajectories at the frames of a video, to which poses are interpolated.
+
+        Args:
+            fps: frames per second of the video.
+            num_frames: number of frames of the video; the reference is NaN outside of the recording.
+            offset_s: time in the recording at the video's frame 0, seconds; above 0 if the recording began first.
+
+        Raises:
+            InputError: no body has a pose in any frame.
+        """
+        frame = np.arange(num_frames)
+        position_m = np.full((num_frames, len(self.poses), 3), np.nan)
+        orientation_wxyz = np.full((num_frames, len(self.poses), 4), np.nan)
+        status = np.full((num_frames, len(self.poses)), int(Status.TRACKED))
+        for index, poses in enumerate(self.poses.values()):
+            if poses is not None:
+                rate_hz = _whole_multiple(self.rate_hz, fps)
+                video = interpolate_poses(poses, rate_hz, frame / fps + offset_s)
+                position_m[:, index], orientation_wxyz[:, index] = video.position_m, video.orientation_wxyz
+                status[video.bridged, index] = Status.COASTING
+        unknown = np.isnan(position_m).any(axis=-1)
+        if unknown.all():
+            expected = "three markers of a drone in some frame of the video"
+            raise InputError(self.where, expected=expected, found="none")
+        status[unknown] = Status.LOST
+        return Trajectories(
+            frame,
+            frame / fps,
+            tuple(self.poses),
+            position_m,
+            orientation_wxyz=None if np.isnan(orientation_wxyz).all() else orientation_wxyz,
+            status=status,
+        )
+
+
+def marker_bodies(
+    markers: Markers, where: Path | str, named: Mapping[str, Sequence[str]] | None = None
+) -> MarkerBodies:
+    """The drones of a motion-capture recording, with their poses.
 
     The position of a body is the centroid of its whole marker cross, whose shape is learned from the recording. Three
     seen markers determine the pose, and the position does not jump when a marker appears or disappears. A gap is a time
@@ -42,42 +93,17 @@ def body_trajectories(
     markers lie on a line.
 
     Args:
-        markers: a recording at any rate; poses are interpolated between its frames.
-        fps: frames per second of the video.
-        num_frames: number of frames of the video; the reference is NaN outside of the recording.
+        markers: a recording at any rate.
         where: path of the recording, for messages.
-        offset_s: time in the recording at the video's frame 0, seconds; above 0 if the recording began first.
         named: labels of the markers by drone, as the user says (see `drone_markers`); None: by the labels.
 
     Raises:
         NoDronesError: no body of the recording is a drone for certain.
         SettingsError: a named marker does not exist.
-        InputError: no body has a pose in any frame.
     """
-    frame = np.arange(num_frames)
     bodies = drone_markers(markers, where, named)
-    position_m = np.full((num_frames, len(bodies), 3), np.nan)
-    orientation_wxyz = np.full((num_frames, len(bodies), 4), np.nan)
-    status = np.full((num_frames, len(bodies)), int(Status.TRACKED))
-    for index, (name, columns) in enumerate(bodies.items()):
-        poses = _body_poses(markers, name, columns, Path(where))
-        if poses is not None:
-            rate_hz = _whole_multiple(markers.rate_hz, fps)
-            video = interpolate_poses(poses, rate_hz, frame / fps + offset_s)
-            position_m[:, index], orientation_wxyz[:, index] = video.position_m, video.orientation_wxyz
-            status[video.bridged, index] = Status.COASTING
-    unknown = np.isnan(position_m).any(axis=-1)
-    if unknown.all():
-        raise InputError(where, expected="three markers of a drone in some frame of the video", found="none")
-    status[unknown] = Status.LOST
-    return Trajectories(
-        frame,
-        frame / fps,
-        tuple(bodies),
-        position_m,
-        orientation_wxyz=None if np.isnan(orientation_wxyz).all() else orientation_wxyz,
-        status=status,
-    )
+    poses = {name: _body_poses(markers, name, columns, Path(where)) for name, columns in bodies.items()}
+    return MarkerBodies(Path(where), markers.rate_hz, len(markers.position_m), poses)
 
 
 def _body_poses(markers: Markers, name: str, columns: list[int], where: Path) -> CrossPoses | None:

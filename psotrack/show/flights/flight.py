@@ -15,8 +15,8 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.evaluation import errors_over_time
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.pipeline import TrackedRecording
-from psotrack.recordings import RECORDING_FILE, Recording, VideoInfo
-from psotrack.recordings.datasets import CALIBRATION, open_recording
+from psotrack.recordings import Recording, VideoInfo
+from psotrack.recordings.datasets import is_recording, open_recording
 from psotrack.recordings.exchange import read_tracks
 from psotrack.show.flights.run_record import RunRecord, as_run_record, read_run_record
 from psotrack.support import drone_colour, short_repr
@@ -98,7 +98,7 @@ class TrackedFlight:
 
 def read_flight(
     tracks: Sequence[Path | str] = (),
-    sequence: Path | str | None = None,
+    sequence: Recording | Path | str | None = None,
     *,
     cameras: Sequence[str] | None = None,
 ) -> TrackedFlight:
@@ -106,8 +106,8 @@ def read_flight(
 
     Args:
         tracks: files of tracks.
-        sequence: the recording, as for `open_recording`; None: the one that the record of the first tracks names, as
-            far as it is there.
+        sequence: the recording, or its path as for `open_recording`; None: the one that the record of the first tracks
+            names, as far as it is there.
         cameras: names of the cameras to keep; None: all.
 
     Raises:
@@ -117,11 +117,14 @@ def read_flight(
     """
     paths = [Path(path) for path in tracks]
     for path in paths:
-        if _is_recording(path):
+        if is_recording(path):
             remedy = "name the recording last, TRACKS [SEQ]"
             raise InputError(path, expected="a file of tracks", found="a recording", remedy=remedy)
     sequence = find_recording(paths[0]) if sequence is None and paths else sequence
-    recording = None if sequence is None else open_recording(sequence)
+    if sequence is None or isinstance(sequence, Recording):
+        recording = sequence
+    else:
+        recording = open_recording(sequence)
     if recording is not None and cameras is not None:
         recording = recording.usable(cameras, videos=False)
     if recording is None and cameras is not None:
@@ -146,7 +149,7 @@ def read_flight(
 
 def split_sequence(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
     """Files of tracks, and the recording if the last one of some paths is a recording."""
-    if paths and _is_recording(paths[-1]):
+    if paths and is_recording(paths[-1]):
         return tuple(paths[:-1]), paths[-1]
     return tuple(paths), None
 
@@ -214,13 +217,12 @@ def first_instants(flight: TrackedFlight, num_frames: int) -> TrackedFlight:
     end_s = float(recording.timeline().time_s[-1]) + 0.5 / recording.fps
     onboard = {
         name: replace(camera, video=replace(camera.video, num_frames=_count_until(camera.video, end_s)))
-        for name, camera in (recording.onboard or {}).items()
+        for name, camera in recording.onboard.items()
     }
-    recording = replace(
-        recording,
-        onboard=onboard or None,
-        truth=None if recording.truth is None else _cut(recording.truth, end_s),
-    )
+    reference = recording.reference
+    if reference is not None:
+        reference = replace(reference, truth=_cut(reference.truth, end_s))
+    recording = replace(recording, onboard=onboard, reference=reference)
     return replace(flight, recording=recording, tracks=tuple(_until(each, end_s) for each in flight.tracks))
 
 
@@ -266,11 +268,6 @@ def _flight_tracks(
     size_m = np.array([sizes_m.get(name, USUAL_SIZE_M) for name in trajectories.drones]).reshape(-1, 3)
     colours = tuple(drone_colour(drone) for drone in range(trajectories.num_drones))
     return FlightTracks(label, path, trajectories, record, size_m, colours)
-
-
-def _is_recording(path: Path) -> bool:
-    names = (RECORDING_FILE, CALIBRATION)
-    return path.suffix.lower() == ".toml" or any((path / name).exists() for name in names)
 
 
 def _record_beside(tracks: Path) -> RunRecord | None:

@@ -129,7 +129,7 @@ def _exposures_s(
     offset_s: Float[np.ndarray, "frames cameras"],
 ) -> Float[np.ndarray, "frames drones cameras"]:
     """Time from each instant to the exposure of each drone in each camera, seconds; 0 where it is not shown."""
-    line_time_s = np.array([recording.line_time_s.get(name, 0.0) for name in recording.rig.names])
+    line_time_s = np.array([each.line_time_s for each in recording.placed])
     height_px = np.asarray(recording.rig.cameras.image_size_wh)[:, 1]
     row_px = np.asarray(project_visible(recording.rig.cameras, position_m[:, :, None])[0])[..., 1] + 0.5
     row_px = np.clip(np.nan_to_num(row_px, nan=0.0), 0.0, height_px)

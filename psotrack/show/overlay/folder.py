@@ -91,6 +91,15 @@ class WrittenOverlays:
     written: tuple[Path, ...]
     kept: tuple[Path, ...]
 
+    def to_dict(self) -> dict[str, Any]:
+        """Paths of the videos."""
+        return {
+            "folder": str(self.folder),
+            "codec": self.codec.name,
+            "written": [str(path) for path in self.written],
+            "kept": [str(path) for path in self.kept],
+        }
+
     def __str__(self) -> str:
         kept = f", {len(self.kept)} were there already" if self.kept else ""
         return f"{self.folder}: {len(self.written)} videos in {self.codec.name}{kept}"
@@ -265,7 +274,7 @@ def _digest(video: DrawnVideo) -> str:
 def _filmed(flight: TrackedFlight) -> tuple[Recording, list[str]]:
     """The recording of a flight, and its cameras that have a video."""
     recording = flight.recording
-    cameras = [] if recording is None else [name for name in recording.rig.names if name in recording.videos]
+    cameras = [] if recording is None else [each.name for each in recording.placed if each.video]
     if recording is None or not cameras:
         where = "overlay" if recording is None else recording.folder
         raise InputError(where, expected="a recording with videos", found="none")

@@ -113,7 +113,7 @@ def _sizes_px_per_m(position_m: Float[np.ndarray, "3"], recording: Recording) ->
     """Number of pixels per metre at a place in each camera; 0 where it is not shown or the camera has no video."""
     cameras = recording.rig.cameras
     depth_m = np.asarray(project_visible(cameras, position_m)[1])
-    films = np.array([name in recording.videos for name in recording.rig.names])
+    films = np.array([each.video is not None for each in recording.placed])
     shown = np.asarray(in_images(cameras, position_m)) & films
     return np.where(shown, np.asarray(cameras.K)[:, 0, 0] / np.where(shown, depth_m, 1.0), 0.0)
 

@@ -165,10 +165,8 @@ def _videos(flight: TrackedFlight, with_onboard: bool) -> dict[CameraKey, VideoI
     recording = flight.recording
     if recording is None:
         return {}
-    videos = {
-        CameraKey(name): recording.videos[name] for name in recording.rig.names if name in recording.videos
-    }
-    onboard = (recording.onboard or {}) if with_onboard else {}
+    videos = {CameraKey(each.name): each.video for each in recording.placed if each.video is not None}
+    onboard = recording.onboard if with_onboard else {}
     return videos | {CameraKey(name, on_drone=True): camera.video for name, camera in onboard.items()}
 
 

@@ -49,8 +49,7 @@ def log_marks(log: EntityLog, flight: TrackedFlight, step: int) -> None:
         _log_tracks(log, recording, tracks, step)
     timeline = recording.timeline()
     for index, name in enumerate(recording.rig.names):
-        if name in (recording.detections or {}):
-            assert recording.detections is not None
+        if name in recording.detections:
             detections = read_detections(recording.detections[name])
             rows = _rows_shown(timeline.frame[:, index], step)
             boxes_px = [detections.in_frame(int(frame)).xyxy for frame in timeline.frame[rows, index]]
@@ -78,7 +77,6 @@ def log_images(
     for kind, reduction in kinds if source.silhouettes is not None else kinds[:1]:
         log.static(f"{path}/{kind}", rr.Transform3D(scale=[reduction, reduction, 1]))
     if camera.on_drone:
-        assert recording.onboard is not None
         _log_path(log, path, recording.onboard[camera.name])
     together: list[EncodedImage] = []
     for image in encode_images(source):
@@ -105,7 +103,6 @@ def log_images(
 def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, tuple[int, float]]:
     """Number and time of the instant at which each frame of a camera is shown first."""
     if camera.on_drone:
-        assert recording.onboard is not None
         video = recording.onboard[camera.name].video
         return {frame: (frame, frame / video.fps) for frame in range(0, video.num_frames, step)}
     timeline = recording.timeline()

@@ -124,4 +124,4 @@ def _cameras(recording: Recording, has_onboard: bool) -> rrb.Container:
     of_rig = grid(recording.rig.names, False, "cameras")
     if not has_onboard:
         return of_rig
-    return rrb.Tabs(of_rig, grid(recording.onboard or {}, True, "cameras on drones"), active_tab=0)
+    return rrb.Tabs(of_rig, grid(recording.onboard, True, "cameras on drones"), active_tab=0)
