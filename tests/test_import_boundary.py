@@ -104,8 +104,6 @@ CORE = {
     "support.array_types",
     "tracking.identity.encounters",
     "tracking.identity.labellings",
-    "tracking.identity.likeness",
-    "tracking.identity.records",
     "tracking.identity.resolving",
     "tracking.motion",
     "tracking.swarm.fitness",

@@ -14,9 +14,10 @@ from .cameras import (
     to_pixels,
     undistort,
 )
+from .image_fit import project_with_jacobian, to_pixels_with_jacobian
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
-from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, distort
-from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
+from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, LensNumbers, distort
+from .reprojection import reconstruct, triangulate
 from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
 from .triangulation import (
@@ -35,6 +36,7 @@ __all__ = [
     "Boxes",
     "Camera",
     "Extents",
+    "LensNumbers",
     "Rig",
     "boxes_at",
     "camera_key",

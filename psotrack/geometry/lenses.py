@@ -45,8 +45,8 @@ _BISECTIONS = 12
 
 
 @runtime_checkable
-class Distortion(Protocol):
-    """The distortion of one lens, or of several along leading axes."""
+class HasLens(Protocol):
+    """One lens, or several along leading axes."""
 
     @property
     def dist(self) -> Float[Array, "*lenses coefficients"]:
@@ -59,13 +59,15 @@ class Distortion(Protocol):
         """(...), which lenses are fisheyes; None: no lens is one."""
 
 
-class _Lens(NamedTuple):
+class LensNumbers(NamedTuple):
+    """A lens without a camera; see `HasLens`."""
+
     dist: Any
-    fisheye: Any
+    fisheye: Any = None
 
 
 def distort(
-    lens: Distortion, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+    lens: HasLens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
     """Distorted normalised image coordinates. Arguments: see the module."""
     distorted_x, distorted_y = _by_model(lens, x, y, _pinhole, _fisheye)
@@ -73,14 +75,14 @@ def distort(
 
 
 def lens_derivative(
-    lens: Distortion, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+    lens: HasLens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], ...]:
     """Derivatives of the distorted coordinates: x by x, x by y, y by x, y by y. Arguments: see the module."""
     return _by_model(lens, x, y, _pinhole_derivative, _fisheye_derivative)
 
 
 def _by_model(
-    lens: Distortion, x: Array, y: Array, pinhole: Callable[..., Any], fisheye: Callable[..., Any]
+    lens: HasLens, x: Array, y: Array, pinhole: Callable[..., Any], fisheye: Callable[..., Any]
 ) -> tuple[Array, ...]:
     """What the function of each lens's model says."""
     xp = _numbers(x)
@@ -92,7 +94,7 @@ def _by_model(
 
 
 def undistort_normalised(
-    lens: Distortion, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
+    lens: HasLens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
     """Inverse of `distort` in float64, by Newton's method; NaN where no point has this image.
 
@@ -107,7 +109,7 @@ def undistort_normalised(
     problem = _Inverse(
         np.broadcast_to(dist, (*shape, dist.shape[-1])).reshape(-1, dist.shape[-1]),
         None if lens.fisheye is None else np.broadcast_to(lens.fisheye, shape).ravel(),
-        np.broadcast_to(second_sheet(_Lens(dist, lens.fisheye)), shape).ravel(),
+        np.broadcast_to(second_sheet(LensNumbers(dist, lens.fisheye)), shape).ravel(),
         np.stack([np.broadcast_to(part, shape).ravel() for part in (x, y)]).astype(np.float64),
     )
     found = np.full(problem.target.shape, np.nan)
@@ -124,7 +126,7 @@ def undistort_normalised(
 
 
 def is_one_to_one(
-    lens: Distortion,
+    lens: HasLens,
     x: Float[Array, "*#points"],
     y: Float[Array, "*#points"],
     beyond: Float[Array, "*lenses"] | None = None,
@@ -140,7 +142,7 @@ def is_one_to_one(
     return _rises(_numbers(x), lens, x, y) & (x * x + y * y < beyond * beyond)
 
 
-def second_sheet(lens: Distortion) -> Float[Array, "*lenses"]:
+def second_sheet(lens: HasLens) -> Float[Array, "*lenses"]:
     """Radius r = hypot(x, y) below which every point with a positive determinant is before the fold; or infinity.
 
     Beyond the first fold the determinant is negative. Further away it may become positive again, on the second sheet
@@ -160,15 +162,15 @@ def second_sheet(lens: Distortion) -> Float[Array, "*lenses"]:
 def _second_sheet_of(dist: bytes, fisheye: bool) -> float:
     """The same for one lens; calibration and triangulation ask again and again for the same few lenses."""
     row = np.frombuffer(dist, np.float64)
-    return float(_second_sheet(np, _Lens(row, np.array(True) if fisheye else None)))
+    return float(_second_sheet(np, LensNumbers(row, np.array(True) if fisheye else None)))
 
 
-def _second_sheet(xp: Any, lens: Distortion) -> Array:
+def _second_sheet(xp: Any, lens: HasLens) -> Array:
     dist, fisheye = lens.dist, lens.fisheye
     radius = np.tan(_ANGLES)
     grid = radius[:, None] * np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])[:, None]
     x, y = (xp.asarray(part, dist.dtype) for part in grid)
-    everywhere = _Lens(dist[..., None, None, :], None if fisheye is None else fisheye[..., None, None])
+    everywhere = LensNumbers(dist[..., None, None, :], None if fisheye is None else fisheye[..., None, None])
     rises = _rises(xp, everywhere, x, y)
     folded = xp.cumsum(~rises, axis=-2) > 0
     again = (folded & rises).any(axis=-1)
@@ -176,7 +178,7 @@ def _second_sheet(xp: Any, lens: Distortion) -> Array:
     return xp.where(again.any(axis=-1), xp.asarray(radius, dist.dtype)[xp.maximum(first - 1, 0)], xp.inf)
 
 
-def _rises(xp: Any, lens: Distortion, x: Array, y: Array) -> Array:
+def _rises(xp: Any, lens: HasLens, x: Array, y: Array) -> Array:
     """True where the determinant of the derivative is positive, and the model has no pole before the point."""
     coefficients = lens.dist.shape[-1]
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -196,7 +198,7 @@ def _numbers(array: Any) -> Any:
     return np if isinstance(array, np.ndarray | np.generic) else jnp
 
 
-def _parted(xp: Any, lens: Distortion) -> tuple[Array, Array]:
+def _parted(xp: Any, lens: HasLens) -> tuple[Array, Array]:
     """Which lenses are fisheyes, and the coefficients with 0 for fisheyes: the pinhole model of such a lens is unused,
     but must be finite.
     """
@@ -362,7 +364,7 @@ class _Inverse:
         wanted = np.hypot(*flat)
         direction = flat / np.maximum(wanted, 1e-300)
         # Only the radial part of the lens: the tangential one and the prism's are small.
-        radial = _Lens(self.dist.copy(), self.fisheye)
+        radial = LensNumbers(self.dist.copy(), self.fisheye)
         across = [column for column in range(radial.dist.shape[-1]) if column in (2, 3) or column >= 8]
         radial.dist[:, across] *= 0 if self.fisheye is None else self.fisheye[:, None]
         low, high = np.zeros(len(wanted)), np.full(len(wanted), np.pi / 2)

@@ -58,6 +58,7 @@ from .schema import (
     toml_key,
     toml_text,
     toml_value,
+    write_toml,
 )
 from .standard_errors import standard_error
 from .text_tables import POSITION, finite_or_none, format_numbers, text_table
@@ -156,4 +157,5 @@ __all__ = [
     "with_traceback",
     "worker_processes",
     "write_rows",
+    "write_toml",
 ]

@@ -17,17 +17,8 @@ if TYPE_CHECKING:
 
 #: Colours of the drones in their order. The first six are from Okabe and Ito (2008), for colour-blind readers.
 COLOURS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#7a5195",
-    "#8c8c00",
-    "#7f4f24",
-    "#4d4d4d",
-)
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c8c00", "#7f4f24", "#4d4d4d",
+)  # fmt: skip
 _DPI = 150
 #: Colours of text, of what is faint, and of lines.
 INK, FAINT, LINE = "#2b313a", "#9aa3ad", "#e3e6ea"

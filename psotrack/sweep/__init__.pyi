@@ -1,8 +1,7 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
 from .cluster import Cluster
-from .estimates import Estimate, SweepPlan, estimate, plan
 from .grid_files import Grid, grid, read_grid
-from .grid_runs import SweepOutcome, sweep
+from .grid_runs import Estimate, SweepOutcome, SweepPlan, estimate, plan, sweep
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
 from .store import Store, is_results_folder

@@ -3,7 +3,7 @@ from .files import DroneRows, check_cells, from_rows, read_trajectories, write_a
 from .resampling import resample
 from .row_streams import RowStream
 from .status import Status
-from .summaries import drones_html, summarise, summary_columns
+from .summaries import drones_html, summary_columns
 from .tracks import ARRAYS, Arrival, Tracks, padded
 from .trajectories import QUANTITIES, Trajectories
 
@@ -25,7 +25,6 @@ __all__ = [
     "padded",
     "read_trajectories",
     "resample",
-    "summarise",
     "summary_columns",
     "write_ambiguity",
     "write_trajectories",

@@ -198,20 +198,14 @@ def words_of(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> Iterator[tupl
 
 
 def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
-    import pyarrow.parquet as pq
-
-    pq.write_table(parquet_table(columns), path)
-
-
-def parquet_table(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> pa.Table:
-    """The columns as a table with units and schema version."""
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
     schema = parquet_schema(list(columns))
     arrays = [
         pa.array(columns[field.name], field.type, mask=~is_known(columns[field.name])) for field in schema
     ]
-    return pa.table(arrays, schema=schema)
+    pq.write_table(pa.table(arrays, schema=schema), path)
 
 
 def parquet_schema(names: Sequence[str]) -> pa.Schema:
