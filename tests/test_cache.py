@@ -65,7 +65,7 @@ def cache(tmp_path: Path) -> Path:
 
 
 def _listed(run: Run, cache: Path) -> list[dict[str, object]]:
-    entries: list[dict[str, object]] = json.loads(run("cache", "list", "--cache", cache, "--json", "-").out)[
+    entries: list[dict[str, object]] = json.loads(run("cache", "--cache", cache, "--json", "-").out)[
         "entries"
     ]
     return entries
@@ -85,36 +85,36 @@ def test_entries_are_listed_the_oldest_first(run_psotrack: Run, cache: Path) -> 
     ]
     ages = [round(float(str(entry["days_unused"]))) for entry in entries]
     assert ages == [40, 9, 0]
-    shown = run_psotrack("cache", "list", "--cache", cache)
+    shown = run_psotrack("cache", "--cache", cache)
     assert shown.code == 0
     assert "a.avi" in shown.out
     assert "silhouettes of 2 videos, 1 programs" in shown.out
 
 
 def test_check_names_what_is_damaged(run_psotrack: Run, cache: Path) -> None:
-    whole = run_psotrack("cache", "check", "--cache", cache)
+    whole = run_psotrack("cache", "--check", "--cache", cache)
     assert (whole.code, "0 damaged" in whole.out) == (0, True)
     silhouettes = Path(str(_listed(run_psotrack, cache)[0]["path"]))
     chunk = silhouettes / "c" / "0" / "0" / "0"
     content = bytearray(chunk.read_bytes())
     content[-1] ^= 1
     chunk.write_bytes(content)
-    result = run_psotrack("cache", "check", "--cache", cache, "--json", "-")
+    result = run_psotrack("cache", "--check", "--cache", cache, "--json", "-")
     assert result.code == 2
     assert set(json.loads(result.out)["damaged"]) == {str(silhouettes)}
 
 
 def test_prune_removes_what_is_old_and_then_what_is_too_much(run_psotrack: Run, cache: Path) -> None:
-    tried = run_psotrack("cache", "prune", "--cache", cache, "--older-than", 30, "--dry-run")
+    tried = run_psotrack("cache", "--cache", cache, "--older-than", 30, "--dry-run")
     assert "would be removed: silhouettes of 1 videos" in tried.out
     assert len(_listed(run_psotrack, cache)) == 3
-    run_psotrack("cache", "prune", "--cache", cache, "--older-than", 30)
+    run_psotrack("cache", "--cache", cache, "--older-than", 30)
     assert [entry["video"] for entry in _listed(run_psotrack, cache)] == ["b.avi", ""]
-    run_psotrack("cache", "prune", "--cache", cache, "--max-gb", 1e-6)
+    run_psotrack("cache", "--cache", cache, "--max-gb", 1e-6)
     assert [entry["kind"] for entry in _listed(run_psotrack, cache)] == ["program"]
-    nothing = run_psotrack("cache", "prune", "--cache", cache)
+    nothing = run_psotrack("cache", "--cache", cache, "--dry-run")
     assert nothing.code == 2
-    assert "expected --older-than DAYS or --max-gb GB" in nothing.err
+    assert "--dry-run: expected --older-than, --max-gb or --empty" in nothing.err
 
 
 def test_what_a_killed_run_left_is_an_entry_and_what_a_running_one_writes_is_not(
@@ -132,7 +132,7 @@ def test_what_a_killed_run_left_is_an_entry_and_what_a_running_one_writes_is_not
         (part / "c" / "0").mkdir(parents=True)
         (part / "zarr.json").write_text("{}")
     assert str(parts[0]) in {str(entry["path"]) for entry in _listed(run_psotrack, cache)}
-    run_psotrack("cache", "empty", "--cache", cache, "--force")
+    run_psotrack("cache", "--empty", "--cache", cache)
     assert [path.exists() for path in parts] == [False, True]
 
 
@@ -142,16 +142,13 @@ def test_empty_leaves_what_is_no_entry_and_disturbs_no_reader(
     silhouettes = _compute(tmp_path)  # reads the stored ones, as a run does
     strangers = _strangers(cache)
     assert len(strangers) == 3
-    refused = run_psotrack("cache", "empty", "--cache", cache)
-    assert refused.code == 2
-    assert "pass --force" in refused.err
-    run_psotrack("cache", "empty", "--cache", cache, "--force")
+    run_psotrack("cache", "--empty", "--cache", cache)
     assert _listed(run_psotrack, cache) == []
     assert _strangers(cache) == strangers
     assert silhouettes.read(0, 12).any(), "the process goes on reading"
 
 
 def test_a_folder_that_does_not_exist_is_named(run_psotrack: Run, tmp_path: Path) -> None:
-    result = run_psotrack("cache", "list", "--cache", tmp_path / "none")
+    result = run_psotrack("cache", "--cache", tmp_path / "none")
     assert result.code == 2
     assert f"{tmp_path / 'none'}: expected a cache folder, found no such file or directory" in result.err
