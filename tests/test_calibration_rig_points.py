@@ -1,5 +1,6 @@
 """A rig from a moving point, and the world of a rig."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,9 @@ from psotrack.calibration import (
     views_of_detections,
     world_of_camera,
 )
+from psotrack.calibration.rig.point_adjustment import adjust
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections
 
 RIG = row_of_cameras(4)
@@ -240,3 +242,49 @@ def test_a_world_of_cameras_and_of_marked_points(tmp_path):
         fit_world(turned, read_world(path), with_scale=False)
     with pytest.raises(InputError, match="not on one line"):
         align(np.arange(9.0).reshape(3, 3), marked[:3], with_scale=False)
+
+
+def adjusted_from(rng, points_px, *, turn_deg=0.6, shift_m=0.03):
+    """Adjust `RIG` with random errors of all cameras but the first one."""
+    T = RIG.cameras.T_cam_world.copy()
+    turns = Rotation.from_rotvec(rng.normal(0, turn_deg, (len(RIG) - 1, 3)), degrees=True).as_matrix()
+    T[1:, :3] = turns @ T[1:, :3]
+    T[1:, :3, 3] += rng.normal(0, shift_m, (len(RIG) - 1, 3))
+    return adjust(Rig(RIG.names, replace(RIG.cameras, T_cam_world=T)), points_px, 1.0)
+
+
+def test_cameras_with_errors_and_false_sightings_are_adjusted_to_the_truth():
+    rng = np.random.default_rng(0)
+    points_m = rng.uniform((-1, -1, 0.6), (1, 1, 1.8), (150, 3))
+    points_px = project(RIG.cameras, points_m[:, None])[0] + rng.normal(0, 0.5, (150, 4, 2))
+    points_px[rng.random((150, 4)) < 0.2] = np.nan
+    seen = np.isfinite(points_px).all(axis=-1)
+    wrong = seen & (rng.random(seen.shape) < 0.03)
+    points_px[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(25, 200, (wrong.sum(), 2))
+    adjusted = adjusted_from(rng, points_px)
+    # The first camera keeps every bit, and outliers are found.
+    np.testing.assert_array_equal(adjusted.rig.cameras.T_cam_world[0], RIG.cameras.T_cam_world[0])
+    assert not adjusted.used[wrong].any()
+    assert adjusted.used[seen & ~wrong].mean() > 0.95
+    np.testing.assert_array_equal(np.isfinite(adjusted.residual_px), seen & (seen.sum(axis=1) >= 2)[:, None])
+    there = np.isfinite(adjusted.points_m).all(axis=1)
+    np.testing.assert_array_equal(there, adjusted.used.any(axis=1))
+    change, left_m = align(adjusted.points_m[there], points_m[there], with_scale=True)
+    # A pixel is about 5 mm at the points' distance.
+    assert np.median(left_m) < 0.005
+    np.testing.assert_allclose(
+        change.rig(adjusted.rig).cameras.centre_world, RIG.cameras.centre_world, atol=0.02
+    )
+
+
+def test_points_that_determine_no_rig_are_refused():
+    rng = np.random.default_rng(1)
+    points_px = project(RIG.cameras, rng.uniform((-1, -1, 0.6), (1, 1, 1.8), (40, 1, 3)))[0]
+    blind_px = points_px.copy()
+    blind_px[5:, 1] = np.nan
+    with pytest.raises(InputError, match=r"camera c1: expected at least 6 points .* found 5"):
+        adjusted_from(rng, blind_px)
+    # Two cameras see one half of the points, and the two others the rest.
+    points_px[:20, :2], points_px[20:, 2:] = np.nan, np.nan
+    with pytest.raises(InputError, match="cameras: expected points that connect all cameras"):
+        adjusted_from(rng, points_px)

@@ -1,4 +1,4 @@
-"""`psotrack calibrate`: points marked by hand, markers in videos, boards, drones, conversions, and wrong input."""
+"""`psotrack calibrate`: points marked by hand, markers in videos, boards, conversions, and wrong input."""
 
 import json
 from dataclasses import replace
@@ -11,14 +11,12 @@ from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import Board
-from psotrack.calibration.doctor import improve_with_check
 from psotrack.cli.calibrate import calibrate
 from psotrack.errors import PsotrackError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import read_lenses, read_rig, write_calibration, write_rig
-from psotrack.recordings import Detections, VideoWriter, write_detections
-from psotrack.recordings.datasets import read_sequence, write_marker_corners
-from psotrack.trajectories import Trajectories, write_trajectories
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets import write_marker_corners
 
 WORLD = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))
 
@@ -291,119 +289,10 @@ def test_intrinsics_of_a_board(tmp_path):
     assert "pass --squares 7x5 --dictionary 4x4_50" in message
 
 
-HALF_PX = np.array([60.0, 35.0])
-
-
-def write_flight(folder, rig, wrong):
-    """Write a sequence with detections by `rig` (noise of 0.5 px) and the calibration `wrong`; returns its tracks."""
-    folder.mkdir()
-    rng = np.random.default_rng(3)
-    frame = np.arange(60)
-    position_m = np.stack(
-        [
-            np.stack(
-                [
-                    1.2 * np.sin(0.11 * frame + k),
-                    1.2 * np.cos(0.07 * frame + 2 * k),
-                    1.2 + 0.8 * np.sin(0.05 * frame + k),
-                ],
-                -1,
-            )
-            for k in range(2)
-        ],
-        axis=1,
-    )
-    write_calibration(folder / "cameras_calibration.csv", wrong)
-    (folder / "dl_data").mkdir()
-    for index, name in enumerate(rig.names):
-        middle = project(rig.cameras[index], position_m)[0] + rng.normal(0, 0.5, (60, 2, 2)) + 0.5
-        xyxy = np.concatenate([middle - HALF_PX, middle + HALF_PX], axis=-1).reshape(-1, 4)
-        write_detections(
-            folder / "dl_data" / f"{name}.csv", Detections(np.repeat(frame, 2), xyxy, np.ones(120))
-        )
-        with VideoWriter(folder / f"{name}.avi", 25.0, (1280, 720)) as writer:
-            for _ in frame[:2]:
-                writer.write(np.zeros((720, 1280, 3), np.uint8))
-    tracks = folder / "tracks.csv"
-    write_trajectories(tracks, Trajectories(frame, frame / 25, ("dron1", "dron2"), position_m))
-    return tracks
-
-
 def square_pixels(rig):
     K = rig.cameras.K.copy()
     K[:, 1, 1] = K[:, 0, 0]
     return Rig(rig.names, replace(rig.cameras, K=K))
-
-
-def test_a_rig_is_adjusted_to_its_drones(tmp_path):
-    rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
-    T = rig.cameras.T_cam_world.copy()
-    # One camera is turned by 1 degree about its own centre, and moved by 3 cm.
-    R = Rotation.from_rotvec([0.01, -0.012, 0.006]).as_matrix() @ T[2, :3, :3]
-    T[2, :3, :3], T[2, :3, 3] = R, -R @ (centres(rig)[2] + (0.02, -0.02, 0.01))
-    wrong = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
-    tracks = write_flight(tmp_path / "SEQ", rig, wrong)
-    fixed = ("--fixed", "c0,c1,c3,c4", "--noise", "0.5")
-    out = tmp_path / "better.csv"
-    shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, *fixed, "--out", out).stdout
-    assert "moved (mm)" in shown
-    better = read_rig(out, (1280, 720))
-    # The bound is four standard deviations: each of 120 points has an error of 0.5 px, which is 1.5 mm.
-    np.testing.assert_allclose(centres(better)[2], centres(rig)[2], atol=0.006)
-    np.testing.assert_allclose(centres(better)[0], centres(rig)[0], atol=1e-12)
-    output = run(
-        "adjust",
-        tmp_path / "SEQ",
-        "--tracks",
-        tracks,
-        "--refine-focal-length",
-        "--out",
-        tmp_path / "b.toml",
-        "--json",
-        "-",
-    ).stdout
-    rows = json.loads(output)["cameras"]
-    assert {name: row["verdict"] for name, row in rows.items() if row["verdict"] != "agrees"} == {
-        "c2": "moved"
-    }
-    assert rows["c2"]["moved_m"] > 0.02
-    assert rows["c2"]["turned_deg"] == pytest.approx(
-        np.rad2deg(np.linalg.norm([0.01, -0.012, 0.006])), abs=0.2
-    )
-    np.testing.assert_allclose(centres(read_rig(tmp_path / "b.toml"))[0], centres(wrong)[0], atol=1e-14)
-    assert rows["c0"]["points"] > 60
-    assert rows["c0"]["worst"][0]["point"].startswith("dron")
-    assert "fixed: expected some of" in refused(
-        "adjust", tmp_path / "SEQ", "--tracks", tracks, "--fixed", "c7", "--out", tmp_path / "c.toml"
-    )
-
-
-def test_why_a_rig_in_which_all_cameras_may_be_off_is_written_unchanged(tmp_path, monkeypatch):
-    """The finding itself is tested with the doctor's other findings; here, what the command says of it."""
-    rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
-    tracks = write_flight(tmp_path / "SEQ", rig, rig)
-    monkeypatch.setattr(
-        "psotrack.calibration.doctor.improve_with_check",
-        lambda *args, **more: replace(improve_with_check(*args, **more), all_off=True),
-    )
-    shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--out", tmp_path / "same.toml").stdout
-    assert "all cameras may be off by a little" in shown
-    assert "the rig is written unchanged" in shown
-    assert "no camera is off" not in shown
-
-
-def test_a_right_rig_is_written_unchanged(tmp_path):
-    rig = square_pixels(ring_rig(5, image_size_wh=(1280, 720)))
-    tracks = write_flight(tmp_path / "SEQ", rig, rig)
-    out = tmp_path / "same.toml"
-    shown = run("adjust", tmp_path / "SEQ", "--tracks", tracks, "--refine-focal-length", "--out", out).stdout
-    assert "no camera is off by more than the uncertainty of these detections" in shown
-    assert "the rig is written unchanged" in shown
-    assert "which may be chance" in shown
-    given = read_sequence(tmp_path / "SEQ").rig
-    # The file has Rodrigues vectors, whose conversion rounds.
-    np.testing.assert_allclose(read_rig(out).cameras.T_cam_world, given.cameras.T_cam_world, atol=1e-14)
-    np.testing.assert_array_equal(read_rig(out).cameras.K, given.cameras.K)
 
 
 def test_files_are_converted(tmp_path):

@@ -11,14 +11,13 @@ from click.testing import CliRunner
 from helpers import ring_rig
 
 import psotrack as pt
-from psotrack.calibration import find_drones_in_boxes
 from psotrack.cli import cli
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
-from psotrack.geometry.rig_files import read_rig, write_rig
-from psotrack.recordings import Detections, read_detections, write_detections
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import Detections, write_detections
 from psotrack.recordings.datasets import open_recording
-from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
+from psotrack.trajectories import Trajectories, read_trajectories
 from psotrack.trajectories.tum import write_tum
 
 LASTS_S = 1.0
@@ -118,32 +117,3 @@ def test_doctor_and_info_read_recordings_without_videos(folder):
     assert "no video" in shown
     assert "1280 x 960" in shown
     assert "50 Hz" in shown
-
-
-def test_adjust_uses_frames_that_were_not_exposed_together(folder, tmp_path):
-    report, out, tracks = (tmp_path / name for name in ("report.json", "rig.toml", "tracks.csv"))
-    time_s = np.arange(int(50 * LASTS_S)) / 50
-    write_trajectories(tracks, Trajectories(np.arange(50), time_s, ("drone",), path_m(time_s)[:, None]))
-    run("calibrate", "adjust", folder, "--tracks", tracks, "--out", out, "--json", report)
-    cameras = json.loads(report.read_text())["cameras"]
-    # The drone moves by 4 px in the 13 ms by which a camera is late.
-    assert max(row["rms_px"] for row in cameras.values()) < 0.1
-    given, written = (read_rig(path) for path in (folder / "rig.toml", out))
-    np.testing.assert_allclose(written.cameras.T_cam_world, given.cameras.T_cam_world, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("track_hz", [50.0, 23.0])
-def test_middles_of_boxes_are_moved_to_the_times_of_the_tracks(folder, track_hz):
-    recording = open_recording(folder)
-    time_s = np.arange(int(LASTS_S * track_hz)) / track_hz
-    tracks = Trajectories(np.arange(len(time_s)), time_s, ("drone",), path_m(time_s)[:, None])
-    detections = {name: read_detections(path) for name, path in recording.detections.items()}
-    views = find_drones_in_boxes(recording.rig, detections, tracks, frame_times=recording.exposed)
-    # The slowest cameras have 25 frames per second.
-    assert np.diff(views.frame).min() >= track_hz / 25 - 1e-9
-    expected_px = project(recording.rig.cameras, path_m(time_s[views.frame])[:, None])[0]
-    seen = np.isfinite(views.points_px).all(axis=-1)
-    assert seen[:, 0].mean() > 0.9
-    # The camera that begins at 0.2 s has no views before.
-    assert not seen[time_s[views.frame] < 0.17, 3].any()
-    np.testing.assert_allclose(views.points_px[seen], expected_px[seen], rtol=0, atol=0.05)

@@ -17,7 +17,7 @@ import pytest
 from flight_files import make_sequence, make_tracks_file
 from helpers import make_once, ring_rig
 from sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
-from test_cli_calibrate import film_board, pairs_of, square_pixels, write_flight
+from test_cli_calibrate import film_board, pairs_of
 from test_fuse_command import make_files
 from test_map_markers import make_walk
 from test_synchronisation import make_recording
@@ -100,7 +100,6 @@ def inputs(tmp_path_factory, root):
         write_rig(folder / "lenses.yml", rig)
         pairs_of(folder / "pairs.csv", rig)
         film_board(folder / "board.avi")
-        write_flight(folder / "boxes", *[square_pixels(ring_rig(5, image_size_wh=(1280, 720)))] * 2)
         for name, make_inputs in (("walk", make_walk), ("fuse", make_files), ("clocks", make_recording)):
             (folder / name).mkdir()
             make_inputs(folder / name)
@@ -156,8 +155,6 @@ COMMANDS = {
         "lens.toml",
     ): "calibrate intrinsics {inputs}/board.avi --squares 7x5 --square 0.04 --marker 0.03 --lens 4 "
     "--out lens.toml --force --quiet",
-    ("better.csv",): "calibrate adjust {inputs}/boxes --tracks {inputs}/boxes/tracks.csv --out better.csv "
-    "--force --quiet",
     (
         "camera.csv",
     ): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
@@ -361,7 +358,6 @@ REFUSED = [
     "export {flight}/tracks.csv --to tum --out out/tum",
     "archive {flight}/tracks.csv {flight} --out out/flight.psotrack",
     "doctor {flight} --detections blobs --json out/doctor.json",
-    "calibrate adjust {flight} --tracks {flight}/tracks.csv --out out/rig.toml",
 ]
 
 

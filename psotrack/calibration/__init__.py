@@ -1,10 +1,8 @@
-"""Calibration: lenses and poses of cameras, and adjustment of a rig to the pixels that its cameras measure.
+"""Calibration: lenses and poses of cameras, and rigs from boards or points.
 
-In: a data sheet or a video of a ChArUco board (`intrinsics`), points of known position (`image_points`, `extrinsics`),
-or detections of drones (`bundle`). Out: lenses and rigs with covariances. `bundle` adjusts all cameras and points
-together, `common_errors` adds errors that many points share to the covariance, and `significance` finds the cameras
-that are certainly wrong. Other rooms may use every name in `__init__.pyi`. The files of rigs are read and written in
-`psotrack.geometry`.
+In: a data sheet or a video of a board (`intrinsics`), points of known position (`image_points`, `extrinsics`), a board
+that is moved before all cameras, or a moving point (`rig`). Out: lenses and rigs with covariances. Other rooms may use
+every name in `__init__.pyi`. The files of rigs are read and written in `psotrack.geometry`.
 """
 
 import lazy_loader

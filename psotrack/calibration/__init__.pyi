@@ -2,14 +2,10 @@ from .board_corners import BoardFinder
 from .board_page import save_board
 from .board_recognition import describe_board, detect_board
 from .boards import Board
-from .bundle import AdjustedRig, adjust
-from .common_errors import CommonErrors
 from .derivatives import centre_by_pose, reproject
 from .extrinsics import Located, locate_camera
 from .image_points import (
-    DroneViews,
     ImagePoints,
-    find_drones_in_boxes,
     find_markers,
     find_markers_in,
     read_image_points,
@@ -50,14 +46,12 @@ from .rig.point_shifts import PointShift, find_point_shifts
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.views import BoardViews, FoundBoards, find_views
 from .rig.world import Similarity, align, world_of_camera
-from .significance import Improved, find_wrong_cameras, improve
 
 __all__ = [
     "GATE",
     "LOOSE",
     "MIN_POINTS",
     "UNLIKELY",
-    "AdjustedRig",
     "Board",
     "BoardFinder",
     "BoardSettings",
@@ -65,12 +59,9 @@ __all__ = [
     "CalibratedRig",
     "CameraFigures",
     "CameraImages",
-    "CommonErrors",
-    "DroneViews",
     "FoundBoards",
     "GivenWorld",
     "ImagePoints",
-    "Improved",
     "Lens",
     "LensChoice",
     "LensModel",
@@ -85,7 +76,6 @@ __all__ = [
     "RigCalibration",
     "RigSettings",
     "Similarity",
-    "adjust",
     "advise",
     "align",
     "calibrate_by_board",
@@ -102,16 +92,13 @@ __all__ = [
     "detect_board",
     "distance_between",
     "figures_of",
-    "find_drones_in_boxes",
     "find_markers",
     "find_markers_in",
     "find_point_shifts",
     "find_shifts",
     "find_views",
-    "find_wrong_cameras",
     "first_images",
     "fit_world",
-    "improve",
     "in_new_world",
     "inflation",
     "instants_of_numbers",

@@ -1,4 +1,4 @@
-"""Points in images: points marked by hand, corners of markers of known positions, and tracked drones.
+"""Points in images: points marked by hand, and corners of markers of known positions.
 
 Points marked by hand are a CSV file, `camera,point,x_px,y_px,x_m,y_m,z_m`, with one row for each camera that sees a
 point. The position of a point in the world is in any of its rows, or in another CSV file, `point,x_m,y_m,z_m`.
@@ -7,21 +7,17 @@ point. The position of a point in the world is in any of its rows, or in another
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from psotrack.calibration.common_errors import CommonErrors
 from psotrack.errors import InputError
 from psotrack.foreground.detection import marker_dictionary
-from psotrack.geometry import Rig, project_visible
-from psotrack.recordings import Detections, FrameTimes, VideoInfo, nearest_frames, read_frames
+from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import Column, Table, TextRow, read_rows
-from psotrack.tracking.matching import BORDER_PX, NOISE_PX, NOISE_SHARE
-from psotrack.trajectories import Trajectories, resample
 
 _SEPARATOR = ","
 _WORLD = ("x_m", "y_m", "z_m")
@@ -29,11 +25,6 @@ _WORLD = ("x_m", "y_m", "z_m")
 _FRAMES = 15
 #: Smallest share of these frames that must show a marker: a rarer marker is a false detection.
 _SEEN = 0.5
-#: Standard deviation of each kind of common error of boxes, as a share of the box's mean side, and time over which the
-#: first kind lasts, seconds. There are three kinds. The first lasts as long as a drone's attitude is the same. The
-#: second comes from the drone's shape and is the same in all frames of a camera. The third is shared by all drones of a
-#: camera and varies over the image, because the camera sees drones at different distances and elevations.
-_COMMON_SHARE, _COMMON_S = 0.015, 1.0
 
 
 @dataclass(frozen=True)
@@ -49,30 +40,6 @@ class ImagePoints:
     points: tuple[str, ...]
     points_m: Float[np.ndarray, "points 3"]
     points_px: Float[np.ndarray, "points 2"]
-
-
-@dataclass(frozen=True)
-class DroneViews:
-    """Tracked drones in the images of all cameras, one point per drone and frame.
-
-    Attributes:
-        points: names of the points, such as `dron1@40` for frame 40.
-        points_px: (points, cameras, 2), middles of boxes, pixels; NaN where a camera has no clear box of the drone.
-        noise_px: (points, cameras), standard deviations of the errors that differ from frame to frame, pixels; NaN like
-            `points_px`.
-        common_errors: errors that last over many frames.
-        frame: (points,), number of each point's frame.
-        drone: (points,), index of each point's drone.
-        side_px: (points, cameras), mean sides of the boxes, pixels; NaN like `points_px`.
-    """
-
-    points: tuple[str, ...]
-    points_px: Float[np.ndarray, "points cameras 2"]
-    noise_px: Float[np.ndarray, "points cameras"]
-    common_errors: tuple[CommonErrors, ...]
-    frame: Int[np.ndarray, "points"]
-    drone: Int[np.ndarray, "points"]
-    side_px: Float[np.ndarray, "points cameras"]
 
 
 def read_image_points(path: str | Path, places: str | Path | None = None) -> dict[str, ImagePoints]:
@@ -159,135 +126,6 @@ def find_markers_in(
         tuple(f"{marker}.{corner + 1}" for marker in kept for corner in range(4)),
         np.array([corners_m[marker] for marker in kept]).reshape(-1, 3),
         np.array([np.median(found[marker], axis=0) for marker in kept]).reshape(-1, 2),
-    )
-
-
-def find_drones_in_boxes(
-    rig: Rig,
-    detections: Mapping[str, Detections],
-    tracks: Trajectories,
-    most_frames: int = 500,
-    frame_times: Mapping[str, FrameTimes] | None = None,
-) -> DroneViews:
-    """Find tracked drones in the images: the middle of the box that contains a drone's projection.
-
-    Boxes that contain two drones, drones in two boxes, boxes that the image's border cuts, and boxes that touch other
-    boxes are not used. Of long tracks only every n-th frame is used, because neighbouring frames have the same errors.
-
-    Where the cameras' frames were not exposed together, each camera shows its frame nearest to the track's time. The
-    middle of a box is moved by the motion of the track's projection from the exposure to that time, which is at most
-    0.6 frames of the camera. No camera shows a frame twice.
-
-    Args:
-        rig: cameras with which the drones were tracked.
-        detections: detections by camera name; a camera without an entry has no detections.
-        tracks: positions of the drones.
-        most_frames: largest number of frames that are used.
-        frame_times: times of each camera's frames on the clock of the tracks; None where frame i of every camera was
-            exposed at the time of the tracks' frame i.
-    """
-    shortest = 1 if frame_times is None else _rows_per_frame(tracks, frame_times)
-    rows = np.arange(0, tracks.num_frames, max(shortest, -(-tracks.num_frames // most_frames)))
-    places_m = np.where(tracks.seen[..., None], tracks.position_m, np.nan)
-    frames = np.repeat(tracks.frame[rows, None], len(rig), axis=1)
-    shown_m = places_m[rows, :, None]
-    if frame_times is not None:
-        frames, shown_m = _at_exposures(rig, replace(tracks, position_m=places_m), rows, frame_times)
-    projected, depth = project_visible(rig.cameras, shown_m)
-    motion_px = np.zeros(projected.shape)
-    if frame_times is not None:
-        motion_px = np.asarray(project_visible(rig.cameras, places_m[rows, :, None])[0] - projected)
-    points_px, side_px = np.full(projected.shape, np.nan), np.full(depth.shape, np.nan)
-    for camera, name in enumerate(rig.names):
-        for row, frame in enumerate(frames[:, camera].tolist() if name in detections else []):
-            xyxy = detections[name].in_frame(frame).xyxy
-            clear = _clear(xyxy, np.asarray(rig.cameras.image_size_wh[camera]))
-            at = projected[row, :, camera, None]
-            # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
-            xyxy = xyxy - 0.5
-            holds = ((at >= xyxy[:, :2]) & (at <= xyxy[:, 2:])).all(axis=-1)
-            holds &= (depth[row, :, camera] > 0)[:, None]
-            alone = holds & (holds.sum(axis=0) == 1) & (holds.sum(axis=1) == 1)[:, None]
-            drone, box = np.nonzero(alone & clear)
-            points_px[row, drone, camera] = (xyxy[box, :2] + xyxy[box, 2:]) / 2
-            side_px[row, drone, camera] = np.sqrt((xyxy[box, 2:] - xyxy[box, :2]).prod(axis=-1))
-    points_px += motion_px
-    side_px[np.isnan(points_px).any(axis=-1)] = np.nan
-    names = [f"{drone}@{frame}" for frame in tracks.frame[rows].tolist() for drone in tracks.drones]
-    drone = np.tile(np.arange(tracks.num_drones), len(rows))
-    second = np.floor(tracks.time_s[rows] / _COMMON_S).astype(np.int64).repeat(tracks.num_drones)
-    points_px, side_px = points_px.reshape(-1, len(rig), 2), side_px.reshape(-1, len(rig))
-    return DroneViews(
-        tuple(names),
-        points_px,
-        NOISE_PX + NOISE_SHARE * side_px,
-        _make_common_errors(
-            rig, points_px, side_px, drone, (second - second.min(initial=0)) * tracks.num_drones + drone
-        ),
-        np.repeat(tracks.frame[rows].astype(np.int64), tracks.num_drones),
-        drone,
-        side_px,
-    )
-
-
-def _rows_per_frame(tracks: Trajectories, frame_times: Mapping[str, FrameTimes]) -> int:
-    """Number of rows of the tracks in an interval of the slowest camera."""
-    if tracks.num_frames < 2 or not frame_times:
-        return 1
-    row_s = float(np.median(np.diff(tracks.time_s)))
-    slowest = min(times.fps for times in frame_times.values())
-    # A thousandth: rates are rounded in files.
-    return max(1, int(np.ceil(1 / (slowest * row_s) - 1e-3)))
-
-
-def _at_exposures(
-    rig: Rig,
-    tracks: Trajectories,
-    rows: Int[np.ndarray, "rows"],
-    frame_times: Mapping[str, FrameTimes],
-) -> tuple[Int[np.ndarray, "rows cameras"], Float[np.ndarray, "rows drones cameras 3"]]:
-    """Each camera's frame nearest to each row of the tracks, -1 for none, and where the drones were at its exposure."""
-    time_s = tracks.time_s[rows]
-    frames = np.full((len(rows), len(rig)), -1)
-    shown_m = np.full((len(rows), tracks.num_drones, len(rig), 3), np.nan)
-    for camera, name in enumerate(rig.names):
-        if name in frame_times:
-            frames[:, camera], offset_s = nearest_frames(frame_times[name], time_s)
-            shown_m[:, :, camera] = resample(tracks, rows, time_s + offset_s).position_m
-    # Two rows may be near one frame at the beginning or the end of a video.
-    frames[1:][np.diff(frames, axis=0) == 0] = -1
-    shown_m[np.broadcast_to((frames < 0)[:, None], shown_m.shape[:3])] = np.nan
-    return frames, shown_m
-
-
-def _clear(
-    xyxy: Float[np.ndarray, "boxes 4"], image_size_wh: Float[np.ndarray, "2"]
-) -> Bool[np.ndarray, " boxes"]:
-    """(boxes,), True for boxes that the image's border does not cut and that no other box touches."""
-    sides = np.minimum(xyxy[:, None, 2:], xyxy[:, 2:]) - np.maximum(xyxy[:, None, :2], xyxy[:, :2])
-    touched = (sides > 0).all(axis=-1).sum(axis=1) > 1
-    cut = (xyxy[:, :2] < BORDER_PX) | (xyxy[:, 2:] > image_size_wh - BORDER_PX)
-    return ~touched & ~cut.any(axis=-1)
-
-
-def _make_common_errors(
-    rig: Rig,
-    points_px: Float[np.ndarray, "points cameras 2"],
-    side_px: Float[np.ndarray, "points cameras"],
-    drone: Int[np.ndarray, " points"],
-    second: Int[np.ndarray, " points"],
-) -> tuple[CommonErrors, ...]:
-    """Errors of boxes that last: per drone for a second, per drone for the recording, and per camera for all drones."""
-    middle_px = np.asarray(rig.cameras.K)[:, :2, 2]
-    from_middle = (points_px - middle_px) / (np.asarray(rig.cameras.image_size_wh) / 2)
-    everything = np.zeros_like(drone)
-    return (
-        CommonErrors(second, _COMMON_SHARE * side_px),
-        CommonErrors(drone, _COMMON_SHARE * side_px),
-        *(
-            CommonErrors(everything, _COMMON_SHARE * side_px * factor)
-            for factor in (1.0, *np.moveaxis(from_middle, -1, 0))
-        ),
     )
 
 

@@ -65,19 +65,17 @@ class PlacedCameras:
         return {name: ", ".join(map(_in_words, row["worst"])) for name, row in self.cameras.items()}
 
     def _table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-        adjusted = any("moved_m" in row for row in self.cameras.values())
-        # An adjusted camera's movement matters more than its position, and a line has no room for both.
-        place = ("moved (mm)", "turned (deg)", "std (mm)", "verdict") if adjusted else (POSITION, "std (mm)")
-        rows = [
+        rows: list[tuple[str, ...]] = [
             (
                 name,
                 f"{row['used']} of {row['points']}",
                 "" if row["rms_px"] is None else f"{row['rms_px']:.2f}",
-                *(_changed(row) if adjusted else _placed(row)),
+                format_numbers(row["centre_m"], 3),
+                format_numbers([1e3 * std for std in row["centre_std_m"]], 1),
             )
             for name, row in self.cameras.items()
         ]
-        return ("camera", "points", "rms (px)", *place), rows
+        return ("camera", "points", "rms (px)", POSITION, "std (mm)"), rows
 
 
 def row_of(
@@ -149,15 +147,6 @@ def place_cameras(
             of_camera.points,
         )
     return PlacedCameras(make_rig(cameras), rows)
-
-
-def _placed(row: dict[str, Any]) -> tuple[str, str]:
-    return format_numbers(row["centre_m"], 3), format_numbers([1e3 * std for std in row["centre_std_m"]], 1)
-
-
-def _changed(row: dict[str, Any]) -> tuple[str, str, str, str]:
-    std_mm = 1e3 * float(np.linalg.norm(row["centre_std_m"]))
-    return f"{1e3 * row['moved_m']:.1f}", f"{row['turned_deg']:.2f}", f"{std_mm:.1f}", row["verdict"]
 
 
 def _in_words(one: dict[str, Any]) -> str:

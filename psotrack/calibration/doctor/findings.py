@@ -21,6 +21,12 @@ ALMOST = 0.9
 #: Smallest relative difference between the scales of rig and reference that is reported: focal lengths are known to a
 #: few per cent.
 SAME_SCALE = 0.03
+#: What to do about a camera's place, and about its lens.
+_PLACE_ANEW = (
+    "place it anew with `psotrack calibrate extrinsics --pairs`, or all cameras with `psotrack calibrate rig`"
+)
+_LENS_ANEW = "calibrate its lens anew with `psotrack calibrate intrinsics`"
+_LENSES_ANEW = "calibrate each lens anew with `psotrack calibrate intrinsics`"
 
 
 @dataclass(frozen=True)
@@ -52,9 +58,7 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault], fp
     fault = next(each for each in explained if each.gain - sound.gain >= ALMOST * (best - sound.gain))
     if best - sound.gain <= CLEARLY:
         message = f"camera {name}: it explains {sound.gain:.0%} of the drones that the others see; no correction helps"
-        return Finding(
-            "disagrees", (name,), message, f"leave {name} out with --cameras, or calibrate it anew"
-        )
+        return Finding("disagrees", (name,), message, f"leave {name} out with --cameras, or {_PLACE_ANEW}")
     numbers = f"(explains {fault.gain:.0%} of the drones that the others see, not {sound.gain:.0%})"
     if fault.kind == "clock":
         late = "late" if fault.amount > 0 else "early"
@@ -65,7 +69,7 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault], fp
         how = f"{abs(percent):.0f} % too {'short' if percent < 0 else 'long'}"
         message = f"camera {name}: its focal length is {how} {numbers}"
         f_px = fault.camera.K[0, 0]
-        return Finding("focal length", (name,), message, f"try {f_px:.0f} px, or calibrate its lens anew")
+        return Finding("focal length", (name,), message, f"try {f_px:.0f} px, or {_LENS_ANEW}")
     if fault.kind == "exchanged":
         other = rig.names[int(fault.amount)]
         message = f"camera {name}: what it sees fits the calibration of {other} {numbers}"
@@ -77,7 +81,7 @@ def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault], fp
         f" and moved by {100 * shift_m:.0f} cm" if fault.kind == "moved" else ""
     )
     centre = ", ".join(f"{value:.2f}" for value in fault.camera.centre_world)
-    remedy = f"calibrate it anew (`psotrack calibrate`); the drones put it at ({centre}) m"
+    remedy = f"{_PLACE_ANEW}; the drones put it at ({centre}) m"
     return Finding(fault.kind, (name,), f"camera {name}: it is {how} {numbers}", remedy)
 
 
@@ -124,7 +128,7 @@ def _in_words(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
         scale, scale_std = float(np.exp(judged.step[-1])), float(judged.std[-1])
         how = f"{100 * abs(1 / scale - 1):.0f} % too {'short' if scale > 1 else 'long'} (± {100 * scale_std:.1f} %)"
         words = f"the calibration: all focal lengths are {how}"
-        return words, f"multiply them by {scale:.3f}, or calibrate the lenses anew"
+        return words, f"multiply them by {scale:.3f}, or {_LENSES_ANEW}"
     name = rig.names[camera]
     step, std = parameters_of(judged.step, camera), parameters_of(judged.std, camera)
     if hypothesis.kind == "clock":
@@ -139,13 +143,13 @@ def _in_words(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
         f_px = scale * rig.cameras.K[camera, 0, 0]
         return (
             f"camera {name}: its focal length is {how}",
-            f"try {f_px:.0f} px, or calibrate its lens anew",
+            f"try {f_px:.0f} px, or {_LENS_ANEW}",
         )
     turn_deg, way_m = np.rad2deg(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
     parts = [f"turned by {turn_deg:.1f} degrees"] if turn_deg else []
     parts += [f"moved by {100 * way_m:.0f} cm"] if way_m else []
     centre = ", ".join(f"{value:.2f}" for value in rig.cameras.centre_world[camera] + step[3:6])
-    remedy = f"calibrate it anew (`psotrack calibrate`); the boxes put it at ({centre}) m"
+    remedy = f"{_PLACE_ANEW}; the boxes put it at ({centre}) m"
     return f"camera {name}: it is {' and '.join(parts)}", remedy
 
 

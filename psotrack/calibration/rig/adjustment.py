@@ -14,7 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.boards import Board
-from psotrack.calibration.bundles.boards import (
+from psotrack.calibration.derivatives import centre_by_pose
+from psotrack.calibration.lens_models import PINHOLE, LensModel, camera_matrix
+from psotrack.calibration.residuals import GATE
+from psotrack.calibration.rig.board_poses import find_lens
+from psotrack.calibration.rig.bundle import (
     LEAST_NOISE_PX,
     BoardBundle,
     BoardProblem,
@@ -22,10 +26,6 @@ from psotrack.calibration.bundles.boards import (
     CameraCorners,
     solve_robustly,
 )
-from psotrack.calibration.derivatives import centre_by_pose
-from psotrack.calibration.lens_models import PINHOLE, LensModel, camera_matrix
-from psotrack.calibration.residuals import GATE
-from psotrack.calibration.rig.board_poses import find_lens
 from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
 from psotrack.calibration.rig.covariance import covariance_over_instants
 from psotrack.calibration.rig.lens_choice import LEAST_VIEWS, MOST_FITS, choose_lens_model

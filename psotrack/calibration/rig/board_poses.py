@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float
 
 from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
-from psotrack.calibration.bundles.boards import (
+from psotrack.calibration.lens_models import PINHOLE, LensModel
+from psotrack.calibration.rig.bundle import (
     BoardBundle,
     BoardProblem,
     BoardState,
     CameraCorners,
     solve_robustly,
 )
-from psotrack.calibration.lens_models import PINHOLE, LensModel
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
 _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration.bundles.boards import BoardBundle
+from psotrack.calibration.rig.bundle import BoardBundle
 from psotrack.errors import InputError
 
 #: Largest condition number of the information, in units of its diagonal.

@@ -3,7 +3,7 @@
 Two cameras see a point along two rays that meet, whatever the point is: the essential matrix (Nistér, PAMI 26(6), 2004)
 gives the direction from one camera to the other. The pair that sees most at wide angles begins; each further camera is
 placed by points that are known already (perspective-n-point), and after each camera all are adjusted together
-(`calibration.bundle`). Detections of other things are left out by random sampling, first with a wide gate. Scale, axes
+(`point_adjustment`). Detections of other things are left out by random sampling, first with a wide gate. Scale, axes
 and origin of the world stay open: see `world`.
 
 How well the cameras are known depends on what fixes the world, and on errors that last: of the lens, of a detector, of
@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.calibration.bundle import AdjustedRig, adjust
 from psotrack.calibration.residuals import spread_px
+from psotrack.calibration.rig.point_adjustment import AdjustedRig, adjust
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, triangulate_linearly, undistort

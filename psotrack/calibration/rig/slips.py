@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.bundles.boards import BoardBundle
+from psotrack.calibration.rig.bundle import BoardBundle
 
 #: Degrees of freedom of Student's distribution: small, because a board moves now fast and now hardly.
 _FREEDOM = 3.0

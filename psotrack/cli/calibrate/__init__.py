@@ -1,4 +1,4 @@
-"""`psotrack calibrate`: lenses, poses of cameras, a rig that agrees with tracked drones, and other programs' files."""
+"""`psotrack calibrate`: lenses, poses of cameras, whole rigs, and other programs' files."""
 
 import click
 
@@ -6,10 +6,6 @@ from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
 
 #: Commands by name, as in `psotrack.cli`.
 COMMANDS = {
-    "adjust": LazyCommand(
-        "psotrack.cli.calibrate.adjust:adjust",
-        "Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.",
-    ),
     "convert": LazyCommand(
         "psotrack.cli.calibrate.convert:convert",
         "Convert the calibration IN, of any program in the list below, to OUT.",
@@ -41,6 +37,5 @@ def calibrate() -> None:
     A rig from nothing: psotrack calibrate rig a.mp4 b.mp4 --squares 7x5 --square 0.04 --marker 0.03 --out rig.toml
     Lenses:             psotrack calibrate intrinsics a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
     Poses of cameras:   psotrack calibrate extrinsics --pairs pairs.csv --intrinsics lens.toml --out rig.toml
-    From the drones:    psotrack calibrate adjust SEQ --tracks tracks.csv --out better.toml
     Other programs:     psotrack calibrate convert rig.toml cameras_calibration.csv
     """

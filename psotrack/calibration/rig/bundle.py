@@ -1,7 +1,8 @@
-"""Bundle adjustment of lenses, cameras and boards: residuals, derivatives and normal equations (see `calibration.rig`).
+"""Bundle adjustment of lenses, cameras and boards: residuals, derivatives and normal equations.
 
 A corner X of the board is seen at K(R_c (R_b X + t_b) + t_c). The unknowns of the lenses and the cameras are shared by
-all instants; the board's pose at an instant is a block, which `psotrack.geometry.estimation` eliminates.
+all instants; the board's pose at an instant is a block, which `psotrack.geometry.estimation` eliminates. A single point
+is a board with one corner, its origin.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
-from psotrack.calibration.bundles.poses import move_poses
 from psotrack.calibration.lens_models import LensModel
 from psotrack.geometry import cross_matrices
 from psotrack.geometry.estimation import (
@@ -306,8 +307,9 @@ class BoardBundle:
             free = columns >= 0
             information[np.ix_(columns[free], columns[free])] += known[np.ix_(free, free)]
             right[columns[free]] += (known @ below)[free]
-        # A board that is not adjusted, or not seen, stays where it is.
-        blocks[np.trace(blocks, axis1=1, axis2=2) == 0] = np.eye(6)
+        # What is not adjusted or not seen stays as it is: a board, or the turn of a board with a single corner.
+        own = np.einsum("bii->bi", blocks)
+        own[own == 0] = 1.0
         return NormalEquations(information, right, blocks, block_right, coupling)
 
     def moved(self, step: Step) -> BoardBundle:
@@ -321,8 +323,8 @@ class BoardBundle:
         cameras = np.append(step.shared, 0.0)[self.problem.camera_columns] * self.problem.free_camera[:, None]
         state = BoardState(
             lenses,
-            move_poses(self.state.T_cam_world, cameras),
-            move_poses(self.state.T_world_board, step.blocks),
+            _moved(self.state.T_cam_world, cameras),
+            _moved(self.state.T_world_board, step.blocks),
         )
         return replace(self, state=state)
 
@@ -330,6 +332,16 @@ class BoardBundle:
         """Lower the cost from this state."""
         least_gain = _LEAST_GAIN_ROBUST if self.robust else _LEAST_GAIN
         return levenberg_marquardt(self, max_steps=_MAX_STEPS, least_gain=least_gain)
+
+
+def _moved(
+    T: Float[np.ndarray, "poses 4 4"], change: Float[np.ndarray, "poses 6"]
+) -> Float[np.ndarray, "poses 4 4"]:
+    """Turn poses by small turns about the target's axes, rad, and shift them, metres: turns first."""
+    moved = T.copy()
+    moved[:, :3, :3] = Rotation.from_rotvec(change[:, :3]).as_matrix() @ T[:, :3, :3]
+    moved[:, :3, 3] += change[:, 3:]
+    return moved
 
 
 def _inverses(matrices: Float[np.ndarray, "views 6 6"]) -> Float[np.ndarray, "views 6 6"]:
