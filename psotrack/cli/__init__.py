@@ -17,109 +17,47 @@ import sys
 import click
 
 from psotrack import __version__
-from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
+from psotrack.cli.lazy import SETTINGS, LazyGroup, commands_in
 from psotrack.errors import PsotrackError, SettingsError, one_short_line
 
 __all__ = ["cli", "main"]
 
-START, RESULTS, RESEARCH, ON_BOARD = "Start", "Results", "Research", "On-board"
-#: Commands by name: where the command is, the first sentence of its help, and its heading in the list. A test holds the
-#: sentences equal to the commands' own.
-COMMANDS = {
-    "demo": LazyCommand(
-        "psotrack.cli.demo:demo",
-        "Simulate four drones, track them in eight videos, print the errors and save a picture.",
-        START,
-    ),
-    "run": LazyCommand(
-        "psotrack.cli.run:run",
-        "Calibrate, check, track and show the videos of a rig in FOLDER, from board to report.",
-        START,
-    ),
-    "board": LazyCommand(
-        "psotrack.cli.board:board", "Draw a ChArUco board to print, in its true size.", START
-    ),
-    "init": LazyCommand(
-        "psotrack.cli.init:init",
-        "Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.",
-        START,
-    ),
-    "calibrate": LazyCommand(
-        "psotrack.cli.calibrate:calibrate",
-        "Calibrate cameras, and convert calibration files.",
-        START,
-    ),
-    "doctor": LazyCommand(
-        "psotrack.cli.doctor:doctor",
-        "Check the calibration of SEQ against the detections of its cameras, before tracking.",
-        START,
-    ),
-    "track": LazyCommand(
-        "psotrack.cli.track:track",
-        "Track the drones of SEQ from its videos, or from detections in them.",
-        START,
-    ),
-    "live": LazyCommand(
-        "psotrack.cli.live:live",
-        "Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.",
-        START,
-    ),
-    "evaluate": LazyCommand(
-        "psotrack.cli.evaluate:evaluate",
-        "Compare TRACKS with the reference of SEQ.",
-        RESULTS,
-    ),
-    "view": LazyCommand(
-        "psotrack.cli.view:view",
-        "Show TRACKS and their recording in space and time, in the viewer Rerun.",
-        RESULTS,
-    ),
-    "report": LazyCommand(
-        "psotrack.cli.report:report",
-        "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
-        RESULTS,
-    ),
-    "overlay": LazyCommand(
-        "psotrack.cli.overlay:overlay",
-        "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
-        RESULTS,
-    ),
-    "export": LazyCommand(
-        "psotrack.cli.export:export",
-        "Write TRACKS in a format of another program.",
-        RESULTS,
-    ),
-    "archive": LazyCommand(
-        "psotrack.cli.archive:archive",
-        "Pack TRACKS and what is needed to compute them again into one file, or unpack such a file.",
-        RESULTS,
-    ),
-    "simulate": LazyCommand(
-        "psotrack.cli.simulate:simulate",
-        "Simulate sequences: videos, calibration, ground truth, masks and detections.",
-        RESEARCH,
-    ),
-    "sweep": LazyCommand(
-        "psotrack.cli.sweep:sweep",
-        "Track with every combination of a grid's settings, and keep one row per run.",
-        RESEARCH,
-    ),
-    "detect": LazyCommand(
-        "psotrack.cli.detect:detect",
-        "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.",
-        RESEARCH,
-    ),
-    "cache": LazyCommand(
-        "psotrack.cli.cache:cache",
-        "List, check, prune and empty the cache of silhouettes and compiled programs.",
-        RESEARCH,
-    ),
-    "onboard": LazyCommand(
-        "psotrack.cli.onboard:onboard",
-        "Localise drones by their own cameras, from ArUco markers of known place.",
-        ON_BOARD,
-    ),
-}
+#: Commands with the first sentences of their help, below the headings of the list. A test holds the sentences equal to
+#: the commands' own.
+COMMANDS = commands_in(
+    "psotrack.cli",
+    {
+        "Start": {
+            "demo": "Simulate four drones, track them in eight videos, print the errors and save a picture.",
+            "run": "Calibrate, check, track and show the videos of a rig in FOLDER, from board to report.",
+            "board": "Draw a ChArUco board to print, in its true size.",
+            "init": "Write the recording.toml of the videos, images and detections in FOLDER, or show "
+            "what a recording contains.",
+            "calibrate": "Calibrate cameras, and convert calibration files.",
+            "doctor": "Check the calibration of SEQ against the detections of its cameras, before tracking.",
+            "track": "Track the drones of SEQ from its videos, or from detections in them.",
+            "live": "Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.",
+        },
+        "Results": {
+            "evaluate": "Compare TRACKS with the reference of SEQ.",
+            "view": "Show TRACKS and their recording in space and time, in the viewer Rerun.",
+            "report": "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
+            "overlay": "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
+            "export": "Write TRACKS in a format of another program.",
+            "archive": "Pack TRACKS and what is needed to compute them again into one file, or unpack such a file.",
+        },
+        "Research": {
+            "simulate": "Simulate sequences: videos, calibration, ground truth, masks and detections.",
+            "sweep": "Track with every combination of a grid's settings, and keep one row per run.",
+            "detect": "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, "
+            "or as blobs of foreground.",
+            "cache": "List, check, prune and empty the cache of silhouettes and compiled programs.",
+        },
+        "On-board": {
+            "onboard": "Localise drones by their own cameras, from ArUco markers of known place.",
+        },
+    },
+)
 #: Commands that there were once, and what replaces them.
 RENAMED = {
     "detect-markers": "onboard detect",

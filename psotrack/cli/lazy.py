@@ -29,6 +29,20 @@ class LazyCommand(NamedTuple):
     heading: str = "Commands"
 
 
+def commands_in(package: str, summaries: Mapping[str, Mapping[str, str]]) -> dict[str, LazyCommand]:
+    """Commands each of which is a function in a module of its own name.
+
+    Args:
+        package: package of the modules.
+        summaries: summaries of the commands by their names, below headings.
+    """
+    return {
+        name: LazyCommand(f"{package}.{name}:{name}", summary, heading)
+        for heading, below in summaries.items()
+        for name, summary in below.items()
+    }
+
+
 class LazyGroup(click.Group):
     """Group whose `--help` and completion of names import no command.
 

@@ -4,8 +4,7 @@ from .detection.marker_table import markers_of_images, markers_of_video, write_m
 from .filtering.pose_filter import PoseFilterParams
 from .filtering.smoothing import smooth
 from .frames import FrameSource, open_source
-from .fusing import FusedDrone, FusedTracks, fuse
-from .fusing.drone_fusion import DroneFusion, SourceErrors
+from .fusing import FusedTracks, fuse
 from .fusing.fused_table import write_fused
 from .lens_files import choose_lens, lens_from_matrix
 from .localising import LineTime, LocalisedVideo, LocaliseSettings, localise_video
@@ -19,11 +18,9 @@ from .pose import PoseSettings, RollingShutter
 __all__ = [
     "BuiltMap",
     "CameraPath",
-    "DroneFusion",
     "FittedSquares",
     "Flag",
     "FrameSource",
-    "FusedDrone",
     "FusedTracks",
     "LineTime",
     "LocaliseSettings",
@@ -34,7 +31,6 @@ __all__ = [
     "PoseFilterParams",
     "PoseSettings",
     "RollingShutter",
-    "SourceErrors",
     "build_map",
     "check_map",
     "choose_lens",

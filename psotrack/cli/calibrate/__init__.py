@@ -2,27 +2,22 @@
 
 import click
 
-from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
+from psotrack.cli.lazy import SETTINGS, LazyGroup, commands_in
 
 #: Commands by name, as in `psotrack.cli`.
-COMMANDS = {
-    "convert": LazyCommand(
-        "psotrack.cli.calibrate.convert:convert",
-        "Convert the calibration IN, of any program in the list below, to OUT.",
-    ),
-    "extrinsics": LazyCommand(
-        "psotrack.cli.calibrate.extrinsics:extrinsics",
-        "Find the poses of cameras, from points whose positions in the world and in the images are known.",
-    ),
-    "intrinsics": LazyCommand(
-        "psotrack.cli.calibrate.intrinsics:intrinsics",
-        "Estimate a camera's lens from VIDEO, in which a board is moved.",
-    ),
-    "rig": LazyCommand(
-        "psotrack.cli.calibrate.rig:rig",
-        "Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.",
-    ),
-}
+COMMANDS = commands_in(
+    "psotrack.cli.calibrate",
+    {
+        "Commands": {
+            "convert": "Convert the calibration IN, of any program in the list below, to OUT.",
+            "extrinsics": "Find the poses of cameras, from points whose positions in the world and in the "
+            "images are known.",
+            "intrinsics": "Estimate a camera's lens from VIDEO, in which a board is moved.",
+            "rig": "Calibrate a rig from nothing: lenses and places of all cameras, from a board that is "
+            "moved before them.",
+        },
+    },
+)
 
 
 @click.group(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 from msgspec import Meta
@@ -12,6 +12,7 @@ from msgspec import Meta
 from psotrack.cli.options import running
 from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.errors import SettingsError
 from psotrack.support import POSITION, format_numbers
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class Conversion:
     """
 
     size: tuple[int, int] | None = None
-    units: Literal["m", "cm", "mm"] | None = None
+    units: Annotated[str, Meta(extra={"metavar": "m|cm|mm"})] | None = None
     format: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
     to: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
     lenses: bool = False
@@ -62,6 +63,8 @@ def convert(output: Output, source: Path, out: Path, how: Conversion) -> None:
     from psotrack.geometry import Rig
     from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
 
+    if how.units is not None and how.units not in UNITS_M:
+        raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=how.units)
     if how.lenses:
         rig = read_lenses(source, how.size, file_format=how.format)
     else:

@@ -15,7 +15,7 @@ from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, check_positive
 
 if TYPE_CHECKING:
-    from psotrack.inside_out import CameraPath, DroneFusion, FusedDrone, FusedTracks, SourceErrors
+    from psotrack.inside_out import CameraPath, FusedTracks
     from psotrack.trajectories import Trajectories
 
 
@@ -87,16 +87,9 @@ def fuse(
     fused = fuse_paths(paths, tracks, point=point, max_offset_s=max_offset_s)
     _check_near(fused, outside)
     write_fused(out, fused, force=output.force)
-    output.json(_content(fused))
-    for drone in fused.drones:
-        output.say(_sentence(drone))
-    for exchange in fused.identity_swaps:
-        output.say(
-            f"from frame {exchange.frame}: {exchange.drone} is track {exchange.after} instead of {exchange.before}"
-        )
-    output.say(
-        f"{out}: {fused.trajectories.num_drones} drones, {fused.trajectories.num_frames} frames{_doubt(fused)}"
-    )
+    output.json(fused.to_dict())
+    *lines, whole = str(fused).splitlines()
+    output.say(*lines, f"{out}: {whole}")
 
 
 def _check_times(paths: Mapping[str, CameraPath], tracks: Trajectories, outside: Path) -> None:
@@ -132,78 +125,3 @@ def _check_near(fused: FusedTracks, outside: Path) -> None:
             found=f"none (the nearest is {min(nearest_m):.2f} m away)",
             remedy="all files must have one recording, one clock (see --max-offset) and one world",
         )
-
-
-def _doubt(fused: FusedTracks) -> str:
-    """Advice where nothing was fused; empty otherwise."""
-    if any(drone.tracks for drone in fused.drones):
-        return ""
-    return "; nothing was fused, because no frame has both a pose and a track"
-
-
-def _sentence(drone: FusedDrone) -> str:
-    parts = [
-        f"{drone.name}: {' and '.join(f'track {name}' for name in drone.tracks) or 'no track, kept as it is'}"
-    ]
-    if drone.offset is not None:
-        parts.append(f"clock {drone.offset.offset_s:+.4f} ± {drone.offset.std_s:.4f} s")
-    parts.append(
-        f"frames of both {drone.frames_both}, inside only {drone.frames_inside}, outside only {drone.frames_outside}"
-    )
-    if drone.fusion is not None:
-        arm = ", ".join(
-            f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
-            for value, std in zip(drone.fusion.arm_m, drone.fusion.arm_std_m, strict=True)
-        )
-        parts.append(f"arm ({arm}) mm")
-        parts.extend(
-            f"{word}: stated errors multiplied by {errors.scale:.2f}, {errors.gated} gross errors left out"
-            for word, errors in (("inside", drone.fusion.inside), ("outside", drone.fusion.outside))
-        )
-    return "; ".join(parts)
-
-
-def _content(fused: FusedTracks) -> dict[str, Any]:
-    """The report as JSON, with null for missing numbers."""
-    return {
-        "point": fused.point,
-        "frames": fused.trajectories.num_frames,
-        "drones": [
-            {
-                "drone": drone.name,
-                "tracks": list(drone.tracks),
-                "offset_s": None if drone.offset is None else drone.offset.offset_s,
-                "offset_std_s": None if drone.offset is None else drone.offset.std_s,
-                "frames_both": drone.frames_both,
-                "frames_inside": drone.frames_inside,
-                "frames_outside": drone.frames_outside,
-                **_found(drone.fusion),
-            }
-            for drone in fused.drones
-        ],
-        "others": list(fused.trajectories.drones[len(fused.drones) :]),
-        "exchanges": [
-            {"drone": of.drone, "frame": of.frame, "before": of.before, "after": of.after}
-            for of in fused.identity_swaps
-        ],
-    }
-
-
-def _found(fusion: DroneFusion | None) -> dict[str, Any]:
-    if fusion is None:
-        return {"lever_arm_m": None, "lever_arm_std_m": None, "inside": None, "outside": None}
-    return {
-        "lever_arm_m": fusion.arm_m.tolist(),
-        "lever_arm_std_m": fusion.arm_std_m.tolist(),
-        "inside": _errors(fusion.inside),
-        "outside": _errors(fusion.outside),
-    }
-
-
-def _errors(errors: SourceErrors) -> dict[str, float]:
-    return {
-        "scale": errors.scale,
-        "lasting_share": errors.lasting_share,
-        "lasting_s": errors.lasting_s,
-        "gross_frames": errors.gated,
-    }

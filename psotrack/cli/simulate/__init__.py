@@ -2,22 +2,19 @@
 
 import click
 
-from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
+from psotrack.cli.lazy import SETTINGS, LazyGroup, commands_in
 
 #: Commands by name, as in `psotrack.cli`.
-COMMANDS = {
-    "sequence": LazyCommand(
-        "psotrack.cli.simulate.sequence:sequence",
-        "Simulate a sequence: videos, calibration, ground truth, masks and detections.",
-    ),
-    "fly": LazyCommand(
-        "psotrack.cli.simulate.fly:fly",
-        "Fly a simulated drone by hand and record the flight for a scenario.",
-    ),
-    "labels": LazyCommand(
-        "psotrack.cli.simulate.labels:labels", "Write a YOLO training set from sequences with a reference."
-    ),
-}
+COMMANDS = commands_in(
+    "psotrack.cli.simulate",
+    {
+        "Commands": {
+            "sequence": "Simulate a sequence: videos, calibration, ground truth, masks and detections.",
+            "fly": "Fly a simulated drone by hand and record the flight for a scenario.",
+            "labels": "Write a YOLO training set from sequences with a reference.",
+        },
+    },
+)
 
 
 @click.group(cls=LazyGroup, lazy_commands=COMMANDS, default="sequence", context_settings=SETTINGS)

@@ -17,7 +17,7 @@ from psotrack.support.interrupts import unhurried_end
 
 
 @dataclass(frozen=True)
-class Flight:
+class Piloting:
     """How a drone is flown.
 
     Attributes:
@@ -38,9 +38,9 @@ class Flight:
 
 
 @click.command(cls=HelpfulCommand)
-@options_of(Flight, "flight")
+@options_of(Piloting, "flight")
 @running(progress=False, json=False)
-def fly(output: Output, flight: Flight) -> None:
+def fly(output: Output, flight: Piloting) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in

@@ -19,7 +19,7 @@ from psotrack.errors import SettingsError, errors_name
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Simulated:
     """What is simulated.
 
     Attributes:
@@ -73,7 +73,7 @@ class Shown:
 @click.command(cls=HelpfulCommand)
 @click.argument("name", required=False)
 @out_option("Root folder of the data.  [default: data]")
-@options_of(Scenario, "chosen")
+@options_of(Simulated, "chosen")
 @click.option(
     "--set",
     "changes",
@@ -88,7 +88,7 @@ def sequence(
     output: Output,
     name: str | None,
     out: Path | None,
-    chosen: Scenario,
+    chosen: Simulated,
     changes: tuple[str, ...],
     shown: Shown,
     made: Made,

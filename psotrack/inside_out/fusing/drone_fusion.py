@@ -53,6 +53,15 @@ class SourceErrors:
     lasting_s: float
     gated: int
 
+    def to_dict(self) -> dict[str, float]:
+        """The error model, fit for JSON."""
+        return {
+            "scale": self.scale,
+            "lasting_share": self.lasting_share,
+            "lasting_s": self.lasting_s,
+            "gross_frames": self.gated,
+        }
+
 
 @dataclass(frozen=True)
 class DroneTrack:

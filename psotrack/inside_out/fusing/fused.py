@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -50,6 +51,43 @@ class FusedDrone:
     nearest_m: float
     fusion: DroneFusion | None
 
+    def to_dict(self) -> dict[str, Any]:
+        """The result, fit for JSON; None for what is not known."""
+        fusion = self.fusion
+        return {
+            "drone": self.name,
+            "tracks": list(self.tracks),
+            "offset_s": None if self.offset is None else self.offset.offset_s,
+            "offset_std_s": None if self.offset is None else self.offset.std_s,
+            "frames_both": self.frames_both,
+            "frames_inside": self.frames_inside,
+            "frames_outside": self.frames_outside,
+            "lever_arm_m": None if fusion is None else fusion.arm_m.tolist(),
+            "lever_arm_std_m": None if fusion is None else fusion.arm_std_m.tolist(),
+            "inside": None if fusion is None else fusion.inside.to_dict(),
+            "outside": None if fusion is None else fusion.outside.to_dict(),
+        }
+
+    def __str__(self) -> str:
+        tracks = " and ".join(f"track {name}" for name in self.tracks) or "no track, kept as it is"
+        parts = [f"{self.name}: {tracks}"]
+        if self.offset is not None:
+            parts.append(f"clock {self.offset.offset_s:+.4f} ± {self.offset.std_s:.4f} s")
+        parts.append(
+            f"frames of both {self.frames_both}, inside only {self.frames_inside}, outside only {self.frames_outside}"
+        )
+        if self.fusion is not None:
+            arm = ", ".join(
+                f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
+                for value, std in zip(self.fusion.arm_m, self.fusion.arm_std_m, strict=True)
+            )
+            parts.append(f"arm ({arm}) mm")
+            parts.extend(
+                f"{word}: stated errors multiplied by {errors.scale:.2f}, {errors.gated} gross errors left out"
+                for word, errors in (("inside", self.fusion.inside), ("outside", self.fusion.outside))
+            )
+        return "; ".join(parts)
+
 
 @dataclass(frozen=True)
 class IdentitySwap:
@@ -65,6 +103,8 @@ class IdentitySwap:
 class FusedTracks:
     """Fused tracks of the drones that carry cameras, followed by the outside tracks of all other drones.
 
+    As text, a line for each drone and each swap, and a line on the whole.
+
     Attributes:
         trajectories: at the frames of both sources, by the clock of the outside tracks. Orientations are the cameras'.
         point: tracked point of the fused drones. Paths without a track are of the camera, tracks without a path of the
@@ -79,6 +119,26 @@ class FusedTracks:
     drones: tuple[FusedDrone, ...]
     identity_swaps: tuple[IdentitySwap, ...]
     source: Int[np.ndarray, "frames drones"]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What was found, fit for JSON; None for what is not known."""
+        return {
+            "point": self.point,
+            "frames": self.trajectories.num_frames,
+            "drones": [drone.to_dict() for drone in self.drones],
+            "others": list(self.trajectories.drones[len(self.drones) :]),
+            "exchanges": [dict(vars(swap)) for swap in self.identity_swaps],
+        }
+
+    def __str__(self) -> str:
+        swaps = (
+            f"from frame {swap.frame}: {swap.drone} is track {swap.after} instead of {swap.before}"
+            for swap in self.identity_swaps
+        )
+        whole = f"{self.trajectories.num_drones} drones, {self.trajectories.num_frames} frames"
+        if not any(drone.tracks for drone in self.drones):
+            whole += "; nothing was fused, because no frame has both a pose and a track"
+        return "\n".join([*map(str, self.drones), *swaps, whole])
 
 
 def fuse(
