@@ -460,7 +460,8 @@ def run(
             remedy="`psotrack board` draws a board",
         )
     step(["doctor", folder, "--json", found], found, lambda: _written(found, doctor(folder, **common)))
-    is_late = any(each["kind"] == "clock" for each in read_json(found)["findings"])
+    kinds = [(each["kind"], *each["nearly_as_likely"]) for each in read_json(found)["findings"]]
+    is_late = any("clock" in of_one for of_one in kinds)
     chosen = {"clocks": "auto"} if is_late else {}
     words = [
         "track",
@@ -471,7 +472,7 @@ def run(
         tracks,
     ]
     settings = {**chosen, "drones.count": drones}
-    step(words, tracks, lambda: _tracked(folder, tracks, settings, again, **common))
+    step(words, tracks, lambda: _tracked(folder, tracks, settings, **common))
     shown: dict[str, Any] = {"recording": folder, "force": again, **common}
     step(["report", tracks, folder, "--out", page], page, lambda: report(tracks, page, **shown))
     # Finished videos are kept.
@@ -497,9 +498,7 @@ def _written(path: Path, diagnosis: Diagnosis) -> Diagnosis:
     return diagnosis
 
 
-def _tracked(
-    folder: Path, path: Path, settings: Mapping[str, Any], force: bool, progress: bool | Report
-) -> str:
+def _tracked(folder: Path, path: Path, settings: Mapping[str, Any], progress: bool | Report) -> str:
     """Track a recording and write the tracks; returns what `psotrack track` prints."""
     began = time.perf_counter()
     recording = read_recording(folder)
@@ -507,8 +506,10 @@ def _tracked(
         settings = {"detections": BLOBS, **settings}
     tracked = track(recording, settings, progress=progress)
     record = with_real_time(tracked.record, time.perf_counter() - began)
-    write_tracked(path, replace(tracked, record=record), folder, force=force)
-    return f"{path}: {tracked!r}"
+    # A record without tracks was left by a run that was killed.
+    write_tracked(path, replace(tracked, record=record), folder, force=True)
+    found = tracked.trajectories
+    return f"{path}: {found.num_drones} drones, {found.num_frames} frames, {found.seen.mean():.1%} seen"
 
 
 def detect_markers(

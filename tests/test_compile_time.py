@@ -67,6 +67,7 @@ def test_whatever_compiles_is_not_in_the_time_of_tracking(
     ("factor", "words"),
     [
         (0.061, "16 times slower than the video"),
+        (0.0077, "130 times slower than the video"),
         (2.0, "2 times faster than the video"),
         (0.99, "as fast as the video"),
     ],

@@ -69,7 +69,7 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
     summary = done.out[done.out.rindex("\nlab\n") :]
     for words in (
         "drones      4",
-        "frames      50, in 2.0 s",
+        "frames      100, in 2.0 s",
         "tracked in",
         "doctor",
         "clocks",

@@ -230,7 +230,7 @@ def speed_in_words(real_time_factor: float) -> str:
     times = max(real_time_factor, 1 / real_time_factor)
     if times < 1.05:
         return "as fast as the video"
-    return f"{times:.2g} times {'faster' if real_time_factor > 1 else 'slower'} than the video"
+    return f"{float(f'{times:.2g}'):g} times {'faster' if real_time_factor > 1 else 'slower'} than the video"
 
 
 def with_real_time(record: Mapping[str, Any], wall_s: float, *, start_s: float = 0.0) -> dict[str, Any]:
