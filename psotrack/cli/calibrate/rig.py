@@ -16,7 +16,6 @@ from psotrack.cli.calibrate.rig_points import (
     calibrate_pairs,
     calibrate_points,
     in_words,
-    is_recording,
 )
 from psotrack.cli.calibrate.shown import show_cameras
 from psotrack.cli.options import FORCE, JSON, plot_option, reporting
@@ -133,7 +132,7 @@ def rig(
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
     """
-    from psotrack.recordings.datasets import videos_in
+    from psotrack.recordings.datasets import is_recording, videos_in
 
     output.refuse(out)
     modes = {
@@ -223,7 +222,7 @@ def _by_board(
         say_print,
         say_searched,
     )
-    from psotrack.recordings.datasets import open_recording
+    from psotrack.recordings.datasets import is_recording, open_recording
 
     if len(sources) == 1 and is_recording(sources[0]):
         cameras, instants = open_recorded(open_recording(sources[0]), floor)

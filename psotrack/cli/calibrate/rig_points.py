@@ -221,14 +221,6 @@ def known_lenses_of(names: tuple[str, ...], path: Path | None) -> Rig:
     return Rig(names, lenses.cameras[rows])
 
 
-def is_recording(path: Path) -> bool:
-    """Whether a path is a recording instead of the images of one camera."""
-    return path.suffix.lower() == ".toml" or (
-        path.is_dir()
-        and any((path / name).is_file() for name in ("recording.toml", "cameras_calibration.csv"))
-    )
-
-
 def in_words(path: Path, left_m: dict[str, float]) -> str:
     """How well the points of a world are met."""
     worst = max(left_m, key=lambda name: left_m[name])

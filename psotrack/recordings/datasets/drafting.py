@@ -23,14 +23,12 @@ from psotrack.recordings import (
     Recording,
     RecordingFile,
     ReferenceTable,
-    image_files,
 )
 from psotrack.recordings.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
 from psotrack.recordings.datasets.recording_files import recording_of
 
 _WORDS: Mapping[Kind, str] = {
     "video": "video",
-    "images": "folder of images",
     "ignore": "image of what is ignored",
     "detections": "file of detections",
     "timestamps": "file of frame times",
@@ -89,12 +87,9 @@ class _Matching:
     def put(self, camera: str, kind: Kind, file: Path | str) -> None:
         """Give a file to a camera."""
         of_camera = self.files.setdefault(camera, {})
-        both = {"video", "images"} if kind in ("video", "images") else {kind}
-        taken = next((of_camera[each] for each in of_camera if each in both), None)
-        if taken is not None:
-            raise _unclear(
-                self.folder, file, f"one {_WORDS[kind]} of camera {camera}", f"{_short(taken)} as well"
-            )
+        if kind in of_camera:
+            expected, found = f"one {_WORDS[kind]} of camera {camera}", f"{_short(of_camera[kind])} as well"
+            raise _unclear(self.folder, file, expected, found)
         of_camera[kind] = file
 
 
@@ -198,13 +193,10 @@ def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tupl
 def _names_of_files(folder: Path, found: Sequence[Found], options: DraftOptions) -> list[str]:
     """Names of cameras without a calibration: those that the user gives, and those of videos, images or detections."""
     given = list(dict.fromkeys(name for name, _ in options.match))
-    for kinds in (("video", "images"), ("detections",)):
-        files = [each for each in found if each.kind in kinds]
-        if files:
-            break
+    videos, detections = ([each for each in found if each.kind == kind] for kind in ("video", "detections"))
     keys = {camera_key(name): name for name in given}
     names = []
-    for file in files:
+    for file in videos or detections:
         name = _name_of(file)
         if camera_key(name) in keys and keys[camera_key(name)] not in given:
             raise _unclear(
@@ -261,7 +253,7 @@ def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None
                 )
             if fitting and fitting[0] not in given:
                 matching.put(fitting[0], kind, each.path)
-            elif kind == "video" and (fitting or not each.alone_in):
+            elif kind == "video" and (fitting or (each.path.is_file() and not each.alone_in)):
                 raise _video_of_no_camera(matching, each.path, calibration, fitting)
             else:
                 matching.unused.append(each.path)
@@ -290,28 +282,20 @@ def _table(
     """Table of one camera."""
     files = matching.files[name]
     fps = size = None
-    if "video" not in files and "timestamps" not in files:
+    video = files.get("video")
+    pictures = isinstance(video, Path) and video.is_dir()
+    if (video is None or pictures) and "timestamps" not in files:
         fps = options.fps
         if fps is None:
             expected = f"frames per second of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
-    if "images" not in files and not isinstance(files.get("video"), Path):
+    if not isinstance(video, Path):
         size = size_wh or options.size_wh
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
     written: dict[str, Any] = {kind: _written(file, base) for kind, file in files.items()}
-    if "images" in files:
-        written["images"] += _pattern(matching.folder, Path(files["images"]))
     return CameraTable(size=size, fps=fps, **written)
-
-
-def _pattern(folder: Path, images: Path) -> str:
-    """Pattern of the images in a folder, such as `/*.png`."""
-    suffixes = sorted({path.suffix for path in image_files(images)})
-    if len(suffixes) > 1:
-        raise _unclear(folder, images, "images of one kind", " and ".join(suffixes), match=False)
-    return f"/*{suffixes[0]}"
 
 
 def _written(file: Path | str, base: Path) -> str:
@@ -335,11 +319,9 @@ def _video_of_no_camera(
     return _unclear(matching.folder, path, expected, "none of these names in its name")
 
 
-def _unclear(folder: Path, file: Path | str, expected: str, found: str, *, match: bool = True) -> InputError:
+def _unclear(folder: Path, file: Path | str, expected: str, found: str) -> InputError:
     name = shlex.quote(file if isinstance(file, str) else os.path.relpath(file, folder))
-    remedy = f"leave it out with --leave-out {name}"
-    if match:
-        remedy = f"say whose it is with --match CAMERA={name}, or {remedy}"
+    remedy = f"say whose it is with --match CAMERA={name}, or leave it out with --leave-out {name}"
     where = file if isinstance(file, Path) else folder
     return InputError(where, expected=expected, found=found, remedy=remedy)
 

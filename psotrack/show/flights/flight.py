@@ -15,8 +15,8 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.evaluation import errors_over_time
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.pipeline import TrackedRecording
-from psotrack.recordings import RECORDING_FILE, Recording, VideoInfo
-from psotrack.recordings.datasets import CALIBRATION, open_recording
+from psotrack.recordings import Recording, VideoInfo
+from psotrack.recordings.datasets import is_recording, open_recording
 from psotrack.recordings.exchange import read_tracks
 from psotrack.show.flights.run_record import RunRecord, as_run_record, read_run_record
 from psotrack.support import drone_colour, short_repr
@@ -117,7 +117,7 @@ def read_flight(
     """
     paths = [Path(path) for path in tracks]
     for path in paths:
-        if _is_recording(path):
+        if is_recording(path):
             remedy = "name the recording last, TRACKS [SEQ]"
             raise InputError(path, expected="a file of tracks", found="a recording", remedy=remedy)
     sequence = find_recording(paths[0]) if sequence is None and paths else sequence
@@ -146,7 +146,7 @@ def read_flight(
 
 def split_sequence(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
     """Files of tracks, and the recording if the last one of some paths is a recording."""
-    if paths and _is_recording(paths[-1]):
+    if paths and is_recording(paths[-1]):
         return tuple(paths[:-1]), paths[-1]
     return tuple(paths), None
 
@@ -265,11 +265,6 @@ def _flight_tracks(
     size_m = np.array([sizes_m.get(name, USUAL_SIZE_M) for name in trajectories.drones]).reshape(-1, 3)
     colours = tuple(drone_colour(drone) for drone in range(trajectories.num_drones))
     return FlightTracks(label, path, trajectories, record, size_m, colours)
-
-
-def _is_recording(path: Path) -> bool:
-    names = (RECORDING_FILE, CALIBRATION)
-    return path.suffix.lower() == ".toml" or any((path / name).exists() for name in names)
 
 
 def _record_beside(tracks: Path) -> RunRecord | None:
