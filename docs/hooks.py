@@ -81,7 +81,9 @@ def api_page(name: str) -> str:
 
 
 def public_names(room: ModuleType) -> list[str]:
-    """Names that a room exports, or those that a module defines."""
+    """Names that a room exports, or those that a module defines; of the package itself, its lazy names."""
+    if room.__name__ == "psotrack":
+        return dir(room)
     own = [name for name, value in vars(room).items() if getattr(value, "__module__", "") == room.__name__]
     return list(getattr(room, "__all__", [name for name in own if not name.startswith("_")]))
 

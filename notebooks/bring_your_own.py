@@ -218,7 +218,7 @@ grid = {
 }
 # Results are stored under the names of the plugins, not under their code: after a change they would be out of date.
 with TemporaryDirectory() as results:
-    rows = sweep(grid, results, data=DATA / "own", cache=DATA / "silhouettes")
+    rows = sweep(grid, results, data=DATA / "own", cache=DATA / "silhouettes").rows()
 
 rows["evaluations"] = particles * (rows["settings.swarm.iterations"] + 1)
 rows["error_mm"] = 1e3 * rows["mean_error_m"]

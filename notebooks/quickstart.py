@@ -21,36 +21,26 @@
 import os
 from pathlib import Path
 
+# The second run does not wait for the compiler.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", "data/compiled")
 import matplotlib.pyplot as plt
 import pandas as pd
 
-from psotrack.evaluation import evaluate, plots, tables
-from psotrack.foreground.silhouettes import SilhouetteSettings
-from psotrack.pipeline import track_recording
-from psotrack.recordings import read_frames
-from psotrack.recordings.datasets import read_sequence
-from psotrack.settings import TrackSettings
-from psotrack.show.flights import flight_of
-from psotrack.show.overlay import save_picture
-from psotrack.show.reports import view_3d
-from psotrack.simulation import SimulationSettings, simulate
-from psotrack.support import keep_compiled
-from psotrack.trajectories import write_trajectories
+import psotrack as pt
 
 # %% [markdown]
-# All sizes are set here. Images have half of their full size to save time; use `SCALE = 1.0` and
-# `SilhouetteSettings()` for the full size.
+# All sizes are set here. Images have half of their full size to save time; use `SCALE = 1.0` and no settings of
+# silhouettes for the full size.
 
 # %%
 TINY = os.environ.get("PSOTRACK_NOTEBOOKS") == "tiny"  # a quick check that everything runs
 NUM_FRAMES = 20 if TINY else 75
 SCALE = 0.25 if TINY else 0.5
-SILHOUETTES = SilhouetteSettings(reduction=2, working_reduction=1)
+SETTINGS = {"seed": 1, "silhouettes.reduction": 2, "silhouettes.working_reduction": 1}
 if TINY:  # so few pixels per drone that noise counts
-    SILHOUETTES = SilhouetteSettings(reduction=1, working_reduction=1, min_blob_px=32)
+    SETTINGS |= {"silhouettes.reduction": 1, "silhouettes.min_blob_px": 32}
 DATA = Path("data", "tiny" if TINY else "normal")
 plt.rcParams.update({"figure.dpi": 80, "font.size": 9})
-keep_compiled(Path("data", "compiled"))  # the second run does not wait for the compiler
 
 # %% [markdown]
 # ## A recording
@@ -61,29 +51,14 @@ keep_compiled(Path("data", "compiled"))  # the second run does not wait for the 
 # %%
 folder = DATA / "Simulated_Data" / "S02_D4_A"
 if not folder.exists():
-    simulation = SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
-    simulate("S02_D4_A", DATA, simulation)
-recording = read_sequence(folder).usable()
-
-print(f"{recording.num_frames} frames at {recording.fps:g} per second")
-for name, video, centre_m in zip(
-    recording.rig.names, recording.videos.values(), recording.rig.cameras.centre_world, strict=True
-):
-    width, height = video.image_size_wh
-    x, y, z = centre_m
-    print(f"{name}: {width} x {height} pixels, hangs at x = {x:5.2f}, y = {y:5.2f}, z = {z:4.2f} m")
-
-# %%
-name = recording.rig.names[0]
-first_frame = next(read_frames(recording.videos[name]))
-figure, axes = plt.subplots(figsize=(9, 5.2), dpi=56, layout="constrained")
-axes.imshow(first_frame[:, :, ::-1])  # OpenCV has blue first
-axes.set(xlabel="x (pixels)", ylabel="y (pixels)", title=f"camera {name}, frame 0")
-plt.show()
+    simulation = pt.SimulationSettings(num_frames=NUM_FRAMES, scale=SCALE, masks=False, onboard=False)
+    pt.simulate("S02_D4_A", DATA, simulation)
+recording = pt.read_recording(folder)
+recording
 
 # %% [markdown]
-# *What to see: four small drones: two left of the middle, two in front of the far corner. The tracker uses only their
-# silhouettes: no markers, no colours, no model of a drone's appearance.*
+# The tracker uses only the drones' silhouettes in the videos: no markers, no colours, no model of a drone's appearance.
+# `pt.doctor(recording)` checks a calibration before tracking.
 
 # %% [markdown]
 # ## Track
@@ -92,10 +67,11 @@ plt.show()
 # come, and follows them. The call does not say how many drones there are, where they start or how large they are.
 
 # %%
-tracked = track_recording(
-    recording, TrackSettings(seed=1, silhouettes=SILHOUETTES), cache=DATA / "silhouettes"
-)
-tracked.trajectories.position_m.shape  # frames, drones, x y z in metres
+tracked = pt.track(recording, SETTINGS, cache=DATA / "silhouettes")
+tracked
+
+# %% [markdown]
+# `tracked.trajectories.position_m` is an array: frames, drones, x y z in metres.
 
 # %%
 pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
@@ -108,7 +84,7 @@ pd.Series(tracked.record["seconds"], name="seconds").to_frame().T.round(1)
 
 # %%
 picture = DATA / "quickstart.png"
-save_picture(picture, flight_of(tracked, recording))
+pt.save_picture(picture, tracked, recording=recording, force=True)
 figure, axes = plt.subplots(figsize=(13, 4.6), dpi=68, layout="constrained")
 axes.imshow(plt.imread(picture))
 axes.set_axis_off()
@@ -122,7 +98,7 @@ plt.show()
 # The flight in 3D turns with the mouse and plays:
 
 # %%
-view_3d(tracked, recording)
+pt.view_3d(tracked, recording)
 
 # %% [markdown]
 # *What to see: the drones with their paths of the last two seconds, the whole paths (faint), the true paths (dashed), and
@@ -131,27 +107,24 @@ view_3d(tracked, recording)
 # ## How good is it?
 
 # %%
-evaluation = evaluate(tracked.trajectories, recording.truth)
-print(f"mean error {1e3 * evaluation.mean_error_m:.0f} mm")
-print(
-    f"mean error without each drone's constant offset {1e3 * evaluation.offset_removed_mean_error_m:.1f} mm"
-)
-print(f"identity switches {evaluation.id_switches}, missed {evaluation.missed_rate:.1%}")
-
-columns = ["drone", "mean_error_m", "p95_error_m", "offset_removed_mean_error_m", "missed_rate"]
-tables.to_frame(evaluation)[columns].round(4)
+evaluation = pt.evaluate(tracked.trajectories, recording.truth)
+evaluation
 
 # %%
+errors = pt.errors_over_time(tracked.trajectories, recording.truth)
 figure, axes = plt.subplots(figsize=(9, 3.4), layout="constrained")
-plots.draw_errors(axes, tracked.trajectories, recording.truth)
+for drone, rows in errors.groupby("drone"):
+    axes.plot(rows["time_s"], 1e3 * rows["error_m"], label=drone)
+axes.set(xlabel="time (s)", ylabel="error (mm)", ylim=(0, None))
+axes.grid(alpha=0.3)
+axes.legend(ncols=4, frameon=False)
 plt.show()
 
 # %% [markdown]
 # *What to see: each drone's distance from the ground truth, frame by frame. Each curve keeps a constant height: the
 # offset between the body's origin, which the ground truth describes, and the silhouette's middle, which cameras show.
-# The offset is constant in each drone's body, and `--body-offset` removes it. The third column of the table is the
-# error without the offset. Gaps and bars at the top would be frames in which a drone is missed; dotted lines would be
-# identity swaps.*
+# The offset is constant in each drone's body, and the setting `drones.body_offset_m` removes it; the column "centred" of
+# the table is the error without it. Gaps would be frames in which a drone is missed.*
 #
 # ## Save the tracks
 #
@@ -159,22 +132,21 @@ plt.show()
 
 # %%
 tracks = DATA / "tracks.parquet"
-write_trajectories(tracks, tracked.trajectories, force=True)
+pt.write_trajectories(tracks, tracked.trajectories, force=True)
 frame = pd.read_parquet(tracks)
 frame[["frame", "time_s", "drone", "x_m", "y_m", "z_m", "fitness", "num_cameras", "status"]].head(8).round(3)
 
 # %%
 figure, panels = plt.subplots(3, 1, figsize=(9, 4.6), sharex=True, layout="constrained")
-colours = plots.colours_of_estimates(tracked.trajectories, recording.truth)
-for colour, (drone, rows) in zip(colours, frame.groupby("drone"), strict=True):
+for drone, rows in frame.groupby("drone"):
     for panel, axis in zip(panels, "xyz", strict=True):
         std_m = rows[f"cov_{axis}{axis}"] ** 0.5
-        panel.plot(rows["time_s"], rows[f"{axis}_m"], color=colour, label=f"drone {drone}")
+        (line,) = panel.plot(rows["time_s"], rows[f"{axis}_m"], label=f"drone {drone}")
         panel.fill_between(
             rows["time_s"],
             rows[f"{axis}_m"] - 20 * std_m,
             rows[f"{axis}_m"] + 20 * std_m,
-            color=colour,
+            color=line.get_color(),
             alpha=0.25,
             linewidth=0,
         )
@@ -186,10 +158,14 @@ panels[-1].set_xlabel("time (s)")
 plt.show()
 
 # %% [markdown]
-# *What to see: the coordinates of each drone, in colours as above. The bands are the standard deviation that the
+# *What to see: the coordinates of each drone. The bands are the standard deviation that the
 # tracker states, drawn twenty times as wide, because the true width would vanish in the line. The bands are wide in
 # the first frames, because the velocities are not known yet. The numbers of the drones are the tracker's; the tracker
 # does not know the names in the ground truth.*
+#
+# The same as a page, and as videos: `pt.report(tracked, "report.html", recording=recording)` and
+# `pt.overlay(tracked, "videos", recording=recording)`. With videos of your own, `pt.run("my_lab", square_m=0.035)` does
+# all of it, from the calibration to the page.
 #
 # Next: [how a score comes from a video](video_to_score.ipynb), [how the swarm moves](how_the_swarm_moves.ipynb),
 # [your own cameras](your_own_cameras.ipynb), [error and time against the size of the swarm](table_5.ipynb).

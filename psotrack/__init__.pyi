@@ -1,6 +1,18 @@
-from .api import background_model, detect_markers, read_recording, track
-from .calibration.clocks import find_offset
-from .evaluation import Evaluation, evaluate
+from .api import (
+    background_model,
+    calibrate_rig,
+    detect_markers,
+    doctor,
+    overlay,
+    read_recording,
+    report,
+    run,
+    save_picture,
+    track,
+)
+from .calibration.clocks import reference_offset
+from .calibration.rig.settings import RigSettings
+from .evaluation import Evaluation, errors_over_time, evaluate
 from .foreground.detection import Detector
 from .foreground.silhouettes import BackgroundModel
 from .geometry import Rig, make_camera, make_rig, project, triangulate
@@ -22,6 +34,7 @@ from .settings import (
 from .show.reports import view_3d
 from .simulation import SimulationSettings, simulate
 from .support import register_plugin
+from .sweep import sweep
 from .tracking.swarm import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
 
@@ -40,6 +53,7 @@ __all__ = [
     "MotionSettings",
     "Recording",
     "Rig",
+    "RigSettings",
     "Score",
     "ScoreInputs",
     "ScoreSettings",
@@ -52,13 +66,16 @@ __all__ = [
     "TrackedRecording",
     "Trajectories",
     "background_model",
+    "calibrate_rig",
     "detect_markers",
+    "doctor",
+    "errors_over_time",
     "evaluate",
     "export_tracks",
-    "find_offset",
     "localise_video",
     "make_camera",
     "make_rig",
+    "overlay",
     "project",
     "read_c3d",
     "read_marker_map",
@@ -66,8 +83,13 @@ __all__ = [
     "read_rig",
     "read_tracks",
     "read_trajectories",
+    "reference_offset",
     "register_plugin",
+    "report",
+    "run",
+    "save_picture",
     "simulate",
+    "sweep",
     "track",
     "track_runs",
     "triangulate",

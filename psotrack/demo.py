@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psotrack.evaluation import evaluate, tables
 from psotrack.foreground.silhouettes import SilhouetteSettings
-from psotrack.pipeline import track_recording
+from psotrack.pipeline import track_recording, with_real_time
 from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.show.flights import flight_of
+from psotrack.show.flights import flight_of, record_files, write_tracked
 from psotrack.show.overlay import save_picture
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.support import Report, atomic_write_all, no_progress, refuse_files
-from psotrack.trajectories import write_trajectories
+from psotrack.support import Report, atomic_write, no_progress, refuse_files
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -49,7 +48,7 @@ def run(
         OutputError: there are results in `out`, or a sequence with another seed, and `force` is not set.
     """
     tracks, picture = out / "tracks.csv", out / "demo.png"
-    refuse_files(tracks, picture, force=force)
+    refuse_files(tracks, *record_files(tracks), picture, force=force)
     began = time.perf_counter()
     folder = simulate(
         NAME,
@@ -67,9 +66,10 @@ def run(
     ended = time.perf_counter()
     assert recording.truth is not None, "the simulator writes one"
     evaluation = evaluate(tracked.trajectories, recording.truth)
-    with atomic_write_all(tracks, picture) as (tracks_file, picture_file):
-        write_trajectories(tracks_file, tracked.trajectories)
+    tracked = replace(tracked, record=with_real_time(tracked.record, ended - simulated))
+    with atomic_write(picture) as picture_file:
         save_picture(picture_file, flight_of(tracked, recording))
+        write_tracked(tracks, tracked, folder, force=force)
     seconds = tracked.record["seconds"]
     stages = {
         "simulate": simulated - began,

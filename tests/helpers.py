@@ -248,3 +248,13 @@ def track_settings(**options):
     return TrackSettings().changed(
         {SHORT_NAMES.get(name) or last.get(name, name): value for name, value in options.items()}
     )
+
+
+def points_in_room(*shape, seed=0):
+    """(*shape, 3), points in the middle of the room of `ring_rig`, metres."""
+    return np.random.default_rng(seed).uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (*shape, 3))
+
+
+def project_points(rig, points):
+    """(..., cameras, 2), pixels of points in all cameras."""
+    return project(rig.cameras, points[..., None, :])[0]

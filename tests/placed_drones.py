@@ -6,11 +6,10 @@ import msgspec
 import numpy as np
 
 from psotrack.geometry import project
-from psotrack.simulation.flights.formulas import HarmonicFlight
-from psotrack.simulation.flights.motion import Heading
+from psotrack.simulation.flights.motion import HarmonicFlight, Heading
 from psotrack.simulation.labels.masks import silhouettes
 from psotrack.simulation.world.drones import DroneModel
-from psotrack.simulation.world.shapes import box
+from psotrack.simulation.world.models import box
 
 
 def straight_flight(position_m, velocity_m_s=(0.0, 0.0, 0.0)):

@@ -172,6 +172,7 @@ def test_a_drone_of_its_own_in_every_row(tmp_path, little_memory):
 def test_an_identity_of_its_own_in_every_row(tmp_path, little_memory):
     rows = "".join(f"{row + 1},{row + 1},-1,-1,-1,-1,1,0,0,1\n" for row in range(20_000))
     path = write(tmp_path / "tracks.txt", rows)
+    write(tmp_path / "seqinfo.ini", "[Sequence]\nframeRate=25\n")
     with pytest.raises(InputError, match=r"tracks\.txt: expected drones that are there in most frames"):
         read_tracks(path)
 

@@ -23,6 +23,7 @@ from psotrack.tracking.births import (
     NEW,
     BirthRules,
     Births,
+    FlightLimits,
     FrameBlobs,
     KnownDrones,
     LostTracks,
@@ -83,13 +84,7 @@ def boxes_of(rig, position_m, size_m):
 
 
 def new_births(rig, *, max_speed_m_s=MAX_SPEED_M_S, **rules):
-    return Births(
-        rig.cameras,
-        BirthRules(**rules),
-        fps=FPS,
-        bounds_m=ROOM_M,
-        max_speed_m_s=max_speed_m_s,
-    )
+    return Births(rig.cameras, FlightLimits(FPS, ROOM_M, max_speed_m_s), BirthRules(**rules))
 
 
 def step(births, instant, images, *known_m, size_m=SIZE_M, drawn_m=None, rig=RIG, reduction=REDUCTION):
@@ -367,7 +362,7 @@ def test_a_drone_departs_that_the_background_model_has_learned(departure):
     )
     nobody = LostTracks(*(getattr(stood, name)[:0] for name in vars(stood)))
     for lost, expected in ((stood, 0), (nobody, NEW)):
-        rows = reidentify(found, lost, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=MAX_SPEED_M_S)
+        rows = reidentify(found, lost, FlightLimits(FPS, ROOM_M, MAX_SPEED_M_S))
         (drone,) = [one for one, row in zip(found, rows, strict=True) if row == expected]
         assert (rows >= NEW).sum() == 1
         # In the first of ten frames the ghost is still beside the drone. Measured 4 cm, limit 8.

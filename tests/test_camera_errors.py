@@ -14,7 +14,7 @@ from psotrack import cli
 from psotrack.errors import SettingsError
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project, reconstruct
-from psotrack.settings import ErrorSettings, TrackSettings
+from psotrack.settings import ErrorSettings, MotionSettings, TrackSettings
 from psotrack.tracking.camera_errors import (
     CameraErrors,
     Fading,
@@ -339,7 +339,7 @@ class TestCovariances:
         )
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, no_error)
         none = only_noise(np.ones((4, 2)), USUAL)
-        lasting = lasting_covariances(views, none, rig_error_deg=0.2)
+        lasting = lasting_covariances(views, none, ErrorSettings(rig_deg=0.2))
         for frame in range(2):
             found = np.cov(moved_m[:, frame, 0].T)
             np.testing.assert_allclose(lasting.absolute_m2[frame, 0], found, atol=0.3 * np.abs(found).max())
@@ -355,14 +355,15 @@ class TestCovariances:
         some = replace(only_noise(np.ones((2, 2)), USUAL), lasting_px=np.full((2, 2), 3.0))
         nothing = lasting_covariances(views, none).absolute_m2
         assert (nothing == 0).all()
-        given = lasting_covariances(views, none, pixel_error_px=2.0).absolute_m2
+        given = lasting_covariances(views, none, ErrorSettings(pixel_px=2.0)).absolute_m2
         expected = 4.0 * np.einsum("fdcik,fdcjk->fdij", views.gain, views.gain)
         np.testing.assert_allclose(given, expected)
         learned = lasting_covariances(views, some).absolute_m2
-        both = lasting_covariances(views, some, pixel_error_px=2.0).absolute_m2
+        both = lasting_covariances(views, some, ErrorSettings(pixel_px=2.0)).absolute_m2
         np.testing.assert_allclose(learned, both)
         assert (
-            np.linalg.eigvalsh(lasting_covariances(views, some, rig_error_deg=1.0).relative_m2) > -1e-12
+            np.linalg.eigvalsh(lasting_covariances(views, some, ErrorSettings(rig_deg=1.0)).relative_m2)
+            > -1e-12
         ).all()
 
     def test_covariances_of_a_long_recording_are_those_of_its_frames(self):
@@ -403,7 +404,7 @@ class TestCovariances:
             rig.cameras, np.full((6, 1, 3, 2), np.nan), np.ones((6, 1, 3, 2)), position_m, velocity_m_s
         )
         none = only_noise(np.ones((3, 2)), USUAL)
-        found = lasting_covariances(views, none, pixel_error_px=1.0).absolute_m2[:, 0]
+        found = lasting_covariances(views, none, ErrorSettings(pixel_px=1.0)).absolute_m2[:, 0]
         np.testing.assert_array_equal(found[[0, 3, 4]], found[[1, 2, 2]])
         assert (np.linalg.eigvalsh(found)[:, 0] > 0).all()
 
@@ -493,7 +494,7 @@ class TestFilteredVariance:
         measured[90:, 2] = np.nan
         errors = only_noise(np.ones((4, 2)), Fading(0.3, 0.7, 0.0, 0.4))
         ratio, filtered = noise_ratios(
-            measured, noise, errors, MeasurementErrors(1.0, 0.7, 0.4), dt_s=0.04, jerk_density_m2_s5=1.0
+            measured, noise, errors, MotionSettings(error_share=0.7, error_time_s=0.4), 25.0
         )
         np.testing.assert_allclose(ratio[:, :2], np.tile([0.25, 1.0], (100, 1)))
         np.testing.assert_allclose(ratio[[0, 30, 70, 89, 99], 2], [0.25, 0.25, 1.0, 1.0, 1.0])

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import InputError, OutputError
+from psotrack.errors import InputError
 from psotrack.inside_out import CameraPath, Flag, read_camera_path, write_camera_path
 from psotrack.inside_out.camera_path import roll_pitch_yaw_deg
 from psotrack.trajectories import Status, read_trajectories
@@ -96,13 +96,6 @@ def test_the_reader_of_tracks_reads_the_table(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tracks.seen, own.seen)
     np.testing.assert_array_equal(tracks.seen[:, 0], written.seen)
     np.testing.assert_array_equal(tracks.covariance_m2, own.covariance_m2)
-
-
-def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "path.csv").write_text("mine")
-    with pytest.raises(OutputError, match=r"path\.csv"):
-        write_camera_path(tmp_path / "path.csv", example_path(), "dron1")
-    assert (tmp_path / "path.csv").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from psotrack.foreground.silhouettes import Exposures, Silhouettes
 from psotrack.geometry import make_extents, project, project_boxes
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
 from psotrack.settings import TrackSettings
-from psotrack.tracking.births import Births, KnownDrones
+from psotrack.tracking.births import Births, FlightLimits, KnownDrones
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings, moved_to_instant
 from psotrack.trajectories import Status, Trajectories
@@ -240,7 +240,7 @@ def test_drones_are_found_by_cameras_with_times_of_their_own():
     shown = sightings_of(times, noise_px=0.0).at_instants(timeline)
 
     def errors_m(sightings):
-        births = Births(RIG.cameras, fps=FPS, bounds_m=ROOM_M, max_speed_m_s=6.0)
+        births = Births(RIG.cameras, FlightLimits(FPS, ROOM_M, 6.0))
         for instant in range(sightings.num_frames):
             births.step(instant, sightings[instant], KnownDrones(np.empty((0, 3)), np.empty((0, 3))))
         found = births.candidates()

@@ -8,8 +8,10 @@ import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
 
 from psotrack import cli
@@ -50,6 +52,46 @@ def test_summaries_are_the_first_sentences_of_the_commands(group: LazyGroup) -> 
         command = group.commands[name]
         assert command.name == name
         assert lazy.summary == command.get_short_help_str(limit=1000), name
+
+
+def every_command(group: click.Group = cli.cli, words: str = "") -> Iterator[tuple[str, click.Command]]:
+    """Every command with what is typed for it, groups included."""
+    yield words.strip() or "psotrack", group
+    for name, command in ((name, group.commands[name]) for name in group.list_commands(click.Context(group))):
+        if isinstance(command, click.Group):
+            yield from every_command(command, f"{words} {name}")
+        else:
+            yield f"{words} {name}".strip(), command
+
+
+EVERY_COMMAND = dict(every_command())
+
+
+@pytest.mark.parametrize("words", sorted(EVERY_COMMAND.keys() - {"calibrate rig"}))
+def test_help_fits_two_screens(words: str) -> None:
+    command = EVERY_COMMAND[words]
+    context = click.Context(command, info_name=f"psotrack {words}", terminal_width=100, max_content_width=100)
+    assert len(command.get_help(context).splitlines()) <= 80
+
+
+@pytest.mark.parametrize("words", EVERY_COMMAND)
+def test_help_names_the_default_that_an_option_has(words: str) -> None:
+    context = click.Context(EVERY_COMMAND[words], resilient_parsing=True)
+    for option in EVERY_COMMAND[words].params:
+        if not isinstance(option, click.Option) or option.is_eager:
+            continue
+        shown = (option.get_help_record(context) or ("", ""))[1]
+        stated = re.findall(r"\[(?:.*; )?default: (.*?)(?:;.*)?\]", shown)
+        default = option.get_default(context)
+        if option.is_flag:
+            default = option.opts[0] if default is True else None
+        if isinstance(default, tuple):
+            default = ",".join(map(str, default))
+        if default is not None and default is not False and default not in ("", click.core.UNSET):
+            assert stated == [str(default)], option.name
+        elif option.callback is None:
+            # Words say what happens without the option: never a number that the program does not have.
+            assert not any(re.fullmatch(r"[\d.]+", each) for each in stated), option.name
 
 
 def test_help_lists_every_command_with_its_whole_summary() -> None:

@@ -55,9 +55,9 @@ def test_whatever_compiles_is_not_in_the_time_of_tracking(
         return track(*args, **kwargs)
 
     grid = {"sequences": ["S01_D2_A"], "settings": SETTINGS}
-    sweep(grid, tmp_path / "warm", data=root, cache=root / "cache")
+    sweep(grid, tmp_path / "warm", data=root, cache=root / "cache").rows()
     monkeypatch.setattr(running, "track_silhouettes", compile_and_track)
-    (row,) = sweep(grid, tmp_path / "out", data=root, cache=root / "cache").to_dict("records")
+    (row,) = sweep(grid, tmp_path / "out", data=root, cache=root / "cache").rows().to_dict("records")
     assert row["seconds.compile"] >= TRACING_S
     assert row["seconds.track"] < TRACING_S
     assert row["track_ms_per_frame"] == pytest.approx(1e3 * row["seconds.track"] / row["frames"])

@@ -90,17 +90,6 @@ def test_distances_from_epipolar_lines_equal_opencvs(coefficients):
         np.testing.assert_allclose(found[..., side], off if side == 0 else off.T, atol=1e-5)
 
 
-def test_pixels_of_one_point_are_on_their_epipolar_lines():
-    rig = ring_rig(3, coefficients=5)
-    pixels = pixels_of(rig, separate_points(4, np.random.default_rng(0)))
-    distance = epipolar_distance(rig.cameras[0], rig.cameras[2], pixels[:, 0], pixels[:, 2])
-    # Distortion is inverted to 1e-8, which is 3e-6 px.
-    np.testing.assert_allclose(distance[np.arange(4), np.arange(4)], 0.0, atol=1e-5)
-    assert (distance[~np.eye(4, dtype=bool)] > 0.1).all()
-    nothing = epipolar_distance(rig.cameras[0], rig.cameras[2], pixels[:0, 0], pixels[:, 2])
-    assert nothing.shape == (0, 4, 2)
-
-
 # --- the least total cost
 
 
@@ -354,11 +343,6 @@ def test_detections_that_are_not_finite_are_ignored():
     points = list(pixels_of(rig, drones).swapaxes(0, 1))
     points[1][0], points[2][1, 0] = np.nan, np.inf
     assert groups_of(match_points(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
-
-
-def test_one_camera_gives_no_groups():
-    rig = ring_rig(1)
-    assert match_points(rig, [np.array([[100.0, 80.0], [10.0, 90.0]])], 1.0).position_m.shape == (0, 3)
 
 
 def test_drones_out_of_bounds_are_ignored():

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
+import psotrack as pt
 from psotrack.calibration.doctor import Agreement, examine, sampled_frames
 from psotrack.cli.doctor import doctor
 from psotrack.geometry import Rig, project
@@ -313,6 +314,10 @@ def test_the_command(tmp_path):
     result = CliRunner(env={"COLUMNS": "200"}).invoke(doctor, [str(folder)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert "nothing disagrees" in result.output
+    found = pt.doctor(folder)
+    assert len(str(found).splitlines()) == len(result.output.splitlines())
+    assert repr(found) == "Diagnosis(nothing disagrees)"
+    assert "detections/frame" in found._repr_html_()
 
     with_centres = with_poses(small.cameras.T_cam_world[:, :3, :3], small.cameras.centre_world, small)
     folder = write_sequence(tmp_path / "with_centres", with_centres, seen, TRUTH_M)
@@ -323,6 +328,7 @@ def test_the_command(tmp_path):
     result = CliRunner().invoke(doctor, [str(folder), "--json", "-"], catch_exceptions=False)
     assert result.exit_code == 1
     content = json.loads(result.output)
+    assert json.loads(json.dumps(pt.doctor(folder).to_dict())) == content
     assert [finding["kind"] for finding in content["findings"]] == ["translation or centre"]
     assert [row["camera"] for row in content["cameras"]] == list(small.names)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import ring_rig
+from test_camera_path import example_path
 
 from psotrack.errors import (
     LONGEST_MESSAGE,
@@ -22,8 +23,18 @@ from psotrack.errors import (
     check_positive,
     errors_name,
 )
-from psotrack.geometry.rig_files import read_cameras, read_lenses, read_rig, write_calibration, write_rig
+from psotrack.evaluation.plots import save_overview
+from psotrack.geometry.rig_files import (
+    read_cameras,
+    read_lenses,
+    read_rig,
+    write_calibration,
+    write_lenses,
+    write_rig,
+)
+from psotrack.inside_out import write_camera_path
 from psotrack.recordings import Detections, VideoWriter, join_videos, probe, read_detections, write_detections
+from psotrack.recordings.exchange import export_tracks
 from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
 from psotrack.support import (
     atomic_write,
@@ -217,6 +228,35 @@ def test_refuse_to_overwrite(tmp_path):
         refuse_to_overwrite(path, force=False)
 
 
+def flight():
+    return Trajectories(np.arange(2), np.arange(2) / 25, ("dron1",), np.ones((2, 1, 3)))
+
+
+#: Functions that write a file, by the name of the file.
+WRITERS = {
+    "rig.toml": lambda path, force: write_rig(path, ring_rig(2), force=force),
+    "lenses.toml": lambda path, force: write_lenses(path, ring_rig(2), force=force),
+    "tracks.csv": lambda path, force: write_trajectories(path, flight(), force=force),
+    "tracks.parquet": lambda path, force: write_trajectories(path, flight(), force=force),
+    "dron1.tum": lambda path, force: write_tum(path.parent, flight(), force=force),
+    "tracks.json": lambda path, force: export_tracks(flight(), "json", path, force=force),
+    "picture.png": lambda path, force: save_overview(path, flight(), flight(), force=force),
+    "path.csv": lambda path, force: write_camera_path(path, example_path(), "dron1", force=force),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_existing_file_is_replaced_only_by_force(tmp_path, name):
+    path = tmp_path / name
+    path.write_text("precious")
+    with pytest.raises(OutputError, match=rf"{name}: expected a path .* pass --force to replace it"):
+        WRITERS[name](path, False)
+    assert path.read_text() == "precious"
+    WRITERS[name](path, True)
+    assert path.read_bytes() != b"precious"
+    assert file_names(tmp_path) == [name]
+
+
 @pytest.mark.parametrize("report", [no_progress, progress_bar])
 def test_progress_is_quiet_where_there_is_no_terminal(report, capfd):
     with report("track", 10) as advance:
@@ -276,10 +316,9 @@ def test_paths_may_be_strings(tmp_path):
     assert tuple(read_cameras(path("rig.csv"))) == rig.names
     write_detections(path("a.csv"), Detections(np.array([0]), np.array([[0.0, 0, 2, 2]]), np.array([0.5])))
     assert len(read_detections(path("a.csv"))) == 1
-    flight = Trajectories(np.arange(2), np.arange(2) / 25, ("dron1",), np.ones((2, 1, 3)))
-    write_trajectories(path("tracks.csv"), flight)
-    assert read_trajectories(path("tracks.csv")).drones == flight.drones
-    assert write_tum(path("tum"), flight) == [tmp_path / "tum" / "dron1.tum"]
+    write_trajectories(path("tracks.csv"), flight())
+    assert read_trajectories(path("tracks.csv")).drones == flight().drones
+    assert write_tum(path("tum"), flight()) == [tmp_path / "tum" / "dron1.tum"]
     assert read_tum(path("tum/dron1.tum")).num_frames == 2
     write_c3d(path("a.c3d"), Markers(("A",), np.ones((2, 1, 3)), 100.0))
     assert read_c3d(path("a.c3d")).labels == ("A",)

@@ -17,24 +17,13 @@ from psotrack.trajectories import GATE_M, UNASSIGNED, Status
 from psotrack.trajectories.association import align, fixed_identity, identity_switches, partners_per_frame
 
 
-def select_metrics(evaluation, *names):
-    return {name: getattr(evaluation, name) for name in names}
-
-
 class TestFiveFrames:
     def test_no_confusion(self):
         evaluation = evaluate(on_x_axis([0.1] * 5, [10, 10, 10.2, 10.2, 10.4]), TRUTH)
         errors_m = [0.1] * 5 + [0, 0, 0.2, 0.2, 0.4]
-        assert select_metrics(
-            evaluation, "frames", "drones", "missed_rate", "id_switches", "mota", "idf1"
-        ) == {
-            "frames": 5,
-            "drones": 2,
-            "missed_rate": 0.0,
-            "id_switches": 0,
-            "mota": 1.0,
-            "idf1": 1.0,
-        }
+        assert (evaluation.frames, evaluation.drones) == (5, 2)
+        assert (evaluation.missed_rate, evaluation.id_switches) == (0, 0)
+        assert (evaluation.mota, evaluation.idf1) == (1, 1)
         mean_m = 13 / 100
         assert evaluation.mean_error_m == pytest.approx(mean_m, abs=ROUNDING)
         assert evaluation.matched_mean_error_m == pytest.approx(mean_m, abs=ROUNDING)
@@ -173,32 +162,20 @@ class TestFiveFrames:
         assert evaluate(empty, TRUTH).missed_rate == 1.0
 
 
-KEYS = [
-    "frames",
-    "drones",
-    "mean_error_m",
-    "median_error_m",
-    "std_error_m",
-    "p95_error_m",
-    "max_error_m",
-    "missed_rate",
-    "id_switches",
-    "mota",
-    "motp_m",
-    "idf1",
-    "matched_mean_error_m",
-    "offset_removed_mean_error_m",
+KEYS = {
+    *("frames", "drones", "missed_rate", "id_switches", "mota", "motp_m", "idf1", "per_drone"),
+    *("mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
+    *("matched_mean_error_m", "offset_removed_mean_error_m"),
     *("hota", "deta", "assa", "loca"),
     *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
     *("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg"),
     *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
-    "per_drone",
-]
+}
 
 
 class TestContract:
     def test_keys(self):
-        assert sorted(evaluate(TRUTH, TRUTH).to_dict()) == sorted(KEYS)
+        assert evaluate(TRUTH, TRUTH).to_dict().keys() == KEYS
 
     def test_json_is_strict_if_values_are_undefined(self):
         text = json.dumps(evaluate(on_x_axis([0] * 5), TRUTH).to_dict(), allow_nan=False)
@@ -352,15 +329,6 @@ class TestAgainstBruteForce:
         mean_m = pair.distance_m[:2].mean(axis=0)
         best = min(itertools.permutations(range(4), 3), key=lambda order: sum(mean_m[range(3), order]))
         assert tuple(fixed_identity(pair)) == best
-
-    @pytest.mark.parametrize("seed", range(5))
-    def test_idf1(self, seed):
-        est, ref = random_flights(seed)
-        est = replace(est, position_m=np.nan_to_num(est.position_m))
-        ref = replace(ref, position_m=np.nan_to_num(ref.position_m))
-        near = np.linalg.norm(ref.position_m[:, :, None] - est.position_m[:, None], axis=-1) <= GATE_M
-        most = max(near[:, range(3), order].sum() for order in itertools.permutations(range(4), 3))
-        assert evaluate(est, ref).idf1 == pytest.approx(2 * most / (7 * 3 + 7 * 4), abs=ROUNDING)
 
     def test_identity_switches(self):
         partners = np.array([[0, 1], [0, -1], [1, 1], [-1, 0], [1, 0]])

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from psotrack.errors import InputError, OutputError
+from psotrack.errors import InputError
 from psotrack.evaluation import evaluate, plots, tables
 from psotrack.trajectories import Status, Trajectories
 
@@ -233,15 +233,6 @@ class TestPictures:
             colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
             # Lines are a few hundred pixels long; a line behind the line of its reference still has visible edges.
             assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
-
-    def test_an_existing_plot_is_replaced_only_by_force(self, tmp_path):
-        path = tmp_path / "picture.png"
-        path.write_text("precious")
-        with pytest.raises(OutputError, match="pass --force"):
-            plots.save_overview(path, *flights())
-        assert path.read_text() == "precious"
-        plots.save_overview(path, *flights(), force=True)
-        assert cv2.imread(str(path)) is not None
 
     def test_recordings_without_common_frames_leave_no_file(self, tmp_path):
         est, ref = flights()

@@ -4,19 +4,15 @@ evo (GPL) runs in a process of its own, as TrackEval and the others are: as judg
 installed without their dependencies (see the Makefile), so that their tests are skipped where they are missing.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import cv2
 import ezc3d
@@ -24,7 +20,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from helpers import LENSES, Output, cameras_of, ring_rig, sphere_points
+from helpers import LENSES, cameras_of, ring_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -60,13 +56,13 @@ CLOCKS = {"c0": (25.0, 0.0, 0.0), "c1": (50.0, 0.0, 0.0), "c2": (25.0, 0.013, 2e
 WH = (320, 240)
 
 
-def path_m(drone: int, time_s: np.ndarray) -> np.ndarray:
+def path_m(drone, time_s):
     """(times, 3), a curve at about 1.5 m/s."""
     angle = 1.5 * time_s + 2.5 * drone
     return np.stack([np.cos(angle), np.sin(angle), 1.2 + 0.2 * time_s + 0.3 * drone], axis=-1)
 
 
-def small_tracks(num_frames: int = 50, fps: float = 50.0) -> Trajectories:
+def small_tracks(num_frames=50, fps=50.0):
     """Two drones with gaps, lost rows, covariances, velocities and orientations, near the paths of the reference."""
     frame = np.arange(num_frames)
     time_s = frame / fps
@@ -91,7 +87,7 @@ def small_tracks(num_frames: int = 50, fps: float = 50.0) -> Trajectories:
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flight(tmp_path_factory):
     """A recording of three cameras that differ in rate and start, the last with a rolling shutter, with a reference."""
     folder = tmp_path_factory.mktemp("flight")
     write_rig(folder / "rig.toml", ring_rig(3, coefficients=5, image_size_wh=WH))
@@ -117,16 +113,16 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recording(flight: Path) -> Recording:
+def recording(flight):
     return open_recording(flight)
 
 
 @pytest.fixture(scope="module")
-def footage(recording: Recording) -> Footage:
+def footage(recording):
     return Footage(recording, np.array([SIZE_M, SIZE_M]))
 
 
-def assert_one_line(result: Output, *words: str) -> None:
+def assert_one_line(result, *words):
     assert result.code == 2, result
     assert result.out == ""
     assert result.err.count("\n") == 1, result.err
@@ -134,7 +130,7 @@ def assert_one_line(result: Output, *words: str) -> None:
         assert word in result.err, result.err
 
 
-def instants(num_frames: int, fps: float = 25.0) -> Recording:
+def instants(num_frames, fps=25.0):
     """A recording that has nothing but instants."""
     rig = ring_rig(1)
     return Recording("any", Path("any"), cameras_of(rig, times={rig.names[0]: FrameTimes(num_frames, fps)}))
@@ -144,7 +140,7 @@ def instants(num_frames: int, fps: float = 25.0) -> Recording:
 
 
 @st.composite
-def with_gaps(draw: st.DrawFn) -> dict[str, Any]:
+def with_gaps(draw):
     """Arguments of `Trajectories`: random positions of 1 to 3 drones in some of 40 frames; each drone is seen."""
     drones = draw(st.integers(1, 3))
     frame = np.array(sorted(draw(st.sets(st.integers(0, 39), min_size=2, max_size=12))))
@@ -163,9 +159,7 @@ def with_gaps(draw: st.DrawFn) -> dict[str, Any]:
 @pytest.mark.parametrize("to", OUTPUTS)
 @given(arguments=with_gaps())
 @settings(max_examples=25)
-def test_positions_and_gaps_come_back(
-    to: str, arguments: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_positions_and_gaps_come_back(to, arguments, tmp_path_factory):
     out = tmp_path_factory.getbasetemp() / "there_and_back" / OUTPUTS[to]
     written = Trajectories(**arguments)
     export_tracks(written, to, out, force=True)
@@ -180,7 +174,7 @@ def test_positions_and_gaps_come_back(
     )
 
 
-def test_what_each_format_keeps(tmp_path: Path) -> None:
+def test_what_each_format_keeps(tmp_path):
     tracks = small_tracks()
     read = {}
     for to, name in OUTPUTS.items():
@@ -203,7 +197,7 @@ def test_what_each_format_keeps(tmp_path: Path) -> None:
     assert (units["qw"], units["cov_xy"], units["vx_m_s"]) == ("1", "m2", "m/s")
 
 
-def test_unknown_orientations_stay_unknown(tmp_path: Path) -> None:
+def test_unknown_orientations_stay_unknown(tmp_path):
     for to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
         export_tracks(replace(small_tracks(), orientation_wxyz=None), to, tmp_path / OUTPUTS[to])
         assert read_tracks(tmp_path / OUTPUTS[to], recording=instants(50, 50.0)).orientation_wxyz is None
@@ -214,9 +208,7 @@ def test_unknown_orientations_stay_unknown(tmp_path: Path) -> None:
     [*OUTPUTS.items(), pytest.param("mot", "mot", marks=pytest.mark.slow), ("mcap", "bag")],
     ids=lambda value: str(value),
 )
-def test_evaluate_takes_back_what_export_wrote(
-    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path, to: str, name: str
-) -> None:
+def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tmp_path, to, name):
     """The same figures, except those of covariances that the format does not hold."""
     more = [flight] if name == "mot" else []
     assert (
@@ -239,9 +231,7 @@ def test_evaluate_takes_back_what_export_wrote(
             assert found[key] == pytest.approx(value, abs=1e-6 if to == "c3d" else 1e-12), key
 
 
-def test_tracks_with_a_rate_of_their_own(
-    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
-) -> None:
+def test_tracks_with_a_rate_of_their_own(run_psotrack, flight, tmp_path):
     """20 Hz, as from `track --rate 20`: the times say so, although the recording has 50 Hz."""
     tracks = tmp_path / "slow.csv"
     write_trajectories(tracks, small_tracks(20, 20.0))
@@ -255,7 +245,7 @@ def test_tracks_with_a_rate_of_their_own(
 
 
 @pytest.mark.parametrize("name", ["one.txt", f"{'long' * 42}.tum"])
-def test_a_file_of_tum_has_any_name(tmp_path: Path, name: str) -> None:
+def test_a_file_of_tum_has_any_name(tmp_path, name):
     """TUM's own files end in .txt. The drone has the name of the file, however long."""
     tracks = replace(
         small_tracks(), position_m=np.where([[[False], [True]]], np.nan, small_tracks().position_m)
@@ -267,9 +257,7 @@ def test_a_file_of_tum_has_any_name(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(read.position_m[:, 0], tracks.position_m[seen, 0])
 
 
-def test_all_commands_read_the_same_formats(
-    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
-) -> None:
+def test_all_commands_read_the_same_formats(run_psotrack, flight, tmp_path):
     """JSON as well as CSV; `test_fuse_command` has the same of `onboard fuse`."""
     export_tracks(small_tracks(), "json", tmp_path / "tracks.json")
     expected, found = (
@@ -280,7 +268,7 @@ def test_all_commands_read_the_same_formats(
     assert found.out == expected.out
 
 
-def test_times_between_the_instants_are_interpolated_and_gaps_stay(tmp_path: Path) -> None:
+def test_times_between_the_instants_are_interpolated_and_gaps_stay(tmp_path):
     time_s = 0.0137 + np.arange(40) / 25
     keep = np.r_[0:15, 16:40]
     position_m = path_m(0, time_s)[:, None]
@@ -311,7 +299,7 @@ print(json.dumps({"rmse": ape.get_statistic(metrics.StatisticsType.rmse), "poses
 
 
 @pytest.mark.skipif(find_spec("evo") is None, reason="evo is not installed; see the Makefile")
-def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path: Path, recording: Recording) -> None:
+def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path, recording):
     tracks, truth = small_tracks(), recording.truth
     assert truth is not None
     for to in ("tum", "kitti"):
@@ -334,7 +322,7 @@ def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path: Path, record
     np.testing.assert_allclose(np.abs(by_evo["turns"]), np.abs(tracks.orientation_wxyz[seen, 0]), atol=1e-12)
 
 
-def test_motmetrics_reads_the_3d_columns(tmp_path: Path) -> None:
+def test_motmetrics_reads_the_3d_columns(tmp_path):
     import motmetrics
 
     tracks = small_tracks()
@@ -351,7 +339,7 @@ def test_motmetrics_reads_the_3d_columns(tmp_path: Path) -> None:
     np.testing.assert_allclose(whole[[7, 8, 9]], tracks.position_m[rows, drones], rtol=1e-14)
 
 
-def trackeval_clear(folder: Path) -> dict[str, dict[str, float]]:
+def trackeval_clear(folder):
     """CLEAR by TrackEval for each sequence in a folder that was exported."""
     import trackeval
 
@@ -378,9 +366,7 @@ def trackeval_clear(folder: Path) -> dict[str, dict[str, float]]:
 
 
 @pytest.mark.skipif(find_spec("trackeval") is None, reason="trackeval is not installed; see the Makefile")
-def test_trackeval_reads_the_boxes_of_every_camera(
-    tmp_path: Path, recording: Recording, footage: Footage
-) -> None:
+def test_trackeval_reads_the_boxes_of_every_camera(tmp_path, recording, footage):
     truth = recording.truth
     assert truth is not None
     perfect = replace(truth, drones=("0", "1"))
@@ -400,9 +386,7 @@ def test_trackeval_reads_the_boxes_of_every_camera(
         assert result["CLR_FP"] == 0
 
 
-def test_boxes_are_around_the_drones_at_the_exposure(
-    tmp_path: Path, recording: Recording, footage: Footage
-) -> None:
+def test_boxes_are_around_the_drones_at_the_exposure(tmp_path, recording, footage):
     """The oracle projects points of the ellipsoids' surface, at the time of the frame or of the drone's row."""
     truth = recording.truth
     assert truth is not None
@@ -431,7 +415,7 @@ def test_boxes_are_around_the_drones_at_the_exposure(
             np.testing.assert_allclose([left - 1 + width, top - 1 + height], high, atol=0.1)
 
 
-def test_ezc3d_reads_units_labels_rate_and_gaps(tmp_path: Path) -> None:
+def test_ezc3d_reads_units_labels_rate_and_gaps(tmp_path):
     tracks = small_tracks()
     export_tracks(tracks, "c3d", tmp_path / "tracks.c3d")
     content = ezc3d.c3d(str(tmp_path / "tracks.c3d"))
@@ -445,7 +429,7 @@ def test_ezc3d_reads_units_labels_rate_and_gaps(tmp_path: Path) -> None:
     np.testing.assert_allclose(position_m[seen], tracks.position_m[seen], atol=2e-7)
 
 
-def test_the_mcap_library_and_rosbags_read_the_messages(tmp_path: Path, footage: Footage) -> None:
+def test_the_mcap_library_and_rosbags_read_the_messages(tmp_path, footage):
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
     from rosbags.highlevel import AnyReader
@@ -493,7 +477,7 @@ def test_the_mcap_library_and_rosbags_read_the_messages(tmp_path: Path, footage:
         assert sum(topic == "/c1/camera_info" for topic, *_ in messages) == 50
 
 
-def test_a_camera_info_and_its_transform_project_as_the_camera_does(tmp_path: Path, footage: Footage) -> None:
+def test_a_camera_info_and_its_transform_project_as_the_camera_does(tmp_path, footage):
     """The oracle is OpenCV, with the numbers that ROS programs get."""
     from rosbags.highlevel import AnyReader
 
@@ -528,7 +512,7 @@ def test_a_camera_info_and_its_transform_project_as_the_camera_does(tmp_path: Pa
         ((*LENSES[8], 0.0, 0.0, 0.0, 0.0, 0.01, 0.0), False, None),
     ],
 )
-def test_the_lens_models_of_ros(dist: tuple[float, ...], fisheye: bool, model: str | None) -> None:
+def test_the_lens_models_of_ros(dist, fisheye, model):
     R, t_m = look_at((3.0, 0.0, 2.0), (0.0, 0.0, 1.0))
     K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
     camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=WH, dist=dist, fisheye=fisheye)
@@ -539,7 +523,7 @@ def test_the_lens_models_of_ros(dist: tuple[float, ...], fisheye: bool, model: s
         assert message["d"] == [*dist, *[0.0] * size][:size]
 
 
-def test_the_definitions_of_the_messages_are_those_of_ros() -> None:
+def test_the_definitions_of_the_messages_are_those_of_ros():
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -551,11 +535,11 @@ def test_the_definitions_of_the_messages_are_those_of_ros() -> None:
 # What is said, and what is refused
 
 
-def test_the_command_and_the_tests_know_every_format() -> None:
+def test_the_command_and_the_tests_know_every_format():
     assert set(FORMAT_NAMES) == set(OUTPUTS) == set(FORMATS)
 
 
-def test_export_says_what_is_lost(run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+def test_export_says_what_is_lost(run_psotrack, flight, tmp_path):
     result = run_psotrack("export", flight / "tracks.csv", "--to", "kitti", "--out", tmp_path / "kitti")
     assert result.out == (
         f"{tmp_path / 'kitti'}: kitti, 2 drones, 50 frames; not in this format: covariances, velocities, status, "
@@ -568,7 +552,7 @@ def test_export_says_what_is_lost(run_psotrack: Callable[..., Output], flight: P
     assert "times" not in export_tracks(late, "tum", tmp_path / "late")
 
 
-def test_nothing_is_overwritten(run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+def test_nothing_is_overwritten(run_psotrack, flight, tmp_path):
     tracks = shutil.copy(flight / "tracks.csv", tmp_path / "tracks.csv")
     record = tmp_path / "tracks.json"
     record.write_text("{}", encoding="utf-8")
@@ -592,14 +576,14 @@ def test_nothing_is_overwritten(run_psotrack: Callable[..., Output], flight: Pat
 
 
 @pytest.mark.parametrize("names", [("a b", "a_b"), ("c1", "d"), ("world", "d")])
-def test_names_that_are_one_name_in_ros(tmp_path: Path, footage: Footage, names: tuple[str, str]) -> None:
+def test_names_that_are_one_name_in_ros(tmp_path, footage, names):
     with pytest.raises(InputError, match="differ as names of ROS"):
         export_tracks(replace(small_tracks(), drones=names), "mcap", tmp_path / "bag", footage=footage)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
+def test_a_failure_leaves_nothing(tmp_path, footage, monkeypatch):
+    def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("psotrack.recordings.exchange.mcap_files._write_bag_file", full)
@@ -619,23 +603,14 @@ def test_a_failure_leaves_nothing(tmp_path: Path, footage: Footage, monkeypatch:
         ("json", "a.csv", ("ends in .json",)),
     ],
 )
-def test_outputs_that_do_not_fit(
-    run_psotrack: Callable[..., Output],
-    flight: Path,
-    tmp_path: Path,
-    to: str,
-    name: str,
-    words: tuple[str, ...],
-) -> None:
+def test_outputs_that_do_not_fit(run_psotrack, flight, tmp_path, to, name, words):
     assert_one_line(
         run_psotrack("export", flight / "tracks.csv", "--to", to, "--out", tmp_path / name), "--out", *words
     )
     assert not list(tmp_path.iterdir())
 
 
-def test_images_and_sizes_need_a_recording(
-    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
-) -> None:
+def test_images_and_sizes_need_a_recording(run_psotrack, flight, tmp_path):
     tracks = shutil.copy(flight / "tracks.csv", tmp_path / "without_record.csv")
     out = tmp_path / "out"
     assert_one_line(
@@ -658,7 +633,7 @@ def test_images_and_sizes_need_a_recording(
     assert (out / "gt" / "seqmaps" / "MOT15-train.txt").is_file()
 
 
-def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_missing_extra_is_named(tmp_path, monkeypatch):
     export_tracks(small_tracks(), "mcap", tmp_path / "tracks.mcap")
     for name in ("mcap.reader", "mcap_ros2.writer"):
         monkeypatch.setitem(sys.modules, name, None)
@@ -668,23 +643,16 @@ def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         read_tracks(tmp_path / "tracks.mcap")
 
 
-def cut(path: Path, size: int) -> Path:
-    """The first bytes of a file, as a file of its own."""
-    short = path.with_name(f"short{path.suffix}")
-    short.write_bytes(path.read_bytes()[:size])
-    return short
-
-
 BAD = {
     "a file of boxes alone": ("boxes.txt", "1,1,10,10,5,5,1,-1,-1,-1\n", "positions in MOT15's 3D columns"),
     "a file of few columns": ("boxes.txt", "1,1,10,10,5,5,1\n", "positions in MOT15's 3D columns"),
     "MOT counts from 1": ("mot.txt", "0,1,-1,-1,-1,-1,1,1,2,3\n", "whole frame numbers from 1"),
-    "MOT twice": ("mot.csv", "1,1,-1,-1,-1,-1,1,1,2,3\n" * 2, "one row per frame and identity"),
+    "MOT twice": ("mot.csv", "1,1,-1,-1,-1,-1,1,1,2,3\n" * 2, "line 2: expected one row per frame and drone"),
     "KITTI of another length": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 3\n" * 3, "50 poses, one for each instant"),
     "no rotation": ("k.txt", "1 0 0 1 0 2 0 2 0 0 1 3\n", "a rotation matrix"),
     "KITTI with words": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 x\n", "line 1: expected 12 finite numbers"),
     "an empty file": ("empty.txt", "", "an empty file"),
-    "comments alone": ("empty.tum", "# timestamp\n", "at least one pose"),
+    "comments alone": ("empty.tum", "# timestamp\n", "at least one line with numbers"),
     "5 numbers": ("five.txt", "1 2 3 4 5\n", "8 numbers per line (TUM), 12 (KITTI)"),
     "an unknown ending": ("tracks.xyz", "1 2 3\n", "tracks as .csv, .parquet"),
     "the record": ("record.json", '{"drones": []}', "the record of a run has no positions"),
@@ -707,24 +675,12 @@ BAD = {
 
 
 @pytest.mark.parametrize(("name", "text", "message"), BAD.values(), ids=BAD)
-def test_bad_input_is_one_line(
-    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path, name: str, text: str, message: str
-) -> None:
+def test_bad_input_is_one_line(run_psotrack, flight, tmp_path, name, text, message):
     (tmp_path / name).write_text(text, encoding="utf-8")
     assert_one_line(run_psotrack("evaluate", tmp_path / name, flight), message, str(tmp_path))
 
 
-def test_files_that_are_cut_short_are_one_line(
-    run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path
-) -> None:
-    for to in ("mcap", "c3d"):
-        export_tracks(small_tracks(), to, tmp_path / OUTPUTS[to])
-        whole = (tmp_path / OUTPUTS[to]).stat().st_size
-        for size in (10, whole // 2, whole * 2 // 3):
-            assert_one_line(run_psotrack("evaluate", cut(tmp_path / OUTPUTS[to], size), flight), "short")
-
-
-def test_folders_without_tracks(run_psotrack: Callable[..., Output], flight: Path, tmp_path: Path) -> None:
+def test_folders_without_tracks(run_psotrack, flight, tmp_path):
     assert_one_line(run_psotrack("evaluate", tmp_path / "nowhere", flight), "no such file or folder")
     assert_one_line(run_psotrack("evaluate", tmp_path, flight), "a folder without them")
     export_tracks(small_tracks(), "kitti", tmp_path / "kitti")
@@ -735,7 +691,7 @@ def test_folders_without_tracks(run_psotrack: Callable[..., Output], flight: Pat
     )
 
 
-def test_tracks_without_a_rate_need_a_recording(tmp_path: Path) -> None:
+def test_tracks_without_a_rate_need_a_recording(tmp_path):
     export_tracks(small_tracks(), "mot", tmp_path / "mot.txt")
     with pytest.raises(InputError, match="name SEQ, too"):
         read_tracks(tmp_path / "mot.txt")
@@ -748,7 +704,7 @@ def test_tracks_without_a_rate_need_a_recording(tmp_path: Path) -> None:
     assert read_tracks(tmp_path / "tum").frame.tolist() == list(range(50))
 
 
-def test_quaternions_of_a_table_must_have_length_1(tmp_path: Path) -> None:
+def test_quaternions_of_a_table_must_have_length_1(tmp_path):
     path = tmp_path / "tracks.csv"
     path.write_text("frame,drone,x_m,y_m,z_m,time_s,qw,qx,qy,qz\n0,a,1,2,3,0,1,1,0,0\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 2: expected a unit quaternion"):

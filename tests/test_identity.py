@@ -199,16 +199,6 @@ class TestTwoDrones:
         separate = nearest_distance_m(flown_m) > 0.3
         np.testing.assert_array_equal(found.order[separate], tracks.truth[separate])
 
-    @pytest.mark.parametrize("exchanged", [False, True])
-    def test_equal_sizes_decide_nothing(self, exchanged):
-        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merge_positions(hovering())])
-        size_m = np.array([0.36, 0.36, 0.12]) + 0.01 * correlated_errors(
-            np.random.default_rng(2), (360, 2, 3)
-        )
-        found = resolve_tracks(simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m))
-        assert list_outcomes(found) == [LabelOutcome.UNDECIDED]
-        assert abs(found.ambiguity[found.encounters[0].last_frame, 0] - 0.5) < 0.2
-
     def test_ambiguity_begins_with_the_encounter_and_ends_with_it(self):
         found = resolve_tracks(simulate_tracks(passing(0.2), 0.02))
         (encounter,) = found.encounters

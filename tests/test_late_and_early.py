@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from test_camera_times import FPS, RIG, alike, make_timeline, positions, sightings_of, tracked
 
-from psotrack.calibration.clocks import camera_offsets, clocks_of_tracks, find_offset
+from psotrack.calibration.clocks import ReferenceOffset, camera_offsets, clocks_of_tracks, find_offset
 from psotrack.calibration.doctor import examine
-from psotrack.cli.doctor import offset_in_words
 from psotrack.geometry import project
 from psotrack.recordings import FrameTimes
 from psotrack.trajectories import Trajectories
@@ -57,6 +56,6 @@ def test_videos_that_are_all_late_are_late_to_synchronise(late):
     time_s = np.arange(-1.0, FRAMES / FPS + 1.0, 0.01)
     offset = find_offset(estimate, time_s, positions(time_s), max_offset_s=0.5)
     assert offset.offset_s == pytest.approx(-late / FPS, abs=1e-3)
-    said = offset_in_words(offset, FPS)
+    said = str(ReferenceOffset("flight", offset, {}, FPS, "world"))
     assert f"the videos show the scene {'late' if late > 0 else 'early'};" in said
     assert f"{'behind' if late > 0 else 'ahead of'} the videos'" in said

@@ -11,7 +11,6 @@ from helpers import float32
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.errors import SettingsError
 from psotrack.geometry import (
     has_image,
     make_camera,
@@ -272,20 +271,6 @@ def test_every_fisheye_comes_back(dist, angle, direction):
         np.testing.assert_allclose(undistort(lens, pixel), point[:2], rtol=1e-6, atol=1e-9)
     elif slope.min() < -1e-3:
         assert not has_image(lens, point)
-
-
-@pytest.mark.parametrize(
-    ("dist", "fisheye", "message"),
-    [
-        ((0.1, 0.2, 0.3), False, "expected 0, 4, 5, 8, 12 or 14 coefficients, found 3"),
-        ((0.1,) * 6, False, "expected 0, 4, 5, 8, 12 or 14 coefficients, found 6"),
-        ((0.1,) * 5, True, "expected 0 or 4 coefficients of a fisheye, found 5"),
-        ((0.1, np.nan, 0.0, 0.0), True, "expected finite numbers, found NaN"),
-    ],
-)
-def test_a_wrong_number_of_coefficients_is_refused(dist, fisheye, message):
-    with pytest.raises(SettingsError, match=message):
-        make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye)
 
 
 @pytest.mark.parametrize("name", ["fisheye", "fisheye that folds"])

@@ -20,7 +20,7 @@ from psotrack.tracking.births import (
     find_cut_off,
     find_outside,
     flight_volume,
-    moving_detections,
+    moving_points,
     room_bounds,
 )
 from psotrack.tracking.lines import track_detections
@@ -79,7 +79,7 @@ def tracked(rig, sightings, volume, size_m=None, **status):
 
 def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
     rig, truth_m = ground_rig(4), flights(60, (4.0, 11.0))
-    points = moving_detections(rig, sightings_of(rig, truth_m), FPS)
+    points = moving_points(rig, sightings_of(rig, truth_m), FPS)
     volume = flight_volume(rig, points)
     assert volume.bounds_from == "cameras and moving points"
     assert volume.speed_from == "moving points"
@@ -94,8 +94,8 @@ def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
     rig, truth_m, size_m = ground_rig(4), flights(60, (4.0, 11.0)), (0.05, 0.05, 0.05)
     drones = sightings_of(rig, truth_m)
     balls = replace(drones, size_px=drones.size_px / 6.5)
-    assert not len(moving_detections(rig, balls, FPS))
-    volume = flight_volume(rig, moving_detections(rig, balls, FPS, size_m))
+    assert not len(moving_points(rig, balls, FPS))
+    volume = flight_volume(rig, moving_points(rig, balls, FPS, size_m))
     assert volume.bounds_from == "cameras and moving points"
     assert tracked(rig, balls, volume).num_drones == 0
     assert tracked(rig, balls, volume, size_m).num_drones == 2
@@ -105,7 +105,7 @@ def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
 
 def test_given_values_win():
     rig, truth_m = ground_rig(4), flights(30, (11.0,))
-    points = moving_detections(rig, sightings_of(rig, truth_m), FPS)
+    points = moving_points(rig, sightings_of(rig, truth_m), FPS)
     volume = flight_volume(rig, points, bounds_m=(-1.0, 1.0, -2.0, 2.0, 0.0, 3.0), max_speed_m_s=5.0)
     np.testing.assert_array_equal(volume.bounds_m, [[-1, -2, 0], [1, 2, 3]])
     assert (volume.bounds_from, volume.max_speed_m_s, volume.speed_from) == ("given", 5.0, "given")
@@ -116,7 +116,7 @@ def test_given_values_win():
 
 def test_false_alarms_alone_leave_the_room_of_the_cameras():
     rig = ground_rig(4)
-    points = moving_detections(rig, sightings_of(rig, flights(60, ()), clutter=3), FPS)
+    points = moving_points(rig, sightings_of(rig, flights(60, ()), clutter=3), FPS)
     volume = flight_volume(rig, points)
     np.testing.assert_array_equal(volume.bounds_m, room_bounds(rig))
     assert (volume.bounds_from, volume.max_speed_m_s) == ("cameras", 6.0)
@@ -127,7 +127,7 @@ def test_what_moves_below_a_floor_does_not_lower_it():
     rig = ground_rig(4, target_m=(0.0, 0.0, 1.0), height_m=9.0)
     real_m = flights(30, (2.0,), centre_m=(0.0, 0.0, 2.0))
     both_m = np.concatenate([real_m, real_m * (1, 1, -1)], axis=1)
-    volume = flight_volume(rig, moving_detections(rig, sightings_of(rig, both_m), FPS))
+    volume = flight_volume(rig, moving_points(rig, sightings_of(rig, both_m), FPS))
     np.testing.assert_array_equal(volume.bounds_m, room_bounds(rig))
 
 
@@ -179,7 +179,7 @@ def test_the_volume_holds_a_drone_that_something_hides_from_the_third_camera():
             for name in ("centre_px", "size_px", "noise_px")
         )
     )
-    volume = flight_volume(rig, moving_detections(rig, both, FPS))
+    volume = flight_volume(rig, moving_points(rig, both, FPS))
     assert 22.0 < volume.bounds_m[1, 2] < 27.0
     assert tracked(rig, both, volume).num_drones == 2
 
@@ -188,7 +188,7 @@ def test_a_fast_drone_far_away_is_not_two():
     """A sharp turn brings a drone out of its gate; three cameras that agree beside the place keep its track."""
     flight = make_flight(SCENES["outdoors, 4 cameras, 3 drones on 100 m"], 250, 54)
     sightings = from_detections(flight.detections, flight.rig, flight.num_frames)
-    volume = flight_volume(flight.rig, moving_detections(flight.rig, sightings, FPS))
+    volume = flight_volume(flight.rig, moving_points(flight.rig, sightings, FPS))
     tracks = tracked(flight.rig, sightings, volume)
     assert tracks.num_drones == 3
 

@@ -72,28 +72,6 @@ def test_foreground_that_neighbours_cover_is_occluded_except_in_the_core(occludi
     assert kept_in_core >= 2
 
 
-def test_occluded_pixels_by_hand():
-    """Two ellipses of 20 x 10 pixels side by side: the occluded pixels in the row of their middles."""
-    white = np.full_like(NOISE, 255)
-    # The middles are 14 px apart. An occluding ellipse extends 11.5 px from its middle plus half a pixel, a core 7 px.
-    expected_m = np.array([[-0.3625, 0, -0.0125], [0.3375, 0, -0.0125]])
-    patches = cut_at(far_rig(1), white, expected_m, SIZES_M[:2])
-    left, right = pixels(patches)[:, 0]
-    # In the left drone's window the middles are at columns 32.25 and 46.25, a quarter of a pixel below the middle of
-    # row 32. In this row the occluding ellipse extends 12 sqrt(1 - (0.25 / 6.25)²) = 11.99 to either side, columns
-    # 34.26 to 58.24, and the core 7 sqrt(1 - (0.25 / 3.5)²) = 6.98, to column 39.23. So pixels 34 to 57 are covered,
-    # and of these, pixels 34 to 38 are kept.
-    occluded = np.zeros(SIDE, bool)
-    occluded[39:58] = True
-    np.testing.assert_array_equal(left[32], np.where(occluded, 0, 255))
-    np.testing.assert_array_equal(occluded_pixels(patches)[0, 0, 32], occluded)
-    # In the right drone's window the middles are at 32.25 and 18.25: pixels 6 to 29 are covered, and the core, from
-    # 25.27 on, is kept.
-    occluded = np.zeros(SIDE, bool)
-    occluded[6:25] = True
-    np.testing.assert_array_equal(right[32], np.where(occluded, 0, 255))
-
-
 def test_a_single_drone_is_not_occluded():
     one, alone = (
         cut_at(far_rig(1), NOISE, CLOSE_M[:1], SIZES_M[:1], occluding=occluding) for occluding in (True, None)
@@ -101,15 +79,6 @@ def test_a_single_drone_is_not_occluded():
     np.testing.assert_array_equal(one.tables, alone.tables)
     np.testing.assert_array_equal(one.clear, 1)
     assert one.packed is alone.packed is False
-
-
-def test_permuting_drones_permutes_windows():
-    order = np.array([2, 0, 1])
-    patches, permuted = (cut_at(far_rig(1), NOISE, CLOSE_M[to], SIZES_M[:3]) for to in (np.arange(3), order))
-    assert patches.clear.min() < 0.9
-    np.testing.assert_array_equal(pixels(permuted), pixels(patches)[order])
-    np.testing.assert_array_equal(occluded_pixels(permuted), occluded_pixels(patches)[order])
-    np.testing.assert_array_equal(permuted.clear, patches.clear[order])
 
 
 def test_only_the_nearest_neighbours_occlude():

@@ -191,17 +191,6 @@ def test_track_refuses_a_folder_before_it_tracks(run_psotrack, flight, tmp_path,
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-@pytest.mark.parametrize("offset", ["inf,0,0", "0,-inf,0", "0,0,nan"])
-def test_an_offset_that_is_no_number_of_metres_is_refused_before_tracking(
-    run_psotrack, flight, tmp_path, offset
-):
-    result = run_psotrack("track", flight, "--out", tmp_path / "tracks.csv", "--body-offset", offset)
-    assert result.code == 2
-    assert result.err.count("\n") == 1
-    assert "finite numbers" in result.err
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     "words",
     [

@@ -4,10 +4,9 @@ In tests by hand, cameras are so far away that metres are pixels.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, ring_rig
+from helpers import far_camera, float32, make_unnamed_rig, ring_rig
 from hypothesis import example, given
 from hypothesis import strategies as st
 from windows import (
@@ -25,9 +24,7 @@ from windows import (
 )
 
 from psotrack.foreground.silhouettes import box_sum
-from psotrack.geometry import make_extents
-from psotrack.tracking.swarm import SoftIoU
-from psotrack.tracking.swarm.fitness import ScoreInputs, camera_scores, drone_fitness, filled_share
+from psotrack.tracking.swarm.fitness import camera_scores, filled_share
 from psotrack.tracking.swarm.patches import NUM_LEVELS, SIDE
 
 #: In the middle; beside it; over the upper left and lower right borders in most cameras; outside all images.
@@ -256,52 +253,3 @@ def test_the_level_is_the_finest_that_contains_ring_and_search(distance_m, reach
         assert level == NUM_LEVELS - 1
     # A window of half the pixel size would not contain the ring and search for every position within a pixel.
     assert level == 0 or needed_px >= (SIDE / 2 - 1) * pixel_px / 2 - slack
-
-
-# Gradients.
-
-
-@pytest.mark.slow
-def test_gradients_agree_with_finite_differences():
-    """Windows of several levels that neighbours may cover, in float64."""
-    pair = np.array([[0.3, -0.2, 1.3], [0.65, -0.05, 1.4]])
-    images = draw_coverage(RIG, pair, SMALL_M, REDUCTION)
-    patches = cut_at(RIG, images, pair, SMALL_M, reach_m=0.65, reduction=REDUCTION)
-    assert set(levels(patches, REDUCTION).ravel()) >= {0, 1}
-    assert patches.clear.min() < 0.9
-    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
-        windows = jax.tree.map(jnp.asarray, patches)
-        view = ScoreInputs(make_extents(RIG.cameras, SMALL_M), windows, SoftIoU())
-
-        @jax.jit
-        def total(position_m):
-            return drone_fitness(view, position_m).sum()
-
-        position_m = pair + 0.013
-        gradient = np.asarray(jax.jit(jax.grad(total))(position_m))
-        # The score is smooth except at borders of pixels, which steps of a micrometre do not cross here. The error is
-        # the square of the step, 1e-12, plus rounding, 1e-16 / 1e-6.
-        steps = 1e-6 * np.eye(6).reshape(6, 2, 3)
-        expected = [(total(position_m + s) - total(position_m - s)) / 2e-6 for s in steps]
-    np.testing.assert_allclose(gradient.ravel(), expected, atol=1e-6)
-    assert np.abs(gradient).min() > 1e-3
-
-
-@pytest.mark.slow
-def test_gradients_are_finite_everywhere():
-    """Also beyond the windows, at a camera, behind a camera, and where a neighbour may cover the whole drone."""
-    expected_m = np.stack([TRUTH_M[0], TRUTH_M[0]])
-    images = draw_coverage(RIG, TRUTH_M[0], SMALL_M[0], REDUCTION)
-    patches = cut_at(
-        RIG, images, expected_m, SMALL_M, reach_m=REACH_M, occluding=[True, False], reduction=REDUCTION
-    )
-    at_cameras = RIG.cameras.centre_world[:4].reshape(2, 2, 3)
-    far = expected_m + 3 * np.random.default_rng(0).standard_normal((5, 2, 3))
-    places = np.concatenate([expected_m[None], expected_m[None] + 0.03, at_cameras, 1.5 * at_cameras, far])
-
-    def gradient(view, position_m):
-        return jax.vmap(jax.grad(lambda where: jnp.nansum(drone_fitness(view, where))))(position_m)
-
-    found = evaluate(gradient, RIG, patches, places, SMALL_M)
-    assert np.isfinite(found).all()
-    assert np.abs(found[1, 0]).max() > 0

@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal, norm
 
 from psotrack.tracking.births import (
     NEW,
+    FlightLimits,
     LostTracks,
     TrackCandidate,
     find_false_tracks,
@@ -51,8 +52,7 @@ def lost_tracks(*rows, left_m=()):
 
 
 def assigned_drones(found, gone, **keywords):
-    keywords = {"fps": FPS, "bounds_m": ROOM_M, "max_speed_m_s": 6.0} | keywords
-    return reidentify(tuple(found), gone, **keywords).tolist()
+    return reidentify(tuple(found), gone, FlightLimits(FPS, ROOM_M, 6.0), **keywords).tolist()
 
 
 AHEAD = ((-0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)

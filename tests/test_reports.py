@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from evaluation_flights import on_x_axis
 from helpers import make_once, ring_rig
 
+import psotrack as pt
 from psotrack.cli import cli
 from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry.rig_files import write_rig
@@ -197,6 +198,8 @@ class TestFlight:
 
     def test_without_a_recording(self, flight, tmp_path):
         out = run("report", flight / "tracks.csv", "--out", tmp_path / "alone.html")
+        again = pt.report(flight / "tracks.csv", tmp_path / "alone.html", force=True)
+        assert f"{again}\n" == out
         assert re.fullmatch(r".*alone\.html: 0\.\d MB\n", out)
         text = (tmp_path / "alone.html").read_text(encoding="utf-8")
         assert "<h2>Cameras</h2>" not in text

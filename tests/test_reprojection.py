@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, make_unnamed_rig, move_world, ring_rig
+from helpers import LENSES, make_unnamed_rig, move_world, points_in_room, project_points, ring_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -23,14 +23,6 @@ from psotrack.geometry import (
     undistort,
 )
 from psotrack.geometry.image_fit import project_with_jacobian
-
-
-def points_in_room(*shape, seed=0):
-    return np.random.default_rng(seed).uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (*shape, 3))
-
-
-def project_points(rig, points):
-    return project(rig.cameras, points[..., None, :])[0]
 
 
 def noisy_pixels(rig, points, seed=0, noise_px=1.0):
@@ -111,15 +103,6 @@ def test_exact_pixels_give_the_point(num_cameras, shape, coefficients, refine):
     # 1e-4 standard deviations of 5 to 20 mm, and it converges quadratically: measured 1e-9.
     np.testing.assert_allclose(found.position_m, points, atol=1e-8 if refine else 1e-6)
     np.testing.assert_allclose(found.reprojection_px, 0.0, atol=1e-5 if refine else 1e-3)
-
-
-def test_two_cameras_agree_with_opencv():
-    rig, points = ring_rig(2), points_in_room(31)
-    pixels = project_points(rig, points)
-    projections = rig.cameras.K @ rig.cameras.T_cam_world[:, :3]
-    homogeneous = cv2.triangulatePoints(*projections, pixels[:, 0].T.copy(), pixels[:, 1].T.copy())
-    found = reconstruct(rig.cameras, pixels)
-    np.testing.assert_allclose(found.position_m, (homogeneous[:3] / homogeneous[3]).T, atol=1e-6)
 
 
 def test_without_refinement_it_equals_triangulate():

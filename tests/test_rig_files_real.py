@@ -52,7 +52,7 @@ def test_caliscopes_points_are_where_its_cameras_saw_them(tmp_path, name):
 
 def test_aniposes_cameras_see_the_board_in_one_place():
     folder = published("talmolab/sleap-anipose") / "tests/data/minimal_session"
-    with pytest.raises(InputError, match="because anipose leaves it open"):
+    with pytest.raises(InputError, match="because the file leaves it open"):
         read_rig(folder / "calibration.toml")
     # The entry `side` is a copy of `top`.
     rig = read_rig(folder / "calibration.toml", metres_per_unit=1e-3).select(("back", "mid", "top"))

@@ -8,7 +8,9 @@ import pandas as pd
 import pytest
 from helpers import Output
 
+import psotrack as pt
 from psotrack.recordings import VideoWriter
+from psotrack.show.flights import find_recording
 
 Run = Callable[..., Output]
 
@@ -48,7 +50,7 @@ def test_ctrl_c_in_a_step_ends_the_run(
         raise KeyboardInterrupt
 
     write_video(tmp_path / "left.avi")
-    monkeypatch.setattr("psotrack.recordings.datasets.draft_recording", press)
+    monkeypatch.setattr("psotrack.api.draft_recording", press)
     with pytest.raises(KeyboardInterrupt):
         run_psotrack("run", tmp_path)
 
@@ -64,6 +66,17 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
     assert "the board is a ChArUco board of 4 x 5 squares of 250 mm" in done.out
     assert commands_in(done) == ["calibrate", "init", "doctor", "track", "report", "overlay"]
     results = lab / "results"
+    summary = done.out[done.out.rindex("\nlab\n") :]
+    for words in (
+        "drones      4",
+        "frames      50, in 2.0 s",
+        "tracked in",
+        "doctor",
+        "clocks",
+        "report.html",
+    ):
+        assert words in summary
+    assert find_recording(results / "tracks.csv").resolve() == lab.resolve()
     assert {"report.html", "tracks.csv", "doctor.json", "overlay"} <= {
         path.name for path in results.iterdir()
     }
@@ -72,8 +85,11 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
     before = (results / "tracks.csv").stat().st_mtime_ns
     (results / "report.html").unlink()
     again = run_psotrack(*words)
-    assert [line.split()[2] for line in again.out.splitlines() if line.startswith("$ psotrack ")] == [
-        "report",
-        "overlay",
-    ]
+    assert commands_in(again) == ["report", "overlay"]
+    # The summary comes also where nothing was left to do, and is the same in Python.
+    said: list[str] = []
+    found = pt.run(lab, say=said.append, progress=False)
+    assert [words.split()[2] for words in said if words.startswith("$")] == ["overlay"]
+    assert str(found) in again.out
+    assert found.to_dict()["drones"] == 4
     assert (results / "tracks.csv").stat().st_mtime_ns == before

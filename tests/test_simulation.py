@@ -40,7 +40,7 @@ from psotrack.simulation import (
     simulate,
 )
 from psotrack.simulation.imaging.onboard import OnboardRenderer
-from psotrack.simulation.unfinished import unfinished
+from psotrack.simulation.segments import unfinished
 
 NAME = "S02_D4_A"
 SMALL = SimulationSettings(num_frames=3, scale=0.1)

@@ -16,7 +16,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.scenarios import Mesh, Rotor
-from psotrack.simulation.world import drones, shapes
+from psotrack.simulation.world import drones, models
 
 MODELS = {name: drones.model(name) for name in drones.MODELS}
 
@@ -88,7 +88,7 @@ def test_rotors_turn_above_their_motors_without_touching_each_other(name):
 
 def test_each_rotor_disc_has_the_radius_of_its_rotor():
     model = drones.DroneModel(
-        shapes.box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
+        models.box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
         np.ones(12),
         np.array([[0.2, 0.0, 0.1], [-0.3, 0.1, 0.2]]),
         np.array([0.05, 0.4]),

@@ -27,8 +27,7 @@ from psotrack.recordings.datasets import (
     write_mocap_markers,
 )
 from psotrack.simulation import CameraRenderer, build, change_scenario, scenario
-from psotrack.simulation.flights.formulas import HarmonicFlight
-from psotrack.simulation.flights.motion import Heading
+from psotrack.simulation.flights.motion import HarmonicFlight, Heading
 from psotrack.simulation.imaging.raster import RasterView, pinhole
 from psotrack.simulation.labels.detector import detect, iou
 from psotrack.simulation.labels.masks import Silhouette, silhouettes

@@ -16,8 +16,7 @@ from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import backdrop, raster, sensor
 from psotrack.simulation.imaging.onboard import OnboardRenderer, intrinsics, onboard_poses
-from psotrack.simulation.imaging.order import Order
-from psotrack.simulation.imaging.painter import LIGHT_UNIT, RoomPainter
+from psotrack.simulation.imaging.painter import LIGHT_UNIT, Order, RoomPainter
 from psotrack.simulation.imaging.shadows import FloorLight
 from psotrack.simulation.scenarios import OnboardCamera
 from psotrack.simulation.world.rooms import MARKER_DICTIONARY, Surface

@@ -16,11 +16,18 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError, SettingsError, install_command
 from psotrack.simulation import flight_space
 from psotrack.simulation.flights import devices
-from psotrack.simulation.flights.devices import Gamepad, Pilot, Script, key_sticks, open_device
-from psotrack.simulation.flights.dynamics import DYNAMICS, Space, Sticks
+from psotrack.simulation.flights.devices import Gamepad, Panel, Pilot, Script, key_sticks, open_device
 from psotrack.simulation.flights.motion import Heading
-from psotrack.simulation.flights.panel import Panel
-from psotrack.simulation.flights.piloting import Sample, fly, read_sticks, until, write_sticks
+from psotrack.simulation.flights.piloting import (
+    DYNAMICS,
+    Sample,
+    Space,
+    Sticks,
+    fly,
+    read_sticks,
+    until,
+    write_sticks,
+)
 from psotrack.simulation.flights.recordings import read_recorded_flight, recorded_flight
 from psotrack.simulation.scenarios import FlightFromFile
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.simulation import Scenario, write_recorded_flight
-from psotrack.simulation.flights.formulas import HarmonicFlight
-from psotrack.simulation.flights.motion import Heading
+from psotrack.simulation.flights.motion import HarmonicFlight, Heading
 from psotrack.simulation.flights.planning import plan
 from psotrack.simulation.flights.recordings import (
     Recorded,

@@ -23,6 +23,7 @@ from test_map_markers import make_walk
 from test_synchronisation import make_recording
 
 from psotrack.geometry.rig_files import write_rig
+from psotrack.show.flights import find_recording
 
 #: Content of the files that a command is to replace.
 OLDER = b"older"
@@ -316,7 +317,11 @@ def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
         return {path: path.stat().st_mtime_ns for path in Path("demo/Simulated_Data").rglob("*")}
 
     whole, made = content_of(disk.place), simulated()
-    results = [Path("demo/tracks.csv"), Path("demo/demo.png")]
+    results = [
+        Path("demo", name) for name in ("tracks.csv", "tracks.json", "tracks.ambiguity.csv", "demo.png")
+    ]
+    # Found: the demo wrote no record, so that `psotrack view demo/tracks.csv` had no cameras.
+    assert find_recording(results[0]).resolve() == Path("demo/Simulated_Data/S02_D4_A").resolve()
     for pages in (0, 2, results[0].stat().st_size // PAGE_BYTES + 2):
         for path in results:
             path.unlink(missing_ok=True)

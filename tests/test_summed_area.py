@@ -74,48 +74,11 @@ def test_fractional_boxes_are_area_weighted_sums(edges, seed):
         assert actual[i, c] == pytest.approx(expected, abs=0.05, rel=1e-6)
 
 
-def test_empty_boxes_have_sum_zero_and_others_are_cut_at_the_border():
-    """Boxes without width, in the wrong order, outside on each side, and a point; then one beyond all borders."""
-    empty = [(3, 3, 3, 9), (9, 2, 4, 8), (2, 8, 6, 3), (3.3, 2.2, 3.3, 2.2)]
-    empty += [(-8, 2, -1, 5), (17, 0, 30, 13), (2, -9, 5, -2), (2, 13, 5, 20)]
-    boxes = np.array([*empty, (-100, -100, 100, 100)], np.float64)[:, None]
-    images = random_images((1, 13, 17))
-    assert box_sums(images, np.zeros(1), boxes).ravel().tolist() == [0] * 8 + [images.sum(dtype=int)]
-
-
 def test_exact_where_sums_exceed_float32():
     """The sum of a 1080p image is 5e8, beyond float32's 2^24, which must not affect a small box at the image's end."""
     images = np.full((1, 1080, 1920), 255, np.uint8)
     boxes = np.array([[[1917, 1078, 1920, 1080]], [[1900.5, 1070.25, 1903.0, 1071.0]]])
     assert box_sums(images, np.zeros(1), boxes).ravel().tolist() == [3 * 2 * 255, 2.5 * 0.75 * 255]
-
-
-def test_gradient_is_the_line_that_an_edge_sweeps():
-    """The derivative of the area-weighted sum, by central differences of the float64 oracle."""
-    image = random_images((1, 13, 17))
-    edges = np.array([2.3, 3.6, 9.4, 11.2])
-
-    def total(edges):
-        return box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
-
-    gradient = jax.jit(jax.grad(total))(jnp.asarray(edges, jnp.float32))
-    # The sum is linear as long as no edge enters another pixel, so such differences are exact.
-    steps = 0.1 * np.eye(4)
-    expected = [
-        (area_weighted_sum(image[0], *(edges + s)) - area_weighted_sum(image[0], *(edges - s))) / 0.2
-        for s in steps
-    ]
-    np.testing.assert_allclose(gradient, expected, rtol=1e-4)
-
-
-def test_gradient_is_finite_everywhere():
-    image = random_images((1, 5, 7))
-
-    def total(edges):
-        return box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
-
-    boxes = jnp.array([[0.0, 0, 7, 5], [3, 3, 3, 3], [5, 4, 1, 1], [-9, -9, -8, -8], [-1e30, 0, 1e30, 5]])
-    assert np.isfinite(jax.jit(jax.vmap(jax.grad(total)))(boxes)).all()
 
 
 # Two images in one table.

@@ -15,7 +15,8 @@ from helpers import listening_at
 from sweeps import all_rows, environment, grid_file, psotrack, small_sequence
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.sweep import Cluster, read_grid, run_on_cluster
+from psotrack.sweep import Cluster, Inputs, Store, read_grid
+from psotrack.sweep.cluster import run_on_cluster
 
 pytest.importorskip("distributed")
 
@@ -57,10 +58,10 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
     assert json.loads(again.stdout) == {"finished": 0, "failed": 0, "left": 4}
 
 
-def test_without_dask_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_without_dask_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(SettingsError, match=r"expected Dask, found .*; pip install '\.\[dask\]'"):
-        run_on_cluster(read_grid(grid_file(tmp_path, [2])), tmp_path, data=tmp_path, cache=tmp_path)
+        Cluster()
 
 
 @pytest.mark.slow
@@ -107,11 +108,9 @@ def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
         raise OSError("nobody listens")
 
     monkeypatch.setattr("distributed.Client", refuse)
-    (tmp_path / "Simulated_Data" / "S01_D2_A").mkdir(parents=True)
-    grid, cluster = read_grid(grid_file(tmp_path, [2])), Cluster(address)
-    monkeypatch.setattr("psotrack.sweep.cluster.sort_out", lambda grid, *_: ([], grid.cells()))
+    cells = read_grid(grid_file(tmp_path, [2])).cells()
     with pytest.raises(InputError, match="nobody listens"):
-        run_on_cluster(grid, tmp_path / "out", data=tmp_path, cache=tmp_path, cluster=cluster)
+        next(run_on_cluster(Cluster(address), list(cells), Inputs(tmp_path, tmp_path), Store(tmp_path)))
     lines = [record.getMessage() for record in caplog.records if "TLS" in record.getMessage()]
     assert len(lines) == warned
     assert all(line.startswith(f"--cluster {address}: ") for line in lines)

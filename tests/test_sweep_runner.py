@@ -115,7 +115,7 @@ def test_a_sweep_drops_the_programs_of_other_shapes(
     monkeypatch.setattr(runner, "track_runs", compile_and_find_nothing)
     (tmp_path / "limit").write_text("0")
     monkeypatch.setattr(compiled, "_MAP_LIMIT", tmp_path / "limit")
-    sweep(varied(2, 3, 4), tmp_path / "out", data=root, cache=root / "cache")
+    sweep(varied(2, 3, 4), tmp_path / "out", data=root, cache=root / "cache").rows()
     assert kept == [[], [0], [0, 0]]
     assert programs[-1]._cache_size() == 1
 
@@ -169,7 +169,7 @@ def test_finished_cells_are_not_run_again(root: Path, swept: Path) -> None:
     assert list(manifest["inputs"]) == rows["input"].unique().tolist()
     assert {run["device"]["processor"] for run in manifest["runs"]} == set(rows["device.processor"])
     assert {run["commit"] for run in manifest["runs"]} == set(rows["commit"])
-    assert len(sweep(swept / "good.toml", swept / "results", data=root, cache=root / "cache")) == 8
+    assert len(sweep(swept / "good.toml", swept / "results", data=root, cache=root / "cache").rows()) == 8
     assert stamps(swept / "results") == before
     once_more = json.loads((swept / "results" / "_manifest.json").read_text())["runs"]
     assert [run["cells"] for run in once_more] == [8, 4]
@@ -207,7 +207,7 @@ def test_an_estimate_counts_the_cells_and_takes_the_time_of_finished_runs(
     assert f"{before}" == (
         "2 cells: 0 finished, 2 to run (4 runs); how long they take is known when a cell is finished"
     )
-    rows = sweep(varied(3, runs=2), tmp_path, data=root, cache=root / "cache")
+    rows = sweep(varied(3, runs=2), tmp_path, data=root, cache=root / "cache").rows()
     # Two runs in a batch of 31 s, each of which compiled for 10 s.
     rows["seconds.batch"], rows["seconds.compile"] = 31.0, 10.0
     store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0, 1]}))
@@ -258,14 +258,14 @@ def test_a_missing_gpu_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_in_python_the_rows_are_the_rows_of_the_grid(root: Path, tracker: Tracker, tmp_path: Path) -> None:
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
-    rows = sweep(varied(3, 4, runs=2), out, **folders)
+    rows = sweep(varied(3, 4, runs=2), out, **folders).rows()
     assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
     assert (rows["missed_rate"] == 1).all()
     rows = sweep(grid_of(varied(5, 4)), out, **folders)
     assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[5, 0], [4, 0]]
     # More runs of a finished cell only add rows.
     (tmp_path / "grid.toml").write_text(grid_file(tmp_path, [3], runs=3).read_text())
-    assert sweep(tmp_path / "grid.toml", out, **folders)["seed"].tolist() == [0, 1, 2]
+    assert sweep(tmp_path / "grid.toml", out, **folders).rows()["seed"].tolist() == [0, 1, 2]
     assert tracker.runs == [(3, [0, 1]), (4, [0, 1]), (5, [0]), (3, [2])]
 
 
@@ -273,13 +273,13 @@ def test_in_python_the_rows_are_the_rows_of_the_grid(root: Path, tracker: Tracke
 def test_a_failure_is_removed_when_the_cell_is_finished(root: Path, tracker: Tracker, tmp_path: Path) -> None:
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
     tracker.failing = {3}
-    rows = sweep(varied(3, 4), out, **folders)
+    rows = sweep(varied(3, 4), out, **folders).rows()
     assert rows["settings.swarm.iterations"].tolist() == [4]
     assert rows.attrs["errors"] == ["S01_D2_A swarm.iterations=3: ZeroDivisionError: planted"]
     (kept,) = (json.loads(path.read_text()) for path in (out / "cells").glob("_*.error.json"))
     assert "in __call__" in kept["where"]
     tracker.failing = set()
-    assert len(sweep(varied(3, 4), out, **folders)) == 2
+    assert len(sweep(varied(3, 4), out, **folders).rows()) == 2
     assert Store(out).status()["failed"] == 0
     assert tracker.runs == [(4, [0]), (3, [0])]
 
@@ -295,10 +295,10 @@ def test_a_failure_to_read_is_removed_when_the_cell_is_finished(
     with pytest.raises(
         InputError, match=r"all failed: S01_D2_A swarm.iterations=3: .*found neither recording.toml nor"
     ):
-        sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
+        sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache").rows()
     assert Store(tmp_path / "out").status()["failed"] == 1
     (tmp_path / calibration.name).rename(calibration)
-    rows = sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache")
+    rows = sweep(varied(3), tmp_path / "out", data=data, cache=root / "cache").rows()
     assert Store(tmp_path / "out").status()["failed"] == 0
     assert rows.attrs["errors"] == []
 
@@ -313,7 +313,7 @@ def test_a_runner_waits_for_locked_cells_and_runs_them_when_they_are_unlocked(
     # If an assertion fails, the lock is released before the pool waits for its thread.
     with ThreadPoolExecutor(1) as threads:
         with Store(out).lock(cell_key(first, inputs.keys_of(first))):
-            waiting = threads.submit(runner.run_in_process, grid, out, data=root, cache=root / "cache")
+            waiting = threads.submit(sweep, grid, out, data=root, cache=root / "cache")
             while not tracker.runs:
                 assert not waiting.done(), waiting.result()
                 time.sleep(0.05)
@@ -343,15 +343,15 @@ def test_a_changed_tracker_runs_every_cell_again(
 ) -> None:
     """Rows of the older code stay in the folder, and no table mixes them with the new ones."""
     out, folders = tmp_path / "out", {"data": root, "cache": root / "cache"}
-    older = sweep(varied(3), out, **folders)
+    older = sweep(varied(3), out, **folders).rows()
     monkeypatch.setattr(inputs_of_cells, "code_digest", lambda: "changed")
-    newer = sweep(varied(3), out, **folders)
+    newer = sweep(varied(3), out, **folders).rows()
     assert tracker.runs == [(3, [0]), (3, [0])]
     assert older["cell"][0] != newer["cell"][0]
     assert Store(out).rows()["cell"].tolist() == newer["cell"].tolist()
     monkeypatch.undo()
     Tracker(monkeypatch)
-    assert sweep(varied(3), out, **folders)["cell"].tolist() == older["cell"].tolist()
+    assert sweep(varied(3), out, **folders).rows()["cell"].tolist() == older["cell"].tolist()
     assert Store(out).rows()["cell"].tolist() == older["cell"].tolist()
 
 
@@ -391,7 +391,7 @@ def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path,
     program = "import sys; from psotrack.sweep import runner, perturbations; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     names = [name.replace(".", "/") for name in done.stdout.split() if name.startswith("psotrack.")]
-    needless = ("sweep/grid_files", "sweep/locks", "sweep/tables")
+    needless = ("sweep/locks", "sweep/tables")
     left_out = tuple(f"psotrack/{name}" for name in machine.COMPUTES_NO_ROW if name not in needless)
     assert [name for name in names if f"{name}/".startswith(left_out)] == []
 
@@ -401,7 +401,7 @@ def test_only_the_instants_of_a_run_count(root: Path, tmp_path: Path) -> None:
     """With fewer frames, or another rate, than the reference: drones are not missed where nothing was tracked."""
     folders = {"data": root, "cache": root / "cache"}
     grid = {"sequences": ["S01_D2_A"], "settings": SETTINGS, "grid": {"frames": [4], "rate_hz": [25.0, 12.5]}}
-    rows = sweep(grid, tmp_path / "out", **folders)
+    rows = sweep(grid, tmp_path / "out", **folders).rows()
     assert rows["missed_rate"].tolist() == [0.0, 0.0]
     assert (rows["mean_error_m"] < 0.2).all()
     frames = [Store(tmp_path / "out").errors(key, [0])["frame"].nunique() for key in rows["cell"]]

@@ -162,16 +162,6 @@ class TestWriting:
         assert paths[0].read_bytes() == paths[1].read_bytes()
 
     @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_an_existing_file_is_replaced_only_by_force(self, tmp_path, suffix):
-        path = tmp_path / f"tracks{suffix}"
-        path.write_text("precious")
-        with pytest.raises(OutputError, match="pass --force"):
-            write_trajectories(path, two_drones())
-        assert path.read_text() == "precious"
-        write_trajectories(path, two_drones(), force=True)
-        assert read_trajectories(path).num_frames == 3
-
-    @pytest.mark.parametrize("suffix", SUFFIXES)
     def test_a_full_disk_leaves_the_old_file(self, tmp_path, suffix, monkeypatch):
         # A module that is imported under the limit would leave an incomplete bytecode file for other processes.
         monkeypatch.setattr(sys, "dont_write_bytecode", True)
@@ -334,13 +324,6 @@ class TestBadFiles:
         with pytest.raises(InputError, match="no such file"):
             read_trajectories(tmp_path / f"nowhere{suffix}")
 
-    @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_bytes_that_are_not_a_table(self, tmp_path, suffix):
-        path = tmp_path / f"noise{suffix}"
-        path.write_bytes(np.random.default_rng(0).bytes(500))
-        with pytest.raises(InputError, match=f"noise{suffix}: expected a (CSV table in UTF-8|Parquet file)"):
-            read_trajectories(path)
-
     def test_a_truncated_parquet_file(self, tmp_path):
         path = tmp_path / "tracks.parquet"
         write_trajectories(path, two_drones())
@@ -403,16 +386,8 @@ class TestTum:
     def test_a_drone_that_was_never_seen_has_a_file_too(self, tmp_path):
         never = two_drones()
         never.status[:, 1] = Status.LOST
-        with pytest.raises(InputError, match="at least one pose"):
+        with pytest.raises(InputError, match="at least one line with numbers"):
             read_tum(write_tum(tmp_path, never)[1])
-
-    def test_existing_files_are_replaced_only_by_force(self, tmp_path):
-        (tmp_path / "dron2.tum").write_text("precious")
-        with pytest.raises(OutputError, match="pass --force"):
-            write_tum(tmp_path, two_drones())
-        assert [path.name for path in tmp_path.iterdir()] == ["dron2.tum"]
-        write_tum(tmp_path, two_drones(), force=True)
-        assert read_tum(tmp_path / "dron2.tum").num_frames == 2
 
     @pytest.mark.parametrize("name", ["a/b", ""])
     def test_drone_names_that_cannot_be_file_names(self, tmp_path, name):

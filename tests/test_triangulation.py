@@ -1,26 +1,14 @@
 """Triangulation against exact cases, OpenCV (two cameras) and explicit least squares; viewpoints."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, make_unnamed_rig, ring_rig
+from helpers import LENSES, make_unnamed_rig, points_in_room, project_points, ring_rig
 
 from psotrack.geometry import (
-    Rig,
-    project,
     triangulate_linearly,
     viewpoints,
 )
-
-
-def points_in_room(*shape, seed=0):
-    return np.random.default_rng(seed).uniform((-1.5, -1.5, 0.3), (1.5, 1.5, 2.3), (*shape, 3))
-
-
-def project_points(rig, points):
-    return project(rig.cameras, points[..., None, :])[0]
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
@@ -68,29 +56,6 @@ def test_weighted_least_squares():
         expected = np.linalg.lstsq(np.array(rows), np.array(right))[0]
         # Normal equations square the condition number, here about 10.
         np.testing.assert_allclose(found[n], expected, atol=1e-10)
-
-
-def test_the_pseudoinverse_of_the_paper():
-    """Equations (3)-(6) in pixels as they are printed, X = pinv(L) B with p1, p2, p3 the rows of K [R | t].
-
-    A row in pixels is the row in normalised coordinates times the focal length, which all cameras share, as in the
-    paper.
-    """
-    rig, points = ring_rig(5), points_in_room(11)
-    one = np.broadcast_to(rig.cameras.K[0], (5, 3, 3)).copy()
-    one[:, 1, 1] = one[:, 0, 0]
-    rig = Rig(rig.names, replace(rig.cameras, K=one))
-    pixels = project_points(rig, points) + np.random.default_rng(4).normal(0, 1.0, (11, 5, 2))
-    P = one @ rig.cameras.T_cam_world[:, :3]
-    for n in range(11):
-        L = [pixels[n, c, i] * P[c, 2, :3] - P[c, i, :3] for c in range(5) for i in range(2)]
-        B = [P[c, i, 3] - pixels[n, c, i] * P[c, 2, 3] for c in range(5) for i in range(2)]
-        # As above: two ways of solving one system of condition 10.
-        np.testing.assert_allclose(
-            triangulate_linearly(rig.cameras, pixels)[n],
-            np.linalg.pinv(np.array(L)) @ np.array(B),
-            atol=1e-10,
-        )
 
 
 def test_a_camera_that_does_not_see_the_point_does_not_count():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -35,7 +37,7 @@ from psotrack.geometry import project
 from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.show.flights import read_flight, view_in_images
-from psotrack.show.viewer import LiveView, ViewContent, write_flight
+from psotrack.show.viewer import LiveView, ViewContent, viewer_program, write_flight
 from psotrack.trajectories import read_trajectories, write_trajectories
 
 
@@ -424,6 +426,12 @@ def test_rows_of_a_live_session_arrive_in_the_viewer(folder, tmp_path):
         for frame in range(NUM_FRAMES):
             view.write(tracks.at_frames(np.array([frame])))
             view.show_delay(0.02)
+        last = tracks.at_frames(np.array([NUM_FRAMES - 1]))
+        view.write(
+            replace(
+                last, frame=last.frame + 1, time_s=last.time_s + 0.04, position_m=last.position_m * np.nan
+            )
+        )
         address = re.findall(r"%3A(\d+)%2Fproxy", view.page)[0]
         program = (sys.executable, "-m", "rerun_cli", "--connect", f"rerun+http://127.0.0.1:{address}/proxy")
         keeper = subprocess.Popen(
@@ -436,16 +444,40 @@ def test_rows_of_a_live_session_arrive_in_the_viewer(folder, tmp_path):
         os.killpg(keeper.pid, signal.SIGTERM)
         keeper.wait(20)
     entities = read_entities(saved)
-    centres = np.array(entities["/world/drones/1/body"]["Boxes3D:centers"][1])[:, 0]
-    np.testing.assert_allclose(centres, tracks.position_m[:, 1], atol=1e-6)
+    # The drones are one entity, which the viewer gets in a tenth of the time of one entity per drone.
+    body = entities["/world/drones/body"]
+    np.testing.assert_allclose(body["Boxes3D:centers"][1][:-1], tracks.position_m, atol=1e-6)
+    assert body["Boxes3D:centers"][1][-1] == [], "drones without a place are not shown"
     words = [word[0] for word in entities["/status/1"]["StateChange:state"][1]]
     assert words == ["tracked", "coasting", "tracked"]
-    # Lines have the colours of the drones.
-    for drone in "01":
-        line = entities[f"/plots/deviation_mm/{drone}"]["SeriesLines:colors"][1]
-        assert line[0] == entities[f"/world/drones/{drone}/body"]["Boxes3D:colors"][1][0]
-    # A lost drone has no ellipsoid.
-    frames, half_sizes = entities["/world/drones/0/ellipsoid"]["Ellipsoids3D:half_sizes"]
-    assert max(frame for frame, half in zip(frames, half_sizes, strict=True) if half) == LOST_FROM - 1
+    # Lines have the colours of the drones, and a lost drone has neither a line nor an ellipsoid.
+    line, deviation = entities["/plots/deviation_mm"], 1e3 * np.sqrt(0.0056)
+    assert line["SeriesLines:colors"][1][0] == body["Boxes3D:colors"][1][0]
+    assert line["SeriesLines:names"][1][0] == ["0", "1"]
+    expected_mm = np.where(np.arange(NUM_FRAMES + 1)[:, None] < [LOST_FROM, NUM_FRAMES], deviation, np.nan)
+    np.testing.assert_allclose(line["Scalars:scalars"][1], expected_mm, rtol=1e-6)
+    ellipsoids = entities["/world/drones/ellipsoid"]["Ellipsoids3D:half_sizes"][1]
+    assert [len(each) for each in ellipsoids] == [2] * LOST_FROM + [1] * (NUM_FRAMES - LOST_FROM) + [0]
+    # A trail begins with the drone and gets longer.
+    trails = entities["/world/drones/trail"]["LineStrips3D:strips"][1]
+    np.testing.assert_allclose(trails[-2], tracks.position_m.swapaxes(0, 1), atol=1e-6)
     assert entities["/plots/delay_ms"]["Scalars:scalars"][1] == [[20.0]] * NUM_FRAMES
     assert "/world/cameras/c0" in entities
+
+
+def test_no_other_program_takes_the_port_of_the_viewer(monkeypatch):
+    """A port that was free when it was looked for may be taken when the viewer starts."""
+    taken, start = [], subprocess.Popen
+
+    def start_late(command, **options):
+        for port in (int(word) for word in command if word.isdigit() and int(word)):
+            taken.append(socket.create_server(("127.0.0.1", port)))
+        return start(command, **options)
+
+    monkeypatch.setattr(subprocess, "Popen", start_late)
+    with contextlib.ExitStack() as ends:
+        program = ends.enter_context(viewer_program(web=True))
+        for server in taken:
+            ends.enter_context(server)
+        with urllib.request.urlopen(program.page, timeout=10) as answer:
+            assert b"<html" in answer.read().lower()

@@ -29,7 +29,7 @@ from bat_flights import RealFlight, read_flight, write_recording
 from formula_flights import FPS, SCENES, make_flight
 from jaxtyping import Float
 
-from psotrack.tracking.births import FlightVolume, flight_volume, moving_detections
+from psotrack.tracking.births import FlightVolume, flight_volume, moving_points
 from psotrack.tracking.matching import Sightings, from_detections
 from psotrack.trajectories import read_trajectories
 from psotrack.trajectories.association import GATE_M, identity_switches, partners_per_frame
@@ -93,7 +93,7 @@ class StoneSoupInputs:
     @cached_property
     def volume(self) -> FlightVolume:
         """Bounds and speed limit."""
-        moving = moving_detections(self.flight.rig, self.sightings, self.flight.fps)
+        moving = moving_points(self.flight.rig, self.sightings, self.flight.fps)
         return flight_volume(self.flight.rig, moving)
 
     @cached_property

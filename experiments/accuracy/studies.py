@@ -15,7 +15,7 @@ import _runs
 import numpy as np
 import pandas as pd
 
-from psotrack.support import atomic_write, keep_compiled, progress_bar
+from psotrack.support import atomic_write, keep_compiled
 from psotrack.sweep import read_grid, sweep
 
 GRIDS = Path(__file__).parent / "studies"
@@ -39,8 +39,8 @@ def run_study(study: str, data: Path) -> pd.DataFrame:
         _runs.simulated(Path(sequence).name, data, seed)
     keep_compiled(_runs.cache_folder(data) / "compiled")
     rows = sweep(
-        grid, data / "studies" / study, data=data, cache=_runs.cache_folder(data), report=progress_bar
-    )
+        grid, data / "studies" / study, data=data, cache=_runs.cache_folder(data), progress=True
+    ).rows()
     flight = {key: number for number, key in enumerate(dict.fromkeys(rows["input"]))}
     return rows.assign(
         study=study,

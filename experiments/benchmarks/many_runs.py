@@ -408,7 +408,7 @@ def time_grid(grid: Grid, data: Path, cache: Path) -> dict[str, Any]:
     for _ in range(2):
         with tempfile.TemporaryDirectory() as out, clock(side_by_side=True) as spent:
             began = time.perf_counter()
-            rows = sweep(grid, out, data=data, cache=cache)
+            rows = sweep(grid, out, data=data, cache=cache).rows()
             total_s = time.perf_counter() - began - spent["aside"] - spent["compile"]
     if rows.attrs["errors"]:
         sys.exit("\n".join(f"bench-gpu: {error}" for error in rows.attrs["errors"]))

@@ -18,7 +18,6 @@ import pandas as pd
 
 from psotrack.errors import PsotrackError
 from psotrack.recordings.datasets import CALIBRATION
-from psotrack.support import progress_bar
 from psotrack.sweep import grid, pivot, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -91,7 +90,7 @@ def simulated(data: Path) -> Path:
     for name in SIMULATED:
         if not (data / "Simulated_Data" / name).is_dir():
             print(f"simulating {name}", flush=True)
-            simulate(name, data, SimulationSettings(masks=False, onboard=False), report=progress_bar)
+            simulate(name, data, SimulationSettings(masks=False, onboard=False), progress=True)
     return data
 
 
@@ -108,7 +107,7 @@ def tracked(cells: dict, out: Path, data: Path) -> pd.DataFrame:
     from psotrack.support import keep_compiled
 
     keep_compiled(out / "cache" / "compiled")
-    return sweep(grid(cells), out, data=data, cache=out / "cache", report=progress_bar)
+    return sweep(grid(cells), out, data=data, cache=out / "cache", progress=True).rows()
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:

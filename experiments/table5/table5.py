@@ -18,7 +18,6 @@ from pathlib import Path
 import pandas as pd
 
 from psotrack.errors import PsotrackError
-from psotrack.support import progress_bar
 from psotrack.sweep import Grid, Store, pivot, read_grid, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -81,7 +80,7 @@ def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
             print(f"simulating {name}", flush=True)
             size = {"num_frames": QUICK_FRAMES, "scale": QUICK_SCALE} if quick else {}
             settings = SimulationSettings(masks=False, onboard=False, **size)
-            simulate(name, data, settings, report=progress_bar)
+            simulate(name, data, settings, progress=True)
     return data
 
 
@@ -90,7 +89,7 @@ def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
     from psotrack.support import keep_compiled
 
     keep_compiled(out / "cache" / "compiled")
-    return sweep(grid, out, data=data, cache=out / "cache", report=progress_bar)
+    return sweep(grid, out, data=data, cache=out / "cache", progress=True).rows()
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:

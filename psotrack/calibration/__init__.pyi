@@ -16,9 +16,12 @@ from .image_points import (
 )
 from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
 from .lens_models import LensModel, known_lenses, parse_lens_model
+from .placed_cameras import PlacedCameras, place_cameras, row_of
 from .pose_search import MIN_POINTS
 from .residuals import GATE, UNLIKELY, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
+from .rig.by_board import RigCalibration, calibrate_by_board
+from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
     CameraFigures,
     advise,
@@ -44,6 +47,7 @@ from .rig.point_files import (
     views_of_detections,
 )
 from .rig.point_shifts import PointShift, find_point_shifts
+from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.views import BoardViews, FoundBoards, find_views
 from .rig.world import Similarity, align, world_of_camera
 from .significance import Improved, find_wrong_cameras, improve
@@ -56,6 +60,7 @@ __all__ = [
     "AdjustedRig",
     "Board",
     "BoardFinder",
+    "BoardSettings",
     "BoardViews",
     "CalibratedRig",
     "CameraFigures",
@@ -69,15 +74,23 @@ __all__ = [
     "Lens",
     "LensChoice",
     "LensModel",
+    "LensSettings",
     "Located",
     "ModelComparison",
+    "PlacedCameras",
     "PointRig",
+    "PointSettings",
     "PointShift",
     "PointViews",
+    "RigCalibration",
+    "RigSettings",
     "Similarity",
     "adjust",
     "advise",
     "align",
+    "calibrate_by_board",
+    "calibrate_by_known_points",
+    "calibrate_by_moving_point",
     "calibrate_by_point",
     "calibrate_rig",
     "centre_by_pose",
@@ -110,10 +123,12 @@ __all__ = [
     "open_images",
     "open_recorded",
     "parse_lens_model",
+    "place_cameras",
     "read_image_points",
     "read_point_views",
     "read_world",
     "reproject",
+    "row_of",
     "save_board",
     "save_coverage",
     "say_not_compared",

@@ -52,8 +52,6 @@ _MOST_SQUARES = 20
 _FITS = 0.2
 #: Sides of a marker in sides of a square that are tried: one of them is near enough to any that is printed.
 _SHARES = (0.75, 0.5)
-#: Sides of a chessboard that are tried differ from the stated ones by at most this.
-_OTHER_SIZES = 2
 
 #: Markers of an image by number, and their middles, pixels.
 _Markers = dict[int, Float[np.ndarray, "2"]]
@@ -134,7 +132,7 @@ def detect_board(square_m: float, images: Sequence[UInt8[np.ndarray, "height wid
             "board",
             expected="a ChArUco board or a chessboard",
             found=f"markers {min(ids)} to {max(ids)} of the dictionary {_smallest(family, max(ids))} in another order",
-            remedy="say with --board, --squares, --marker and --dictionary what the board is",
+            remedy="say with --board, --squares, --marker, --dictionary and --first-marker what the board is",
         )
     dictionary = _smallest(family, size[0] * size[1] // 2 - 1)
     board = Board(size, square_m, square_m / 2, dictionary)
@@ -266,53 +264,34 @@ def _any_inside(
     return any(cv2.pointPolygonTest(hull, (float(u), float(v)), False) > 0 for u, v in points_px)
 
 
-def explain_missing_board(
-    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
-) -> tuple[str, str]:
-    """Say what is seen instead of a board that is not found in any image.
-
-    Returns:
-        what was found, and what to do; both are parts of a message.
-    """
-    if board.kind == "chessboard":
-        return _explain_missing_chessboard(board, images)
+def missing_board(board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]) -> InputError:
+    """The error for a board that is not found in any image: it says what is seen instead."""
     if board.num_markers == 1:
-        return _explain_missing_marker(images)
-    counted = [(len(ids), name, turned, ids) for name, turned, ids in _markers_of_all_dictionaries(images)]
-    most, family, inverted, ids = max(counted, key=lambda one: one[0], default=(0, "", False, np.zeros(0)))
-    if most < _LEAST_MARKERS:
-        return (
-            f"no such board, and no markers of any known dictionary, in {len(images)} images",
-            "check that the board is large and sharp enough in the images",
-        )
-    dictionary = _smallest(family, int(ids.max()))
-    how = ", printed white on black" if inverted else ""
-    if family != _family(board.dictionary) or int(ids.max()) >= _size(board.dictionary):
-        return (
-            f"markers {ids.min()} to {ids.max()} of the dictionary {dictionary}{how}",
-            f"pass --dictionary {dictionary}",
-        )
-    if board.kind == "charuco":
-        size = _size_by_markers(
-            replace(board, dictionary=f"{family}_1000" if _FAMILIES[family] else family), images, inverted
-        )
-        if size is not None and size != board.squares_wh:
-            return (
-                f"markers {ids.min()} to {ids.max()} in the order of a board of {size[0]} x {size[1]} squares{how}",
-                f"pass --squares {size[0]}x{size[1]}",
-            )
-    if board.kind == "grid" and ids.min() >= board.first_marker + board.num_markers:
-        return (
-            f"markers {ids.min()} to {ids.max()} of its dictionary{how}",
-            f"pass --first-marker {ids.min()}, or the lowest number on the board",
-        )
-    return (
-        f"markers {ids.min()} to {ids.max()} of its dictionary{how}, but not in its order",
-        "check --squares, columns before rows, and --board",
-    )
+        found, remedy = _other_marker(images)
+    else:
+        try:
+            seen = detect_board(board.square_m, images)
+        except InputError as error:
+            return error
+        if (seen.kind, seen.squares_wh) == (board.kind, board.squares_wh) and _family(seen) == _family(board):
+            found = "too few of its corners in each image"
+            remedy = "is the board large and sharp in the images?"
+        else:
+            found = describe_board(seen)
+            remedy = f"pass --squares {seen.squares_wh[0]}x{seen.squares_wh[1]}"
+            if seen.marker_m is not None:
+                # A ruler is better than the images.
+                marker = f" --marker {seen.marker_m:g}" if board.marker_m is None else ""
+                remedy += f"{marker} --dictionary {seen.dictionary}"
+    return InputError("board", expected=f"a {board}", found=found, remedy=remedy)
 
 
-def _explain_missing_marker(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[str, str]:
+def _family(board: Board) -> str:
+    return "" if board.marker_m is None else board.dictionary.lower().removeprefix("dict_").rpartition("_")[0]
+
+
+def _other_marker(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[str, str]:
+    """The marker that most images show, in words, and what to do."""
     seen = Counter[tuple[str, int]]()
     for grey, inverted, mirrored in product(images, (False, True), (False, True)):
         sides = np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey
@@ -329,32 +308,6 @@ def _explain_missing_marker(images: Sequence[UInt8[np.ndarray, "height width"]])
     return (
         f"marker {marker} of the dictionary {dictionary} in {count} of {len(images)} images",
         f"pass --dictionary {dictionary} --first-marker {marker}",
-    )
-
-
-def _explain_missing_chessboard(
-    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
-) -> tuple[str, str]:
-    # Before other sizes: a board with markers has corners of squares, too.
-    if any(len(ids) >= _LEAST_MARKERS for _, _, ids in _markers_of_all_dictionaries(images)):
-        return "a board with markers", "pass --marker and --dictionary"
-    columns, rows = board.squares_wh
-    around = range(-_OTHER_SIZES, _OTHER_SIZES + 1)
-    # A part of a board is a smaller board: the largest one comes first.
-    sizes = sorted(
-        ((columns + a, rows + b) for a, b in product(around, repeat=2) if min(columns + a, rows + b) >= 4),
-        key=lambda size: (-size[0] * size[1], abs(size[0] - columns)),
-    )
-    for size in sizes:
-        finder = BoardFinder(replace(board, squares_wh=size))
-        if sum(np.isfinite(finder.find(grey)[0, 0]) for grey in images[:_IMAGES]) >= 2:
-            return (
-                f"a chessboard of {size[0]} x {size[1]} squares, which has {size[0] - 1} x {size[1] - 1} inner corners",
-                f"pass --squares {size[0]}x{size[1]}",
-            )
-    return (
-        f"no such board in {len(images)} images",
-        "check that the whole board is in the images, with a white border",
     )
 
 
@@ -466,16 +419,6 @@ def _misfit(flat: Float[np.ndarray, "markers 4 2"], quads: Float[np.ndarray, "ma
     ends = cv2.perspectiveTransform(flat.reshape(-1, 1, 2), homography).reshape(-1, 2)
     side = np.linalg.norm(np.diff(quads, axis=1), axis=-1).mean()
     return float(np.median(np.linalg.norm(ends - quads.reshape(-1, 2), axis=-1)) / side)
-
-
-def _family(dictionary: str) -> str:
-    name = dictionary.lower().removeprefix("dict_")
-    stem = name.rpartition("_")[0]
-    return stem if stem in _FAMILIES else name
-
-
-def _size(dictionary: str) -> int:
-    return len(marker_dictionary(dictionary).bytesList)
 
 
 def _smallest(family: str, highest: int) -> str:

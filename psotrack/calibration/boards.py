@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from psotrack.calibration.rig.settings import BoardSettings
 from psotrack.errors import SettingsError, check_positive
 from psotrack.foreground.detection import marker_dictionary
 
@@ -70,6 +71,35 @@ class Board:
             raise SettingsError(
                 "board.marker_m", expected="a side above 0 and below the square's", found=found
             )
+
+    @classmethod
+    def of(cls, settings: BoardSettings) -> Board:
+        """The board that settings state.
+
+        Raises:
+            SettingsError: the settings do not say what the board is like.
+        """
+        if settings.squares is None:
+            raise SettingsError("board", expected="--squares, the number of squares", found="none")
+        kind, marker_m, separation_m = settings.kind, settings.marker_m, settings.separation_m
+        if kind is None:
+            is_grid = separation_m is not None or settings.squares == (1, 1)
+            kind = "grid" if is_grid else "charuco" if marker_m is not None else "chessboard"
+        if kind == "grid":
+            if marker_m is not None and settings.squares == (1, 1):
+                # A single marker has no gap to another one.
+                separation_m = 0.0
+            if marker_m is None or separation_m is None:
+                raise SettingsError(
+                    "board",
+                    expected="--marker and --separation of a grid",
+                    found="--marker only" if marker_m else "no --marker",
+                )
+            side_m = marker_m + separation_m
+            return cls(settings.squares, side_m, marker_m, settings.dictionary, "grid", settings.first_marker)
+        if settings.square_m is None:
+            raise SettingsError("board", expected="--square, the side of a square in metres", found="none")
+        return cls(settings.squares, settings.square_m, marker_m, settings.dictionary, kind)
 
     def __str__(self) -> str:
         columns, rows = self.squares_wh

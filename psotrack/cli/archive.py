@@ -8,15 +8,14 @@ import click
 
 from psotrack.cli.options import (
     CACHE,
-    FORCE,
     TRACKS,
     cache_folder,
     out_option,
-    reporting,
+    running,
     sequence_argument,
     sequence_of,
 )
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX
@@ -31,9 +30,7 @@ from psotrack.support import ARCHIVE_SUFFIX
 )
 @click.option("--videos", is_flag=True, help="Pack the videos, too.  [default: a digest of each video]")
 @CACHE
-@FORCE
-@reporting
-@pass_output
+@running(json=False)
 def archive(
     output: Output, tracks: Path, sequence: Path | None, out: Path | None, videos: bool, cache: Path | None
 ) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, compiled_folder, out_option, reporting
-from psotrack.cli.output import Output, pass_output
+from psotrack.cli.options import JOBS, compiled_folder, out_option, running
+from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand
 
 
@@ -18,9 +18,7 @@ from psotrack.cli.records import HelpfulCommand
 @out_option("Folder of the results.", default=Path("psotrack-demo"), show_default=True)
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of flights, noise and swarm.")
 @JOBS
-@FORCE
-@reporting
-@pass_output
+@running(json=False)
 def demo(output: Output, out: Path, seed: int, jobs: int | None) -> None:
     """Simulate four drones, track them in eight videos, print the errors and save a picture.
 

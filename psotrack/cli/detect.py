@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 from msgspec.structs import replace
 
 from psotrack.cli.options import (
     DETECTOR_SIZE,
-    FORCE,
-    JSON,
     SEQUENCE,
     Extent,
     beside,
     extent_options,
     filmed_recording,
     out_option,
-    reporting,
+    running,
 )
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.output import Output
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.settings import settings_options
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import SilhouetteSettings
@@ -34,64 +34,56 @@ if TYPE_CHECKING:
 MASKS_REDUCTION = 1
 
 
+@dataclass(frozen=True)
+class What:
+    """What is written.
+
+    Attributes:
+        detector: YOLO network (v5 to v11) that was trained on drones, or the detector that an installed package adds
+            under NAME.
+        blobs: write the blobs of foreground instead of a network's detections.
+        silhouettes: compute and store the silhouettes, which `track` reads.
+        masks: write the foreground of every frame at the size of the video, 0 to 255: as FOLDER/CAMERA/000000.png and
+            so on, or as one video (.mp4, or .avi without loss).
+    """
+
+    detector: Annotated[str, Meta(extra={"metavar": "MODEL.onnx|NAME"})] | None = None
+    blobs: bool = False
+    silhouettes: bool = False
+    masks: Annotated[Path, Meta(extra={"metavar": "FOLDER|FILE.mp4"})] | None = None
+
+
+@dataclass(frozen=True)
+class Network:
+    """Settings of a network, as `psotrack.foreground.detection.DetectorSettings`, whose import takes long.
+
+    Attributes:
+        confidence: smallest score of a detection that is kept.
+        nms: intersection over union above which two boxes are taken for one drone.
+        size: side of the network's square input, in pixels.
+    """
+
+    confidence: float = 0.25
+    nms: float = 0.45
+    size: int = DETECTOR_SIZE
+
+
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
-@click.option(
-    "--detector",
-    metavar="MODEL.onnx|NAME",
-    help="YOLO network (v5 to v11) that was trained on drones, or the detector that an installed package adds under "
-    "NAME.",
-)
-@click.option(
-    "--blobs", is_flag=True, help="Write the blobs of foreground instead of a network's detections."
-)
-@click.option("--silhouettes", is_flag=True, help="Compute and store the silhouettes, which `track` reads.")
-@click.option(
-    "--masks",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER|FILE.mp4",
-    help="Write the foreground of every frame at the size of the video, 0 to 255: as FOLDER/CAMERA/000000.png and so "
-    "on, or as one video (.mp4, or .avi without loss).",
-)
+@options_of(What, "what")
 @out_option("Folder of the detections.  [default: SEQ/results/detections]")
-@click.option(
-    "--confidence",
-    type=float,
-    default=0.25,
-    show_default=True,
-    help="Smallest score of a detection that is kept.",
-)
-@click.option(
-    "--nms",
-    type=float,
-    default=0.45,
-    show_default=True,
-    help="Intersection over union above which two boxes are taken for one drone.",
-)
-@click.option(
-    "--size",
-    type=int,
-    default=DETECTOR_SIZE,
-    show_default=True,
-    help="Side of the network's square input, in pixels.",
-)
+@options_of(Network, "network", heading="With --detector")
 @settings_options("silhouettes.background", "silhouettes.drone_px", part="silhouettes.")
 @extent_options
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def detect(
     output: Output,
     sequence: Path,
-    detector: str | None,
-    blobs: bool,
-    silhouettes: bool,
-    masks: Path | None,
+    what: What,
     out: Path | None,
+    network: Network,
     settings: dict[str, Any],
     extent: Extent,
-    **network: Any,
 ) -> None:
     """Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.
 
@@ -111,25 +103,20 @@ def detect(
       psotrack detect my_lab --silhouettes --frames 100 --json -
       psotrack detect flight.mp4 --masks flight_mask.mp4
     """
-    wanted = {
-        "--detector": detector is not None,
-        "--blobs": blobs,
-        "--silhouettes": silhouettes,
-        "--masks": masks,
-    }
+    wanted = {f"--{name}": value for name, value in vars(what).items()}
     given = [name for name, value in wanted.items() if value]
     if len(given) != 1:
         found = " and ".join(given) or "none of them"
         raise SettingsError("detect", expected=f"one of {', '.join(wanted)}", found=found)
     recording = filmed_recording(sequence, extent)
-    if masks is not None:
-        _write_masks(output, recording, masks, settings, extent)
-    elif silhouettes:
+    if what.masks is not None:
+        _write_masks(output, recording, what.masks, settings, extent)
+    elif what.silhouettes:
         _store(output, recording, _silhouettes(settings), extent)
-    elif blobs:
+    elif what.blobs:
         _write(output, sequence, recording, out, _by_blobs(output, recording, _silhouettes(settings), extent))
     else:
-        _write(output, sequence, recording, out, _by_network(output, recording, str(detector), network))
+        _write(output, sequence, recording, out, _by_network(output, recording, f"{what.detector}", network))
 
 
 def _silhouettes(settings: dict[str, Any]) -> SilhouetteSettings:
@@ -156,11 +143,11 @@ def _write(output: Output, sequence: Path, recording: Recording, out: Path | Non
     )
 
 
-def _by_network(output: Output, recording: Recording, chosen: str, network: dict[str, Any]) -> Any:
+def _by_network(output: Output, recording: Recording, chosen: str, network: Network) -> Any:
     """Detections of each camera by a network, one camera after the other."""
     from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
 
-    detector = find_detector(chosen, DetectorSettings(**network))
+    detector = find_detector(chosen, DetectorSettings(**vars(network)))
     for name, video in recording.videos.items():
         yield name, detect_drones(detector, name, video, report=output.report)
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import click
-import numpy as np
 
 from psotrack.cli.options import (
     BODIES,
@@ -22,14 +20,7 @@ from psotrack.cli.options import (
 )
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand
-from psotrack.errors import InputError, SettingsError, errors_name
-
-if TYPE_CHECKING:
-    from psotrack.recordings import Recording
-    from psotrack.trajectories import Trajectories
-
-#: Tracks whose rate differs by less than this share from the recording's have the recording's rate.
-RATE_TOLERANCE = 1e-3
+from psotrack.errors import SettingsError, errors_name
 
 
 @click.command(cls=HelpfulCommand)
@@ -39,6 +30,7 @@ RATE_TOLERANCE = 1e-3
 @click.option(
     "--offset",
     metavar="SECONDS|auto",
+    callback=lambda _, __, given: _read_offset(given),
     help="Time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s.  [default: 0]",
 )
 @BODIES
@@ -51,7 +43,7 @@ def evaluate(
     tracks: Path,
     sequence: Path | None,
     plot: Path | None,
-    offset: str | None,
+    offset: float | Literal["auto"] | None,
     bodies: dict[str, tuple[str, ...]],
 ) -> None:
     """Compare TRACKS with the reference of SEQ.
@@ -69,6 +61,7 @@ def evaluate(
       psotrack evaluate tracks.csv flight --body cf1=M1,M2,M3,M4 --body cf2
       psotrack evaluate folder_of_tum_files data/Simulated_Data/S02_D4_A
     """
+    from psotrack.calibration.clocks import reference_for
     from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
     from psotrack.recordings.datasets import open_recording
@@ -76,58 +69,30 @@ def evaluate(
 
     sequence = sequence_of(tracks, sequence)
     recording = open_recording(sequence, bodies=bodies)
-    if recording.truth is None:
-        raise InputError(sequence, expected="a reference to compare with", found="none")
     estimate = read_tracks(tracks, recording=recording)
-    recording = _at_rate_of(estimate, recording)
-    truth, offset_s, both = recording.truth, 0.0, f"{tracks} and {sequence}"
-    assert truth is not None
-    if offset is not None:
-        truth, offset_s = _shifted_reference(recording, estimate, offset, where=both)
-    with errors_name(both):
+    with errors_name(f"{tracks} and {sequence}"):
+        truth, offset_s = reference_for(recording, estimate, offset)
         evaluation = compare(estimate, truth)
-    content = evaluation.to_dict() | ({"reference_offset_s": offset_s} if offset else {})
+    content = evaluation.to_dict() | ({} if offset is None else {"reference_offset_s": offset_s})
     output.json(content)
-    title = f"{recording.name}, reference's clock {offset_s:+.4f} s" if offset else recording.name
-    output.show(tables.render(evaluation, title=title))
+    clock = "" if offset is None else f", reference's clock {offset_s:+.4f} s"
+    output.show(tables.render(evaluation, title=f"{recording.name}{clock}"))
     if plot is not None:
         picture = plot if plot.name else tracks.with_suffix(".png")
         plots.save_overview(picture, estimate, truth, force=output.force)
         output.say(f"{picture}: paths, and errors over time")
 
 
-def _at_rate_of(estimate: Trajectories, recording: Recording) -> Recording:
-    """The recording, with its reference at the instants of tracks that have a rate of their own (`track --rate`)."""
-    from psotrack.trajectories import resample
-
-    if estimate.num_frames < 2 or recording.reference is None:
-        return recording
-    rate_hz = float(np.ptp(estimate.frame) / max(np.ptp(estimate.time_s), 1e-9))
-    if abs(rate_hz / recording.fps - 1) < RATE_TOLERANCE:
-        return recording
-    timed = replace(recording, timing=replace(recording.timing, rate_hz=rate_hz))
-    time_s = timed.timeline().time_s
-    truth = resample(recording.reference.truth, np.arange(len(time_s)), time_s)
-    return replace(timed, reference=replace(recording.reference, truth=truth))
-
-
-def _shifted_reference(
-    recording: Recording, estimate: Trajectories, offset: str, *, where: str
-) -> tuple[Trajectories, float]:
-    """The reference at the frames of the videos, and the time by which the reference's clock is ahead, seconds."""
-    from psotrack.calibration.clocks import find_offset, own_reference, shifted
-
-    reference = own_reference(recording)
-    if offset == "auto":
-        clock = (reference.time_s, reference.position_m, reference.orientation_wxyz)
-        with errors_name(where):
-            offset_s = find_offset(estimate, *clock, max_offset_s=2.0).offset_s
-    else:
-        try:
-            offset_s = float(offset)
-        except ValueError:
-            offset_s = math.nan
-        if not math.isfinite(offset_s):
-            raise SettingsError("--offset", expected="a number of seconds, or auto", found=offset)
-    time_s = recording.timeline().time_s
-    return shifted(reference, offset_s, np.arange(len(time_s)), time_s), offset_s
+def _read_offset(given: str | None) -> float | Literal["auto"] | None:
+    """The value of --offset."""
+    if given is None:
+        return None
+    if given == "auto":
+        return "auto"
+    try:
+        offset_s = float(given)
+    except ValueError:
+        offset_s = math.nan
+    if not math.isfinite(offset_s):
+        raise SettingsError("--offset", expected="a number of seconds, or auto", found=given)
+    return offset_s

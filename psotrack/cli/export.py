@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.options import FORCE, QUIET, TRACKS, out_option, sequence_argument
-from psotrack.cli.output import Output, pass_output
+from psotrack.cli.options import TRACKS, out_option, running, sequence_argument
+from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand
 from psotrack.cli.types import Numbers
 from psotrack.errors import OutputError, SettingsError, errors_name
@@ -40,9 +40,7 @@ FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
     help="Full lengths of a drone along x, y and z, in metres, for boxes of --to mot.  [default: those that the record "
     "beside TRACKS has]",
 )
-@FORCE
-@QUIET
-@pass_output
+@running(progress=False, json=False)
 def export(
     output: Output,
     tracks: Path,

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.options import BODIES, FORCE, JSON, QUIET, out_option
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.options import BODIES, out_option, positive, running
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand
 from psotrack.cli.types import SequencePath, Size
 from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.recordings.datasets import Draft
+    from psotrack.recordings.datasets import DraftOptions, Unclear, Unmatched
+
+
+def _pairs(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Cameras and files of --match."""
+    pairs = []
+    for match in given:
+        camera, equals, file = match.partition("=")
+        if not (camera and equals and file):
+            raise SettingsError("--match", expected="CAMERA=FILE", found=match)
+        pairs.append((camera, file))
+    return pairs
 
 
 @click.command("init", cls=HelpfulCommand)
@@ -27,22 +38,26 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--units",
-    "--unit",
     "unit",
     type=click.Choice(["m", "cm", "mm"]),
     help="Unit of the lengths in the rig file; needed if the format leaves the unit open.",
 )
 @click.option(
     "--match",
-    "matches",
     multiple=True,
+    callback=_pairs,
     metavar="CAMERA=FILE",
     help="FILE of FOLDER, or address of a stream, that belongs to CAMERA; may be repeated.",
 )
 @click.option(
     "--leave-out", multiple=True, metavar="FILE", help="File of FOLDER that is not used; may be repeated."
 )
-@click.option("--fps", type=float, help="Frames per second of cameras that have images or detections only.")
+@click.option(
+    "--fps",
+    type=float,
+    callback=positive,
+    help="Frames per second of cameras that have images or detections only.",
+)
 @click.option(
     "--size",
     "size_wh",
@@ -58,15 +73,13 @@ if TYPE_CHECKING:
     help="Show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.",
 )
 @BODIES
-@FORCE
-@QUIET
-@JSON
-@pass_output
+@running(progress=False)
 def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: Any) -> None:
     """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
 
     Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to
-    GoPro 3. Nothing is guessed: where a name does not say whose a file is, the command asks for --match or --leave-out.
+    GoPro 3. Nothing is guessed: where names do not say whose files are, the command asks once on a terminal, for all
+    files; --match and --leave-out answer before.
     Detections, frame times (frame,time_s), images of what is ignored (a name with "ignore" or "mask"), references and
     marker corners are found by name and content.
 
@@ -82,12 +95,24 @@ def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: 
       psotrack init my_lab --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
       psotrack init data/Simulated_Data/S02_D4_A --show
     """
-    from psotrack.recordings import RECORDING_FILE
+    from psotrack.recordings import RECORDING_FILE, inventory_table
+    from psotrack.recordings.datasets import DraftOptions, draft_recording
 
     if shown:
         _show(output, folder, chosen["bodies"])
-    else:
-        _draft(output, folder, out or folder / RECORDING_FILE, **chosen)
+        return
+    out = out or folder / RECORDING_FILE
+    check_suffix("--out", out, ".toml")
+    output.refuse(out)
+    options = DraftOptions(**chosen)
+    draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
+    older = draft.write()
+    content = draft.to_dict()
+    output.json(content)
+    output.show(inventory_table(content), wide=True)
+    output.say(*str(draft).splitlines())
+    if older is not None:
+        output.say(f"{older}: the file as it was; copy what you had written into it")
 
 
 def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) -> None:
@@ -108,86 +133,53 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
     output.show(inventory_table(content), wide=True)
 
 
-def _draft(
-    output: Output,
-    folder: Path,
-    path: Path,
-    *,
-    calibration: Path | None,
-    unit: Literal["m", "cm", "mm"] | None,
-    matches: tuple[str, ...],
-    leave_out: tuple[str, ...],
-    fps: float | None,
-    size_wh: tuple[int, int] | None,
-    bodies: dict[str, tuple[str, ...]],
-) -> None:
-    """Write the file of a recording."""
-    from psotrack.errors import check_positive
-    from psotrack.recordings import (
-        inventory_table,
-        recording_file_text,
-        write_recording_file,
+def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
+    """The options with what the user answers of the files whose names do not say whose they are.
+
+    Raises:
+        InputError: a line is empty: the error of the first file that needs an answer.
+    """
+    from dataclasses import replace
+
+    from psotrack.recordings.datasets import unclear_files
+
+    unclear = unclear_files(folder, out, options)
+    if not unclear.files:
+        return options
+    # Numbers of a list beside cameras that are numbers would be read wrongly.
+    numbered = not any(name.isdecimal() for name in unclear.cameras)
+    numbers = {f"{number}": name for number, name in enumerate(unclear.cameras, 1)} if numbered else {}
+    click.echo("cameras:")
+    for number, name in enumerate(unclear.cameras, 1):
+        click.echo(f"  {number}  {name}" if numbered else f"  {name}")
+    click.echo(
+        f"Whose are these {len(unclear.files)} files? A camera's {'number or ' if numbered else ''}name; "
+        "- leaves a file out; an empty line ends without any change."
     )
-    from psotrack.recordings.datasets import DraftOptions, draft_recording
-
-    check_suffix("--out", path, ".toml")
-    if fps is not None:
-        check_positive("--fps", fps)
-    output.refuse(path)
-    options = DraftOptions(
-        calibration, unit, [_pair(match) for match in matches], leave_out, fps, size_wh, bodies
-    )
-    draft = draft_recording(folder, path, options)
-    content = draft.recording.to_dict()
-    kept = _keep_older(path, recording_file_text(draft.content))
-    write_recording_file(path, draft.content)
-    output.json(_content(path, draft, content))
-    output.show(inventory_table(content), wide=True)
-    output.say(*_lines(path, draft), *kept)
+    matched, left_out = [], []
+    for file in unclear.files:
+        answer = _answer(file, unclear, numbers)
+        if answer == "-":
+            left_out.append(file.file)
+        else:
+            matched.append((answer, file.file))
+    return replace(options, match=[*options.match, *matched], leave_out=[*options.leave_out, *left_out])
 
 
-def _keep_older(path: Path, text: str) -> list[str]:
-    """Keep the file that is replaced, which may have been edited, beside the new one; returns a line that says so."""
-    from psotrack.support import atomic_write
+def _answer(file: Unmatched, unclear: Unclear, numbers: dict[str, str]) -> str:
+    """The camera of a file, or "-"."""
+    from psotrack.geometry import chosen_camera
 
-    if not path.is_file() or path.read_bytes() == text.encode():
-        return []
-    older = path.with_name(f"{path.name}.bak")
-    with atomic_write(older) as temporary:
-        temporary.write_bytes(path.read_bytes())
-    return [f"{older}: the file as it was; copy what you had written into it"]
-
-
-def _pair(match: str) -> tuple[str, str]:
-    camera, equals, file = match.partition("=")
-    if not (camera and equals and file):
-        raise SettingsError("--match", expected="CAMERA=FILE", found=match)
-    return camera, file
-
-
-def _content(path: Path, draft: Draft, content: dict[str, Any]) -> dict[str, Any]:
-    """The draft as JSON."""
-    return {
-        "recording": str(path),
-        "calibration": draft.content.calibration,
-        **content,
-        "without_files": list(draft.without_files),
-        "unused": [str(file) for file in draft.unused],
-    }
-
-
-def _lines(path: Path, draft: Draft) -> list[str]:
-    """What a user needs to know of a draft."""
-    lines = []
-    if draft.without_files:
-        lines.append(f"cameras without any file, left out: {', '.join(draft.without_files)}")
-    if draft.unused:
-        lines.append(f"files that are not used: {', '.join(file.name for file in draft.unused)}")
-    unplaced = [each.name for each in draft.recording.cameras if each.camera is None]
-    if unplaced:
-        lines.append(
-            f"cameras without place: {', '.join(unplaced)}; `psotrack calibrate rig` makes the rig file, then "
-            f"`psotrack init {path.parent} --calibration rig.toml --force`"
-        )
-    count = len(draft.content.cameras)
-    return [*lines, f"{path}: {count} camera{'s' if count > 1 else ''}"]
+    while True:
+        try:
+            answer = input(f"  {file.file} ({file.found}): ").strip()
+        except EOFError:
+            answer = ""
+        if not answer:
+            raise file.error
+        camera = numbers.get(answer) or chosen_camera(answer, unclear.cameras)
+        if answer == "-" or camera is not None:
+            return camera or answer
+        if unclear.calibration is None:
+            return answer
+        click.echo(f"  expected a camera of {unclear.calibration.name}, or -, found {answer}")

@@ -16,19 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 from msgspec import Meta
 
-from psotrack.cli.options import (
-    CACHE,
-    CAMERAS,
-    FORCE,
-    JSON,
-    LOG,
-    MOST_DRONES,
-    QUIET,
-    SEQUENCE,
-    compiled_folder,
-    out_option,
-    recording_named,
-)
+from psotrack.cli.options import CACHE, FORCE, JSON, LOG, QUIET, SEQUENCE, compiled_folder, recording_named
 from psotrack.cli.output import Output, check_suffix, pass_output, write_json
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.settings import config_options, settings_options
@@ -46,50 +34,49 @@ _SHOWN_S = 0.5
 
 
 @dataclass(frozen=True)
-class Replay:
-    """How videos are played instead of cameras.
-
-    Attributes:
-        replay: play the videos of SEQ at their own rate, instead of cameras.
-        speed: seconds of video per second, for --replay.
-        loops: how often the videos are played, for --replay.
-    """
-
-    replay: bool = False
-    speed: Annotated[float, Meta(gt=0)] = 1.0
-    loops: Annotated[int, Meta(ge=1)] = 1
-
-
-@dataclass(frozen=True)
-class RowTargets:
+class Targets:
     """Where rows go.
 
     Attributes:
+        out: file of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end.
         lines: write each row as a line of JSON to stdout.
         udp: send each row as a line of JSON by UDP.
         websocket: send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer;
             without HOST, only programs on this computer reach the server.
+        record: keep what the cameras film in FOLDER, as a recording that can be tracked again.
     """
 
+    out: Path | None = None
     lines: bool = False
     udp: Annotated[str, Meta(extra={"metavar": "HOST:PORT"})] | None = None
     websocket: Annotated[str, Meta(extra={"metavar": "[HOST:]PORT"})] | None = None
+    record: Annotated[Path, Meta(extra={"metavar": "FOLDER"})] | None = None
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is filmed, and how long.
+
+    Attributes:
+        seconds: end after this time.
+        replay: play the videos of SEQ at their own rate, instead of cameras.
+        speed: seconds of video per second, for --replay.
+        loops: how often the videos are played, for --replay.
+        cameras: use these cameras only; None: all cameras of the calibration.
+        most_drones: largest number of drones at one time.
+    """
+
+    seconds: Annotated[float, Meta(gt=0)] | None = None
+    replay: bool = False
+    speed: Annotated[float, Meta(gt=0)] = 1.0
+    loops: Annotated[int, Meta(ge=1)] = 1
+    cameras: tuple[str, ...] | None = None
+    most_drones: Annotated[int, Meta(ge=1, le=1000)] = 16
 
 
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
-@out_option(
-    "File of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end."
-)
-@options_of(Replay, "replay", names={"replay": "replay"})
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after this time.")
-@options_of(RowTargets, "targets")
-@click.option(
-    "--record",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Keep what the cameras film in FOLDER, as a recording that can be tracked again.",
-)
+@options_of(Targets, "targets")
 @click.option(
     "--view",
     "viewer",
@@ -99,14 +86,13 @@ class RowTargets:
     help="Show drones in space and their values over time, in a window of Rerun or on a page for a browser.  [without "
     "a value: window]",
 )
+@options_of(Session, "chosen", rare=("most_drones",))
 @settings_options(
     "swarm.particles",
     "swarm.iterations",
     "drones.count",
     without=["method", "detections", "init", "smooth", "clocks", "rate_hz"],
 )
-@MOST_DRONES
-@CAMERAS
 @CACHE
 @config_options
 @FORCE
@@ -117,14 +103,9 @@ class RowTargets:
 def live(
     output: Output,
     sequence: Path,
-    out: Path | None,
-    replay: Replay,
-    seconds: float | None,
-    targets: RowTargets,
-    record: Path | None,
+    targets: Targets,
     viewer: str | None,
-    most_drones: int,
-    cameras: list[str] | None,
+    chosen: Session,
     cache: Path | None,
     settings: dict[str, Any],
 ) -> None:
@@ -159,7 +140,8 @@ def live(
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
-    if out is None and targets == RowTargets() and viewer is None:
+    out, record = targets.out, targets.record
+    if viewer is None and targets == Targets(record=record):
         expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None:
@@ -167,24 +149,26 @@ def live(
         output.refuse(out, out.with_suffix(".json"))
     if viewer is not None:
         _check_viewer(viewer)
-    chosen = TrackSettings().changed(settings)
+    tracking = TrackSettings().changed(settings)
     keep_compiled(compiled_folder(cache))
     start_s = time.perf_counter() - output.started_s
     recording = open_recording(sequence)
-    if replay.replay:
-        recording = recording.usable(cameras)
-    used = live_cameras(recording, cameras, **vars(replay))
+    if chosen.replay:
+        recording = recording.usable(chosen.cameras)
+    used = live_cameras(
+        recording, chosen.cameras, replay=chosen.replay, speed=chosen.speed, loops=chosen.loops
+    )
     if record is not None:
         used = [replace(each, recorder=CameraRecorder(record, each.name, each.fps)) for each in used]
-    first_s = float(recording.timeline().time_s[0]) if replay.replay else 0.0
+    first_s = float(recording.timeline().time_s[0]) if chosen.replay else 0.0
     session = LiveSession(
         recording,
         used,
-        chosen,
-        most_drones=most_drones,
+        tracking,
+        most_drones=chosen.most_drones,
         first_s=first_s,
         # In a slow replay everything may take longer.
-        wait_s=WAIT_S / min(1.0, replay.speed) if replay.replay else WAIT_S,
+        wait_s=WAIT_S / min(1.0, chosen.speed) if chosen.replay else WAIT_S,
     )
     hidden = output.quiet or targets.lines
     with contextlib.ExitStack() as stack:
@@ -213,8 +197,8 @@ def live(
                 stack.enter_context(unhurried_end())
             table.show(result)
 
-        result = session.run(outputs, show, longest_s=seconds or float("inf"))
-    warn_of_missing_drones(chosen, len(result.drones))
+        result = session.run(outputs, show, longest_s=chosen.seconds or float("inf"))
+    warn_of_missing_drones(tracking, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients}

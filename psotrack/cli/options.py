@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from psotrack.cli.log_file import LogFile
-from psotrack.cli.output import PROGRESS, Output, current_output
+from psotrack.cli.output import PROGRESS, Output, current_output, pass_output
 from psotrack.cli.records import Command, Option
-from psotrack.cli.types import Numbers, SequencePath, names_of
-from psotrack.errors import InputError, SettingsError
+from psotrack.cli.types import Names, SequencePath
+from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.settings import BLOBS, YOLO
 from psotrack.support import refuse_files, user_cache
 
@@ -136,6 +136,29 @@ def reporting(command: Command) -> Command:
     return QUIET(_PROGRESS(LOG(command)))
 
 
+def running(*, progress: bool = True, json: bool = True) -> Callable[[Command], Command]:
+    """Give a command its `Output`, and the options that are not about the work itself.
+
+    Args:
+        progress: whether the work may take long: with --progress and --log.
+        json: whether there are results for --json.
+    """
+
+    def decorate(command: Command) -> Command:
+        command = pass_output(command)
+        command = JSON(command) if json else command
+        return FORCE(reporting(command) if progress else QUIET(command))
+
+    return decorate
+
+
+def positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
+    """Callback of an option whose value is a number above 0."""
+    if value is not None:
+        check_positive(parameter.opts[0], value)
+    return value
+
+
 def out_option(words: str, **attributes: Any) -> Callable[[Command], Command]:
     """Option `--out`: a path."""
     return click.option("--out", type=click.Path(path_type=Path), help=words, **attributes)
@@ -143,31 +166,8 @@ def out_option(words: str, **attributes: Any) -> Callable[[Command], Command]:
 
 CAMERAS = click.option(
     "--cameras",
-    metavar="NAME,NAME...",
-    callback=lambda _, __, given: names_of("--cameras", given),
+    type=Names(),
     help="Use these cameras only.  [default: all cameras of the calibration]",
-)
-MOST_DRONES = click.option(
-    "--most-drones",
-    type=click.IntRange(1, 1000),
-    default=16,
-    show_default=True,
-    cls=Option,
-    rare=True,
-    heading="Drones",
-    help="Largest number of drones at one time, where no frame uses a later one.",
-)
-FOV = click.option(
-    "--fov",
-    "fov_deg",
-    type=Numbers(2),
-    metavar="H,V",
-    help="Horizontal and vertical field of view in degrees, instead of intrinsics.",
-)
-SCALE_CAMERA = click.option(
-    "--scale-camera",
-    is_flag=True,
-    help="Scale the intrinsics to the size of the images; both must show the same field of view.",
 )
 
 
@@ -227,7 +227,7 @@ class Extent:
         jobs: largest number of processes; None is one per processor.
     """
 
-    cameras: list[str] | None
+    cameras: tuple[str, ...] | None
     num_frames: int | None
     cache: Path | None
     jobs: int | None
@@ -244,7 +244,7 @@ def extent_options(command: Command) -> Command:
     @functools.wraps(command)
     def with_extent(
         *args: Any,
-        cameras: list[str] | None,
+        cameras: tuple[str, ...] | None,
         num_frames: int | None,
         cache: Path | None,
         jobs: int | None,

@@ -7,12 +7,11 @@
 from __future__ import annotations
 
 import functools
-import json
-import math
+import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import click
 
@@ -22,11 +21,13 @@ from psotrack.support import (
     Report,
     atomic_write,
     joined,
+    json_text,
     no_progress,
     progress_bar,
     progress_lines,
     refuse_files,
     terminal_bar,
+    text_table,
 )
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
     from psotrack.trajectories import Trajectories
 
-#: Heading of a column of positions; `Output.table` keeps each of its cells on one line.
-POSITION = "centre (m)"
 #: Width of a wide table in a file or a pipe, characters.
 _WIDE = 200
 #: Values of --progress.
@@ -46,6 +45,14 @@ PROGRESS: dict[str, Report] = {
     "none": no_progress,
 }
 _STDOUT = Path("-")
+
+
+@runtime_checkable
+class _Shown(Protocol):
+    """What a function of the public face returns: its text is what the command prints."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of --json."""
 
 
 class Output:
@@ -68,6 +75,11 @@ class Output:
     def shows(self) -> bool:
         """Whether people get sentences and tables on stdout."""
         return not self.quiet and self.json_path != _STDOUT
+
+    @property
+    def can_ask(self) -> bool:
+        """Whether somebody at a terminal reads questions and answers them."""
+        return self.shows and sys.stdin.isatty() and sys.stdout.isatty()
 
     @property
     def report(self) -> Report:
@@ -108,15 +120,13 @@ class Output:
 
     def table(self, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]], title: str = "") -> None:
         """Print a table, names in the first column and numbers in the others."""
-        from rich import box
-        from rich.table import Table
+        if self.shows:
+            click.echo(text_table(headings, rows, title))
 
-        table = Table(box=box.HORIZONTALS, show_edge=False, title=title or None)
-        for index, heading in enumerate(headings):
-            table.add_column(heading, justify="right" if index else "left", no_wrap=heading == POSITION)
-        for row in rows:
-            table.add_row(*row)
-        self.show(table)
+    def result(self, result: _Shown) -> None:
+        """Write a result as --json says, and print it."""
+        self.json(result.to_dict())
+        self.say(*f"{result}".splitlines())
 
     def drones(self, tracks: Trajectories, size_m: np.ndarray | None = None) -> None:
         """Print a table of the drones, at most 80 characters wide.
@@ -149,7 +159,7 @@ class Output:
     def json(self, content: Any) -> None:
         """Write the results for programs, as --json says; a missing number, NaN, is written as null."""
         if self.json_path == _STDOUT:
-            click.echo(_json_text(content))
+            click.echo(json_text(content))
         elif self.json_path is not None:
             refuse_files(self.json_path, force=self.force)
             write_json(self.json_path, content)
@@ -171,16 +181,6 @@ def pass_output(command: Callable[..., None]) -> Callable[..., None]:
     return with_output
 
 
-def finite_or_none(value: float) -> float | None:
-    """The number, or None (null in JSON) for NaN and infinities."""
-    return float(value) if math.isfinite(value) else None
-
-
-def format_numbers(values: Iterable[float], digits: int) -> str:
-    """Numbers with `digits` decimals and spaces between them."""
-    return " ".join(f"{value:.{digits}f}" for value in values)
-
-
 def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
     """Raise `SettingsError` for a file that ends otherwise than an option wants."""
     if path is not None and path.suffix not in suffixes:
@@ -190,17 +190,4 @@ def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
 def write_json(path: str | Path, content: Any) -> None:
     """Write a JSON file, NaN as null; an interruption leaves no partial file."""
     with atomic_write(Path(path)) as temporary:
-        temporary.write_text(_json_text(content) + "\n", encoding="utf-8")
-
-
-def _json_text(content: Any) -> str:
-    """The content as JSON. JSON has no NaN: a missing number is null. Infinite numbers are an error of the caller."""
-    return json.dumps(_with_null(content), indent=2, allow_nan=False)
-
-
-def _with_null(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {key: _with_null(value) for key, value in content.items()}
-    if isinstance(content, (list, tuple)):
-        return [_with_null(value) for value in content]
-    return None if isinstance(content, float) and math.isnan(content) else content
+        temporary.write_text(json_text(content) + "\n", encoding="utf-8")

@@ -60,13 +60,18 @@ def overlay(
       psotrack overlay tracks.csv my_lab --out videos --mosaic
       psotrack overlay tracks.csv my_lab --out videos --cameras cam1,cam2 --scale 0.5
     """
-    from psotrack.show.flights import first_instants, read_flight
-    from psotrack.show.overlay import OverlayOptions, write_overlays
+    from psotrack import api
 
-    out = out or tracks.parent / "overlay"
-    flight = read_flight([tracks], sequence_of(tracks, sequence), cameras=extent.cameras)
-    if extent.num_frames is not None:
-        flight = first_instants(flight, extent.num_frames)
-    options = OverlayOptions(mosaic=mosaic, scale=scale, force=output.force)
-    written = write_overlays(out, flight, options, jobs=extent.jobs, report=output.report)
+    written = api.overlay(
+        tracks,
+        out,
+        recording=sequence_of(tracks, sequence),
+        cameras=extent.cameras,
+        num_frames=extent.num_frames,
+        jobs=extent.jobs,
+        progress=output.report,
+        mosaic=mosaic,
+        scale=scale,
+        force=output.force,
+    )
     output.say(f"{written}")

@@ -9,13 +9,12 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
-import msgspec
 from click.core import ParameterSource
 from msgspec.inspect import (
     BoolType,
@@ -26,6 +25,7 @@ from msgspec.inspect import (
     LiteralType,
     Metadata,
     NoneType,
+    StrType,
     StructType,
     TupleType,
     UnionType,
@@ -33,12 +33,12 @@ from msgspec.inspect import (
     type_info,
 )
 
-from psotrack.cli.types import Numbers
+from psotrack.cli.types import Distance, Names, Numbers, Size
 
 Command = Callable[..., Any]
 
 #: Ends of the names of fields that state a unit; options state it in their help.
-_UNITS = re.compile(r"_(m|s|m_s|hz|deg|px|m_s2|m2_s5)$")
+_UNITS = re.compile(r"_(m|mm|s|m_s|hz|deg|px|mb|m_s2|m2_s5)$")
 #: End of a description that says what the default None means.
 _NONE = re.compile(r"[.;,] None: (.*?)\.?$")
 
@@ -59,6 +59,13 @@ class Option(click.Option):
 
 class HelpfulCommand(click.Command):
     """Command whose help has its options under headings, the rare ones only with --help-all."""
+
+    def __init__(self, name: str | None, *, params: list[click.Parameter], **attributes: Any) -> None:
+        if any(getattr(param, "rare", False) for param in params):
+            flag: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False}
+            words = "Show all options."
+            params = [*params, Option(["--help-all"], callback=_show_all, help=words, **flag)]
+        super().__init__(name, params=params, **attributes)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options."""
@@ -81,17 +88,6 @@ def _show_all(context: click.Context, _: click.Parameter, wanted: bool) -> None:
         context.exit()
 
 
-#: Option that shows the rare options too.
-HELP_ALL = click.option(
-    "--help-all",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_show_all,
-    help="Show all options.",
-)
-
-
 @dataclass(frozen=True)
 class Field:
     """A field of a record, or of a record inside of it.
@@ -99,13 +95,15 @@ class Field:
     Attributes:
         name: dotted name, such as `swarm.particles`.
         kind: its type, as msgspec describes it.
-        default: its default.
+        default: its default; None where it has none.
+        required: whether it has no default.
         words: its description.
     """
 
     name: str
     kind: Any
     default: Any
+    required: bool
     words: str
 
 
@@ -123,8 +121,9 @@ def fields_of(record: type, prefix: str = "") -> Iterator[Field]:
         if isinstance(field.type, StructType | DataclassType):
             yield from fields_of(field.type.cls, f"{prefix}{field.name}.")
         else:
-            default = None if field.default is msgspec.NODEFAULT else field.default
-            yield Field(f"{prefix}{field.name}", field.type, default, described.get(field.name, ""))
+            default = None if field.required else field.default
+            words = described.get(field.name, "")
+            yield Field(f"{prefix}{field.name}", field.type, default, field.required, words)
 
 
 def _descriptions(record: type) -> dict[str, str]:
@@ -136,7 +135,7 @@ def _descriptions(record: type) -> dict[str, str]:
 
 
 def option_of(
-    field: Field, *, flag: str = "", heading: str = "Options", rare: bool = False
+    field: Field, *, flag: str = "", heading: str = "Options", rare: bool = False, limited: bool = False
 ) -> Callable[[Command], Command]:
     """The option of a field.
 
@@ -145,22 +144,24 @@ def option_of(
         flag: name of the option, without dashes; "" is the field's name without its unit.
         heading: heading of the option's part of the help.
         rare: whether only --help-all shows the option.
+        limited: whether the option has the limits of the field; else the record refuses what exceeds them.
     """
     kind, said = _plain_kind(field.kind)
     name = flag or _UNITS.sub("", field.name.rpartition(".")[2]).replace("_", "-")
     words, default = _sentence(field.words)
-    if not default and field.default not in (None, "", False):
+    if not default and not isinstance(field.default, bool) and field.default not in (None, "", ()):
         default = (
             ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
         )
-    declared, value, flag_value = f"--{name}", _TYPES.get(type(kind), str), {}
+    declared, flag_value = f"--{name}", {}
+    value = _number_type(kind, limited) if isinstance(kind, IntType | FloatType) else str
     if isinstance(kind, BoolType):
         declared = f"--{name}/--no-{name}" if field.default else f"--{name}"
         flag_value, default = {"is_flag": True}, f"--{name}" if field.default else ""
     elif isinstance(kind, LiteralType):
         value = click.Choice(list(kind.values))
     elif isinstance(kind, TupleType | VarTupleType):
-        value = Numbers(len(kind.item_types) if isinstance(kind, TupleType) else 0)
+        value = _tuple_type(kind)
     elif isinstance(kind, CustomType) and issubclass(kind.cls, Path):
         value = click.Path(path_type=Path)
     return click.option(
@@ -171,13 +172,29 @@ def option_of(
         rare=rare,
         type=None if flag_value else said.get("type", value),
         default=field.default,
+        required=field.required,
         metavar=said.get("metavar"),
         help=f"{words}  [default: {default}]" if default else words,
         **flag_value,
     )
 
 
-_TYPES: dict[type, Any] = {IntType: int, FloatType: float}
+def _number_type(kind: IntType | FloatType, limited: bool) -> Any:
+    """Type of an option whose value is a number, with the limits of the field."""
+    smallest, largest = (b if a is None else a for a, b in ((kind.gt, kind.ge), (kind.lt, kind.le)))
+    whole = isinstance(kind, IntType)
+    if not limited or (smallest is None and largest is None):
+        return int if whole else float
+    make: Any = click.IntRange if whole else click.FloatRange
+    return make(smallest, largest, min_open=kind.gt is not None, max_open=kind.lt is not None)
+
+
+def _tuple_type(kind: TupleType | VarTupleType) -> click.ParamType:
+    """Type of an option whose value is a tuple: names, numbers, a size, or two names and a distance."""
+    if isinstance(kind, VarTupleType):
+        return Names() if isinstance(kind.item_type, StrType) else Numbers(0)
+    items = {type(_plain_kind(each)[0]) for each in kind.item_types}
+    return Size() if items == {IntType} else Distance() if StrType in items else Numbers(len(kind.item_types))
 
 
 def _plain_kind(kind: Any) -> tuple[Any, dict[str, Any]]:
@@ -212,6 +229,7 @@ def options_of(
     *,
     names: Mapping[str, str] | None = None,
     heading: str = "Options",
+    rare: Collection[str] = (),
 ) -> Callable[[Command], Command]:
     """Add the options of a record, which the command gets as one argument.
 
@@ -220,6 +238,7 @@ def options_of(
         parameter: name of the command's argument that gets the record.
         names: names of options by field, where they are not the field's; "" leaves the field out.
         heading: heading of the options in the help.
+        rare: names of fields whose options only --help-all shows.
     """
     names = names or {}
     fields = [field for field in fields_of(record) if names.get(field.name) != ""]
@@ -232,7 +251,8 @@ def options_of(
 
         decorated: Command = with_record
         for field in reversed(fields):
-            option = option_of(field, flag=names.get(field.name, ""), heading=heading)
+            flag, is_rare = names.get(field.name, ""), field.name in rare
+            option = option_of(field, flag=flag, heading=heading, rare=is_rare, limited=True)
             decorated = option(decorated)
         return decorated
 

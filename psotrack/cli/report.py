@@ -11,7 +11,7 @@ import click
 from psotrack.cli.options import FORCE, JOBS, out_option, reporting, sequence_argument
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import Command, HelpfulCommand, Option
-from psotrack.errors import SettingsError, errors_name
+from psotrack.errors import errors_name
 
 
 def _table_option(name: str, words: str, **attributes: Any) -> Callable[[Command], Command]:
@@ -86,35 +86,21 @@ def report(
       psotrack report results --table --rows sequence,particles --columns iterations --scale 1000
       psotrack report calibration.json --out calibration.html
     """
-    from psotrack.show.flights import read_flight
-    from psotrack.show.reports import (
-        is_calibration_record,
-        write_calibration_report,
-        write_flight_report,
-        write_sweep_report,
-    )
-    from psotrack.sweep import is_results_folder
+    from psotrack import api
 
     if layout is not None:
         click.echo(_table(source, layout, **labels))  # type: ignore[arg-type]
         return
-    is_sweep = is_results_folder(source)
-    is_calibration = source.suffix == ".json" and is_calibration_record(source)
-    if (is_sweep or is_calibration) and (sequence is not None or compare):
-        what = "the results of a sweep" if is_sweep else "a calibration"
-        found = f"{sequence}" if sequence is not None else f"--compare {compare[0]}"
-        raise SettingsError("report", expected=f"no further files with {what}", found=found)
-    out = out or (source / "report.html" if is_sweep else source.with_suffix(".html"))
-    if is_sweep:
-        write_sweep_report(out, source, force=output.force)
-    elif is_calibration:
-        write_calibration_report(out, source, force=output.force)
-    else:
-        flight = read_flight([source, *compare], sequence)
-        write_flight_report(
-            out, flight, pictures=not no_pictures, jobs=jobs, force=output.force, report=output.report
-        )
-    output.say(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+    written = api.report(
+        [source, *compare],
+        out,
+        recording=sequence,
+        pictures=not no_pictures,
+        jobs=jobs,
+        force=output.force,
+        progress=output.report,
+    )
+    output.say(f"{written}")
 
 
 def _table(folder: Path, layout: str, rows: str, columns: str | None, value: str, scale: float) -> str:

@@ -16,7 +16,7 @@ import msgspec
 from psotrack import __version__
 from psotrack.cli.archived import archive_of
 from psotrack.cli.output import check_suffix, current_output
-from psotrack.cli.records import HELP_ALL, Command, Option, fields_of, is_given, option_of, parameter_name
+from psotrack.cli.records import Command, Option, fields_of, is_given, option_of, parameter_name
 from psotrack.cli.types import change_of
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings, flatten
@@ -107,7 +107,7 @@ def config_options(command: Command) -> Command:
     path = functools.partial(click.option, type=click.Path(path_type=Path), metavar="FILE.toml", cls=Option)
     config = path("--config", help="Take settings from FILE.toml; what is typed has precedence.")
     save = path("--save-config", help="Write all settings of this run to FILE.toml at the end.")
-    return config(save(HELP_ALL(with_files)))
+    return config(save(with_files))
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -21,10 +20,7 @@ from psotrack.cli.options import (
 from psotrack.cli.output import Output, pass_output
 from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import SettingsError
-from psotrack.support import Device, Report
-
-if TYPE_CHECKING:
-    from psotrack.sweep import Cluster, Grid, Inputs, Store, SweepOutcome
+from psotrack.support import Device
 
 
 @click.command(cls=HelpfulCommand)
@@ -101,87 +97,34 @@ def sweep(
         raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
     if workers is not None and cluster is None:
         raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
-    from psotrack.sweep import Cluster, read_grid
-
-    where_to_run = None if cluster is None else Cluster(cluster, workers, device)
-    grid = read_grid(grid_file)
-    out = out or grid_file.with_name(f"{grid_file.stem}_results")
-    if dry_run:
-        from psotrack.sweep import Inputs, Store
-
-        inputs = Inputs(data, cache_folder(cache), jobs)
-        _show(output, grid, inputs, Store(out) if out.is_dir() else None)
-        return
-    if where_to_run is None:
-        outcome = _run_here(grid, out, data, cache, jobs, device, output.report)
-    else:
-        outcome = _run_on_cluster(output, grid, out, data, cache, where_to_run)
-    output.json(outcome.to_dict())
-    output.say(f"{outcome}")
-    if outcome.count("failed"):
-        sys.exit(2)
-
-
-def _run_here(
-    grid: Grid,
-    out: Path,
-    data: Path,
-    cache: Path | None,
-    jobs: int | None,
-    device: Device | None,
-    report: Report,
-) -> SweepOutcome:
-    """Run the cells in this process."""
     from psotrack.support import keep_compiled, share_processors, use_device
-    from psotrack.sweep import run_in_process
-
-    share_processors()
-    if device is not None:
-        use_device(device)
-    keep_compiled(compiled_folder(cache))
-    return run_in_process(grid, out, data=data, cache=cache_folder(cache), jobs=jobs, report=report)
-
-
-def _run_on_cluster(
-    output: Output, grid: Grid, out: Path, data: Path, cache: Path | None, cluster: Cluster
-) -> SweepOutcome:
-    """Run the cells as tasks of a cluster's workers."""
-    from psotrack.support import use_device
-    from psotrack.sweep import run_on_cluster
-
-    use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
+    from psotrack.sweep import Cluster, Inputs, Store, plan, read_grid
+    from psotrack.sweep import sweep as run
 
     def say(address: str) -> None:
         if not output.quiet:
             click.echo(f"the cluster listens at {address}, for programs on this computer only", err=True)
 
-    return run_on_cluster(
-        grid, out, data=data, cache=cache_folder(cache), cluster=cluster, report=output.report, say=say
+    where = None if cluster is None else Cluster(cluster, workers, device, say)
+    grid = read_grid(grid_file)
+    out = out or grid_file.with_name(f"{grid_file.stem}_results")
+    if dry_run:
+        inputs = Inputs(data, cache_folder(cache), jobs)
+        output.result(plan(grid, inputs, Store(out) if out.is_dir() else None))
+        return
+    if where is not None:
+        use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
+    else:
+        share_processors()
+        if device is not None:
+            use_device(device)
+        keep_compiled(compiled_folder(cache))
+    outcome = run(
+        grid, out, data=data, cache=cache_folder(cache), jobs=jobs, cluster=where, progress=output.report
     )
-
-
-def _show(output: Output, grid: Grid, inputs: Inputs, store: Store | None) -> None:
-    """Print the cells of a grid, and an estimate of the time that they take."""
-    from psotrack.sweep import cameras_label, estimate
-
-    cells = grid.cells()
-    listed = [
-        {
-            "sequence": cell.sequence,
-            "method": cell.method,
-            "cameras": cameras_label(cell.cameras),
-            "runs": cell.runs,
-            **cell.axes,
-        }
-        for cell in cells
-    ]
-    expected = estimate(cells, inputs, store)
-    output.json({"cells": listed, "estimate": expected.to_dict()})
-    for number, cell in enumerate(listed):
-        output.say(f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items()))
-    for fault in expected.faults:
-        output.say(f"cannot be read: {fault}")
-    output.say(f"{expected}")
+    output.result(outcome)
+    if outcome.count("failed"):
+        sys.exit(2)
 
 
 def _status(output: Output, folder: Path) -> None:

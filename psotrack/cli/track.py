@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 
 from psotrack.cli.archived import chosen_extent, with_comparison
 from psotrack.cli.options import (
     DETECTOR_SIZE,
-    FORCE,
-    JSON,
-    MOST_DRONES,
     SEQUENCE,
     Extent,
     beside,
@@ -23,17 +21,34 @@ from psotrack.cli.options import (
     extent_options,
     out_option,
     recording_named,
-    reporting,
+    running,
 )
-from psotrack.cli.output import Output, check_suffix, pass_output, write_json
-from psotrack.cli.records import HelpfulCommand, Option
+from psotrack.cli.output import Output, check_suffix, write_json
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.settings import chosen_settings, config_options, settings_options
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
-from psotrack.support import atomic_write_all
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
+
+
+@dataclass(frozen=True)
+class How:
+    """How a recording is tracked, apart from the settings.
+
+    Attributes:
+        detector: detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a
+            detector NAME that an installed package adds. Its detections are stored.
+        detector_size: side of the network's square input, in pixels.
+        causal: track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.
+        most_drones: largest number of drones at one time with --causal.
+    """
+
+    detector: Annotated[str, Meta(extra={"metavar": "MODEL.onnx|NAME"})] | None = None
+    detector_size: int = DETECTOR_SIZE
+    causal: bool = False
+    most_drones: Annotated[int, Meta(ge=1, le=1000)] = 16
 
 
 @dataclass(frozen=True)
@@ -62,44 +77,12 @@ class _Run:
     "swarm.iterations",
     "seed",
 )
-@click.option(
-    "--detector",
-    metavar="MODEL.onnx|NAME",
-    help="Detector, instead of --detections: a YOLO network (v5 to v11) that was trained on drones, or a detector NAME "
-    "that an installed package adds. Its detections are stored.",
-)
-@click.option(
-    "--detector-size",
-    type=int,
-    default=DETECTOR_SIZE,
-    show_default=True,
-    cls=Option,
-    rare=True,
-    heading="Drones",
-    help="Side of the network's square input, in pixels.",
-)
-@click.option(
-    "--causal",
-    is_flag=True,
-    help="Track as if the cameras were live: no frame uses a later one, and a drone's rows begin when it is found.",
-)
-@MOST_DRONES
+@options_of(How, "how", rare=("detector_size", "most_drones"))
 @extent_options
 @config_options
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def track(
-    output: Output,
-    sequence: Path,
-    out: Path | None,
-    settings: dict[str, Any],
-    detector: str | None,
-    detector_size: int,
-    causal: bool,
-    most_drones: int,
-    extent: Extent,
+    output: Output, sequence: Path, out: Path | None, settings: dict[str, Any], how: How, extent: Extent
 ) -> None:
     """Track the drones of SEQ from its videos, or from detections in them.
 
@@ -129,20 +112,21 @@ def track(
         with_real_time,
     )
     from psotrack.recordings.datasets import open_recording
+    from psotrack.show.flights import write_tracked
     from psotrack.support import keep_compiled
-    from psotrack.trajectories import write_ambiguity, write_trajectories
 
+    detector = how.detector
     out = out or beside(sequence, "tracks.csv")
     check_suffix("--out", out, ".csv", ".parquet")
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
-    output.refuse(out, record_path, *([] if causal else [ambiguity_path]))
+    output.refuse(out, record_path, *([] if how.causal else [ambiguity_path]))
     chosen = chosen_settings(settings)
-    num_frames, causal, most_drones = chosen_extent(extent.num_frames, causal, most_drones)
+    num_frames, causal, most_drones = chosen_extent(extent.num_frames, how.causal, how.most_drones)
     parts = Parts()
     if detector is not None:
         if causal:
             raise SettingsError("--detector", expected="none with --causal", found=detector)
-        parts["detector"] = find_detector(detector, DetectorSettings(size=detector_size))
+        parts["detector"] = find_detector(detector, DetectorSettings(size=how.detector_size))
     keep_compiled(compiled_folder(extent.cache))
     start_s = time.perf_counter() - output.started_s
     opened = open_recording(sequence)
@@ -159,14 +143,13 @@ def track(
     tracked = track_recording(
         recording, chosen, cache=extent.silhouettes, jobs=extent.jobs, report=output.report, **parts
     )
-    identities, tracks = tracked.identities, tracked.trajectories
+    tracks = tracked.trajectories
     record = with_real_time(tracked.record, time.perf_counter() - output.started_s, start_s=start_s)
     record = {**record, "recording": recording_named(sequence, out)}
-    with atomic_write_all(record_path, ambiguity_path, out) as (record_file, ambiguity_file, tracks_file):
-        write_trajectories(tracks_file, tracks)
-        write_ambiguity(ambiguity_file, tracks.time_s, identities.pairs, identities.ambiguity)
-        record, sentence = with_comparison(record, tracks_file, chosen)
-        write_json(record_file, record)
+    write_tracked(out, replace(tracked, record=record), force=output.force)
+    record, sentence = with_comparison(record, out, chosen)
+    if sentence:
+        write_json(record_path, record)
     output.json(record)
     seen = f"{tracks.num_drones} drones, {tracks.num_frames} frames, {tracks.seen.mean():.1%} seen"
     output.say(f"{out}: {seen}, {_speed(record)}{sentence}")

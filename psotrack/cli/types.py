@@ -34,6 +34,21 @@ class Numbers(click.ParamType):
         return numbers
 
 
+class Names(click.ParamType):
+    """Names with commas between them, such as left,right."""
+
+    name = "NAME,NAME..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Tuple of names from a string; a value that is not a string is returned as it is."""
+        if not isinstance(value, str):
+            return value
+        names = tuple(name.strip() for name in value.split(","))
+        if not all(names):
+            self.fail(f"expected names with commas between them, found {value!r}", param, ctx)
+        return names
+
+
 class Size(click.ParamType):
     """Two whole numbers above 0, such as 1920,1080 or 7x5."""
 
@@ -48,6 +63,28 @@ class Size(click.ParamType):
         if len(numbers) != 2 or not all(numbers):
             self.fail(f"expected two whole numbers above 0, such as 1920,1080, found {value!r}", param, ctx)
         return tuple(numbers)
+
+
+class Distance(click.ParamType):
+    """Two cameras and the distance between their centres, such as left,right=4.20."""
+
+    name = "NAME,NAME=METRES"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Names and metres from a string; a value that is not a string is returned as it is."""
+        if not isinstance(value, str):
+            return value
+        names, _, length = value.partition("=")
+        cameras = tuple(names.split(","))
+        try:
+            metres = float(length)
+        except ValueError:
+            metres = 0.0
+        if len(cameras) != 2 or not 0 < metres < float("inf"):
+            self.fail(
+                f"expected two cameras and metres, such as left,right=4.20, found {value!r}", param, ctx
+            )
+        return *cameras, metres
 
 
 class SequencePath(click.Path):
@@ -68,14 +105,6 @@ def opened_sequence(path: Path) -> Path:
     from psotrack.cli.archived import opened_archive
 
     return opened_archive(click.get_current_context(), path)
-
-
-def names_of(option: str, given: str | None) -> list[str] | None:
-    """Names with commas between them; None where none are given."""
-    names = None if given is None else [name.strip() for name in given.split(",")]
-    if names is not None and not all(names):
-        raise SettingsError(option, expected="names with commas between them", found=repr(given))
-    return names
 
 
 def change_of(text: str, example: str = "swarm.particles=50") -> tuple[str, Any]:

@@ -5,64 +5,48 @@ from __future__ import annotations
 import sys
 import tempfile
 import webbrowser
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.options import (
-    FORCE,
-    Extent,
-    dictionary_option,
-    extent_options,
-    reporting,
-)
-from psotrack.cli.output import Output, check_suffix, pass_output
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.options import Extent, extent_options, running
+from psotrack.cli.output import Output, check_suffix
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.types import opened_sequence
 from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What is shown, and where.
+
+    Attributes:
+        save: write a file that `rerun FILE.rrd` shows, instead of opening a window.
+        web: show a page for a browser on this computer, instead of a window.
+        max_size_mb: largest size: images get smaller, then frames are left out; None: 5.8 per second, at most 1950.
+        silhouettes: compute the silhouettes that are not stored, not only show stored ones.
+        onboard: show the cameras on drones too, with the markers that they see.
+        dictionary: dictionary of the markers; any dictionary of OpenCV.
+    """
+
+    save: Annotated[Path, Meta(extra={"metavar": "FILE.rrd"})] | None = None
+    web: bool = False
+    max_size_mb: Annotated[float, Meta(ge=1, extra={"metavar": "MB"})] | None = None
+    silhouettes: bool = False
+    onboard: bool = False
+    dictionary: str = "4x4_1000"
+
+
 @click.command(cls=HelpfulCommand)
 @click.argument("tracks", nargs=-1, metavar="TRACKS... [SEQ]", type=click.Path(path_type=Path))
-@click.option(
-    "--save",
-    type=click.Path(path_type=Path),
-    metavar="FILE.rrd",
-    help="Write a file that `rerun FILE.rrd` shows, instead of opening a window.",
-)
-@click.option("--web", is_flag=True, help="Show a page for a browser on this computer, instead of a window.")
-@click.option(
-    "--max-size",
-    "max_size_mb",
-    type=click.FloatRange(min=1),
-    metavar="MB",
-    help="Largest size: images get smaller, then frames are left out.  [default: 5.8 per second, at most 1950]",
-)
-@click.option(
-    "--silhouettes",
-    is_flag=True,
-    help="Compute the silhouettes that are not stored.  [default: show stored ones]",
-)
-@click.option(
-    "--onboard", is_flag=True, help="Show the cameras on drones too, with the markers that they see."
-)
-@dictionary_option()
+@options_of(Shown, "shown")
 @extent_options
-@FORCE
-@reporting
-@pass_output
-def view(
-    output: Output,
-    tracks: tuple[Path, ...],
-    save: Path | None,
-    web: bool,
-    max_size_mb: float | None,
-    silhouettes: bool,
-    onboard: bool,
-    dictionary: str,
-    extent: Extent,
-) -> None:
+@running(json=False)
+def view(output: Output, tracks: tuple[Path, ...], shown: Shown, extent: Extent) -> None:
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
 
     SEQ is the recording, with its cameras, their images and its reference; the record beside TRACKS names it. Several
@@ -85,7 +69,8 @@ def view(
         show_window,
     )
 
-    if save is not None and web:
+    save = shown.save
+    if save is not None and shown.web:
         raise SettingsError("--web", expected="either --save or --web", found="both")
     check_suffix("--save", save, ".rrd")
     check_installed()
@@ -94,7 +79,7 @@ def view(
 
     if save is not None:
         output.refuse(save)
-    elif not web:
+    elif not shown.web:
         check_display()
     if not tracks:
         raise SettingsError("view", expected="TRACKS, SEQ or both", found="neither")
@@ -103,14 +88,16 @@ def view(
     flight = read_flight(files, sequence, cameras=extent.cameras)
     if extent.num_frames is not None:
         flight = first_instants(flight, extent.num_frames)
-    if onboard and (flight.recording is None or not flight.recording.onboard):
+    if shown.onboard and (flight.recording is None or not flight.recording.onboard):
         raise SettingsError("--onboard", expected="a recording with cameras on drones", found="none")
     report, jobs = output.report, extent.jobs
     content = ViewContent(
-        silhouettes=find_silhouettes(flight, extent.silhouettes, make=silhouettes, jobs=jobs, report=report),
-        onboard=onboard,
-        dictionary=dictionary,
-        max_bytes=None if max_size_mb is None else 1e6 * max_size_mb,
+        silhouettes=find_silhouettes(
+            flight, extent.silhouettes, make=shown.silhouettes, jobs=jobs, report=report
+        ),
+        onboard=shown.onboard,
+        dictionary=shown.dictionary,
+        max_bytes=None if shown.max_size_mb is None else 1e6 * shown.max_size_mb,
     )
 
     def write(path: Path) -> None:
@@ -123,7 +110,7 @@ def view(
     with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
         path = Path(folder) / "flight.rrd"
         write(path)
-        if web:
+        if shown.web:
             show_in_browser(path, _say_page)
         else:
             show_window(path)

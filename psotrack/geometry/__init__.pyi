@@ -4,7 +4,6 @@ from .cameras import (
     NEAR_M,
     Camera,
     Rig,
-    distort,
     has_image,
     look_at,
     make_camera,
@@ -15,9 +14,10 @@ from .cameras import (
     to_pixels,
     undistort,
 )
+from .image_fit import project_with_jacobian, to_pixels_with_jacobian
 from .image_scale import sizes_m, sizes_px, undistortion_stretch
-from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, undistort_approximately
-from .reprojection import project_with_jacobian, reconstruct, to_pixels_with_jacobian, triangulate
+from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, LensNumbers, distort
+from .reprojection import reconstruct, triangulate
 from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet
 from .triangulation import (
@@ -36,6 +36,7 @@ __all__ = [
     "Boxes",
     "Camera",
     "Extents",
+    "LensNumbers",
     "Rig",
     "boxes_at",
     "camera_key",
@@ -68,7 +69,6 @@ __all__ = [
     "triangulate",
     "triangulate_linearly",
     "undistort",
-    "undistort_approximately",
     "undistortion_stretch",
     "viewpoints",
     "views_meet",

@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from psotrack.geometry.cameras import NEAR_M, Camera, distort
-from psotrack.geometry.lenses import is_one_to_one, lens_derivative, second_sheet
+from psotrack.geometry.cameras import NEAR_M, Camera
+from psotrack.geometry.lenses import distort, is_one_to_one, lens_derivative, second_sheet
 from psotrack.support.array_types import Array
 
 #: Middle and half width of the interval between the tangents of an ellipsoid along one direction across the optical
@@ -130,7 +130,7 @@ def make_extents(
         skew=K[:, 0, 1],
         c_x=K[:, 0, 2] + 0.5,
         c_y=K[:, 1, 2] + 0.5,
-        beyond=second_sheet(cameras.dist, cameras.fisheye) if cameras.dist.shape[-1] else None,
+        beyond=second_sheet(cameras) if cameras.dist.shape[-1] else None,
     )
 
 
@@ -204,7 +204,7 @@ def _distorted_boxes(
 ) -> Boxes:
     """Boxes of ellipsoids with these middles in lenses with distortion."""
     x, y, z = middle
-    xx, xy, yx, yy = lens_derivative(seen.cameras.dist, seen.cameras.fisheye, x / z, y / z)
+    xx, xy, yx, yy = lens_derivative(seen.cameras, x / z, y / z)
     slopes = (seen.f_x * xx + seen.skew * yx, seen.f_x * xy + seen.skew * yy), (yx, yy)
     # Without the barriers, XLA computes the derivative again for each side, and the sides for each number of a box.
     slopes = _computed_once(seen, slopes)
@@ -277,6 +277,4 @@ def _is_shown(seen: Extents, middle: tuple[Array, Array, Array], tangents: _Tang
     s_along = p * p * seen.s_xx + 2 * p * q * seen.s_xy + q * q * seen.s_yy
     at, half = tangents(radius, p * seen.s_xz + q * seen.s_yz, s_along)
     farthest = at + half
-    return jnp.asarray(
-        is_one_to_one(seen.cameras.dist, seen.cameras.fisheye, p * farthest, q * farthest, seen.beyond)
-    )
+    return jnp.asarray(is_one_to_one(seen.cameras, p * farthest, q * farthest, seen.beyond))

@@ -13,15 +13,13 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from psotrack.errors import InputError, SettingsError
 
 #: Fewer digits in a row are the number of a camera, not the serial number of its body.
 _SERIAL_DIGITS = 6
-#: A run of digits, or a run of other characters that are not separators.
-_WORD = re.compile(r"\d+|[^\W\d_]+|[^\s\w.\-]+")
 
 
 def camera_key(name: str) -> str:
@@ -30,7 +28,12 @@ def camera_key(name: str) -> str:
     >>> camera_key("cam1i_s"), camera_key("cam_60881257"), camera_key("GoPro 03")
     ('cam1i', '60881257', 'gopro3')
     """
-    return _words(name, whole=True).text
+    folded = name.casefold().removesuffix("_s")
+    numbers = re.findall(r"\d+", folded)
+    if len(numbers) == 1 and len(numbers[0]) >= _SERIAL_DIGITS:
+        folded = numbers[0]
+    # A separator counts between two numbers only.
+    return re.sub(r"(?<!\d)-|-(?!\d)", "", _words(folded))
 
 
 def camera_of(name: str, cameras: Sequence[str]) -> str | None:
@@ -117,67 +120,31 @@ def files_by_camera(paths: Iterable[Path], cameras: Sequence[str]) -> dict[str, 
 _SAME, _BEGINS, _CONTAINS, _LONGER_WORD = range(4)
 
 
-@dataclass(frozen=True)
-class _Words:
-    """A name without separators.
-
-    Attributes:
-        text: the words in lower case, with a bar between two numbers.
-        starts: positions in the text at which a word begins after a separator, or the text begins.
-    """
-
-    text: str
-    starts: frozenset[int]
-
-
-def _words(name: str, *, whole: bool) -> _Words:
-    """Words of a name; with `whole`, a serial number is all that counts, and the ending `_s` does not count."""
+def _words(name: str) -> str:
+    """A name in lower case, with a dash for each separator, and without zeros before numbers."""
     # Some systems store an accented letter as a letter and an accent.
     folded = unicodedata.normalize("NFC", name).casefold()
-    if whole:
-        folded = folded.removesuffix("_s")
-        numbers = re.findall(r"\d+", folded)
-        if len(numbers) == 1 and len(numbers[0]) >= _SERIAL_DIGITS:
-            folded = numbers[0]
-    text, starts, end = "", set(), 0
-    for match in _WORD.finditer(folded):
-        word = (match[0].lstrip("0") or "0") if match[0].isdecimal() else match[0]
-        if match.start() > end or not text:
-            text += "|" if text[-1:].isdecimal() and word.isdecimal() else ""
-            starts.add(len(text))
-        text += word
-        end = match.end()
-    return _Words(text, frozenset(starts))
+    parted = re.sub(r"[\s_.\-]+", "-", folded).strip("-")
+    return re.sub(r"\d+", lambda number: number[0].lstrip("0") or "0", parted)
 
 
 def _rank(name: str, camera: str) -> tuple[int, int] | None:
     """How well a file's name fits a camera's, and minus the length of the latter; smaller is better, None is not."""
-    wanted = _words(camera, whole=True).text
-    if not wanted:
+    key, text = camera_key(camera), _words(name)
+    if not key:
         return None
-    if wanted == camera_key(name):
-        return _SAME, -len(wanted)
-    whole = _words(name, whole=False)
-    ranks = [
-        _rank_at(whole, wanted, at.start()) for at in re.finditer(f"(?={re.escape(wanted)})", whole.text)
-    ]
-    best = min((rank for rank in ranks if rank is not None), default=None)
-    return None if best is None else (best, -len(wanted))
-
-
-def _rank_at(name: _Words, wanted: str, start: int) -> int | None:
-    """Rank of a camera's name at one position of a file's name; None where it is only a part of a word there."""
-    text, stop = name.text, start + len(wanted)
-    before, after = text[start - 1 : start], text[stop : stop + 1]
-    begins = start in name.starts or before == "|" or _kind(before) != _kind(wanted[0])
-    parted = (
-        not after or stop in name.starts or after == "|" or (wanted[-1].isdecimal() and not after.isdecimal())
-    )
-    if begins and parted:
-        return _BEGINS if start == 0 else _CONTAINS
-    return _LONGER_WORD if start == 0 and not after.isdecimal() else None
-
-
-def _kind(character: str) -> str:
-    """Whether a character is a digit or a letter; empty for none."""
-    return "" if not character else "digit" if character.isdecimal() else "letter"
+    if key == camera_key(name):
+        return _SAME, -len(key)
+    pattern = re.escape(key[0])
+    for before, after in pairwise(key):
+        # A separator between two digits makes two numbers of them.
+        between = "" if f"{before}{after}".isdecimal() or "-" in (before, after) else "-?"
+        pattern += f"{between}{re.escape(after)}"
+    # The name is whole words of the text. A word ends before and after a number, but `cam` is not `cam1`.
+    begin = r"(?<!\d)" if key[0].isdecimal() else r"(?<![^\d-])"
+    end = r"(?!\d)" if key[-1].isdecimal() else r"(?![^-])"
+    if re.match(f"{pattern}{end}", text):
+        return _BEGINS, -len(key)
+    if re.search(f"{begin}{pattern}{end}", text):
+        return _CONTAINS, -len(key)
+    return (_LONGER_WORD, -len(key)) if re.match(rf"{pattern}(?!\d)", text) else None

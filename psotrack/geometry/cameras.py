@@ -28,7 +28,7 @@ from psotrack.geometry.camera_names import chosen_cameras
 from psotrack.geometry.lenses import (
     FISHEYE_COEFFICIENTS,
     PINHOLE_COEFFICIENTS,
-    distort_normalised,
+    distort,
     is_one_to_one,
     undistort_normalised,
 )
@@ -277,19 +277,7 @@ def has_image(cam: Camera, points_cam: Float[Array, "*#points 3"]) -> Bool[Array
         return in_front
     xp = np if isinstance(points_cam, np.ndarray) else jnp
     z = xp.maximum(points_cam[..., 2], NEAR_M)
-    return in_front & is_one_to_one(cam.dist, cam.fisheye, points_cam[..., 0] / z, points_cam[..., 1] / z)
-
-
-def distort(
-    cam: Camera, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
-) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
-    """Distorted normalised image coordinates, by each camera's lens model (see `lenses`).
-
-    Args:
-        cam: cameras with leading axes (*batch).
-        x, y: (...), undistorted normalised image coordinates.
-    """
-    return distort_normalised(cam.dist, cam.fisheye, x, y)
+    return in_front & is_one_to_one(cam, points_cam[..., 0] / z, points_cam[..., 1] / z)
 
 
 def undistort(cam: Camera, pixels: Float[np.ndarray, "*#points 2"]) -> Float[np.ndarray, "*#points 2"]:
@@ -302,4 +290,4 @@ def undistort(cam: Camera, pixels: Float[np.ndarray, "*#points 2"]) -> Float[np.
     K = np.asarray(cam.K)
     v = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     u = (pixels[..., 0] - K[..., 0, 2] - K[..., 0, 1] * v) / K[..., 0, 0]
-    return np.stack(undistort_normalised(cam.dist, cam.fisheye, u, v), axis=-1)
+    return np.stack(undistort_normalised(cam, u, v), axis=-1)

@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry.cameras import NEAR_M, Camera, distort, has_image, to_camera
+from psotrack.geometry.cameras import NEAR_M, Camera, has_image, to_camera
 from psotrack.geometry.estimation import Damping, NormalEquations, Step, levenberg_marquardt
-from psotrack.geometry.lenses import lens_derivative
+from psotrack.geometry.lenses import distort, lens_derivative
 
 #: A step shorter than this is not taken, standard deviations of the point.
 _LEAST_LENGTH = 1e-4
@@ -172,7 +172,7 @@ def _differentiate(
     # d(x, y) / d world = (r1 - x r3, r2 - y r3) / z, with the rows r1, r2, r3 of the rotation.
     x_by_world = (R[..., 0, :] - x[..., None] * R[..., 2, :]) / z[..., None]
     y_by_world = (R[..., 1, :] - y[..., None] * R[..., 2, :]) / z[..., None]
-    xx, xy, yx, yy = (slope[..., None] for slope in lens_derivative(cameras.dist, cameras.fisheye, x, y))
+    xx, xy, yx, yy = (slope[..., None] for slope in lens_derivative(cameras, x, y))
     bent_x_by_world = xx * x_by_world + xy * y_by_world
     bent_y_by_world = yx * x_by_world + yy * y_by_world
     u_by_world = K[..., 0, 0, None] * bent_x_by_world + K[..., 0, 1, None] * bent_y_by_world

@@ -60,6 +60,6 @@ def undistortion_stretch(
         cameras: cameras with leading axes (*batch).
         normalised: (..., 2), undistorted normalised image coordinates.
     """
-    xx, xy, yx, yy = lens_derivative(cameras.dist, cameras.fisheye, normalised[..., 0], normalised[..., 1])
+    xx, xy, yx, yy = lens_derivative(cameras, normalised[..., 0], normalised[..., 1])
     # The squared norm of the inverse of a 2 x 2 matrix is that of the matrix divided by its squared determinant.
     return np.asarray(np.sqrt((xx**2 + xy**2 + yx**2 + yy**2) / 2) / np.abs(xx * yy - xy * yx))

@@ -6,20 +6,17 @@ reaches 90 degrees off the optical axis. Missing coefficients are 0, which chang
 
 A model is one to one around the optical axis only. Where the determinant of its derivative changes sign, it folds: a
 point beyond the fold has the pixel of another point that is nearer to the axis, but no real lens shows it there. Such
-a point has no image. The functions below take these arguments:
-
-    dist: (..., coefficients), in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y; of a
-        fisheye k1, k2, k3, k4.
-    fisheye: (...), which lenses are fisheyes; None: no lens is one.
-    x, y: (...), undistorted normalised image coordinates: x / z and y / z in the camera.
-
-They take and return NumPy or JAX arrays, except the inverse, which is for NumPy.
+a point has no image. The functions below take lenses (a `Camera`, for example), and x, y: (...), undistorted normalised
+image coordinates: x / z and y / z in the camera. They take and return NumPy or JAX arrays, except the inverse, which is
+for NumPy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,66 +40,80 @@ _MAX_STEPS = 60
 _RESIDUAL = 1e-11
 #: A point is given up when even this share of Newton's step makes the residual no smaller.
 _LEAST_SHARE = 1e-6
-#: Newton's steps in compiled programs.
-_FEW_STEPS = 5
 #: Bisections of the angle before Newton's steps, for lenses that are bent much.
 _BISECTIONS = 12
 
 
-def distort_normalised(
-    dist: Float[Array, "*lenses coefficients"],
-    fisheye: Bool[Array, "*lenses"] | None,
-    x: Float[Array, "*#points"],
-    y: Float[Array, "*#points"],
+@runtime_checkable
+class HasLens(Protocol):
+    """One lens, or several along leading axes."""
+
+    @property
+    def dist(self) -> Float[Array, "*lenses coefficients"]:
+        """(..., coefficients), in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y; of a
+        fisheye k1, k2, k3, k4.
+        """
+
+    @property
+    def fisheye(self) -> Bool[Array, "*lenses"] | None:
+        """(...), which lenses are fisheyes; None: no lens is one."""
+
+
+class LensNumbers(NamedTuple):
+    """A lens without a camera; see `HasLens`."""
+
+    dist: Any
+    fisheye: Any = None
+
+
+def distort(
+    lens: HasLens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
     """Distorted normalised image coordinates. Arguments: see the module."""
-    if fisheye is None:
-        return _pinhole(dist, x, y)
-    xp = _numbers(x)
-    fisheye, pinhole_dist = _parted(xp, dist, fisheye)
-    of_pinhole, of_fisheye = _pinhole(pinhole_dist, x, y), _fisheye(xp, dist, x, y)
-    return tuple(xp.where(fisheye, one, other) for one, other in zip(of_fisheye, of_pinhole, strict=True))
+    distorted_x, distorted_y = _by_model(lens, x, y, _pinhole, _fisheye)
+    return distorted_x, distorted_y
 
 
 def lens_derivative(
-    dist: Float[Array, "*lenses coefficients"],
-    fisheye: Bool[Array, "*lenses"] | None,
-    x: Float[Array, "*#points"],
-    y: Float[Array, "*#points"],
+    lens: HasLens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], ...]:
     """Derivatives of the distorted coordinates: x by x, x by y, y by x, y by y. Arguments: see the module."""
+    return _by_model(lens, x, y, _pinhole_derivative, _fisheye_derivative)
+
+
+def _by_model(
+    lens: HasLens, x: Array, y: Array, pinhole: Callable[..., Any], fisheye: Callable[..., Any]
+) -> tuple[Array, ...]:
+    """What the function of each lens's model says."""
     xp = _numbers(x)
-    if fisheye is None:
-        return _pinhole_derivative(xp, dist, x, y)
-    fisheye, pinhole_dist = _parted(xp, dist, fisheye)
-    of_pinhole = _pinhole_derivative(xp, pinhole_dist, x, y)
-    of_fisheye = _fisheye_derivative(xp, dist, x, y)
-    return tuple(xp.where(fisheye, one, other) for one, other in zip(of_fisheye, of_pinhole, strict=True))
+    if lens.fisheye is None:
+        return tuple(pinhole(xp, lens.dist, x, y))
+    is_fisheye, pinhole_dist = _parted(xp, lens)
+    both = zip(fisheye(xp, lens.dist, x, y), pinhole(xp, pinhole_dist, x, y), strict=True)
+    return tuple(xp.where(is_fisheye, one, other) for one, other in both)
 
 
 def undistort_normalised(
-    dist: Float[Array, "*lenses coefficients"],
-    fisheye: Bool[Array, "*lenses"] | None,
-    x: Float[Array, "*#points"],
-    y: Float[Array, "*#points"],
+    lens: HasLens, x: Float[Array, "*#points"], y: Float[Array, "*#points"]
 ) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
-    """Inverse of `distort_normalised` in float64, by Newton's method; NaN where no point has this image.
+    """Inverse of `distort` in float64, by Newton's method; NaN where no point has this image.
 
     Args:
-        dist, fisheye: lenses, see the module.
+        lens: lenses.
         x, y: (...), distorted normalised image coordinates.
     """
+    dist = np.asarray(lens.dist)
     if dist.shape[-1] == 0:
         return x, y
-    dist = np.asarray(dist)
     shape = np.broadcast_shapes(np.shape(x), np.shape(y), dist.shape[:-1])
-    flat_dist = np.broadcast_to(dist, (*shape, dist.shape[-1])).reshape(-1, dist.shape[-1])
-    flat_fisheye = None if fisheye is None else np.broadcast_to(fisheye, shape).ravel()
-    beyond = np.broadcast_to(second_sheet(dist, fisheye), shape).ravel()
-    target = np.stack([np.broadcast_to(part, shape).ravel() for part in (x, y)]).astype(np.float64)
-    problem = _Inverse(flat_dist, flat_fisheye, beyond, target)
-    found = np.full(target.shape, np.nan)
-    pending = np.flatnonzero(np.isfinite(target).all(axis=0))
+    problem = _Inverse(
+        np.broadcast_to(dist, (*shape, dist.shape[-1])).reshape(-1, dist.shape[-1]),
+        None if lens.fisheye is None else np.broadcast_to(lens.fisheye, shape).ravel(),
+        np.broadcast_to(second_sheet(LensNumbers(dist, lens.fisheye)), shape).ravel(),
+        np.stack([np.broadcast_to(part, shape).ravel() for part in (x, y)]).astype(np.float64),
+    )
+    found = np.full(problem.target.shape, np.nan)
+    pending = np.flatnonzero(np.isfinite(problem.target).all(axis=0))
     # The distorted point is a good start for most lenses. For the others, a search of the radius finds a better start.
     for start in (_Inverse.near_start, _Inverse.far_start):
         some = problem.at(pending)
@@ -114,38 +125,8 @@ def undistort_normalised(
     return found[0].reshape(shape), found[1].reshape(shape)
 
 
-def undistort_approximately(
-    dist: Float[Array, "*lenses coefficients"],
-    fisheye: Bool[Array, "*lenses"] | None,
-    x: Float[Array, "*#points"],
-    y: Float[Array, "*#points"],
-) -> tuple[Float[Array, "*#points"], Float[Array, "*#points"]]:
-    """Inverse of `distort_normalised` inside of compiled programs; NaN where a few steps of Newton do not find it.
-
-    Args:
-        dist, fisheye: lenses, see the module.
-        x, y: (...), distorted normalised image coordinates.
-    """
-    xp = _numbers(x)
-    u, v = x, y = xp.broadcast_arrays(x, y)
-    if fisheye is not None:
-        bent = xp.sqrt(x * x + y * y) + 1e-9
-        scale = xp.where(fisheye, xp.tan(xp.minimum(bent, 1.5)) / bent, 1.0)
-        u, v = x * scale, y * scale
-    for _ in range(_FEW_STEPS):
-        bent_u, bent_v = distort_normalised(dist, fisheye, u, v)
-        xx, xy, yx, yy = lens_derivative(dist, fisheye, u, v)
-        determinant = xx * yy - xy * yx
-        off_x, off_y = x - bent_u, y - bent_v
-        u, v = u + (yy * off_x - xy * off_y) / determinant, v + (xx * off_y - yx * off_x) / determinant
-    bent_u, bent_v = distort_normalised(dist, fisheye, u, v)
-    is_there = (xp.abs(x - bent_u) + xp.abs(y - bent_v) < 1e-3) & is_one_to_one(dist, fisheye, u, v)
-    return xp.where(is_there, u, xp.nan), xp.where(is_there, v, xp.nan)
-
-
 def is_one_to_one(
-    dist: Float[Array, "*lenses coefficients"],
-    fisheye: Bool[Array, "*lenses"] | None,
+    lens: HasLens,
     x: Float[Array, "*#points"],
     y: Float[Array, "*#points"],
     beyond: Float[Array, "*lenses"] | None = None,
@@ -153,68 +134,60 @@ def is_one_to_one(
     """True for points before the fold of their lens: no point nearer to the axis has the same image.
 
     Args:
-        dist, fisheye, x, y: see the module.
+        lens, x, y: see the module.
         beyond: result of `second_sheet`, for callers that need the result more than once.
     """
-    xp = _numbers(x)
     if beyond is None:
-        beyond = second_sheet(dist, fisheye)
-    return _rises(xp, dist, fisheye, x, y) & (x * x + y * y < beyond * beyond)
+        beyond = second_sheet(lens)
+    return _rises(_numbers(x), lens, x, y) & (x * x + y * y < beyond * beyond)
 
 
-def second_sheet(
-    dist: Float[Array, "*lenses coefficients"], fisheye: Bool[Array, "*lenses"] | None
-) -> Float[Array, "*lenses"]:
+def second_sheet(lens: HasLens) -> Float[Array, "*lenses"]:
     """Radius r = hypot(x, y) below which every point with a positive determinant is before the fold; or infinity.
 
     Beyond the first fold the determinant is negative. Further away it may become positive again, on the second sheet
     of the folded image. The radius lies between the first fold and the second sheet, in the direction in which the
     second sheet begins nearest to the axis.
     """
-    if isinstance(dist, np.ndarray | np.generic):
-        dist = np.ascontiguousarray(dist, np.float64)
-        flat = dist.reshape(-1, dist.shape[-1])
-        kinds = np.zeros(len(flat), bool) if fisheye is None else np.broadcast_to(fisheye, dist.shape[:-1])
-        rows = [
-            _second_sheet_of(row.tobytes(), bool(kind)) for row, kind in zip(flat, kinds.ravel(), strict=True)
-        ]
-        return np.array(rows).reshape(dist.shape[:-1])
-    return _second_sheet(jnp, dist, fisheye)
+    if not isinstance(lens.dist, np.ndarray | np.generic):
+        return _second_sheet(jnp, lens)
+    dist = np.ascontiguousarray(lens.dist, np.float64)
+    flat = dist.reshape(-1, dist.shape[-1])
+    kinds = np.broadcast_to(False if lens.fisheye is None else lens.fisheye, dist.shape[:-1]).ravel()
+    rows = [_second_sheet_of(row.tobytes(), bool(kind)) for row, kind in zip(flat, kinds, strict=True)]
+    return np.array(rows).reshape(dist.shape[:-1])
 
 
 @lru_cache(maxsize=4096)
 def _second_sheet_of(dist: bytes, fisheye: bool) -> float:
     """The same for one lens; calibration and triangulation ask again and again for the same few lenses."""
     row = np.frombuffer(dist, np.float64)
-    return float(_second_sheet(np, row, np.array(True) if fisheye else None))
+    return float(_second_sheet(np, LensNumbers(row, np.array(True) if fisheye else None)))
 
 
-def _second_sheet(xp: Any, dist: Array, fisheye: Array | None) -> Array:
+def _second_sheet(xp: Any, lens: HasLens) -> Array:
+    dist, fisheye = lens.dist, lens.fisheye
     radius = np.tan(_ANGLES)
     grid = radius[:, None] * np.stack([np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)])[:, None]
     x, y = (xp.asarray(part, dist.dtype) for part in grid)
-    rises = _rises(
-        xp,
-        dist[..., None, None, :],
-        None if fisheye is None else fisheye[..., None, None],
-        x,
-        y,
-    )
+    everywhere = LensNumbers(dist[..., None, None, :], None if fisheye is None else fisheye[..., None, None])
+    rises = _rises(xp, everywhere, x, y)
     folded = xp.cumsum(~rises, axis=-2) > 0
     again = (folded & rises).any(axis=-1)
     first = again.argmax(axis=-1)
     return xp.where(again.any(axis=-1), xp.asarray(radius, dist.dtype)[xp.maximum(first - 1, 0)], xp.inf)
 
 
-def _rises(xp: Any, dist: Array, fisheye: Array | None, x: Array, y: Array) -> Array:
+def _rises(xp: Any, lens: HasLens, x: Array, y: Array) -> Array:
     """True where the determinant of the derivative is positive, and the model has no pole before the point."""
+    coefficients = lens.dist.shape[-1]
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        xx, xy, yx, yy = lens_derivative(dist, fisheye, x, y)
+        xx, xy, yx, yy = lens_derivative(lens, x, y)
         rises = xx * yy - xy * yx > 0
-        if dist.shape[-1] >= 8:
-            pinhole_dist = dist if fisheye is None else _parted(xp, dist, fisheye)[1]
+        if coefficients >= 8:
+            pinhole_dist = lens.dist if lens.fisheye is None else _parted(xp, lens)[1]
             rises = rises & (_below(pinhole_dist, x * x + y * y) > 0)
-            if dist.shape[-1] == 14:
+            if coefficients == 14:
                 H = _tilt(xp, pinhole_dist)
                 flat_x, flat_y = _before_tilt(pinhole_dist, x, y)
                 rises = rises & (H[2][0] * flat_x + H[2][1] * flat_y + H[2][2] > 0)
@@ -225,22 +198,21 @@ def _numbers(array: Any) -> Any:
     return np if isinstance(array, np.ndarray | np.generic) else jnp
 
 
-def _parted(xp: Any, dist: Array, fisheye: Array) -> tuple[Array, Array]:
+def _parted(xp: Any, lens: HasLens) -> tuple[Array, Array]:
     """Which lenses are fisheyes, and the coefficients with 0 for fisheyes: the pinhole model of such a lens is unused,
     but must be finite.
     """
-    fisheye = xp.asarray(fisheye)
-    return fisheye, xp.where(fisheye[..., None], xp.zeros_like(dist), dist)
+    fisheye = xp.asarray(lens.fisheye)
+    return fisheye, xp.where(fisheye[..., None], xp.zeros_like(lens.dist), lens.dist)
 
 
-def _pinhole(dist: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    if dist.shape[-1] == 14:
-        xp = _numbers(x)
-        (a, b, c), (d, e, f), (g, h, i) = _tilt(xp, dist)
-        x, y = _before_tilt(dist, x, y)
-        w = g * x + h * y + i
-        return (a * x + b * y + c) / w, (d * x + e * y + f) / w
-    return _before_tilt(dist, x, y)
+def _pinhole(xp: Any, dist: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    x, y = _before_tilt(dist, x, y)
+    if dist.shape[-1] < 14:
+        return x, y
+    (a, b, c), (d, e, f), (g, h, i) = _tilt(xp, dist)
+    w = g * x + h * y + i
+    return (a * x + b * y + c) / w, (d * x + e * y + f) / w
 
 
 def _before_tilt(dist: Array, x: Array, y: Array) -> tuple[Array, Array]:
@@ -342,6 +314,7 @@ def _fisheye_scale(xp: Any, dist: Array, r2: Array) -> tuple[Array, Array]:
     return scale, slope
 
 
+@dataclass(frozen=True)
 class _Inverse:
     """Points whose undistorted coordinates are searched; all arrays have the points as last axis, except `dist`.
 
@@ -352,10 +325,10 @@ class _Inverse:
         target: (2, points), distorted coordinates.
     """
 
-    def __init__(
-        self, dist: np.ndarray, fisheye: np.ndarray | None, beyond: np.ndarray, target: np.ndarray
-    ) -> None:
-        self.dist, self.fisheye, self.beyond, self.target = dist, fisheye, beyond, target
+    dist: np.ndarray
+    fisheye: np.ndarray | None
+    beyond: np.ndarray
+    target: np.ndarray
 
     def at(self, index: np.ndarray) -> _Inverse:
         """Points with these indices."""
@@ -391,18 +364,17 @@ class _Inverse:
         wanted = np.hypot(*flat)
         direction = flat / np.maximum(wanted, 1e-300)
         # Only the radial part of the lens: the tangential one and the prism's are small.
-        radial = self.dist.copy()
-        for columns in (slice(2, 4), slice(8, 14)):
-            kept = 0.0 if self.fisheye is None else np.where(self.fisheye[:, None], radial[:, columns], 0.0)
-            radial[:, columns] = kept
+        radial = LensNumbers(self.dist.copy(), self.fisheye)
+        across = [column for column in range(radial.dist.shape[-1]) if column in (2, 3) or column >= 8]
+        radial.dist[:, across] *= 0 if self.fisheye is None else self.fisheye[:, None]
         low, high = np.zeros(len(wanted)), np.full(len(wanted), np.pi / 2)
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
             r = np.tan(middle)
             zero = np.zeros_like(r)
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                bent = distort_normalised(radial, self.fisheye, r, zero)[0]
-                is_far = ~_rises(np, radial, self.fisheye, r, zero) | ~(bent < wanted) | (r > self.beyond)
+                bent = distort(radial, r, zero)[0]
+                is_far = ~_rises(np, radial, r, zero) | ~(bent < wanted) | (r > self.beyond)
             low, high = np.where(is_far, low, middle), np.where(is_far, middle, high)
         return direction * np.tan((low + high) / 2)
 
@@ -434,10 +406,10 @@ class _Inverse:
                 derivative = derivative[:, kept]
                 if not len(index):
                     break
-            is_there = is_one_to_one(self.dist, self.fisheye, solution[0], solution[1], self.beyond)
+            is_there = is_one_to_one(self, solution[0], solution[1], self.beyond)
         return np.where(is_there, solution, np.nan)
 
     def _linearise(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(2, points), residuals at points, and (4, points), derivatives of the distorted coordinates."""
-        residual = self.target - np.stack(distort_normalised(self.dist, self.fisheye, *at))
-        return residual, np.stack(np.broadcast_arrays(*lens_derivative(self.dist, self.fisheye, *at)))
+        residual = self.target - np.stack(distort(self, *at))
+        return residual, np.stack(np.broadcast_arrays(*lens_derivative(self, *at)))

@@ -14,15 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import SettingsError
 from psotrack.geometry.cameras import Camera, has_image, to_camera, to_pixels
-from psotrack.geometry.image_fit import (
-    ImageFit,
-    fit_in_image,
-    project_with_jacobian,
-    to_pixels_with_jacobian,
-)
-from psotrack.geometry.triangulation import projection_equations, solve_normal_equations, viewpoints
-
-__all__ = ["Triangulated", "project_with_jacobian", "reconstruct", "to_pixels_with_jacobian", "triangulate"]
+from psotrack.geometry.image_fit import ImageFit, fit_in_image
+from psotrack.geometry.triangulation import projection_equations, solve_equations, viewpoints
 
 #: Largest number of refinement steps. From a linear start two steps suffice; nearly parallel rays need more.
 _MAX_STEPS = 10
@@ -166,11 +159,7 @@ class _Lines:
 
     def solve(self, scale: Float[np.ndarray, "points cameras"]) -> Float[np.ndarray, "points 3"]:
         """(points, 3), weighted least-squares solutions, metres; NaN if the used views do not determine a point."""
-        shape = (len(scale), 2 * scale.shape[1])
-        rows = (self.rows * scale[..., None, None]).reshape(*shape, 3)
-        right = (self.right * scale[..., None]).reshape(shape)
-        turned = rows.swapaxes(-1, -2)
-        return solve_normal_equations(turned @ rows, np.matvec(turned, right))
+        return solve_equations(self.rows, self.right, scale)
 
 
 def _learn_noise(

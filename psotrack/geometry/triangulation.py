@@ -36,8 +36,9 @@ def triangulate_linearly(
         (..., 3), positions in the world, metres; NaN if fewer than two cameras see the point, or if all rays are
         parallel.
     """
-    normal, right, seen = _normal_equations(cameras, points_px, weights)
-    return np.where(seen.sum(axis=-1, keepdims=True) >= 2, solve_normal_equations(normal, right), np.nan)
+    rows, right, seen = projection_equations(cameras, points_px)
+    scale = seen * np.sqrt(1.0 if weights is None else weights)
+    return np.where(seen.sum(axis=-1, keepdims=True) >= 2, solve_equations(rows, right, scale), np.nan)
 
 
 def projection_equations(
@@ -72,26 +73,26 @@ def projection_equations(
     return rows, right, seen
 
 
-def _normal_equations(
-    cameras: Camera,
-    points_px: Float[np.ndarray, "*points cameras 2"],
-    weights: Float[np.ndarray, "*points cameras"] | None,
-) -> tuple[
-    Float[np.ndarray, "*points 3 3"], Float[np.ndarray, "*points 3"], Bool[np.ndarray, "*points cameras"]
-]:
-    """Left and right side of the normal equations, summed over cameras, and which cameras see the points."""
-    rows, right, seen = projection_equations(cameras, points_px)
-    weights = seen * (1.0 if weights is None else weights)
-    normal = np.einsum("...c,...cik,...cil->...kl", weights, rows, rows)
-    return normal, np.einsum("...c,...cik,...ci->...k", weights, rows, right), seen
-
-
-def solve_normal_equations(
-    normal: Float[np.ndarray, "*points 3 3"], right: Float[np.ndarray, "*points 3"]
+def solve_equations(
+    rows: Float[np.ndarray, "*points cameras 2 3"],
+    right: Float[np.ndarray, "*points cameras 2"],
+    scale: Float[np.ndarray, "*points cameras"],
 ) -> Float[np.ndarray, "*points 3"]:
-    """(..., 3), solutions of normal equations; NaN if the equations are singular."""
+    """Least-squares solutions of linear equations of points.
+
+    Args:
+        rows, right: equations from `projection_equations`.
+        scale: (..., cameras), factor of each camera's two equations; 0 for views that are not used.
+
+    Returns:
+        (..., 3), positions, metres; NaN if the used views do not determine a point.
+    """
+    flat = (*scale.shape[:-1], 2 * scale.shape[-1])
+    A = (rows * scale[..., None, None]).reshape(*flat, 3)
+    normal = A.swapaxes(-1, -2) @ A
+    right_side = np.matvec(A.swapaxes(-1, -2), (right * scale[..., None]).reshape(flat))
     solvable = np.linalg.cond(normal) < MAX_CONDITION
-    point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right[..., None])
+    point = np.linalg.solve(np.where(solvable[..., None, None], normal, np.eye(3)), right_side[..., None])
     return np.where(solvable[..., None], point[..., 0], np.nan)
 
 

@@ -3,7 +3,7 @@
 In: a rig and one source of frames per camera: a device, the address of a stream, or a video that is played at its own
 rate. Out: the rows of each instant, and counts of what was lost. `sources` read frames, `front_end` turns them into
 silhouettes in a thread for each camera, `meeting` brings the frames of all cameras together, `session` runs the
-tracker, `messages` and `websocket` send rows, `recorder` keeps the frames. Other rooms may use every name in
+tracker, `messages` sends rows, `recorder` keeps the frames. Other rooms may use every name in
 `__init__.pyi`.
 """
 

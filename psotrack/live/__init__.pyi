@@ -1,11 +1,9 @@
 from .cameras import LiveCamera, live_cameras
 from .meeting import CameraCounts, Instant, Meeting
-from .messages import UdpLines, lines_of, write_lines
+from .messages import UdpLines, WebSocketLines, lines_of, write_lines
 from .recorder import CameraRecorder, RecordedCounts, recording_folder
 from .session import WAIT_S, LiveResult, LiveSession, RowsOutput
-from .sources import CameraStream, LiveSource, ReplayedVideo, SourceFrame
-from .stream_clock import StreamClock
-from .websocket import WebSocketLines
+from .sources import CameraStream, LiveSource, ReplayedVideo, SourceFrame, StreamClock
 
 __all__ = [
     "WAIT_S",

@@ -25,11 +25,10 @@ from psotrack.foreground.silhouettes import (
     ignored_pixels,
     reduce_frame,
 )
-from psotrack.live.addresses import ANSWER_S
 from psotrack.live.cameras import LiveCamera
 from psotrack.live.meeting import Instant, Meeting
 from psotrack.live.recorder import CLOSE_S, RecordedCounts
-from psotrack.live.sources import SourceFrame
+from psotrack.live.sources import ANSWER_S, SourceFrame
 
 logger = logging.getLogger(__name__)
 

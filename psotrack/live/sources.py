@@ -8,21 +8,81 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import queue
+import re
+import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.errors import InputError
-from psotrack.live.addresses import ANSWER_S, device_of, shown_address, why_silent
-from psotrack.live.stream_clock import StreamClock
 from psotrack.recordings import VideoInfo, read_frames, silence_opencv
+
+#: How long a stream may take to answer and to bring a frame, seconds.
+ANSWER_S = 5.0
+_PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443, "rtmp": 1935}
+#: How the recording's addresses name devices.
+_DEVICE = "device "
+
+
+def device_of(address: str) -> int | str | None:
+    """Number or path of a device; None for an address of a stream."""
+    if not address.startswith(_DEVICE):
+        return None
+    device = address.removeprefix(_DEVICE)
+    return int(device) if device.isdecimal() else device
+
+
+def shown_address(address: str) -> str:
+    """The address without its password, which does not belong into logs."""
+    return re.sub(r"(://[^/@:]*):[^/@]*@", r"\1:***@", address)
+
+
+def why_silent(address: str, took_s: float) -> str:
+    """Why a camera could not be opened, as the end of a sentence after "found".
+
+    Args:
+        address: address of a stream, or a device.
+        took_s: time after which OpenCV gave up, seconds.
+    """
+    device = device_of(address)
+    if device is not None:
+        return _why_no_device(f"/dev/video{device}" if isinstance(device, int) else device)
+    if took_s >= ANSWER_S:
+        return f"that it does not answer within {ANSWER_S:g} s"
+    parts = urlsplit(address)
+    port = parts.port or _PORTS.get(parts.scheme)
+    if parts.hostname is None or port is None:
+        return "that it does not answer"
+    try:
+        socket.create_connection((parts.hostname, port), ANSWER_S).close()
+    except OSError as error:
+        return f"that it does not answer: {error.strerror or error}".lower()
+    return "no video there; are path, user name and password right?"
+
+
+def _why_no_device(path: str) -> str:
+    if sys.platform != "linux":
+        return "no such camera, no permission for it, or another program that uses it"
+    try:
+        os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK))
+    except FileNotFoundError:
+        return f"no {path}; is the camera plugged in?"
+    except PermissionError:
+        return f"no permission for {path}; is this user in the group that owns it, mostly `video`?"
+    except OSError as error:
+        return f"{error.strerror} ({path})"
+    return f"no camera at {path}, or another program that uses it"
+
 
 logger = logging.getLogger(__name__)
 
@@ -188,3 +248,51 @@ class CameraStream:
             limit_ms = round(1000 * ANSWER_S)
             limits = cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms
             return cv2.VideoCapture(self.address, cv2.CAP_FFMPEG, limits)
+
+
+#: Time over which the least delay of a stream is taken, seconds.
+_BLOCK_S = 2.0
+#: The least delays of two blocks that differ by more do not come from one clock, seconds: 0.5 % of `_BLOCK_S`, a frame
+#: that the stream does not count, or a network that is held up for the whole block.
+_AGREED_S = 0.01
+
+
+class StreamClock:
+    """Removes the jitter of arrival from the times of a stream's frames.
+
+    A frame is filmed at its stream's time plus a delay that nobody knows, and arrives late by an amount that changes
+    from frame to frame. The least delay of the last seconds is the one with no such lateness in it. It is found anew
+    every two seconds, because two clocks drift apart. The times are used only where the last two least delays agree:
+    a stream of JPEG images over HTTP, for instance, carries no times, and FFmpeg invents them at 25 per second.
+
+    Attributes:
+        is_used: whether the stream's times are used; None until the first two blocks are over.
+    """
+
+    def __init__(self) -> None:
+        self.is_used: bool | None = None
+        self._ends_s = self._last_s = -np.inf
+        self._least_s = self._before_s = np.inf
+
+    def time_s(self, stream_s: float, arrived_s: float) -> float:
+        """When a frame would have arrived without jitter; its arrival where the stream's times cannot be used.
+
+        Args:
+            stream_s: the frame's time in the stream, seconds.
+            arrived_s: when it arrived, seconds of `time.monotonic`.
+        """
+        if arrived_s >= self._ends_s:
+            self._end_block(arrived_s)
+        # A time that does not increase is none, and agrees with nothing.
+        delay_s = arrived_s - stream_s if stream_s > self._last_s else -np.inf
+        self._last_s = stream_s
+        self._least_s = min(self._least_s, delay_s)
+        least_s = min(self._least_s, self._before_s)
+        return stream_s + least_s if self.is_used and np.isfinite(least_s) else arrived_s
+
+    def _end_block(self, now_s: float) -> None:
+        least_s = np.array([self._before_s, self._least_s])
+        if not np.isposinf(least_s).any():  # else a block had no frame
+            self.is_used = bool(np.isfinite(least_s).all() and np.ptp(least_s) <= _AGREED_S)
+        self._before_s, self._least_s = self._least_s, np.inf
+        self._ends_s = now_s + _BLOCK_S

@@ -22,8 +22,7 @@ from psotrack.tracking.births import (
     MovingPoints,
     StartSource,
     flight_volume,
-    moving_blobs,
-    moving_detections,
+    moving_points,
     start_source,
 )
 from psotrack.tracking.matching import Sightings, from_detections, from_silhouettes
@@ -192,11 +191,9 @@ def prepare(
     bounds_m, speed_m_s = settings.bounds_m or recording.bounds_m, settings.motion.max_speed_m_s
     size_m = settings.drones.size_m
     key = source, size_m
-    if key not in points and (bounds_m is None or speed_m_s is None):
-        if sightings is not None:
-            points[key] = moving_detections(recording.rig, sightings, recording.fps, size_m)
-        elif silhouettes is not None:
-            points[key] = moving_blobs(recording.rig, silhouettes, recording.fps, size_m)
+    found = silhouettes if sightings is None else sightings
+    if key not in points and found is not None and (bounds_m is None or speed_m_s is None):
+        points[key] = moving_points(recording.rig, found, recording.fps, size_m)
     volume = flight_volume(recording.rig, points.get(key), bounds_m=bounds_m, max_speed_m_s=speed_m_s)
     settings = settings.changed({"motion.max_speed_m_s": volume.max_speed_m_s})
     start = start_source(recording, settings.init)

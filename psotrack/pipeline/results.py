@@ -207,9 +207,9 @@ def _no_drones(run: Run) -> InputError:
     recording = run.recording
     detected = run.silhouettes if run.sightings is None else run.sightings
     if detected is not None:
-        common = count_common(recording.rig, detected)
-        if common.met < _FEW_MET * common.seen:
-            share = f"{common.met} of {common.seen} frames"
+        seen, met = count_common(recording.rig, detected)
+        if met < _FEW_MET * seen:
+            share = f"{met} of {seen} frames"
             found += f", and detections of different cameras that meet in a place in {share}"
             remedy = f"check the rig, its unit and the clocks: `psotrack doctor {shlex.quote(f'{recording.folder}')}`"
     return InputError(recording.folder, expected="drones", found=found, remedy=remedy)

@@ -9,8 +9,9 @@ many settings of a sweep at once.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
@@ -211,15 +212,16 @@ def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResu
         )
         for run in runs
     ]
-    began = time.perf_counter()
-    with measured_compiling() as compiling_s:
+    with _timed() as seconds:
         tracked, compile_s = track_silhouettes(
             recording.rig, silhouettes, inputs, fps=recording.fps, report=report
         )
-        # What compiles besides the tracker, or for a device of its own, is not part of `compile_s`.
-        compile_s = max(compile_s, compiling_s())
-    track_s = time.perf_counter() - began - compile_s
-    shares = {"compile": compile_s / len(runs), "track": track_s / len(runs)}
+    # What compiles besides the tracker, or for a device of its own, is not part of `compile_s`.
+    more_s = max(0.0, compile_s - seconds["compile"])
+    shares = {
+        "compile": (seconds["compile"] + more_s) / len(runs),
+        "track": (seconds["track"] - more_s) / len(runs),
+    }
 
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found
@@ -236,8 +238,7 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
     """The result of the projection lines."""
     assert run.sightings is not None
     rig, settings = run.recording.rig, run.settings
-    began = time.perf_counter()
-    with measured_compiling() as compiling_s:
+    with _timed() as seconds:
         tracks = track_detections(
             rig.cameras,
             run.sightings,
@@ -247,8 +248,7 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
             known=known_motion(run.source, settings.drones, run.recording.fps),
             report=report,
         )
-        compile_s = compiling_s()
-    seconds = {"compile": compile_s, "track": run.read_s + time.perf_counter() - began - compile_s}
+    seconds["track"] += run.read_s
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
     return _with_camera_errors(run, result, partial(views_of_sightings, rig.cameras, run.sightings))
 
@@ -309,23 +309,23 @@ def _track_by_plugin(run: Run, report: Report) -> MethodResult:
             max_speed_m_s=settings.motion.speed_limit_m_s,
             drones=settings.drones,
         )
+    inputs = MethodInputs(
+        recording.rig, silhouettes, run.sightings, initial, run.volume.bounds_m, recording.fps, settings
+    )
+    with _timed() as seconds:
+        tracks = run.plugin(inputs, report)
+    return MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
+
+
+@contextlib.contextmanager
+def _timed() -> Iterator[dict[str, float]]:
+    """The seconds of "compile" and "track" of the block, which are there after the block."""
+    seconds: dict[str, float] = {}
     began = time.perf_counter()
     with measured_compiling() as compiling_s:
-        tracks = run.plugin(
-            MethodInputs(
-                recording.rig,
-                silhouettes,
-                run.sightings,
-                initial,
-                run.volume.bounds_m,
-                recording.fps,
-                settings,
-            ),
-            report,
-        )
-        compile_s = compiling_s()
-    seconds = {"compile": compile_s, "track": time.perf_counter() - began - compile_s}
-    return MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, seconds)
+        yield seconds
+        seconds["compile"] = compiling_s()
+    seconds["track"] = time.perf_counter() - began - seconds["compile"]
 
 
 def _points(tracks: Tracks, middle_of: Literal["silhouette", "box"]) -> list[dict[str, Any]]:

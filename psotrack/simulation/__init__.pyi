@@ -1,4 +1,4 @@
-from .flights.dynamics import flight_space
+from .flights.piloting import flight_space
 from .flights.recordings import write_recorded_flight
 from .generate import SimulationSettings, simulate
 from .imaging.renderer import CameraRenderer

@@ -42,8 +42,16 @@ from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
 from psotrack.simulation.scene import Scene, build
-from psotrack.simulation.segments import Stream, Work, draw, join, join_masks, segment_folder, segments
-from psotrack.simulation.unfinished import unfinished
+from psotrack.simulation.segments import (
+    Stream,
+    Work,
+    draw,
+    join,
+    join_masks,
+    segment_folder,
+    segments,
+    unfinished,
+)
 from psotrack.support import (
     Report,
     atomic_write,

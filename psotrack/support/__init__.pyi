@@ -4,7 +4,7 @@ from .compiled import drop_programs_if_many, keep_compiled
 from .covariances import has_negative_eigenvalue
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
-from .figures import COLOURS, drone_colour, save_figure
+from .figures import COLOURS, FAINT, INK, LINE, STYLE, drone_colour, save_figure
 from .files import (
     ARCHIVE_SUFFIX,
     atomic_write,
@@ -21,6 +21,7 @@ from .files import (
     user_cache,
 )
 from .html import html_block, html_lines, html_table
+from .number_lines import are_numbers, first_line, first_repeated, first_true, number_words, read_numbers
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,
@@ -33,13 +34,23 @@ from .plugins import (
     register_plugin,
 )
 from .processes import map_in_processes, with_traceback, worker_processes
-from .progress import Advance, Report, joined, no_progress, progress_bar, progress_lines, terminal_bar
+from .progress import (
+    Advance,
+    Report,
+    joined,
+    no_progress,
+    progress_bar,
+    progress_lines,
+    report_of,
+    terminal_bar,
+)
 from .representation import short_repr, short_text
 from .schema import (
     assign,
     bind,
     check_types,
     convert,
+    json_text,
     nearest,
     plain,
     read_json,
@@ -47,16 +58,23 @@ from .schema import (
     toml_key,
     toml_text,
     toml_value,
+    write_toml,
 )
 from .standard_errors import standard_error
+from .text_tables import POSITION, finite_or_none, format_numbers, text_table
 from .times import LEAST_STEP_S, first_repeat
 
 __all__ = [
     "ARCHIVE_SUFFIX",
     "COLOURS",
+    "FAINT",
+    "INK",
     "LARGEST",
     "LEAST_STEP_S",
+    "LINE",
     "MODERATE",
+    "POSITION",
+    "STYLE",
     "Advance",
     "Column",
     "Device",
@@ -67,6 +85,7 @@ __all__ = [
     "Share",
     "Table",
     "TextRow",
+    "are_numbers",
     "assign",
     "atomic_write",
     "atomic_write_all",
@@ -83,7 +102,12 @@ __all__ = [
     "drone_colour",
     "drop_programs_if_many",
     "end_of_links",
+    "finite_or_none",
+    "first_line",
     "first_repeat",
+    "first_repeated",
+    "first_true",
+    "format_numbers",
     "has_negative_eigenvalue",
     "html_block",
     "html_lines",
@@ -91,6 +115,7 @@ __all__ = [
     "identify",
     "is_moderate",
     "joined",
+    "json_text",
     "keep_compiled",
     "lasting_name",
     "left_over",
@@ -99,6 +124,7 @@ __all__ = [
     "measured_compiling",
     "nearest",
     "no_progress",
+    "number_words",
     "plain",
     "plugin_names",
     "plugin_source",
@@ -106,6 +132,7 @@ __all__ = [
     "progress_bar",
     "progress_lines",
     "read_json",
+    "read_numbers",
     "read_rows",
     "read_table",
     "read_text",
@@ -113,12 +140,14 @@ __all__ = [
     "refuse_files",
     "refuse_to_overwrite",
     "register_plugin",
+    "report_of",
     "save_figure",
     "share_processors",
     "short_repr",
     "short_text",
     "standard_error",
     "terminal_bar",
+    "text_table",
     "toml_key",
     "toml_text",
     "toml_value",
@@ -128,4 +157,5 @@ __all__ = [
     "with_traceback",
     "worker_processes",
     "write_rows",
+    "write_toml",
 ]

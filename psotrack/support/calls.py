@@ -13,7 +13,7 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,6 +49,9 @@ def check_records(kind: type) -> None:
     The shapes of arrays are left to a class that checks its fields; the fields of others are compared with nothing,
     because JAX puts what it likes into them.
     """
+    if "_is_checked" in vars(kind):
+        return
+    kind._is_checked = True  # type: ignore[attr-defined]
     make: Any = kind.__init__  # type: ignore[misc]
     name, signature = f"{kind.__name__}()", inspect.signature(kind)
     annotations = typing.get_type_hints(kind) if hasattr(kind, "__post_init__") else {}
@@ -80,7 +83,10 @@ def checked(function: _Called) -> _Called:
 
 @functools.cache
 def _annotations(function: Callable[..., Any]) -> dict[str, Any]:
-    return typing.get_type_hints(function)
+    """Annotations of the arguments; that of the result may name what only a checker of types imports."""
+    original: Any = inspect.unwrap(function)
+    named = {name: each for name, each in original.__annotations__.items() if name != "return"}
+    return typing.get_type_hints(types.SimpleNamespace(__annotations__=named), original.__globals__)
 
 
 def _check(name: str, values: Mapping[str, Any], annotations: Mapping[str, Any], *, shapes: bool) -> None:
@@ -110,9 +116,17 @@ def _fits(value: Any, annotation: Any, shapes: bool) -> bool:
     if issubclass(origin, AbstractArray):
         if not shapes or not hasattr(value, "shape"):
             return hasattr(value, "shape")
-        of_this_kind: Any = Shaped[type(value), origin.dim_str]
-        return isinstance(value, of_this_kind)
+        return isinstance(value, _shaped(typing.cast(Hashable, type(value)), origin.dim_str))
+    if origin is collections.abc.Sequence and isinstance(value, str | bytes):
+        # A text where several are expected would be taken for its letters.
+        return False
     return isinstance(value, (origin, *_AS_GOOD.get(origin, ())))
+
+
+@functools.cache
+def _shaped(kind: Hashable, shape: str) -> Any:
+    """The annotation of arrays of a kind and a shape; to make it takes longer than to check it."""
+    return Shaped[kind, shape]
 
 
 def _expected(annotation: Any) -> str:

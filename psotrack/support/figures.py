@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from psotrack.errors import OutputError
 from psotrack.support.files import atomic_write, refuse_to_overwrite
@@ -17,18 +17,37 @@ if TYPE_CHECKING:
 
 #: Colours of the drones in their order. The first six are from Okabe and Ito (2008), for colour-blind readers.
 COLOURS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#7a5195",
-    "#8c8c00",
-    "#7f4f24",
-    "#4d4d4d",
-)
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#8c8c00", "#7f4f24", "#4d4d4d",
+)  # fmt: skip
 _DPI = 150
+#: Colours of text, of what is faint, and of lines.
+INK, FAINT, LINE = "#2b313a", "#9aa3ad", "#e3e6ea"
+#: How figures look, as Matplotlib's settings: for `matplotlib.rc_context`.
+STYLE: dict[Any, Any] = {
+    "figure.constrained_layout.use": True,
+    "figure.dpi": _DPI,
+    "font.family": "sans-serif",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9,
+    "axes.edgecolor": FAINT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.6,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    # Text stays text, and the ids of elements are the same each time.
+    "svg.fonttype": "none",
+    "svg.hashsalt": "psotrack",
+}
 
 
 def drone_colour(drone: int) -> str:

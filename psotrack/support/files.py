@@ -167,23 +167,17 @@ def _prepare(path: Path) -> _Output:
         return _Output(path, path, Path(tempfile.gettempdir()) / name)
     target = end_of_links(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    output = _Output(path, target, target.with_name(name))
-    _remove_left_over(output)
-    return output
+    # What killed processes have left of the same output.
+    for rest in _left_over(target.parent.resolve()):
+        if (found := _TEMPORARY.match(rest.name)) and found[1] == path.stem:
+            _remove(rest)
+    return _Output(path, target, target.with_name(name))
 
 
 def remove_temporary_files() -> None:
     """Remove what `atomic_write` of this process is writing: for a program that ends without its clean-up."""
     for path in list(_OPEN):
         _remove(path)
-
-
-def _remove_left_over(output: _Output) -> None:
-    """Remove temporary files of an output that killed processes of this machine have left."""
-    for path in _left_over(output.target.parent.resolve()):
-        found = _TEMPORARY.match(path.name)
-        if found and found[1] == output.path.stem:
-            _remove(path)
 
 
 def left_over(folder: Path) -> tuple[Path, ...]:

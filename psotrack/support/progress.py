@@ -34,6 +34,11 @@ def no_progress(description: str, total: int) -> Iterator[Advance]:
     yield lambda steps: None
 
 
+def report_of(progress: bool | Report) -> Report:
+    """How functions of the public face show progress: as a function says, or by bars, or not at all."""
+    return progress if callable(progress) else progress_bar if progress else no_progress
+
+
 def progress_bar(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
     """Show progress where the reader is.
 

@@ -21,7 +21,7 @@ import msgspec
 from msgspec import inspect
 
 from psotrack.errors import InputError, PsotrackError, SettingsError
-from psotrack.support.files import read_text
+from psotrack.support.files import atomic_write, read_text
 from psotrack.support.numbers import MODERATE, is_moderate
 
 #: Function that makes an exception from the field, what was expected, what was found, and the remedy.
@@ -135,6 +135,11 @@ def read_json(path: Path | str, expected: str = "a JSON object", remedy: str = "
     return content
 
 
+def json_text(content: Any) -> str:
+    """The content as JSON. JSON has no NaN: a missing number is null. Infinite numbers are an error of the caller."""
+    return json.dumps(_with_null(content), indent=2, allow_nan=False)
+
+
 def toml_key(name: str) -> str:
     """A name as key of a TOML file, in quotes where it needs them."""
     return name if _BARE_KEY.fullmatch(name) else toml_value(name)
@@ -158,6 +163,16 @@ def toml_text(tables: Mapping[tuple[str, ...], Mapping[str, Any]]) -> str:
         lines += [f"{toml_key(key)} = {toml_value(value)}" for key, value in values.items()]
         blocks.append("\n".join(lines) + "\n")
     return "\n".join(blocks)
+
+
+def write_toml(path: Path | str, tables: Mapping[tuple[str, ...], Mapping[str, Any]]) -> None:
+    """Write a TOML file; see `toml_text`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(toml_text(tables), encoding="utf-8")
 
 
 def assign(data: dict[str, Any], path: str, value: Any, error: MakeError) -> None:
@@ -225,6 +240,14 @@ def bind(name: str, signature: Signature, args: Sequence[Any], kwargs: dict[str,
         ) from None
 
 
+def _with_null(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _with_null(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_with_null(value) for value in content]
+    return None if isinstance(content, float) and math.isnan(content) else content
+
+
 def _can_hold(container: Any, token: str | int) -> bool:
     """Whether the container has this index (list), or can have this key (dict)."""
     if isinstance(container, list):
@@ -254,32 +277,26 @@ def _translate(message: str, data: Any, kind: type) -> tuple[str, str, str, str]
     assert match
     fault, path = match["fault"], match["path"] or ""
     name = _on_one_line(next(iter(re.findall(r"`(.*)`", fault, re.DOTALL)), ""))
-    if fault.startswith("Object contains unknown field"):
-        names = [field.encode_name for field in _struct_at(data, kind, path).fields]
-        return f"{path}.{name}" if path else name, *_suggestion(names, name)
     if fault.startswith("Object missing required field"):
         return f"{path}.{name}" if path else name, "a value", "none", ""
     found = data
     for token in _tokens(path):
         if not _can_hold(found, token) or (isinstance(found, dict) and token not in found):
             # msgspec does not say which key of a mapping is meant.
-            return (
-                path,
-                _expected_words(fault),
-                _words_of(fault.partition(", got ")[2]) or "another value",
-                "",
-            )
+            words = _words_of(fault.partition(", got ")[2])
+            return path, _expected_words(fault), words or "another value", ""
         found = found[token]
+    if fault.startswith("Object contains unknown field"):
+        structs = _structs_with_tag_of(found, _types_at(data, kind, path))
+        names = [field.encode_name for field in structs[0].fields]
+        return f"{path}.{name}" if path else name, *_suggestion(names, name)
     if fault.startswith("Invalid value"):
-        tags = [struct.tag for struct in _structs_at(data, kind, path.rpartition(".")[0])]
-        return path, *_suggestion([str(tag) for tag in tags], found)
+        structs = _structs(_types_at(data, kind, path.rpartition(".")[0]))
+        return path, *_suggestion([str(struct.tag) for struct in structs], found)
     if fault.startswith("Invalid enum value"):
-        literals = [
-            literal for literal in _types_at(data, kind, path) if isinstance(literal, inspect.LiteralType)
-        ]
-        return path, *_suggestion(
-            [str(value) for literal in literals for value in literal.values], str(found)
-        )
+        types = _types_at(data, kind, path)
+        values = [value for each in types if isinstance(each, inspect.LiteralType) for value in each.values]
+        return path, *_suggestion([str(value) for value in values], str(found))
     return path, _expected_words(fault), _quoted(found), ""
 
 
@@ -318,45 +335,29 @@ def _quoted(value: Any) -> str:
     return text if len(text) <= _QUOTED else f"{text[:_QUOTED]}..."
 
 
-def _structs_at(data: Any, kind: type, path: str) -> list[inspect.StructType]:
-    """Record types that are allowed at a path."""
-    return [allowed for allowed in _types_at(data, kind, path) if isinstance(allowed, inspect.StructType)]
-
-
 def _types_at(data: Any, kind: type, path: str) -> list[inspect.Type]:
     """Types that are allowed at a path."""
     types: list[inspect.Type] = [inspect.type_info(kind)]
     for token in _tokens(path):
         if isinstance(token, int):
-            types = [_item_type(tuple_type, token) for tuple_type in types if isinstance(tuple_type, _TUPLES)]
+            types = [
+                each.item_types[token] if isinstance(each, inspect.TupleType) else each.item_type
+                for each in types
+                if isinstance(each, inspect.TupleType | inspect.VarTupleType)
+            ]
         else:
             fields = [field for struct in _structs_with_tag_of(data, types) for field in struct.fields]
             types = [field.type for field in fields if field.encode_name == token]
-        types = [
-            member
-            for allowed in types
-            for member in (allowed.types if isinstance(allowed, inspect.UnionType) else (allowed,))
-        ]
+        unions = [each.types if isinstance(each, inspect.UnionType) else (each,) for each in types]
+        types = [each for union in unions for each in union]
         data = data[token]
     return types
 
 
-def _struct_at(data: Any, kind: type, path: str) -> inspect.StructType:
-    """Record type at a path; if several are allowed, the type with the tag in the data."""
-    value = data
-    for token in _tokens(path):
-        value = value[token]
-    return _structs_with_tag_of(value, list(_structs_at(data, kind, path)))[0]
+def _structs(types: list[inspect.Type]) -> list[inspect.StructType]:
+    return [each for each in types if isinstance(each, inspect.StructType)]
 
 
-def _structs_with_tag_of(value: Any, types: list[Any]) -> list[inspect.StructType]:
+def _structs_with_tag_of(value: Any, types: list[inspect.Type]) -> list[inspect.StructType]:
     """Record types without a tag, or with the tag of the value."""
-    structs = [struct for struct in types if isinstance(struct, inspect.StructType)]
-    return [struct for struct in structs if struct.tag is None or value.get(struct.tag_field) == struct.tag]
-
-
-_TUPLES = (inspect.TupleType, inspect.VarTupleType)
-
-
-def _item_type(container: inspect.TupleType | inspect.VarTupleType, index: int) -> inspect.Type:
-    return container.item_types[index] if isinstance(container, inspect.TupleType) else container.item_type
+    return [each for each in _structs(types) if each.tag is None or value.get(each.tag_field) == each.tag]

@@ -1,11 +1,9 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
-from .cluster import Cluster, run_on_cluster
-from .estimates import Estimate, estimate
-from .frames import sweep
+from .cluster import Cluster
 from .grid_files import Grid, grid, read_grid
+from .grid_runs import Estimate, SweepOutcome, SweepPlan, estimate, plan, sweep
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
-from .runner import SweepOutcome, run_in_process
 from .store import Store, is_results_folder
 from .tables import pivot, render_table
 
@@ -18,6 +16,7 @@ __all__ = [
     "Perturbation",
     "Store",
     "SweepOutcome",
+    "SweepPlan",
     "cameras_label",
     "cell_key",
     "delays_frames",
@@ -26,9 +25,8 @@ __all__ = [
     "is_results_folder",
     "perturb",
     "pivot",
+    "plan",
     "read_grid",
     "render_table",
-    "run_in_process",
-    "run_on_cluster",
     "sweep",
 ]

@@ -12,7 +12,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,29 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 from psotrack.errors import InputError, PsotrackError, SettingsError, install_command
 from psotrack.foreground.silhouettes import compute
-from psotrack.support import (
-    Device,
-    Report,
-    keep_compiled,
-    no_progress,
-    processors,
-    share_processors,
-    use_device,
-)
+from psotrack.support import Device, keep_compiled, processors, share_processors, use_device
 from psotrack.sweep.cells import Cell
-from psotrack.sweep.grid_files import Grid
 from psotrack.sweep.inputs import Inputs, source_of
 from psotrack.sweep.locks import POLL_S
-from psotrack.sweep.machine import provenance
-from psotrack.sweep.runner import (
-    Result,
-    SweepOutcome,
-    open_store,
-    outcome,
-    run_cell,
-    sort_out,
-    store_failure,
-)
+from psotrack.sweep.runner import Result, run_cell, store_failure
 from psotrack.sweep.store import Store
 
 if TYPE_CHECKING:
@@ -63,18 +45,21 @@ class Cluster:
         address: address of the cluster's scheduler; "local" starts a cluster on this machine for each call.
         workers: number of processes of the local cluster; None is one per processor, or one if `device` is "gpu".
         device: device on which the workers compute; None leaves the choice to JAX.
+        say: receives the address at which the scheduler of a local cluster listens.
 
     Raises:
-        SettingsError: `workers` is given for a cluster that is not local.
+        SettingsError: `workers` is given for a cluster that is not local, or Dask is not installed.
     """
 
     address: str = "local"
     workers: int | None = None
     device: Device | None = None
+    say: Callable[[str], object] = lambda address: None
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.address != "local":
             raise SettingsError("--workers", expected="--cluster local", found=f"--cluster {self.address}")
+        _distributed()
 
 
 @dataclass(frozen=True)
@@ -82,7 +67,7 @@ class _Job:
     """Settings of a sweep that its workers need.
 
     Attributes:
-        out, data, cache: folders, as in `run_on_cluster`.
+        out, data, cache: folders of the results, the sequences, and the stored silhouettes and programs.
         device: device on which the workers compute; None leaves the choice to JAX.
         devices: number of JAX devices that share a worker's batches; None is one per processor.
         token: text that differs from sweep to sweep, so that a worker reads files again for each sweep.
@@ -97,47 +82,47 @@ class _Job:
 
 
 def run_on_cluster(
-    grid: Grid,
-    out: Path | str,
-    *,
-    data: Path | str,
-    cache: Path | str,
-    cluster: Cluster = Cluster(),
-    report: Report = no_progress,
-    say: Callable[[str], object] = lambda address: None,
-) -> SweepOutcome:
-    """Run the unfinished cells of a grid as tasks of a cluster; see `runner.run_in_process` for runs without a cluster.
+    cluster: Cluster, cells: list[Cell], inputs: Inputs, store: Store
+) -> Generator[Result, None, None]:
+    """Yield the result of each cell when it ends. Each cell waits for its silhouettes, one task per camera.
 
     Args:
-        grid: the cells to run.
-        out: folder of the results. All workers must see `out`, `data` and `cache` under the same paths.
-        data: root folder of the sequences that the grid names.
-        cache: folder of the stored silhouettes and of compiled programs.
-        cluster: the cluster.
-        report: progress bar for the cells that are not finished.
-        say: receives the address at which the scheduler of a local cluster listens.
+        cluster: the cluster; without cells, it is not needed.
+        cells: the cells to run.
+        inputs: inputs of the cells; all workers must see its folders, and that of the results, under the same paths.
+        store: the results.
 
     Raises:
-        InputError: a sequence does not exist, or there is no cluster at the address.
+        InputError: there is no cluster at the address, or it ends.
         OutputError: the results cannot be written.
-        SettingsError: Dask is not installed.
     """
+    if not cells:
+        return
     dask = _distributed()
-    out, data, cache = (Path(os.path.abspath(folder)) for folder in (out, data, cache))
-    # Each row names the device on which it was made, which may differ from this one.
-    origin = {name: value for name, value in provenance().items() if name != "device"} | {"cluster": True}
-    store, inputs = open_store(grid, out, data, origin), Inputs(data, cache)
-    results, cells = sort_out(grid, inputs, store)
     workers = cluster.workers or (1 if cluster.device == "gpu" else processors())
     devices = max(1, processors() // workers) if cluster.address == "local" else None
+    out, data, cache = (Path(os.path.abspath(each)) for each in (store.folder, inputs.data, inputs.cache))
     job = _Job(out, data, cache, cluster.device, devices, secrets.token_hex(8))
-    with report("sweep", len(cells)) as advance, contextlib.ExitStack() as stack:
-        if cells:
-            client = stack.enter_context(_client(dask, cluster.address, workers, say))
-            for result in _results(dask, client, cells, job, inputs, store):
-                results.append(result)
-                advance(1)
-    return outcome(grid, results, store)
+    with _client(dask, cluster, workers) as client:
+        silhouettes: dict[Any, list[Any]] = {}
+        futures = {}
+        for cell in cells:
+            source = source_of(cell)
+            if source not in silhouettes:
+                cameras = inputs.recording_of(cell).rig.names if cell.settings.needs_silhouettes else ()
+                silhouettes[source] = client.map(_make_silhouettes, cameras, cell=cell, job=job, pure=False)
+            futures[client.submit(_run, cell, job, silhouettes[source], pure=False)] = cell
+        for future in dask.as_completed(futures):
+            try:
+                yield future.result()
+            except dask.KilledWorker as error:
+                yield store_failure(futures[future], None, error, store)
+            except CancelledError as error:
+                remedy = "finished cells are kept, and the same command continues the sweep"
+                found = "a scheduler that has ended"
+                raise InputError(
+                    "--cluster", expected="a running scheduler", found=found, remedy=remedy
+                ) from error
 
 
 def _distributed() -> Any:
@@ -155,7 +140,8 @@ def _distributed() -> Any:
 
 
 @contextlib.contextmanager
-def _client(dask: Any, address: str, workers: int, say: Callable[[str], object]) -> Iterator[Client]:
+def _client(dask: Any, cluster: Cluster, workers: int) -> Iterator[Client]:
+    address = cluster.address
     if address == "local":
         with (
             dask.LocalCluster(
@@ -168,10 +154,10 @@ def _client(dask: Any, address: str, workers: int, say: Callable[[str], object])
                 # What happens to a cell is in its result. When Ctrl-C ends the cluster, workers would report their
                 # cancelled tasks on the terminal of the sweep.
                 silence_logs=logging.CRITICAL,
-            ) as cluster,
-            dask.Client(cluster) as client,
+            ) as local,
+            dask.Client(local) as client,
         ):
-            say(cluster.scheduler_address)
+            cluster.say(local.scheduler_address)
             yield client
         return
     if not _SAFE.fullmatch(address):
@@ -188,30 +174,6 @@ def _client(dask: Any, address: str, workers: int, say: Callable[[str], object])
         raise InputError("--cluster", expected=f"a Dask scheduler at {address}", found=why) from error
     with client:
         yield client
-
-
-def _results(
-    dask: Any, client: Client, cells: list[Cell], job: _Job, inputs: Inputs, store: Store
-) -> Iterator[Result]:
-    """Yield the result of each cell when it ends. Each cell waits for its silhouettes, one task per camera."""
-    silhouettes: dict[Any, list[Any]] = {}
-    futures = {}
-    for cell in cells:
-        source = source_of(cell)
-        if source not in silhouettes:
-            cameras = inputs.recording_of(cell).rig.names if cell.settings.needs_silhouettes else ()
-            silhouettes[source] = client.map(_make_silhouettes, cameras, cell=cell, job=job, pure=False)
-        futures[client.submit(_run, cell, job, silhouettes[source], pure=False)] = cell
-    for future in dask.as_completed(futures):
-        try:
-            yield future.result()
-        except dask.KilledWorker as error:
-            yield store_failure(futures[future], None, error, store)
-        except CancelledError as error:
-            remedy = "finished cells are kept, and the same command continues the sweep"
-            raise InputError(
-                "--cluster", expected="a running scheduler", found="a scheduler that has ended", remedy=remedy
-            ) from error
 
 
 def _make_silhouettes(camera: str, cell: Cell, job: _Job) -> None:

@@ -8,25 +8,34 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from psotrack.errors import SettingsError
-from psotrack.support import COLOURS, atomic_write, drone_colour, refuse_to_overwrite
+from psotrack.support import (
+    COLOURS,
+    FAINT,
+    INK,
+    LINE,
+    STYLE,
+    atomic_write,
+    drone_colour,
+    refuse_to_overwrite,
+)
 from psotrack.sweep.tables import natural
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-_DARK, _GREY, _LIGHT = "#2b313a", "#9aa3ad", "#e3e6ea"
-_DPI = 150
 _MARKERS = "osD^vP"
 #: Width of all boxes of a drone, as a share of the distance between drones.
 _BOXES = 0.8
+#: A label of a point of the front that has nearly the height of the one before would cover it.
+_HEIGHT = 0.99
 
 
 def method_colours(methods: Iterable[str]) -> dict[str, str]:
@@ -44,7 +53,7 @@ def save(path: Path | str, figure: Figure, *, force: bool = False) -> None:
     path = Path(path)
     refuse_to_overwrite(path, force)
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI)
+        figure.savefig(temporary, format="png")
 
 
 def pareto_front(
@@ -61,6 +70,7 @@ def pareto_front(
     return order[error[order] < best]
 
 
+@rc_context(STYLE)
 def error_against_work(
     rows: pd.DataFrame,
     *,
@@ -78,57 +88,25 @@ def error_against_work(
     """
     cells = _cells(rows, error)
     sequences, colours = list(dict.fromkeys(cells["sequence"])), method_colours(cells["method"])
-    figure = _figure(4.6 * len(sequences), 4.4)
+    figure = Figure((4.6 * len(sequences), 4.4))
     panels = figure.subplots(1, len(sequences), sharey=True, squeeze=False)[0]
     for axes, sequence in zip(panels, sequences, strict=True):
         here = cells[cells["sequence"] == sequence]
         if sequence in (published or {}):
             low, high = (1e3 * value for value in (published or {})[sequence])
-            axes.axhspan(low, max(high, 1.02 * low), color=_LIGHT, label="published", zorder=0)
-        front = here.iloc[pareto_front(here["work"].to_numpy(), here["error"].to_numpy())]
-        axes.plot(
-            front["work"],
-            front["error"],
-            color=_DARK,
-            linewidth=0.9,
-            zorder=1,
-            label="Pareto front",
-            drawstyle="steps-post",
-        )
+            axes.axhspan(low, max(high, 1.02 * low), color=LINE, label="published", zorder=0)
+        _draw_front(axes, here.iloc[pareto_front(here["work"].to_numpy(), here["error"].to_numpy())])
         for number, (method, colour) in enumerate(colours.items()):
-            of = here[here["method"] == method]
-            axes.errorbar(
-                of["work"],
-                of["error"],
-                of["std"],
-                fmt=_MARKERS[number % len(_MARKERS)],
-                color=colour,
-                markersize=5,
-                linewidth=0.8,
-                label=method,
-            )
-        labelled = np.inf
-        for _, point in front.iterrows():
-            if point["error"] > 0.99 * labelled:
-                continue  # the label would cover the previous point's label
-            labelled = point["error"]
-            axes.annotate(
-                f"{point['particles']:.0f} x {point['iterations']:.0f}",
-                (point["work"], point["error"]),
-                xytext=(3, 3),
-                textcoords="offset points",
-                fontsize=7,
-                rotation=40,
-                rotation_mode="anchor",
-                verticalalignment="bottom",
-                color=_DARK,
-            )
+            points = here.loc[here["method"] == method, ["work", "error", "std"]].to_numpy().T
+            marker = _MARKERS[number % len(_MARKERS)]
+            axes.errorbar(*points, fmt=marker, color=colour, markersize=5, linewidth=0.8, label=method)
         _make_logarithmic(axes, "xy")
-        _finish(axes, "track stage (ms per frame)", "mean error (mm)" if axes is panels[0] else "", sequence)
-    _legend(figure, panels)
-    return figure
+        axes.set(title=sequence, xlabel="track stage (ms per frame)")
+    panels[0].set_ylabel("mean error (mm)")
+    return _with_legend(figure)
 
 
+@rc_context(STYLE)
 def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """A panel per method: each drone's error in the run of median error, and the identity switches of all runs.
 
@@ -136,29 +114,20 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
         errors: rows of `errors_over_time` with a column `seed`, by method.
         title: title of the figure.
     """
-    figure = _figure(9.0, 0.8 + 2.1 * len(errors))
+    figure = Figure((9.0, 0.8 + 2.1 * len(errors)))
     panels = figure.subplots(len(errors), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (method, rows) in zip(panels, errors.items(), strict=True):
         seed = _median_run(rows)
         run = rows[rows["seed"] == seed]
         for number, (drone, of) in enumerate(run.groupby("drone", observed=True)):
-            axes.plot(
-                of["time_s"], 1e3 * of["error_m"], color=drone_colour(number), linewidth=1.0, label=drone
-            )
-            missed = of[of["error_m"].isna()]
-            _mark(
-                axes,
-                missed["time_s"],
-                0.97 - 0.03 * number,
-                marker="_",
-                color=drone_colour(number),
-                label="missed",
-            )
+            colour, missed = drone_colour(number), of.loc[of["error_m"].isna(), "time_s"]
+            axes.plot(of["time_s"], 1e3 * of["error_m"], color=colour, linewidth=1.0, label=drone)
+            _mark(axes, missed, 0.97 - 0.03 * number, marker="_", color=colour, label="missed")
         own, others = (np.unique(of.loc[of["switch"], "time_s"]) for of in (run, rows[rows["seed"] != seed]))
         if len(own):
             heights = axes.get_xaxis_transform()
-            axes.vlines(own, 0, 1, color=_DARK, linestyle=":", label="identity switch", transform=heights)
-        _mark(axes, others, 0.02, marker="|", color=_GREY, label="switch in another run")
+            axes.vlines(own, 0, 1, color=INK, linestyle=":", label="identity switch", transform=heights)
+        _mark(axes, others, 0.02, marker="|", color=FAINT, label="switch in another run")
         error_mm = 1e3 * run["error_m"].dropna()
         # A few very small errors would take half of the logarithmic scale.
         smallest_mm = error_mm.quantile(0.02)
@@ -169,12 +138,13 @@ def error_over_time(errors: Mapping[str, pd.DataFrame], title: str = "") -> Figu
             axes.set_ylim(bottom=0.0)
         runs = rows["seed"].nunique()
         which = f"run {seed}, the median of {runs}" if runs > 1 else f"run {seed}"
-        _finish(axes, "time (s)" if axes is panels[-1] else "", "error (mm)", f"{method}: {which}")
-    figure.suptitle(title, fontsize=10, color=_DARK)
-    _legend(figure, panels)
-    return figure
+        axes.set(title=f"{method}: {which}", ylabel="error (mm)")
+    panels[-1].set_xlabel("time (s)")
+    figure.suptitle(title, fontsize=10)
+    return _with_legend(figure)
 
 
+@rc_context(STYLE)
 def error_per_drone(
     errors: Mapping[str, Mapping[str, pd.DataFrame]], methods: Iterable[str] | None = None
 ) -> Figure:
@@ -188,7 +158,7 @@ def error_per_drone(
     """
     shown = [name for each in errors.values() for name in each]
     colours = method_colours(shown if methods is None else methods)
-    figure = _figure(9.0, 0.8 + 2.3 * len(errors))
+    figure = Figure((9.0, 0.8 + 2.3 * len(errors)))
     panels = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
     for axes, (sequence, runs) in zip(panels, errors.items(), strict=True):
         width = _BOXES / len(runs)
@@ -196,30 +166,52 @@ def error_per_drone(
             # Runs without any drone have no errors.
             if rows.empty:
                 continue
-            colour = colours[method]
-            groups = [
-                (str(name), of["error_m"].dropna()) for name, of in rows.groupby("drone", observed=True)
-            ]
-            places = np.arange(len(groups)) + (number - (len(runs) - 1) / 2) * width
-            boxes = axes.boxplot(
-                [1e3 * values for _, values in groups],
-                positions=places,
+            groups = {f"{name}": of["error_m"].dropna() for name, of in rows.groupby("drone", observed=True)}
+            line, places = {"color": colours[method]}, np.arange(len(groups))
+            axes.boxplot(
+                [1e3 * values for values in groups.values()],
+                positions=places + (number - (len(runs) - 1) / 2) * width,
                 widths=0.85 * width,
                 whis=(5, 95),
                 showfliers=False,
                 patch_artist=True,
                 manage_ticks=False,
+                label=method,
                 medianprops={"color": "white", "linewidth": 1.4},
-                boxprops={"facecolor": colour, "edgecolor": colour},
-                whiskerprops={"color": colour},
-                capprops={"color": colour},
+                boxprops={"facecolor": colours[method], "edgecolor": colours[method]},
+                whiskerprops=line,
+                capprops=line,
             )
-            boxes["boxes"][0].set_label(method)
-            axes.set_xticks(np.arange(len(groups)), [name for name, _ in groups])
+            axes.set_xticks(places, list(groups))
         _make_logarithmic(axes, "y")
-        _finish(axes, "", "error (mm)", sequence)
-    _legend(figure, panels)
-    return figure
+        axes.set(title=sequence, ylabel="error (mm)")
+    return _with_legend(figure)
+
+
+def _draw_front(axes: Axes, front: pd.DataFrame) -> None:
+    """Draw the Pareto front as a line, with the particles and iterations of its points."""
+    axes.plot(
+        front["work"],
+        front["error"],
+        color=INK,
+        linewidth=0.9,
+        drawstyle="steps-post",
+        label="Pareto front",
+        zorder=1,
+    )
+    labelled = np.inf
+    turned: dict[str, Any] = {"rotation": 40, "rotation_mode": "anchor", "verticalalignment": "bottom"}
+    for work, error, *size in front[["work", "error", "particles", "iterations"]].to_numpy(float).tolist():
+        if error <= _HEIGHT * labelled:
+            labelled = error
+            axes.annotate(
+                "{:.0f} x {:.0f}".format(*size),
+                (work, error),
+                xytext=(3, 3),
+                textcoords="offset points",
+                fontsize=7,
+                **turned,
+            )
 
 
 def _mark(axes: Axes, time_s: Any, height: float, **style: Any) -> None:
@@ -247,30 +239,8 @@ def _median_run(rows: pd.DataFrame) -> Any:
     return means.index[(len(means) - 1) // 2]
 
 
-def _figure(width_in: float, height_in: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure((width_in, height_in), dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _finish(axes: Axes, x: str, y: str, title: str) -> None:
-    axes.set_title(title, fontsize=9, color=_DARK, loc="left")
-    axes.set_xlabel(x, color=_DARK)
-    axes.set_ylabel(y, color=_DARK)
-    axes.grid(color=_LIGHT, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors=_DARK, labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(_GREY)
-
-
 def _make_logarithmic(axes: Axes, names: str) -> None:
     """Make the axes x or y logarithmic where they have numbers above 0, with labels such as 20 and 50."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
     for name in names:
         if np.isfinite(getattr(axes.dataLim, f"minpos{name}")):
             getattr(axes, f"set_{name}scale")("log")
@@ -280,19 +250,13 @@ def _make_logarithmic(axes: Axes, names: str) -> None:
             axis.set_minor_formatter(NullFormatter())
 
 
-def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
-    """Add one legend for all panels, below the panels."""
+def _with_legend(figure: Figure) -> Figure:
+    """The figure with one legend for all panels, below them."""
     labelled = {
         label: handle
-        for axes in panels
+        for axes in figure.axes
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(
-        list(labelled.values()),
-        list(labelled),
-        loc="outside lower center",
-        ncols=max(1, min(len(labelled), 7)),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=_DARK,
-    )
+    columns = max(1, min(len(labelled), 7))
+    figure.legend([*labelled.values()], [*labelled], loc="outside lower center", ncols=columns)
+    return figure

@@ -1,13 +1,12 @@
-"""Run the unfinished cells of a grid, one batch of runs per cell, and store their rows."""
+"""Run a cell of a grid: its missing runs as one batch, whose rows are stored."""
 
 from __future__ import annotations
 
 import logging
 import time
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
@@ -18,13 +17,10 @@ from psotrack.errors import InputError, OutputError, PsotrackError
 from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
 from psotrack.settings import flatten
-from psotrack.support import Report, drop_programs_if_many, no_progress
+from psotrack.support import drop_programs_if_many
 from psotrack.sweep.cells import Cell, cell_key, cell_name, describe, input_digest, title
-from psotrack.sweep.grid_files import Grid
-from psotrack.sweep.inputs import Input, Inputs, folder_of, source_of
-from psotrack.sweep.locks import POLL_S
+from psotrack.sweep.inputs import Input, Inputs
 from psotrack.sweep.machine import provenance
-from psotrack.sweep.manifest import note_input, note_run
 from psotrack.sweep.store import Store
 
 logger = logging.getLogger(__name__)
@@ -48,155 +44,7 @@ class Result:
     error: str = ""
 
 
-@dataclass(frozen=True)
-class SweepOutcome:
-    """Results of all cells, in the grid's order, and where they are stored."""
-
-    results: tuple[Result, ...]
-    store: Store
-
-    def count(self, state: str) -> int:
-        """Number of cells whose result has a state."""
-        return sum(result.state == state for result in self.results)
-
-    def to_dict(self) -> dict[str, int]:
-        """Numbers of cells that were finished, that failed, and that an earlier run had finished."""
-        return {state: self.count(state) for state in ("finished", "failed", "left")}
-
-    def __str__(self) -> str:
-        failed = self.count("failed")
-        said = (
-            f"{self.store.folder}: {self.count('finished')} cells finished now, {self.count('left')} before"
-        )
-        return f"{said}, {failed} failed (see {self.store.folder}/cells/*.error.json)" if failed else said
-
-    @property
-    def errors(self) -> list[str]:
-        """One line per failed cell: the cell's title and why it failed."""
-        return [f"{title(result.cell)}: {result.error}" for result in self.results if result.error]
-
-    def rows(self) -> pd.DataFrame:
-        """Rows of the grid's cells and seeds only, in the grid's order; `attrs["errors"]` has the failed cells.
-
-        Raises:
-            InputError: every cell failed.
-        """
-        seeds = {each.key: each.cell.seeds for each in self.results if each.key and not each.error}
-        if not seeds:
-            found = f"that all failed: {self.errors[0]}"
-            raise InputError(self.store.folder, expected="a cell that can be run", found=found)
-        rows = self.store.rows(seeds)
-        rows.attrs["errors"] = self.errors
-        return rows
-
-
-def run_in_process(
-    grid: Grid,
-    out: Path | str,
-    *,
-    data: Path | str,
-    cache: Path | str,
-    jobs: int | None = None,
-    report: Report = no_progress,
-) -> SweepOutcome:
-    """Run the unfinished cells of a grid, one after the other. Several runners on one folder share the work.
-
-    The function returns when every cell is finished or has failed. It waits for cells that other runners work on, and
-    runs these cells when the other runners were killed.
-
-    Args:
-        grid: the cells to run.
-        out: folder of the results (see `Store`).
-        data: root folder of the sequences that the grid names.
-        cache: folder of the stored silhouettes.
-        jobs: number of processes that make silhouettes; None is one per processor.
-        report: progress bar for the cells that are not finished.
-
-    Raises:
-        InputError: a sequence does not exist.
-        OutputError: the results cannot be written.
-    """
-    store, inputs = open_store(grid, out, data, provenance()), Inputs(Path(data), Path(cache), jobs)
-    results, waiting = sort_out(grid, inputs, store)
-    with report("sweep", len(waiting)) as advance:
-        while waiting:
-            busy = []
-            for cell in waiting:
-                result = run_cell(cell, inputs, store)
-                if result.state == "busy":
-                    busy.append(cell)
-                else:
-                    results.append(result)
-                    advance(1)
-            if len(busy) == len(waiting):
-                time.sleep(POLL_S)
-            waiting = busy
-    return outcome(grid, results, store)
-
-
-def outcome(grid: Grid, results: Iterable[Result], store: Store) -> SweepOutcome:
-    """Sort results into the order of the grid's cells."""
-    order = {cell_name(cell): number for number, cell in enumerate(grid.cells())}
-    return SweepOutcome(tuple(sorted(results, key=lambda result: order[cell_name(result.cell)])), store)
-
-
-def open_store(grid: Grid, out: Path | str, data: Path | str, origin: Mapping[str, Any]) -> Store:
-    """Open the folder of a grid's results, and record in the manifest that the grid is run.
-
-    Args:
-        grid: the grid.
-        out: folder of the results.
-        data: root folder of the sequences that the grid names.
-        origin: versions, device, code and commit.
-
-    Raises:
-        InputError: a sequence does not exist.
-        OutputError: the folder cannot be written.
-    """
-    for sequence in grid.sequences:
-        folder_of(sequence, Path(data))
-    store = Store(out)
-    store.tidy()
-    store.change_manifest(lambda manifest: note_run(manifest, grid, origin))
-    return store
-
-
-def sort_out(grid: Grid, inputs: Inputs, store: Store) -> tuple[list[Result], list[Cell]]:
-    """Results of the cells that are finished or cannot be read, and the other cells, sorted by their input.
-
-    The manifest notes the inputs of all cells, so that results of these inputs are those that count.
-    """
-    results, cells, noted = [], [], {}
-    for cell in _by_input(grid.cells()):
-        try:
-            keys = inputs.keys_of(cell)
-        except PsotrackError as error:
-            results.append(store_failure(cell, None, error, store))
-            continue
-        noted[input_digest(keys)] = cell, keys
-        result = _finished(cell, cell_key(cell, keys), store)
-        if result is None:
-            cells.append(cell)
-        else:
-            results.append(result)
-
-    def note(manifest: dict[str, Any]) -> None:
-        for cell, keys in noted.values():
-            note_input(manifest, cell, keys)
-
-    store.change_manifest(note)
-    return results, cells
-
-
-def _by_input(cells: Iterable[Cell]) -> list[Cell]:
-    """Put cells with the same input next to each other; the order stays the grid's otherwise."""
-    groups: dict[Any, list[Cell]] = {}
-    for cell in cells:
-        groups.setdefault((source_of(cell), cell.cameras, cell.perturbation), []).append(cell)
-    return [cell for group in groups.values() for cell in group]
-
-
-def _finished(cell: Cell, key: str, store: Store) -> Result | None:
+def finished_before(cell: Cell, key: str, store: Store) -> Result | None:
     """Result of a cell that is finished already; None if runs are missing."""
     if not set(cell.seeds) <= store.finished_seeds(key):
         return None
@@ -217,7 +65,7 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
         key = cell_key(cell, keys)
         with store.lock(key) as locked:
             # Another process may have finished the cell meanwhile.
-            result = _finished(cell, key, store)
+            result = finished_before(cell, key, store)
             if result is not None:
                 return result
             given = inputs.read(cell) if locked else None

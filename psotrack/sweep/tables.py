@@ -67,7 +67,7 @@ def pivot(
     except (ValueError, TypeError) as error:
         raise SettingsError("value", expected="a column of numbers", found=measured) from error
     labels = pd.DataFrame({name: _sorted_labels(rows[name]) for name in axes})
-    _warn_if_mixed(rows, labels, [name for name in names if name not in axes])
+    _warn_if_mixed(rows, labels)
     groups = labels.assign(value=(scale * numbers).to_numpy()).groupby(axes, observed=True)["value"]
     table = groups.agg(["mean", "std", "count"]).set_axis(FIGURES, axis="columns")
     if columns_by:
@@ -159,21 +159,14 @@ def _find_column(where: str, name: str, names: list[str]) -> str:
     raise SettingsError(where, expected="the name of one column", found=name, remedy=remedy)
 
 
-def _warn_if_mixed(rows: pd.DataFrame, labels: pd.DataFrame, others: list[str]) -> None:
+def _warn_if_mixed(rows: pd.DataFrame, labels: pd.DataFrame) -> None:
     """Log a warning with the columns that describe runs and differ within a figure of the table."""
-    mixed = [
-        name
-        for name in others
-        if name.startswith(DESCRIBING)
-        and name not in _RANDOM
-        and (
-            labels.assign(other=rows[name].map(_label).to_numpy())
-            .groupby(list(labels), observed=True)["other"]
-            .nunique()
-            > 1
-        ).any()
-    ]
-    if mixed:
+    names = [str(name) for name in rows]
+    others = [name for name in names if name.startswith(DESCRIBING) and name not in (*labels, *_RANDOM)]
+    values = rows[others].map(_label).set_axis(labels.index)
+    counts = values.groupby([labels[name] for name in labels], observed=True).nunique()
+    mixed = counts.columns[(counts > 1).any()]
+    if len(mixed):
         logger.warning("figures are not only over runs: they mix different %s", ", ".join(mixed))
 
 

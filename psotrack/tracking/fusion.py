@@ -25,7 +25,7 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
-from psotrack.tracking.camera_errors import LastingCovariances, MeasurementErrors, TrackErrors, noise_ratios
+from psotrack.tracking.camera_errors import LastingCovariances, TrackErrors, noise_ratios
 from psotrack.tracking.matching import SEPARATION_M
 from psotrack.tracking.motion import GATE_999, Measurements, filter_measurements, motion_params
 from psotrack.trajectories import ARRAYS, Status, Tracks, padded
@@ -253,14 +253,8 @@ def _with_errors(
         clock_s=float(mean_square("clock_s")),
         constant_covariance=np.mean([each.constant_covariance for each in known], axis=0),
     )
-    _, filtered = noise_ratios(
-        fused.measured_covariance_m2,
-        fused.measured_covariance_m2,
-        cameras,
-        MeasurementErrors(1.0, motion.error_share, motion.error_time_s),
-        dt_s=1 / fps,
-        jerk_density_m2_s5=motion.jerk_density,
-    )
+    measured_m2 = fused.measured_covariance_m2
+    _, filtered = noise_ratios(measured_m2, measured_m2, cameras, motion, fps)
     # A drone that is not found keeps the weights of the frame in which it was last found, or first will be.
     found = np.isfinite(lines_share)
     last = _last_found(found)

@@ -1,18 +1,19 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
-from .files import check_cells, read_trajectories, write_ambiguity, write_trajectories
+from .files import DroneRows, check_cells, from_rows, read_trajectories, write_ambiguity, write_trajectories
 from .resampling import resample
 from .row_streams import RowStream
 from .status import Status
-from .summaries import DroneSummary, drones_html, summarise, summary_columns
+from .summaries import drones_html, summary_columns
 from .tracks import ARRAYS, Arrival, Tracks, padded
-from .trajectories import Trajectories
+from .trajectories import QUANTITIES, Trajectories
 
 __all__ = [
     "ARRAYS",
     "GATE_M",
+    "QUANTITIES",
     "UNASSIGNED",
     "Arrival",
-    "DroneSummary",
+    "DroneRows",
     "RowStream",
     "Status",
     "Tracks",
@@ -20,10 +21,10 @@ __all__ = [
     "check_cells",
     "drones_html",
     "fixed_partner_values",
+    "from_rows",
     "padded",
     "read_trajectories",
     "resample",
-    "summarise",
     "summary_columns",
     "write_ambiguity",
     "write_trajectories",

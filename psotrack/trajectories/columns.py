@@ -36,43 +36,43 @@ COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov
 RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
 #: The unit quaternion that turns body coordinates into world coordinates, if orientations are known.
 ORIENTATION_COLUMNS = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
+#: Columns of each quantity of `Trajectories`, in written order.
+PARTS = {
+    "position_m": ("x_m", "y_m", "z_m"),
+    "velocity_m_s": ("vx_m_s", "vy_m_s", "vz_m_s"),
+    "fitness": ("fitness",),
+    "num_cameras": ("num_cameras",),
+    "status": ("status",),
+    "covariance_m2": tuple(COVARIANCE_COLUMNS),
+    "relative_covariance_m2": tuple(RELATIVE_COLUMNS),
+    "orientation_wxyz": tuple(ORIENTATION_COLUMNS),
+}
 _UPPER = np.triu_indices(3)
 
 
 def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows"]]:
     """One array per column; unknown values are NaN, and -1 in `num_cameras`."""
     shape = (trajectories.num_frames, trajectories.num_drones)
-    unknown = np.full(shape, np.nan, np.float32)
-    velocity_m_s = trajectories.velocity_m_s
-    status = trajectories.status
-    if status is None:
-        status = np.where(trajectories.seen, Status.TRACKED, Status.LOST)
-    labels = np.array([status.label for status in Status])
     columns = {
         "frame": np.broadcast_to(trajectories.frame[:, None], shape),
         "time_s": np.broadcast_to(trajectories.time_s[:, None], shape),
         "drone": np.broadcast_to(np.array(trajectories.drones, str), shape),
-        "x_m": trajectories.position_m[..., 0],
-        "y_m": trajectories.position_m[..., 1],
-        "z_m": trajectories.position_m[..., 2],
-        "vx_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 0],
-        "vy_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 1],
-        "vz_m_s": unknown if velocity_m_s is None else velocity_m_s[..., 2],
-        "fitness": unknown if trajectories.fitness is None else trajectories.fitness,
-        "num_cameras": np.full(shape, -1) if trajectories.num_cameras is None else trajectories.num_cameras,
-        "status": labels[status],
     }
-    columns = {name: columns[name] for name in COLUMNS}
-    for names, covariance_m2 in (
-        (COVARIANCE_COLUMNS, trajectories.covariance_m2),
-        (RELATIVE_COLUMNS, trajectories.relative_covariance_m2),
-    ):
-        if covariance_m2 is not None:
-            columns |= dict(zip(names, np.moveaxis(covariance_m2[..., *_UPPER], -1, 0), strict=True))
-    if trajectories.orientation_wxyz is not None:
-        columns |= dict(
-            zip(ORIENTATION_COLUMNS, np.moveaxis(trajectories.orientation_wxyz, -1, 0), strict=True)
-        )
+    unknown = {
+        "num_cameras": np.full(shape, -1),
+        "status": np.where(trajectories.seen, Status.TRACKED, Status.LOST),
+    }
+    for quantity, names in PARTS.items():
+        values = getattr(trajectories, quantity)
+        if values is None and names[0] not in COLUMNS:
+            continue
+        if values is None:
+            values = unknown.get(quantity, np.full((*shape, len(names)), np.nan, np.float32))
+        if quantity == "status":
+            values = np.array([status.label for status in Status])[values]
+        if values.ndim > 3:
+            values = values[..., *_UPPER]
+        columns |= dict(zip(names, np.moveaxis(values.reshape(*shape, len(names)), -1, 0), strict=True))
     return {name: column.ravel() for name, column in columns.items()}
 
 

@@ -13,7 +13,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -26,6 +26,8 @@ from psotrack.support import (
     atomic_write,
     check_no_nul,
     first_repeat,
+    first_repeated,
+    first_true,
     has_negative_eigenvalue,
     refuse_to_overwrite,
 )
@@ -33,12 +35,13 @@ from psotrack.trajectories.columns import (
     COLUMNS,
     COVARIANCE_COLUMNS,
     ORIENTATION_COLUMNS,
+    PARTS,
     RELATIVE_COLUMNS,
     columns_of,
     is_known,
 )
 from psotrack.trajectories.status import Status
-from psotrack.trajectories.trajectories import Trajectories
+from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -135,25 +138,24 @@ def read_trajectories(path: Path | str, *, fps: float | None = None) -> Trajecto
     read = _by_suffix(path, {".csv": _read_csv, ".parquet": _read_parquet})
     if not path.is_file():
         raise InputError(path, expected="a file of trajectories", found="no such file")
-    return _from_table(read(path), fps)
+    return from_rows(path, read(path), fps)
 
 
 @dataclass(frozen=True)
-class _Table:
-    """Columns of a file.
+class DroneRows:
+    """The rows of a file, each about one drone in one frame.
 
     Attributes:
-        path: path of the file.
-        columns: values by column name.
-        place: gives the line or row of a row index, for messages.
+        columns: values by column name; `_REQUIRED` at least.
+        place: gives file and line of a row, for messages.
     """
 
-    path: Path
     columns: Mapping[str, Shaped[np.ndarray, "rows"]]
     place: Callable[[int], str]
 
     def error(self, row: int, *, expected: str, found: object) -> InputError:
-        return InputError(f"{self.path}, {self.place(row)}", expected=expected, found=f"{found}")
+        """Error whose message names file and line of a row."""
+        return InputError(self.place(row), expected=expected, found=f"{found}")
 
 
 def check_cells(where: object, num_frames: int, num_drones: int, num_rows: int) -> None:
@@ -196,20 +198,14 @@ def words_of(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> Iterator[tupl
 
 
 def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> None:
-    import pyarrow.parquet as pq
-
-    pq.write_table(parquet_table(columns), path)
-
-
-def parquet_table(columns: Mapping[str, Shaped[np.ndarray, "rows"]]) -> pa.Table:
-    """The columns as a table with units and schema version."""
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
     schema = parquet_schema(list(columns))
     arrays = [
         pa.array(columns[field.name], field.type, mask=~is_known(columns[field.name])) for field in schema
     ]
-    return pa.table(arrays, schema=schema)
+    pq.write_table(pa.table(arrays, schema=schema), path)
 
 
 def parquet_schema(names: Sequence[str]) -> pa.Schema:
@@ -225,7 +221,7 @@ def parquet_schema(names: Sequence[str]) -> pa.Schema:
 # Reading
 
 
-def _read_csv(path: Path) -> _Table:
+def _read_csv(path: Path) -> DroneRows:
     lines: list[int] = []
     rows: list[list[str]] = []
     try:
@@ -261,7 +257,7 @@ def _read_csv(path: Path) -> _Table:
             columns[name] = np.array(words, object)
         else:
             columns[name] = np.array([number(*item, name) for item in zip(lines, words, strict=True)], float)
-    return _Table(path, columns, lambda row: f"line {lines[row]}")
+    return DroneRows(columns, lambda row: f"{path}, line {lines[row]}")
 
 
 def _without_nul(path: Path, lines: Iterable[str]) -> Iterator[str]:
@@ -271,7 +267,7 @@ def _without_nul(path: Path, lines: Iterable[str]) -> Iterator[str]:
         yield line
 
 
-def _read_parquet(path: Path) -> _Table:
+def _read_parquet(path: Path) -> DroneRows:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -288,7 +284,7 @@ def _read_parquet(path: Path) -> _Table:
         raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
     _check_columns(path, names)
     columns = {name: _parquet_column(path, table, name) for name in _READ if name in names}
-    return _Table(path, columns, lambda row: f"row {row + 1}")
+    return DroneRows(columns, lambda row: f"{path}, row {row + 1}")
 
 
 def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray, "rows"]:
@@ -316,56 +312,54 @@ def _check_columns(path: Path, names: list[str]) -> None:
         )
 
 
-def _from_table(table: _Table, fps: float | None) -> Trajectories:
-    columns = table.columns
+def from_rows(path: Path, rows: DroneRows, fps: float | None = None) -> Trajectories:
+    """Trajectories of the rows of a file, in any order; the drones have the order of their first rows.
+
+    Args:
+        path: the file, for messages.
+        rows: the rows.
+        fps: frames per second, for rows without `time_s`.
+
+    Raises:
+        InputError: see `read_trajectories`.
+    """
+    columns = rows.columns
     if not len(columns["frame"]):
-        raise InputError(table.path, expected="at least one row", found="none")
-    _check_values(table)
+        raise InputError(path, expected="at least one row", found="none")
+    _check_values(rows)
     frame, frame_index = np.unique(columns["frame"].astype(np.int64), return_inverse=True)
-    names: dict[str, int] = {}
-    drone_index = np.array([names.setdefault(name, len(names)) for name in columns["drone"]])
-    check_cells(table.path, len(frame), len(names), len(frame_index))
-    cell = frame_index * len(names) + drone_index
-    first = np.unique(cell, return_index=True)[1]
-    if len(first) < len(cell):
-        again = int(np.setdiff1d(np.arange(len(cell)), first)[0])
-        raise table.error(
-            again,
-            expected="one row per frame and drone",
-            found=f"a second row for frame {frame[frame_index[again]]} and drone {columns['drone'][again]}",
-        )
-
-    def grid(*parts: str, missing: float) -> np.ndarray:
-        values = np.full((len(frame) * len(names), len(parts)), missing)
-        values[cell] = np.stack([columns[part] for part in parts], axis=-1)
-        return values.reshape(len(frame), len(names), len(parts))
-
-    def optional(*parts: str) -> np.ndarray | None:
-        known = all(part in columns and np.isfinite(columns[part]).any() for part in parts)
-        return grid(*parts, missing=np.nan) if known else None
-
-    fitness, num_cameras = optional("fitness"), optional("num_cameras")
-    covariance_m2, relative_m2 = optional(*COVARIANCE_COLUMNS), optional(*RELATIVE_COLUMNS)
-    status = np.full(len(frame) * len(names), int(Status.LOST))
-    if "status" in columns:
-        status[cell] = [_STATUS[word] for word in columns["status"]]
+    drones: dict[str, int] = {}
+    drone_index = np.array([drones.setdefault(name, len(drones)) for name in columns["drone"]])
+    check_cells(path, len(frame), len(drones), len(frame_index))
+    cell = frame_index * len(drones) + drone_index
+    if (row := first_repeated(cell)) is not None:
+        found = f"a second row for frame {frame[frame_index[row]]} and drone {columns['drone'][row]}"
+        raise rows.error(row, expected="one row per frame and drone", found=found)
+    shape = (len(frame), len(drones))
+    quantities: dict[str, Any] = {}
+    for name, parts in PARTS.items():
+        if name != "position_m" and not all(part in columns and _has_any(columns[part]) for part in parts):
+            continue
+        values = np.full((len(frame) * len(drones), len(parts)), Status.LOST if name == "status" else np.nan)
+        words = [_STATUS[word] for word in columns["status"]] if name == "status" else None
+        values[cell] = np.stack([columns[part] if words is None else words for part in parts], axis=-1)
+        quantities[name] = values[:, _PLACES] if len(parts) == len(COVARIANCE_COLUMNS) else values
+        quantities[name] = quantities[name].reshape(*shape, *QUANTITIES[name])
+    for name in {"num_cameras", "status"} & quantities.keys():
+        quantities[name] = np.nan_to_num(quantities[name]).astype(np.int64)
     return Trajectories(
-        frame=frame,
-        time_s=_times(table, frame, frame_index, fps),
-        drones=tuple(names),
-        position_m=grid("x_m", "y_m", "z_m", missing=np.nan),
-        velocity_m_s=optional("vx_m_s", "vy_m_s", "vz_m_s"),
-        orientation_wxyz=optional(*ORIENTATION_COLUMNS),
-        fitness=None if fitness is None else fitness[..., 0],
-        num_cameras=None if num_cameras is None else np.nan_to_num(num_cameras[..., 0]).astype(np.int64),
-        status=status.reshape(len(frame), len(names)) if "status" in columns else None,
-        covariance_m2=None if covariance_m2 is None else covariance_m2[..., _PLACES],
-        relative_covariance_m2=None if relative_m2 is None else relative_m2[..., _PLACES],
+        frame=frame, time_s=_times(rows, frame, frame_index, fps), drones=tuple(drones), **quantities
     )
 
 
-def _check_values(table: _Table) -> None:
-    for name, values in table.columns.items():
+def _has_any(column: Shaped[np.ndarray, "rows"]) -> bool:
+    """Whether some value of a column is known."""
+    return column.dtype == object or bool(np.isfinite(column).any())
+
+
+def _check_values(rows: DroneRows) -> None:
+    columns = rows.columns
+    for name, values in columns.items():
         if name == "drone":
             wrong, expected = values == "", "a name"
         elif name == "status":
@@ -376,33 +370,22 @@ def _check_values(table: _Table) -> None:
             wrong, expected = ~(_whole(values) | np.isnan(values)), "a whole number from 0, or nothing"
         else:
             wrong, expected = np.abs(values) > LARGEST, f"{MODERATE}, or nothing"
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            raise table.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
-    _check_orientations(table)
-    for names in (COVARIANCE_COLUMNS, RELATIVE_COLUMNS):
-        _check_covariances(table, list(names))
-
-
-def _check_orientations(table: _Table) -> None:
-    if all(name in table.columns for name in ORIENTATION_COLUMNS):
-        length = np.linalg.norm([table.columns[name] for name in ORIENTATION_COLUMNS], axis=0)
-        wrong = np.abs(length - 1) > LENGTH_TOLERANCE
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            names = ", ".join(ORIENTATION_COLUMNS)
-            raise table.error(row, expected=f"a unit quaternion in {names}", found=f"length {length[row]:g}")
-
-
-def _check_covariances(table: _Table, names: list[str]) -> None:
-    if not all(name in table.columns for name in names):
-        return
-    upper = np.stack([table.columns[name] for name in names], axis=-1)
-    wrong = has_negative_eigenvalue(upper[:, _PLACES])
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        found = f"a matrix with a negative eigenvalue, {upper[row].tolist()}"
-        raise table.error(row, expected=f"a covariance in {', '.join(names)}", found=found)
+        if (row := first_true(wrong)) is not None:
+            raise rows.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
+    for names in (ORIENTATION_COLUMNS, COVARIANCE_COLUMNS, RELATIVE_COLUMNS):
+        if not all(name in columns for name in names):
+            continue
+        together = np.stack([columns[name] for name in names], axis=-1)
+        length = np.linalg.norm(together, axis=-1)
+        if names is ORIENTATION_COLUMNS:
+            wrong, expected = np.abs(length - 1) > LENGTH_TOLERANCE, "a unit quaternion"
+        else:
+            wrong, expected = has_negative_eigenvalue(together[:, _PLACES]), "a covariance"
+        if (row := first_true(wrong)) is not None:
+            found = f"length {length[row]:g}"
+            if names is not ORIENTATION_COLUMNS:
+                found = f"a matrix with a negative eigenvalue, {together[row].tolist()}"
+            raise rows.error(row, expected=f"{expected} in {', '.join(names)}", found=found)
 
 
 def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
@@ -411,26 +394,24 @@ def _whole(values: Float[np.ndarray, "rows"]) -> Bool[np.ndarray, "rows"]:
 
 
 def _times(
-    table: _Table, frame: Int[np.ndarray, "frames"], frame_index: Int[np.ndarray, "rows"], fps: float | None
+    rows: DroneRows, frame: Int[np.ndarray, "frames"], frame_index: Int[np.ndarray, "rows"], fps: float | None
 ) -> Float[np.ndarray, "frames"]:
     """(frames,), times of the frames, seconds; all rows of a frame must agree."""
     time_s = np.full(len(frame), np.nan) if fps is None else frame / fps
-    given_s = table.columns.get("time_s", np.full(len(frame_index), np.nan))
+    given_s = rows.columns.get("time_s", np.full(len(frame_index), np.nan))
     known = np.flatnonzero(~np.isnan(given_s))
     # In reverse order, so that the time of a frame's first row is used.
     time_s[frame_index[known[::-1]]] = given_s[known[::-1]]
+    wanted_s = time_s[frame_index]
     # The limit is far above rounding errors and far below the time between two frames.
-    differs = np.abs(time_s[frame_index[known]] - given_s[known]) > 1e-3
-    if differs.any():
-        row = int(known[np.argmax(differs)])
-        expected = f"{time_s[frame_index[row]]:g} s as in another row of this frame"
-        raise table.error(row, expected=expected, found=f"{given_s[row]:g} s")
-    after = first_repeat(time_s)
-    if after is not None:
-        row = int(np.argmax(frame_index == after))
+    if (row := first_true(np.abs(wanted_s - given_s) > 1e-3)) is not None:
+        expected = f"{wanted_s[row]:g} s as in another row of this frame"
+        raise rows.error(row, expected=expected, found=f"{given_s[row]:g} s")
+    if (after := first_repeat(time_s)) is not None:
         expected = f"a time after {time_s[after - 1]:g} s, that of frame {frame[after - 1]}"
-        raise table.error(row, expected=expected, found=f"{time_s[after]:g} s")
-    if np.isnan(time_s).any():
-        row = int(np.argmax(np.isnan(time_s)[frame_index]))
-        raise table.error(row, expected="a time_s, or a frame rate to compute it", found="neither")
+        raise rows.error(
+            int(np.argmax(frame_index == after)), expected=expected, found=f"{time_s[after]:g} s"
+        )
+    if (row := first_true(np.isnan(wanted_s))) is not None:
+        raise rows.error(row, expected="a time_s, or a frame rate to compute it", found="neither")
     return time_s

@@ -34,7 +34,7 @@ def resample(
     Orientations are also NaN between samples that are more than 150 degrees apart: which way they turned is not known.
 
     Args:
-        trajectories: trajectories with at least two samples.
+        trajectories: trajectories; with a single sample, no position is known.
         frame: (frames,), numbers of the new frames.
         time_s: (frames,), times of the new frames, seconds.
         later_s: the trajectories at time t + `later_s` are the new ones at time t, seconds.
@@ -81,7 +81,7 @@ def _turned(
 
 def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:
     """Longest gap between samples over which positions are interpolated, seconds."""
-    return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s))))
+    return max(MAX_GAP_S, 1.5 * float(np.median(np.diff(time_s)))) if len(time_s) > 1 else MAX_GAP_S
 
 
 def between_samples(

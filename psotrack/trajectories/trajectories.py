@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,6 +18,17 @@ from psotrack.trajectories.summaries import drones_html
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+#: Quantities with axes (frames, drones, ...), and the shape of one value.
+QUANTITIES: dict[str, tuple[int, ...]] = {
+    "position_m": (3,),
+    "velocity_m_s": (3,),
+    "orientation_wxyz": (4,),
+    "fitness": (),
+    "num_cameras": (),
+    "status": (),
+    "covariance_m2": (3, 3),
+    "relative_covariance_m2": (3, 3),
+}
 #: Largest asymmetry of a covariance relative to its largest element: about a hundred roundings of float32.
 SYMMETRY = 1e-5
 
@@ -59,20 +71,10 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         frames, drones = len(self.frame), len(self.drones)
-        expected = {
-            "time_s": (frames,),
-            "position_m": (frames, drones, 3),
-            "velocity_m_s": (frames, drones, 3),
-            "orientation_wxyz": (frames, drones, 4),
-            "fitness": (frames, drones),
-            "num_cameras": (frames, drones),
-            "status": (frames, drones),
-            "covariance_m2": (frames, drones, 3, 3),
-            "relative_covariance_m2": (frames, drones, 3, 3),
-        }
-        for name, shape in expected.items():
-            value = getattr(self, name)
-            if value is not None and value.shape != shape:
+        shapes = {name: (frames, drones, *shape) for name, shape in QUANTITIES.items()}
+        for name, value in {"time_s": self.time_s, **self.quantities()}.items():
+            shape = shapes.get(name, (frames,))
+            if value.shape != shape:
                 raise InputError(f"trajectories.{name}", expected=f"shape {shape}", found=f"{value.shape}")
         if len(set(self.drones)) < drones:
             raise InputError("trajectories.drones", expected="different names", found=f"{self.drones}")
@@ -80,9 +82,9 @@ class Trajectories:
             raise InputError(
                 "trajectories.frame", expected="increasing frame numbers", found="repeats or steps back"
             )
-        for name in ("covariance_m2", "relative_covariance_m2"):
-            if getattr(self, name) is not None:
-                _check_symmetric(name, getattr(self, name))
+        for name, value in self.quantities().items():
+            if name.endswith("covariance_m2"):
+                _check_symmetric(name, value)
 
     def _repr_html_(self) -> str:
         """What a notebook shows: a table with a row for each drone."""
@@ -93,6 +95,11 @@ class Trajectories:
     def to_pandas(self) -> DataFrame:
         """A data frame with the rows and columns of a file of tracks; what is not known is NaN."""
         return data_frame(self)
+
+    def quantities(self) -> dict[str, np.ndarray]:
+        """The quantities with axes (frames, drones, ...) that are known, by name."""
+        values = {name: getattr(self, name) for name in QUANTITIES}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def num_frames(self) -> int:
@@ -126,22 +133,19 @@ class Trajectories:
                 "trajectories", expected=f"frames {frame[0]} to {frame[-1]}", found="some missing"
             )
 
-        def rows(value: np.ndarray | None) -> np.ndarray | None:
-            return None if value is None else value[index_in]
-
-        return replace(
-            self,
-            frame=self.frame[index_in],
-            time_s=self.time_s[index_in],
-            position_m=self.position_m[index_in],
-            velocity_m_s=rows(self.velocity_m_s),
-            orientation_wxyz=rows(self.orientation_wxyz),
-            fitness=rows(self.fitness),
-            num_cameras=rows(self.num_cameras),
-            status=rows(self.status),
-            covariance_m2=rows(self.covariance_m2),
-            relative_covariance_m2=rows(self.relative_covariance_m2),
+        return self._with(
+            lambda value: value[index_in], frame=self.frame[index_in], time_s=self.time_s[index_in]
         )
+
+    def of_drones(self, index: Sequence[int]) -> Trajectories:
+        """Trajectories of chosen drones only, by their indices."""
+        drones = tuple(self.drones[each] for each in index)
+        return self._with(lambda value: value[:, list(index)], drones=drones)
+
+    def _with(self, change: Callable[[np.ndarray], np.ndarray], **values: Any) -> Trajectories:
+        """These trajectories with other values, and all quantities changed."""
+        changed: dict[str, Any] = {name: change(value) for name, value in self.quantities().items()}
+        return replace(self, **values, **changed)
 
 
 def _check_symmetric(name: str, covariance_m2: Float[np.ndarray, "frames drones 3 3"]) -> None:

@@ -5,18 +5,16 @@ The format is defined by the TUM RGB-D benchmark (Sturm et al., IROS 2012). It h
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
-from psotrack.errors import InputError
 from psotrack.support import (
-    LEAST_STEP_S,
     atomic_write,
     check_file_name,
-    is_moderate,
+    first_repeat,
+    first_true,
+    read_numbers,
     read_text,
     refuse_to_overwrite,
 )
@@ -44,10 +42,8 @@ def write_tum(folder: Path | str, trajectories: Trajectories, *, force: bool = F
         InputError: a drone's name cannot be the name of a file.
         OutputError: a file exists and `force` is not set, or it cannot be written; older files are unchanged.
     """
-    folder = Path(folder)
-    for name in trajectories.drones:
-        check_file_name(name, "drones")
-    paths = [folder / f"{name}.tum" for name in trajectories.drones]
+    names = [check_file_name(name, "drones") for name in trajectories.drones]
+    paths = [Path(folder) / f"{name}.tum" for name in names]
     for path in paths:
         refuse_to_overwrite(path, force)
     for drone, path in enumerate(paths):
@@ -64,23 +60,21 @@ def read_tum(path: Path | str) -> Trajectories:
             line.
     """
     path = Path(path)
-    lines = read_text(path).splitlines()
-    poses: list[list[float]] = []
-    for place, values in _poses(path, lines):
-        if poses and values[0] - poses[-1][0] < LEAST_STEP_S:
-            expected = "times that increase from line to line"
-            raise InputError(place, expected=expected, found=f"{values[0]} s after {poses[-1][0]} s")
-        poses.append(values)
-    if not poses:
-        raise InputError(path, expected="at least one pose", found="none")
-    table = np.array(poses)
-    orientation_wxyz = np.roll(_unit(table[:, 4:]), 1, axis=-1)[:, None]
+    read = read_numbers(path, 8, "8 finite numbers: timestamp tx ty tz qx qy qz qw")
+    time_s, position_m, quaternion = read.values[:, 0], read.values[:, 1:4], read.values[:, 4:]
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    if (row := first_true(length[:, 0] == 0)) is not None:
+        raise read.error(row, expected="a quaternion", found="0 0 0 0")
+    if (row := first_repeat(time_s)) is not None:
+        found = f"{time_s[row]} s after {time_s[row - 1]} s"
+        raise read.error(row, expected="times that increase from line to line", found=found)
+    known = _UNKNOWN not in read_text(path).splitlines()
     return Trajectories(
-        frame=np.arange(len(table)),
-        time_s=table[:, 0],
+        frame=np.arange(len(time_s)),
+        time_s=time_s,
         drones=(path.stem,),
-        position_m=table[:, None, 1:4],
-        orientation_wxyz=None if _UNKNOWN in lines else orientation_wxyz,
+        position_m=position_m[:, None],
+        orientation_wxyz=np.roll(quaternion / length, 1, axis=-1)[:, None] if known else None,
     )
 
 
@@ -97,29 +91,3 @@ def tum_text(trajectories: Trajectories, drone: int) -> str:
     words = [column.astype(str) for column in columns]
     lines = [_HEADER] + [_UNKNOWN] * (not known) + [" ".join(row) for row in zip(*words, strict=True)]
     return "".join(f"{line}\n" for line in lines)
-
-
-def _poses(path: Path, lines: list[str]) -> Iterator[tuple[str, list[float]]]:
-    """Yield place and numbers of each line with a pose."""
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.startswith("#"):
-            place = f"{path}, line {number}"
-            yield place, _numbers(place, line)
-
-
-def _unit(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "rows 4"]:
-    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-
-
-def _numbers(place: str, line: str) -> list[float]:
-    expected = "8 finite numbers: timestamp tx ty tz qx qy qz qw"
-    try:
-        values = [float(word) for word in line.split()]
-    except ValueError as error:
-        raise InputError(place, expected=expected, found=f"{error}") from None
-    if len(values) != 8 or not all(map(is_moderate, values)):
-        raise InputError(place, expected=expected, found=repr(line.strip()))
-    if not np.linalg.norm(values[4:]):
-        found = " ".join(f"{value:g}" for value in values[4:])
-        raise InputError(place, expected="a quaternion", found=found)
-    return values

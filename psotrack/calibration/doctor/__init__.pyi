@@ -1,6 +1,7 @@
 from .agreement import Agreement
 from .checked_adjustment import CheckedAdjustment, improve_with_check
-from .examination import Diagnosis, examine, sampled_frames
+from .diagnosis import Diagnosis
+from .examination import examine, sampled_frames
 from .findings import Finding
 
 __all__ = [

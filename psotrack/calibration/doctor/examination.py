@@ -8,7 +8,7 @@ Small faults, of cameras and of clocks, are found by comparing all hypotheses on
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from psotrack.calibration.doctor.agreement import MIN_VIEWPOINTS, Agreement, measure_agreement
 from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, collect_views, explain_camera
 from psotrack.calibration.doctor.common_points import CommonPoints, find_common_points
+from psotrack.calibration.doctor.diagnosis import Diagnosis
 from psotrack.calibration.doctor.fault_search import consistent_share, find_faults
 from psotrack.calibration.doctor.findings import (
     Finding,
@@ -26,7 +27,7 @@ from psotrack.calibration.doctor.findings import (
 )
 from psotrack.calibration.doctor.hypotheses import parameters_of
 from psotrack.calibration.doctor.late_videos import measure_lags
-from psotrack.calibration.doctor.reference_fit import ReferenceFit, fit_reference
+from psotrack.calibration.doctor.reference_fit import fit_reference
 from psotrack.calibration.doctor.rig_interpretations import (
     find_better_interpretation,
     required_share,
@@ -60,29 +61,6 @@ MIN_POINTS = 12
 MIN_CONSISTENT = 0.75
 #: Smallest and largest plausible size of a body, metres.
 PLAUSIBLE_BODY_M = (0.01, 10.0)
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Result of an examination.
-
-    Attributes:
-        findings: disagreements; empty for a correct rig.
-        found: agreement of the rig with its sightings, after a wrong unit or interpretation was corrected.
-        late_frames: (cameras,), how late each camera's video shows the scene, relative to the median camera, frames:
-            frame i of a video that is late by k shows what the others show in frame i - k; NaN if it cannot be found.
-        late_std_frames: (cameras,), standard deviations of `late_frames`.
-        epipolar_px: (cameras, cameras), median distances of sightings from each other's epipolar lines, pixels; NaN for
-            pairs of cameras without common points.
-        reference: fit of the reference; None without a reference.
-    """
-
-    findings: tuple[Finding, ...]
-    found: Agreement
-    late_frames: Float[np.ndarray, "cameras"]
-    late_std_frames: Float[np.ndarray, "cameras"]
-    epipolar_px: Float[np.ndarray, "cameras cameras"]
-    reference: ReferenceFit | None
 
 
 def examine(
@@ -135,7 +113,7 @@ def examine(
             rig, found = interpretation.rig, better
             points = find_common_points(rig, sightings, frames, bounds_m, fps)
     if max(found.share, float(points.share.max())) < MIN_SHARE or len(points.frame) < MIN_POINTS:
-        return _undecided(rig, found, [*findings, _nothing_agrees(found, points)])
+        return _undecided(rig, found, [*findings, _nothing_agrees(found, points)], fps)
     consistent = consistent_share(rig, points)
     if consistent < MIN_CONSISTENT:
         message = (
@@ -145,7 +123,7 @@ def examine(
         finding = Finding(
             "too little seen", (), message, "the rig cannot be checked; pass other --detections"
         )
-        return _undecided(rig, found, [*findings, finding])
+        return _undecided(rig, found, [*findings, finding], fps)
     lag, std = measure_lags(rig, points, fps)
     gross, sound = _find_gross_faults(rig, found, points, sightings, frames, bounds_m, fps)
     findings += gross
@@ -170,13 +148,15 @@ def examine(
         inside = found.frame < reference.num_frames
         fit = fit_reference(found.frame[inside], found.position_m[inside], reference, fps)
         findings += describe_reference(fit, fps)
-    return Diagnosis(tuple(findings), found, lag, std, _median_epipolar_distances(rig, found), fit)
+    epipolar_px = _median_epipolar_distances(rig, found)
+    return Diagnosis(rig.names, fps, tuple(findings), found, lag, std, epipolar_px, fit)
 
 
-def _undecided(rig: Rig, found: Agreement, findings: list[Finding]) -> Diagnosis:
+def _undecided(rig: Rig, found: Agreement, findings: list[Finding], fps: float) -> Diagnosis:
     """The diagnosis of a rig that cannot be checked further."""
     nothing = np.full(len(rig), np.nan)
-    return Diagnosis(tuple(findings), found, nothing, nothing, _median_epipolar_distances(rig, found), None)
+    epipolar_px = _median_epipolar_distances(rig, found)
+    return Diagnosis(rig.names, fps, tuple(findings), found, nothing, nothing, epipolar_px, None)
 
 
 def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chosen"]:

@@ -211,7 +211,7 @@ def _open(name: str, path: Path) -> CameraImages:
     elif path.is_dir():
         files = image_files(path)
         if not files:
-            raise InputError(path, expected="a folder of images", found="none in it")
+            raise InputError(path, expected="a folder with videos or images", found="neither in it")
     else:
         video = probe(path)
         return CameraImages(name, path, video.image_size_wh, np.arange(video.num_frames), video)

@@ -274,6 +274,21 @@ def fit_world(
     return change, dict(zip(names, left_m.tolist(), strict=True))
 
 
+def world_in_words(path: Path, left_m: Mapping[str, float]) -> str:
+    """What the world is, and how well its points are met.
+
+    Args:
+        path: file of the points.
+        left_m: the distances that are left, metres, by point.
+    """
+    worst = max(left_m, key=lambda name: left_m[name])
+    rms_mm = 1e3 * float(np.sqrt(np.mean(np.square(list(left_m.values())))))
+    worst_mm = 1e3 * left_m[worst]
+    return (
+        f"that of {path}: {len(left_m)} points are met to {rms_mm:.1f} mm (rms), {worst} to {worst_mm:.1f} mm"
+    )
+
+
 def _triangulated(rig: Rig, given: GivenWorld) -> dict[str, np.ndarray]:
     """Positions of marked points in the rig's world; NaN for a point that one camera sees."""
     unknown = [name for name in given.sightings if name not in rig.names]

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from psotrack.calibration.board_recognition import (
     Recognised,
     explain_markers_on_chessboard,
-    explain_missing_board,
     measure_marker_share,
+    missing_board,
     number_of_first_images,
     recognise_board,
 )
@@ -98,8 +98,7 @@ def find_views(
     recognised = recognise_board(board, _samples(cameras, frames))
     if not recognised.views:
         images = list(islice(_samples(cameras, frames), _MOST_SAMPLES))
-        found, remedy = explain_missing_board(board, images)
-        raise InputError("board", expected=f"a {board}", found=found, remedy=remedy)
+        raise missing_board(board, images)
     _check_markers(recognised, _samples(cameras, frames))
     finder = recognised.finder()
     corners_px = np.full((len(cameras), len(number), board.num_corners, 2), np.nan)

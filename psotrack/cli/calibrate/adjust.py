@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from psotrack.cli.calibrate.options import OUT
-from psotrack.cli.calibrate.shown import row_of, show_cameras
-from psotrack.cli.options import FORCE, JSON, QUIET, SEQUENCE
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.options import SEQUENCE, running
+from psotrack.cli.output import Output
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,35 +30,33 @@ ALL_OFF = (
 )
 
 
+@dataclass(frozen=True)
+class Adjusting:
+    """By what a rig is adjusted.
+
+    Attributes:
+        tracks: tracks of SEQ's drones, a file of `track`.
+        fixed: cameras that are not moved.
+        refine_focal_length: scale all focal lengths by a common factor, too.
+        noise_px: standard deviation of the middle of a box from frame to frame, along x and along y, in pixels; None:
+            1, plus 5 % of the box's mean side.
+    """
+
+    tracks: Path
+    fixed: tuple[str, ...] = ()
+    refine_focal_length: bool = False
+    noise_px: float | None = None
+
+
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
-@click.option(
-    "--tracks",
-    type=click.Path(path_type=Path),
-    required=True,
-    help="Tracks of SEQ's drones, a file of `track`.",
-)
-@click.option("--fixed", default="", metavar="NAME,NAME...", help="Cameras that are not moved.")
-@click.option("--refine-focal-length", is_flag=True, help="Scale all focal lengths by a common factor, too.")
-@click.option(
-    "--noise",
-    "noise_px",
-    type=float,
-    help="Standard deviation of the middle of a box from frame to frame, along x and along y, in pixels.  "
-    "[default: 1, plus 5 % of the box's mean side]",
-)
+@options_of(Adjusting, "how")
 @OUT
-@FORCE
-@QUIET
-@JSON
-@pass_output
+@running(progress=False)
 def adjust(
     output: Output,
     sequence: Path,
-    tracks: Path,
-    fixed: str,
-    refine_focal_length: bool,
-    noise_px: float | None,
+    how: Adjusting,
     out: Path,
 ) -> None:
     """Move the cameras of SEQ that disagree with the other cameras about its drones, by a bundle adjustment.
@@ -77,7 +75,7 @@ def adjust(
     Example:
       psotrack calibrate adjust data/Simulated_Data/S02_D4_A --tracks tracks.csv --out better.toml
     """
-    from psotrack.calibration import find_drones_in_boxes
+    from psotrack.calibration import PlacedCameras, find_drones_in_boxes
     from psotrack.calibration.doctor import improve_with_check
     from psotrack.geometry.rig_files import write_rig
     from psotrack.recordings import read_detections
@@ -95,26 +93,26 @@ def adjust(
         )
     recording.check_detections(recording.detections)
     detections = {name: read_detections(path) for name, path in recording.detections.items()}
-    flown = read_tracks(tracks, recording=recording if recording.videos else None)
+    flown = read_tracks(how.tracks, recording=recording if recording.videos else None)
     frame_times = None
     if not _is_synchronous(recording):
         frame_times = {name: times for name, times in recording.exposed.items() if name in detections}
     views = find_drones_in_boxes(recording.rig, detections, flown, frame_times=frame_times)
-    held = tuple(name for name in fixed.split(",") if name)
+    held = how.fixed
     checked = improve_with_check(
-        recording.rig, views, noise_px, fixed=held, refine_focal_length=refine_focal_length
+        recording.rig, views, how.noise_px, fixed=held, refine_focal_length=how.refine_focal_length
     )
     improved = checked.improved
     write_rig(out, improved.rig, force=output.force)
     rows = _rows(recording.rig, improved, views, held)
-    show_cameras(output, rows, out)
+    output.result(PlacedCameras(improved.rig, rows, path=out))
     if checked.all_off:
         output.say(ALL_OFF)
     elif checked.better:
         output.say(_in_words(improved, rows))
     for line in _check_in_words(checked):
         output.say(line)
-    if refine_focal_length:
+    if how.refine_focal_length:
         scale, std = improved.everything.focal_scale, improved.everything.focal_scale_std
         done = "" if improved.rescaled else ", which may be chance: the focal lengths are not changed"
         output.say(f"focal lengths x {scale:.5f} ± {std:.5f}{done}")
@@ -134,6 +132,8 @@ def _rows(
     rig: Rig, improved: Improved, views: DroneViews, held: tuple[str, ...]
 ) -> dict[str, dict[str, Any]]:
     """Results of each camera, by name."""
+    from psotrack.calibration import row_of
+
     shown = improved.everything if improved.final is None else improved.final
     T, T_before = (np.asarray(one.cameras.T_cam_world) for one in (improved.rig, rig))
     turns = Rotation.from_matrix(T[:, :3, :3] @ T_before[:, :3, :3].swapaxes(-1, -2))

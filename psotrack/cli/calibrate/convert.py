@@ -2,56 +2,49 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.calibrate.options import SIZE
-from psotrack.cli.options import FORCE, JSON, QUIET
-from psotrack.cli.output import POSITION, Output, format_numbers, pass_output
-from psotrack.cli.records import HelpfulCommand
-from psotrack.errors import SettingsError
+from psotrack.cli.options import running
+from psotrack.cli.output import Output
+from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.support import POSITION, format_numbers
 
 if TYPE_CHECKING:
     from psotrack.geometry import Rig
 
 
+@dataclass(frozen=True)
+class Conversion:
+    """How a calibration is read and written.
+
+    Attributes:
+        size: size of the images in pixels, if the calibration file does not contain the size.
+        units: unit of the lengths in IN; needed if the format leaves the unit open.
+        format: format of IN; None: found by the content.
+        to: format of OUT; None: by the name of OUT.
+        lenses: convert only the lenses; IN need not have poses.
+        undistorted: set the distortion to zero: the videos are undistorted already.
+    """
+
+    size: tuple[int, int] | None = None
+    units: Literal["m", "cm", "mm"] | None = None
+    format: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
+    to: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
+    lenses: bool = False
+    undistorted: bool = False
+
+
 @click.command(cls=HelpfulCommand)
 @click.argument("source", metavar="IN", type=click.Path(path_type=Path))
 @click.argument("out", metavar="OUT", type=click.Path(path_type=Path))
-@SIZE
-@click.option(
-    "--units",
-    "--unit",
-    "units",
-    metavar="m|cm|mm",
-    help="Unit of the lengths in IN; needed if the format leaves the unit open.",
-)
-@click.option(
-    "--format", "file_format", metavar="NAME", help="Format of IN.  [default: found by the content]"
-)
-@click.option("--to", "out_format", metavar="NAME", help="Format of OUT.  [default: by the name of OUT]")
-@click.option("--lenses", is_flag=True, help="Convert only the lenses; IN need not have poses.")
-@click.option(
-    "--undistorted", is_flag=True, help="Set the distortion to zero: the videos are undistorted already."
-)
-@FORCE
-@QUIET
-@JSON
-@pass_output
-def convert(
-    output: Output,
-    source: Path,
-    out: Path,
-    image_size_wh: tuple[int, int] | None,
-    units: str | None,
-    file_format: str | None,
-    out_format: str | None,
-    lenses: bool,
-    undistorted: bool,
-) -> None:
+@options_of(Conversion, "how")
+@running(progress=False)
+def convert(output: Output, source: Path, out: Path, how: Conversion) -> None:
     """Convert the calibration IN, of any program in the list below, to OUT.
 
     \b
@@ -69,20 +62,18 @@ def convert(
     from psotrack.geometry import Rig
     from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
 
-    if units is not None and units not in UNITS_M:
-        raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=units)
-    if lenses:
-        rig = read_lenses(source, image_size_wh, file_format=file_format)
+    if how.lenses:
+        rig = read_lenses(source, how.size, file_format=how.format)
     else:
-        metres = None if units is None else UNITS_M[units]
-        rig = read_rig(source, image_size_wh, metres_per_unit=metres, file_format=file_format)
-    if undistorted:
+        metres = None if how.units is None else UNITS_M[how.units]
+        rig = read_rig(source, how.size, metres_per_unit=metres, file_format=how.format)
+    if how.undistorted:
         rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
-    if lenses:
+    if how.lenses:
         write_lenses(out, rig, force=output.force)
     else:
-        write_rig(out, rig, force=output.force, file_format=out_format)
-    _show(output, rig, out, placed=not lenses)
+        write_rig(out, rig, force=output.force, file_format=how.to)
+    _show(output, rig, out, placed=not how.lenses)
 
 
 def _show(output: Output, rig: Rig, out: Path, *, placed: bool) -> None:

@@ -3,75 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.calibrate.located import locate_cameras
-from psotrack.cli.calibrate.options import OUT, SIZE, noise_option
-from psotrack.cli.calibrate.shown import show_cameras
-from psotrack.cli.options import FORCE, FOV, JSON, QUIET, dictionary_option
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
-from psotrack.cli.types import Numbers
+from psotrack.cli.calibrate.options import OUT
+from psotrack.cli.options import running
+from psotrack.cli.output import Output
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import InputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
     from psotrack.calibration import ImagePoints
 
 
+@dataclass(frozen=True)
+class Points:
+    """Points whose positions are known.
+
+    Attributes:
+        pairs: points marked by hand: camera,point,x_px,y_px,x_m,y_m,z_m.
+        points: positions of the points, if --pairs has none: point,x_m,y_m,z_m.
+        markers: sequence whose videos show the ArUco markers of its aruco_corners.csv, instead of --pairs.
+        dictionary: dictionary of the markers; any dictionary of OpenCV.
+        noise_px: standard deviation of a point in the image, along x and along y, in pixels.
+    """
+
+    pairs: Path | None = None
+    points: Path | None = None
+    markers: Annotated[Path, Meta(extra={"metavar": "SEQ"})] | None = None
+    dictionary: str = "4x4_1000"
+    noise_px: float = 1.0
+
+
+@dataclass(frozen=True)
+class LensOptions:
+    """The lenses of the cameras.
+
+    Attributes:
+        intrinsics: intrinsics of the cameras; if FILE has only one camera, its intrinsics are used for all cameras.
+        fov_deg: horizontal and vertical field of view in degrees, instead of intrinsics.
+        focal_length_mm: focal length in millimetres, with --sensor, instead of intrinsics.
+        sensor_mm: size of the sensor in millimetres.
+        size: size of the images in pixels, if the calibration file does not contain the size.
+    """
+
+    intrinsics: Annotated[Path, Meta(extra={"metavar": "FILE"})] | None = None
+    fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
+    focal_length_mm: float | None = None
+    sensor_mm: Annotated[tuple[float, float], Meta(extra={"metavar": "W,H"})] | None = None
+    size: tuple[int, int] | None = None
+
+
 @click.command(cls=HelpfulCommand)
-@click.option(
-    "--pairs",
-    type=click.Path(path_type=Path),
-    help="Points marked by hand: camera,point,x_px,y_px,x_m,y_m,z_m.",
-)
-@click.option(
-    "--points",
-    type=click.Path(path_type=Path),
-    help="Positions of the points, if --pairs has none: point,x_m,y_m,z_m.",
-)
-@click.option(
-    "--markers",
-    type=click.Path(path_type=Path),
-    metavar="SEQ",
-    help="Sequence whose videos show the ArUco markers of its aruco_corners.csv, instead of --pairs.",
-)
-@dictionary_option()
-@click.option(
-    "--intrinsics",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Intrinsics of the cameras; if FILE has only one camera, its intrinsics are used for all cameras.",
-)
-@FOV
-@click.option(
-    "--focal-length",
-    "focal_length_mm",
-    type=float,
-    help="Focal length in millimetres, with --sensor, instead of intrinsics.",
-)
-@click.option(
-    "--sensor", "sensor_mm", type=Numbers(2), metavar="W,H", help="Size of the sensor in millimetres."
-)
-@SIZE
-@noise_option(1.0)
+@options_of(Points, "known")
+@options_of(LensOptions, "lens", heading="Lenses")
 @OUT
-@FORCE
-@QUIET
-@JSON
-@pass_output
-def extrinsics(
-    output: Output,
-    pairs: Path | None,
-    points: Path | None,
-    markers: Path | None,
-    dictionary: str,
-    noise_px: float,
-    out: Path,
-    **lens: Any,
-) -> None:
+@running(progress=False)
+def extrinsics(output: Output, known: Points, lens: LensOptions, out: Path) -> None:
     """Find the poses of cameras, from points whose positions in the world and in the images are known.
 
     At least four points that are not on one line are needed. Twelve points that are spread over the image and in depth
@@ -83,57 +75,54 @@ def extrinsics(
       psotrack calibrate extrinsics --pairs pairs.csv --points points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
       psotrack calibrate extrinsics --markers data/Simulated_Data/S01_D2_A --intrinsics rig.toml --out found.toml
     """
-    from psotrack.calibration import read_image_points
+    from psotrack.calibration import place_cameras, read_image_points
     from psotrack.geometry.rig_files import write_rig
 
+    pairs, markers = known.pairs, known.markers
     if (pairs is None) == (markers is None):
         found = "neither" if pairs is None else "both"
         raise SettingsError("extrinsics", expected="--pairs FILE or --markers SEQ", found=found)
     output.refuse(out)
-    marks = read_image_points(pairs, points) if pairs else _find_markers(Path(str(markers)), dictionary)
-    lenses = _lenses(list(marks), **lens)
+    marks = (
+        read_image_points(pairs, known.points)
+        if pairs
+        else _find_markers(Path(f"{markers}"), known.dictionary)
+    )
+    lenses = _lenses(list(marks), lens)
     with errors_name(pairs or markers):
-        rig, rows = locate_cameras(marks, lenses, noise_px)
-    write_rig(out, rig, force=output.force)
-    show_cameras(output, rows, out)
+        placed = place_cameras(marks, lenses, known.noise_px)
+    write_rig(out, placed.rig, force=output.force)
+    output.result(replace(placed, path=out))
 
 
-def _lenses(
-    names: list[str],
-    *,
-    intrinsics: Path | None,
-    fov_deg: tuple[float, float] | None,
-    focal_length_mm: float | None,
-    sensor_mm: tuple[float, float] | None,
-    image_size_wh: tuple[int, int] | None,
-) -> Mapping[str, Any]:
+def _lenses(names: list[str], given: LensOptions) -> Mapping[str, Any]:
     """Lens of each camera, by name, from intrinsics, fields of view, or focal length and sensor."""
     from psotrack.calibration import lens_of_sensor, lens_of_view
     from psotrack.geometry.rig_files import read_lenses
 
-    given = [value is not None for value in (intrinsics, fov_deg, focal_length_mm)]
-    if sum(given) != 1 or (focal_length_mm is None) != (sensor_mm is None):
+    ways = [value is not None for value in (given.intrinsics, given.fov_deg, given.focal_length_mm)]
+    if sum(ways) != 1 or (given.focal_length_mm is None) != (given.sensor_mm is None):
         raise SettingsError(
             "lens",
             expected="--intrinsics FILE, or --fov H,V, or --focal-length with --sensor",
-            found="another combination" if any(given) else "none",
+            found="another combination" if any(ways) else "none",
         )
-    if intrinsics is not None:
-        rig = read_lenses(intrinsics, image_size_wh)
+    if given.intrinsics is not None:
+        rig = read_lenses(given.intrinsics, given.size)
         if len(rig) == 1:
             return dict.fromkeys(names, rig.cameras[0])
         missing = [name for name in names if name not in rig.names]
         if missing:
             raise InputError(
-                intrinsics, expected=f"the lens of {missing[0]}", found=f"only {', '.join(rig.names)}"
+                given.intrinsics, expected=f"the lens of {missing[0]}", found=f"only {', '.join(rig.names)}"
             )
         return {name: rig.cameras[rig.names.index(name)] for name in names}
-    if image_size_wh is None:
+    if given.size is None:
         raise SettingsError("--size", expected="width and height of the images", found="none")
-    if fov_deg is not None:
-        return dict.fromkeys(names, lens_of_view(*fov_deg, image_size_wh))
+    if given.fov_deg is not None:
+        return dict.fromkeys(names, lens_of_view(*given.fov_deg, given.size))
     return dict.fromkeys(
-        names, lens_of_sensor(focal_length_mm or 0.0, sensor_mm or (0.0, 0.0), image_size_wh)
+        names, lens_of_sensor(given.focal_length_mm or 0.0, given.sensor_mm or (0.0, 0.0), given.size)
     )
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from psotrack.cli.calibrate.options import BOARD_NAMES, LENS, OUT, BoardOptions
-from psotrack.cli.options import FORCE, JSON, reporting
-from psotrack.cli.output import Output, pass_output
+from psotrack.calibration.rig.settings import BoardSettings, LensSettings
+from psotrack.cli.calibrate.options import BOARD_NAMES, OUT
+from psotrack.cli.options import running
+from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import errors_name
 
@@ -20,16 +21,13 @@ _FISHEYE = ("k1", "k2", "k3", "k4")
 
 @click.command(cls=HelpfulCommand)
 @click.argument("video", type=click.Path(path_type=Path))
-@options_of(BoardOptions, "board", names=BOARD_NAMES)
-@LENS
+@options_of(BoardSettings, "board", names=BOARD_NAMES)
+@options_of(LensSettings, "lenses", names={"same_lens": "", "lenses": ""})
 @click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def intrinsics(
-    output: Output, video: Path, board: BoardOptions, lens: str, name: str | None, out: Path
+    output: Output, video: Path, board: BoardSettings, lenses: LensSettings, name: str | None, out: Path
 ) -> None:
     """Estimate a camera's lens from VIDEO, in which a board is moved.
 
@@ -42,6 +40,7 @@ def intrinsics(
       psotrack calibrate intrinsics photos --squares 10x7 --square 0.025 --lens fisheye --out lens.toml
     """
     from psotrack.calibration import (
+        Board,
         lens_of_board,
         open_images,
         parse_lens_model,
@@ -53,9 +52,9 @@ def intrinsics(
 
     output.refuse(out)
     (images,) = open_images([video], [name] if name else None)
-    model = parse_lens_model(lens)
+    model = parse_lens_model(lenses.lens)
     with errors_name(video):
-        found = lens_of_board(images, board.board(), model, output.report)
+        found = lens_of_board(images, Board.of(board), model, output.report)
     # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.
     write = write_lenses if out.suffix.lower() == ".toml" else write_rig
     write(out, make_rig({images.name: found.camera}), force=output.force)
@@ -78,9 +77,9 @@ def intrinsics(
         ("", "value", "standard deviation"), ((key, f"{value:.5g}", f"{std:.2g}") for key, value, std in rows)
     )
     if found.compared_px:
-        errors = ", ".join(f"{model} {error:.3f}" for model, error in found.compared_px.items())
+        errors = ", ".join(f"{name} {error:.3f}" for name, error in found.compared_px.items())
         output.say(f"lens {found.model}; median errors on views left out (px): {errors}")
-    elif parse_lens_model(lens) is None:
+    elif model is None:
         output.say(say_not_compared({images.name: len(found.frame)}))
     for sentence in say_searched({images.name: (found.searched, len(images.frames))}):
         output.say(sentence)

@@ -8,15 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from psotrack.cli.options import (
-    FORCE,
-    JSON,
-    dictionary_option,
-    frames_option,
-    out_option,
-    reporting,
-)
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.options import dictionary_option, frames_option, out_option, running
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, SettingsError
 
@@ -29,10 +22,7 @@ if TYPE_CHECKING:
 @out_option("CSV file of the markers.", default=Path("markers.csv"), show_default=True)
 @dictionary_option("4x4_50")
 @frames_option
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def detect_markers(
     output: Output, images: tuple[Path, ...], out: Path, dictionary: str, num_frames: int | None
 ) -> None:

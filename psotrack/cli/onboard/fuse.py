@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from psotrack.cli.options import FORCE, JSON, QUIET, out_option
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.options import out_option, running
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, check_positive
 
@@ -38,10 +38,7 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Estimate the offset of each on-board camera's clock, up to SECONDS.  [default: no clock has an offset]",
 )
-@FORCE
-@QUIET
-@JSON
-@pass_output
+@running(progress=False)
 def fuse(
     output: Output,
     inside: tuple[Path, ...],

@@ -12,16 +12,8 @@ from msgspec import Meta
 
 from psotrack.cli.onboard.shutter import Shutter, shutter_content, shutter_sentence
 from psotrack.cli.onboard.sources import LENS_NAMES, Lenses
-from psotrack.cli.options import (
-    FORCE,
-    JSON,
-    dictionary_option,
-    frames_option,
-    out_option,
-    plot_option,
-    reporting,
-)
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.options import frames_option, out_option, plot_option, running
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import InputError, SettingsError
 from psotrack.support.interrupts import unhurried_end
@@ -50,6 +42,29 @@ class _Input:
 
 
 @dataclass(frozen=True)
+class Given:
+    """What is known of the video and of the markers in it.
+
+    Attributes:
+        markers: table of marker corners, or of centres (id,x_m,y_m,z_m); None: the sequence's.
+        side_m: side of the markers in metres, if --markers has only their centres; None: estimated for each marker.
+        drone: drone whose video is used, if VIDEO is a sequence's folder.
+        name: name of the drone in the table; None: --drone, or VIDEO's name.
+        dictionary: dictionary of the markers; any dictionary of OpenCV.
+        fps: frames per second of a folder of images.
+        live: VIDEO is a camera's number or a stream; always use the newest frame.
+    """
+
+    markers: Path | None = None
+    side_m: float | None = None
+    drone: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
+    name: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
+    dictionary: str = "4x4_1000"
+    fps: float | None = None
+    live: bool = False
+
+
+@dataclass(frozen=True)
 class Poses:
     """How poses are estimated.
 
@@ -71,52 +86,21 @@ class Poses:
 @click.command(cls=HelpfulCommand)
 @click.argument("video")
 @out_option("CSV file of the poses, one row per frame.  [default: NAME.csv, by the drone's name]")
-@click.option(
-    "--markers",
-    type=click.Path(path_type=Path),
-    help="Table of marker corners, or of centres (id,x_m,y_m,z_m).  [default: the sequence's]",
-)
-@click.option(
-    "--marker-size",
-    "side_m",
-    type=float,
-    metavar="METRES",
-    help="Side of the markers, if --markers has only their centres.  [default: estimated for each marker]",
-)
-@options_of(Lenses, "lenses", names=LENS_NAMES)
-@click.option("--drone", metavar="NAME", help="Drone whose video is used, if VIDEO is a sequence's folder.")
-@click.option(
-    "--name", metavar="NAME", help="Name of the drone in the table.  [default: --drone, or VIDEO's name]"
-)
-@dictionary_option()
-@options_of(Poses, "poses")
-@options_of(Shutter, "given_shutter")
-@click.option("--fps", type=float, help="Frames per second of a folder of images.")
-@click.option(
-    "--live", is_flag=True, help="VIDEO is a camera's number or a stream; always use the newest frame."
-)
+@options_of(Given, "given", names={"side_m": "marker-size"})
+@options_of(Lenses, "lenses", names=LENS_NAMES, heading="Lens", rare=("names", "scale"))
+@options_of(Poses, "poses", heading="Poses")
+@options_of(Shutter, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
 @plot_option("the path from above, and the height over time", "beside --out, as .png")
 @frames_option
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def localise(
     output: Output,
     video: str,
     out: Path | None,
-    markers: Path | None,
-    side_m: float | None,
-    lenses: Lenses,
-    drone: str | None,
-    name: str | None,
-    dictionary: str,
-    poses: Poses,
-    given_shutter: Shutter,
-    fps: float | None,
-    live: bool,
     plot: Path | None,
     num_frames: int | None,
+    given: Given,
+    **known: Any,
 ) -> None:
     """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.
 
@@ -161,29 +145,30 @@ def localise(
     )
     from psotrack.inside_out import localise_video as localise_camera
 
-    given = _input(video, drone, fps, live)
-    drone_name = name or given.name
+    poses: Poses = known["poses"]
+    filmed = _input(video, given.drone, given.fps, given.live)
+    drone_name = given.name or filmed.name
     out = out or Path(f"{drone_name}.csv")
     check_suffix("--out", out, ".csv")
     picture = None if plot is None else plot if plot.name else out.with_suffix(".png")
     output.refuse(out, picture)
-    if markers is None and given.markers is None:
+    if given.markers is None and filmed.markers is None:
         raise SettingsError("--markers", expected="a table of marker corners", found="none")
-    table = Path(str(markers or given.markers))
+    table = Path(f"{given.markers or filmed.markers}")
     marker_map = read_marker_table(table)
     centres_only = not isinstance(marker_map, MarkerMap)
-    if side_m is not None:
-        check_positive("--marker-size", side_m)
+    if given.side_m is not None:
+        check_positive("--marker-size", given.side_m)
         if not centres_only:
             raise SettingsError(
                 "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
             )
-    lens = _lens(given, lenses)
-    source = given.source.first(num_frames)
+    lens = _lens(filmed, known["lenses"])
+    source = filmed.source.first(num_frames)
     rows = source.image_size_wh[1]
-    shutter = given_shutter.of(rows, source.fps)
+    shutter = known["shutter"].of(rows, source.fps)
     settings = LocaliseSettings(
-        dictionary=dictionary,
+        dictionary=given.dictionary,
         pose=PoseSettings(
             min_markers=poses.min_markers,
             map_error_m=poses.map_error / 1e3,
@@ -194,7 +179,7 @@ def localise(
     ).within(source.num_frames)
     # What a stream has shown is kept: no one can show the stream again.
     with unhurried_end() if source.stream else contextlib.nullcontext():
-        found = localise_camera(source, marker_map, lens, settings, output.report, side_m=side_m)
+        found = localise_camera(source, marker_map, lens, settings, output.report, side_m=given.side_m)
         if poses.smooth:
             found = replace(found, path=smooth(found.raw, settings.filter))
         write_camera_path(out, found.path, drone_name, force=output.force)
@@ -203,10 +188,10 @@ def localise(
             picture,
             found.path,
             found.marker_map,
-            caption=f"{drone_name}: {given.source.name}",
+            caption=f"{drone_name}: {filmed.source.name}",
             force=output.force,
         )
-    content = _content(found, given.source.name, drone_name, settings.pose.min_markers)
+    content = _content(found, filmed.source.name, drone_name, settings.pose.min_markers)
     content |= {"track": str(out), "filtered": poses.filter, "smoothed": poses.smooth}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
     content |= {"shutter": shutter_content(shutter, found.shutter, found.line_time, rows)}

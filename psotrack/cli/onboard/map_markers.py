@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import click
 from msgspec import Meta
 
 from psotrack.cli.onboard.shown import show_built, show_check, show_measured
 from psotrack.cli.onboard.shutter import Shutter
-from psotrack.cli.onboard.sources import LENS_NAMES, PICTURES_FPS, Lenses, known_corners, leading, videos_of
-from psotrack.cli.options import FORCE, JSON, dictionary_option, frames_option, out_option, reporting
-from psotrack.cli.output import Output, check_suffix, pass_output
+from psotrack.cli.onboard.sources import LENS_NAMES, Lenses, known_corners, leading, videos_of
+from psotrack.cli.options import frames_option, out_option, running
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import SettingsError, check_positive
 
@@ -43,6 +43,22 @@ class World:
     seen_from_m: Annotated[tuple[float, float, float], Meta(extra={"metavar": "X,Y,Z"})] | None = None
 
 
+@dataclass(frozen=True)
+class Videos:
+    """Which videos show the markers, and how they are searched.
+
+    Attributes:
+        drone: drones of a sequence whose videos are used; None: all.
+        dictionary: dictionary of the markers; any dictionary of OpenCV.
+        fps: frames per second of folders of images, on which only the time from row to row depends; None: 25 for
+            folders of images.
+    """
+
+    drone: tuple[str, ...] | None = None
+    dictionary: str = "4x4_1000"
+    fps: Annotated[float, Meta(gt=0)] | None = None
+
+
 @click.command("map", cls=HelpfulCommand)
 @click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @out_option("Table of corners to write.  [default: aruco_corners.csv]")
@@ -53,39 +69,20 @@ class World:
     metavar="MAP",
     help="Check the table MAP instead of writing one.",
 )
-@options_of(World, "world")
-@click.option(
-    "--drone",
-    "drones",
-    metavar="NAME,NAME...",
-    help="Drones of a sequence whose videos are used.  [default: all]",
-)
-@options_of(Lenses, "lenses", names=LENS_NAMES)
-@dictionary_option()
-@options_of(Shutter, "given_shutter")
-@click.option(
-    "--fps",
-    type=float,
-    help=f"Frames per second of folders of images, on which only the time from row to row depends.  "
-    f"[default: {PICTURES_FPS:g}]",
-)
+@options_of(World, "world", heading="World")
+@options_of(Videos, "given")
+@options_of(Lenses, "lenses", names=LENS_NAMES, heading="Lenses", rare=("names", "scale"))
+@options_of(Shutter, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
 @frames_option
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def map_markers(
     output: Output,
     sources: tuple[Path, ...],
     out: Path | None,
     checked: Path | None,
     world: World,
-    drones: str | None,
-    lenses: Lenses,
-    dictionary: str,
-    given_shutter: Shutter,
-    fps: float | None,
     num_frames: int | None,
+    **filmed: Any,
 ) -> None:
     """Write the table of a room's marker corners from SOURCE, or check such a table.
 
@@ -126,8 +123,6 @@ def map_markers(
         output.refuse(out)
     if world.side_m is not None:
         check_positive("--side", world.side_m)
-    if fps is not None:
-        check_positive("--fps", fps)
     if out is not None and sources[0].suffix.lower() in _MEASURED:
         if len(sources) > 1:
             raise SettingsError(
@@ -143,12 +138,15 @@ def map_markers(
     # Errors of small files are found before the videos are read, which takes long.
     marker_map = None if checked is None else read_marker_map(checked)
     known = {} if out is None else known_corners(world.known, world.markers, world.side_m, sources)
-    videos = videos_of(sources, drones, lenses, fps)
+    given: Videos = filmed["given"]
+    videos = videos_of(sources, given.drone, filmed["lenses"], given.fps)
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
     shutter = None
     for video, _ in videos.values():
-        shutter = given_shutter.of(video.image_size_wh[1], video.fps)
-    sightings = find_sightings(list(videos.values()), dictionary, consecutive=True, report=output.report)
+        shutter = filmed["shutter"].of(video.image_size_wh[1], video.fps)
+    sightings = find_sightings(
+        list(videos.values()), given.dictionary, consecutive=True, report=output.report
+    )
     rows = {name: video.image_size_wh[1] for name, (video, _) in videos.items()}
     if marker_map is not None:
         checkup = check_map(sightings, marker_map, shutter)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from psotrack.cli.onboard.shutter import shutter_content, shutter_sentence
-from psotrack.cli.output import POSITION, Output, finite_or_none, format_numbers
+from psotrack.cli.output import Output
+from psotrack.support import POSITION, finite_or_none, format_numbers
 
 if TYPE_CHECKING:
     from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap, RollingShutter

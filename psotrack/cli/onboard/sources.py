@@ -63,7 +63,7 @@ class Lenses:
     """
 
     file: Path | None = None
-    names: Annotated[str, Meta(extra={"metavar": "NAME,NAME..."})] | None = None
+    names: tuple[str, ...] | None = None
     scale: bool = False
     fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
 
@@ -71,7 +71,7 @@ class Lenses:
         """Lens of video number `index` of `count` videos, whose images have `size_wh` pixels."""
         from psotrack.inside_out import choose_lens
 
-        names = [None] if self.names is None else self.names.split(",")
+        names: tuple[str | None, ...] = self.names or (None,)
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
             raise SettingsError("--camera-name", expected=expected, found=f"{len(names)}")
@@ -84,7 +84,7 @@ LENS_NAMES = {"file": "camera", "names": "camera-name", "scale": "scale-camera"}
 
 
 def videos_of(
-    sources: tuple[Path, ...], drones: str | None, lenses: Lenses, fps: float | None = None
+    sources: tuple[Path, ...], drones: tuple[str, ...] | None, lenses: Lenses, fps: float | None = None
 ) -> dict[str, tuple[VideoInfo, Camera]]:
     """Videos with their lenses, by name; a folder of pictures is a video of `fps` frames per second."""
     from psotrack.recordings import is_picture_folder, open_video
@@ -104,7 +104,9 @@ def videos_of(
     }
 
 
-def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, tuple[VideoInfo, Camera]]:
+def _of_sequence(
+    folder: Path, drones: tuple[str, ...] | None, lenses: Lenses
+) -> dict[str, tuple[VideoInfo, Camera]]:
     from psotrack.inside_out import lens_from_matrix
     from psotrack.recordings.datasets import open_recording
 
@@ -113,7 +115,7 @@ def _of_sequence(folder: Path, drones: str | None, lenses: Lenses) -> dict[str, 
         raise InputError(
             folder, expected="videos of drones' own cameras, such as dron1_cam_s.avi", found="none"
         )
-    chosen = list(onboard) if drones is None else drones.split(",")
+    chosen = list(onboard) if drones is None else list(drones)
     unknown = [name for name in chosen if name not in onboard]
     if unknown:
         raise SettingsError("--drone", expected=f"names among {', '.join(onboard)}", found=", ".join(unknown))

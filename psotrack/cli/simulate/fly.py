@@ -2,69 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.options import FORCE, QUIET, out_option
-from psotrack.cli.output import Output, check_suffix, pass_output
-from psotrack.cli.records import HelpfulCommand
-from psotrack.cli.types import Numbers
+from psotrack.cli.options import running
+from psotrack.cli.output import Output, check_suffix
+from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import errors_name
 from psotrack.support.interrupts import unhurried_end
 
 
+@dataclass(frozen=True)
+class Flight:
+    """How a drone is flown.
+
+    Attributes:
+        device: controller; a file has the columns time_s,forward,left,up,turn, the last four from -1 to 1.
+        out: CSV file of the recorded flight.
+        rate_hz: samples per second.
+        hall: hall in which the drone flies; halls are named as in scenarios.
+        start_m: position in which the drone hovers at first, in metres.
+        max_seconds: longest duration of the flight, in seconds.
+    """
+
+    device: Annotated[str, Meta(extra={"metavar": "gamepad|keyboard|FILE.csv"})]
+    out: Annotated[Path, Meta(extra={"metavar": "FILE.csv"})] = Path("flight.csv")
+    rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 25.0
+    hall: str = "laboratory"
+    start_m: Annotated[tuple[float, float, float], Meta(extra={"metavar": "X,Y,Z"})] = (0.0, 0.0, 1.0)
+    max_seconds: Annotated[float, Meta(ge=1)] = 300.0
+
+
 @click.command(cls=HelpfulCommand)
-@out_option(
-    "CSV file of the recorded flight.", default=Path("flight.csv"), show_default=True, metavar="FILE.csv"
-)
-@click.option(
-    "--device",
-    required=True,
-    metavar="gamepad|keyboard|FILE.csv",
-    help="Controller; a file has the columns time_s,forward,left,up,turn, the last four from -1 to 1.",
-)
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=click.FloatRange(1, 1000),
-    default=25.0,
-    show_default=True,
-    help="Samples per second.",
-)
-@click.option(
-    "--hall",
-    default="laboratory",
-    show_default=True,
-    help="Hall in which the drone flies; halls are named as in scenarios.",
-)
-@click.option(
-    "--start",
-    "start_m",
-    type=Numbers(3),
-    metavar="X,Y,Z",
-    default=(0.0, 0.0, 1.0),
-    help="Position in which the drone hovers at first, in metres.  [default: 0,0,1]",
-)
-@click.option(
-    "--max-seconds",
-    type=click.FloatRange(1),
-    default=300.0,
-    show_default=True,
-    help="Longest duration of the flight, in seconds.",
-)
-@FORCE
-@QUIET
-@pass_output
-def fly(
-    output: Output,
-    out: Path,
-    device: str,
-    rate_hz: float,
-    hall: str,
-    start_m: tuple[float, float, float],
-    max_seconds: float,
-) -> None:
+@options_of(Flight, "flight")
+@running(progress=False, json=False)
+def fly(output: Output, flight: Flight) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in
@@ -83,22 +59,23 @@ def fly(
     from psotrack.simulation import flight_space, write_recorded_flight
     from psotrack.simulation.flights import devices, piloting
 
+    out = flight.out
     sticks_path = out.with_suffix(".sticks.csv")
     check_suffix("--out", out, ".csv")
     output.refuse(out, sticks_path)
-    space = flight_space(hall)
-    start = np.array(start_m)
-    piloting.check(start, space, rate_hz)
+    space = flight_space(flight.hall)
+    start = np.array(flight.start_m)
+    piloting.check(start, space, flight.rate_hz)
     # Ctrl-C ends the flight, which is then written.
-    with unhurried_end(), errors_name(device):
-        with devices.open_device(device, space) as opened:
-            samples = piloting.until(opened.samples(), max_seconds)
-            flown = piloting.fly(samples, start, space, rate_hz=rate_hz, watch=opened.watch)
+    with unhurried_end(), errors_name(flight.device):
+        with devices.open_device(flight.device, space) as opened:
+            samples = piloting.until(opened.samples(), flight.max_seconds)
+            flown = piloting.fly(samples, start, space, rate_hz=flight.rate_hz, watch=opened.watch)
         recorded = flown.recorded
         write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
         piloting.write_sticks(sticks_path, flown.samples)
     output.say(
-        f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s",
+        f"{out}: {len(recorded.time_s)} samples at {flight.rate_hz:g} Hz, {recorded.duration_s:.1f} s",
         f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}',
         f"the same again: --device {sticks_path}, with the same --start and --hall",
     )

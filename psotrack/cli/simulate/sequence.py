@@ -11,11 +11,27 @@ from typing import Annotated
 import click
 from msgspec import Meta
 
-from psotrack.cli.options import FORCE, JOBS, JSON, out_option, reporting
-from psotrack.cli.output import Output, pass_output
+from psotrack.cli.options import out_option, running
+from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.types import change_of
 from psotrack.errors import SettingsError, errors_name
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What is simulated.
+
+    Attributes:
+        scenario: a scenario of your own, instead of NAME.
+        restless: add an automatic exposure, a lamp that goes off, a screen and a plant.
+        as_own_cameras: write OUT as a laboratory would have it: videos of different rates and sizes, and videos of a
+            board.
+    """
+
+    scenario: Annotated[Path, Meta(extra={"metavar": "FILE.toml"})] | None = None
+    restless: bool = False
+    as_own_cameras: bool = False
 
 
 @dataclass(frozen=True)
@@ -28,6 +44,7 @@ class Made:
         seed: seed of flights and noise.
         masks: write drone_masks.zip.
         onboard: render the videos of on-board cameras.
+        jobs: largest number of processes; None: one per processor.
     """
 
     num_frames: Annotated[int, Meta(extra={"metavar": "N"})] | None = None
@@ -35,6 +52,7 @@ class Made:
     seed: int = 0
     masks: bool = True
     onboard: bool = True
+    jobs: Annotated[int, Meta(ge=1)] | None = None
 
 
 @dataclass(frozen=True)
@@ -55,13 +73,7 @@ class Shown:
 @click.command(cls=HelpfulCommand)
 @click.argument("name", required=False)
 @out_option("Root folder of the data.  [default: data]")
-@click.option(
-    "--scenario",
-    "scenario_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE.toml",
-    help="A scenario of your own, instead of NAME.",
-)
+@options_of(Scenario, "chosen")
 @click.option(
     "--set",
     "changes",
@@ -69,35 +81,17 @@ class Shown:
     metavar="FIELD=VALUE",
     help="Change a field of the scenario, e.g. imaging.reflections=0; may be repeated.",
 )
-@click.option(
-    "--restless",
-    is_flag=True,
-    help="Add an automatic exposure, a lamp that goes off, a screen and a plant.",
-)
 @options_of(Shown, "shown")
 @options_of(Made, "made", names={"num_frames": "frames"})
-@click.option(
-    "--as-own-cameras",
-    "own_cameras",
-    is_flag=True,
-    help="Write OUT as a laboratory would have it: videos of different rates and sizes, and videos of a board.",
-)
-@JOBS
-@FORCE
-@reporting
-@JSON
-@pass_output
+@running()
 def sequence(
     output: Output,
     name: str | None,
     out: Path | None,
-    scenario_file: Path | None,
+    chosen: Scenario,
     changes: tuple[str, ...],
-    restless: bool,
     shown: Shown,
     made: Made,
-    own_cameras: bool,
-    jobs: int | None,
 ) -> None:
     """Simulate a sequence: videos, calibration, ground truth, masks and detections.
 
@@ -132,7 +126,7 @@ def sequence(
     )
     from psotrack.simulation import simulate as make
 
-    if (name is None) == (scenario_file is None):
+    if (name is None) == (chosen.scenario is None):
         raise SettingsError(
             "simulate",
             expected="the NAME of a scenario or --scenario FILE.toml",
@@ -142,7 +136,7 @@ def sequence(
     if shown.show:
         if name is None:
             raise SettingsError("--show", expected="the NAME of a scenario", found="none")
-        for option, found in (("--set", changes[:1]), ("--restless", ("--restless",) * restless)):
+        for option, found in (("--set", changes[:1]), ("--restless", ("--restless",) * chosen.restless)):
             if found:
                 raise SettingsError(
                     "--show",
@@ -153,8 +147,8 @@ def sequence(
         click.echo(preset_text(str(name)), nl=False)
         return
     out = out or Path("data")
-    recipe = load(scenario_file) if scenario_file else scenario(str(name))
-    recipe = change_scenario(recipe, RESTLESS if restless else {})
+    recipe = load(chosen.scenario) if chosen.scenario else scenario(str(name))
+    recipe = change_scenario(recipe, RESTLESS if chosen.restless else {})
     recipe = change_scenario(recipe, dict(change_of(change, "imaging.shutter_s=0.01") for change in changes))
     if shown.preview:
         from psotrack.simulation import save_preview
@@ -165,19 +159,19 @@ def sequence(
             num_frames=made.num_frames,
             seed=made.seed,
             force=output.force,
-            jobs=jobs or os.cpu_count() or 1,
+            jobs=made.jobs or os.cpu_count() or 1,
             report=output.report,
         )
         output.json({"preview": str(page)})
         output.say(f"{page}")
         return
-    with errors_name(scenario_file) if scenario_file else contextlib.nullcontext():
-        folder = (simulate_own_cameras if own_cameras else make)(
+    with errors_name(chosen.scenario) if chosen.scenario else contextlib.nullcontext():
+        folder = (simulate_own_cameras if chosen.as_own_cameras else make)(
             recipe,
             out,
-            SimulationSettings(*vars(made).values()),
+            SimulationSettings(made.num_frames, made.scale, made.seed, made.masks, made.onboard),
             force=output.force,
-            jobs=jobs,
+            jobs=made.jobs,
             report=output.report,
         )
     output.json({"sequence": str(folder)})

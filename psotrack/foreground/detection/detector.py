@@ -28,8 +28,25 @@ from jaxtyping import Float, UInt8
 from msgspec import Meta
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import Detections, VideoInfo, read_frames, silence_opencv
-from psotrack.support import Report, check_types, digest_file, make_plugin, no_progress
+from psotrack.recordings import (
+    Detections,
+    Recording,
+    VideoInfo,
+    digest_video,
+    read_frames,
+    silence_opencv,
+    write_detections,
+)
+from psotrack.support import (
+    Report,
+    check_file_name,
+    check_types,
+    digest_file,
+    digest_record,
+    identify,
+    make_plugin,
+    no_progress,
+)
 
 #: Boxes (found, 4) and confidences (found,), as `Detector` describes them.
 FoundBoxes = tuple[Float[np.ndarray, "found 4"], Float[np.ndarray, "found"]]
@@ -288,3 +305,34 @@ def _letterboxed(
     resized = cv2.resize(bgr, inside_wh.tolist(), interpolation=cv2.INTER_LINEAR)
     image = cv2.copyMakeBorder(resized, top, bottom, left, right, cv2.BORDER_CONSTANT, value=_GREY)
     return np.asarray(image, np.uint8), inside_wh / image_wh, start.astype(np.float64)
+
+
+def stored_detections(
+    detector: Detector, recording: Recording, *, cache: Path | str, report: Report = no_progress
+) -> Path:
+    """Detect drones in the videos of a sequence, unless the detections are stored already.
+
+    The file of a video appears when it is complete. A call after an interruption continues with the first video without
+    a file.
+
+    Args:
+        detector: the detector.
+        recording: a consistent recording (see `Recording.usable`).
+        cache: folder for stored results.
+        report: shows the progress in frames.
+
+    Returns:
+        Folder with one file of detections per video.
+
+    Raises:
+        InputError: a video cannot be read, or the network cannot be used.
+        SettingsError: the detector's key is no plain data, or it yields arrays of wrong shapes.
+        OutputError: a file cannot be written.
+    """
+    videos = {name: [video.num_frames, digest_video(video)] for name, video in recording.videos.items()}
+    folder = Path(cache) / "detections" / digest_record({"detector": identify(detector), "videos": videos})
+    for name, video in recording.videos.items():
+        path = folder / f"{check_file_name(name, recording.folder)}.csv"
+        if not path.exists():
+            write_detections(path, detect_drones(detector, name, video, report=report))
+    return folder

@@ -1,5 +1,4 @@
-from .blob_boxes import blob_detections
-from .blobs import border_cells, find_blobs
+from .blobs import blob_detections, border_cells, find_blobs
 from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
 from .computation import (
     compute,
@@ -14,9 +13,8 @@ from .foreground import BackgroundModel, Mog2, coverage, learning_step, reduce_f
 from .frames import Silhouettes, exposures_of
 from .living_background import Living, LivingBackground
 from .masks import masks_out, write_masks
-from .seals import SEAL_FILE, is_whole
 from .settings import ForegroundSettings, Shadows, SilhouetteSettings, check_whole
-from .store import Task, ignored_pixels
+from .store import SEAL_FILE, Task, ignored_pixels, is_whole
 from .summed_area import LOW_BITS, box_sum, pack, packed_box_sums, summed_area_table
 from .usable_frames import foreground_is_everywhere
 

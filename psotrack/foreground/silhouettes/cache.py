@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from psotrack.errors import InputError, OutputError
-from psotrack.foreground.silhouettes.seals import CHUNKS, SEAL_FILE, is_whole
+from psotrack.foreground.silhouettes.store import CHUNKS, SEAL_FILE, is_whole
 from psotrack.recordings import ARRAY_FILE
 from psotrack.support import left_over
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,28 +38,19 @@ class Exposures:
     line_time_s: Float[Array, "*instants cameras"]
 
     def __getitem__(self, index: int | slice | Shaped[np.ndarray, "chosen"]) -> Exposures:
-        return Exposures(
-            self.offset_s[index], self.is_there[index], self.share[index], self.line_time_s[index]
-        )
+        return self._changed(lambda values: values[index])
 
     def of_cameras(self, chosen: Int[np.ndarray, "chosen"]) -> Exposures:
         """The exposures of some cameras."""
-        return Exposures(
-            self.offset_s[..., chosen],
-            self.is_there[..., chosen],
-            self.share[..., chosen],
-            self.line_time_s[..., chosen],
-        )
+        return self._changed(lambda values: values[..., chosen])
 
     def padded(self, num_instants: int) -> Exposures:
         """These exposures, and after them instants without frames, up to a number of instants."""
         missing = ((0, num_instants - len(self.offset_s)), (0, 0))
-        return Exposures(
-            np.pad(self.offset_s, missing),
-            np.pad(self.is_there, missing),
-            np.pad(self.share, missing),
-            np.pad(self.line_time_s, missing),
-        )
+        return self._changed(lambda values: np.pad(values, missing))
+
+    def _changed(self, change: Callable[[Any], Any]) -> Exposures:
+        return Exposures(*map(change, vars(self).values()))
 
     def seeing(self, cameras: Camera) -> Camera:
         """The cameras of one instant, where those without a frame see nothing."""

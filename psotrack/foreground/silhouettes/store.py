@@ -6,9 +6,10 @@ This module does not import JAX, because every worker process imports this modul
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,50 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes.first_look import look_first
 from psotrack.foreground.silhouettes.foreground import BackgroundModel, coverage, learning_step, reduce_frame
 from psotrack.foreground.silhouettes.living_background import Living
-from psotrack.foreground.silhouettes.seals import SEAL_FILE, is_whole, read_files, seal_of
 from psotrack.foreground.silhouettes.settings import ForegroundSettings
 from psotrack.foreground.silhouettes.usable_frames import LEAST_FRAMES, foreground_is_everywhere, intervals_of
-from psotrack.recordings import MADE_OF, StoredSilhouettes, VideoInfo, digest_video, read_frames, read_mask
+from psotrack.recordings import (
+    ARRAY_FILE,
+    MADE_OF,
+    StoredSilhouettes,
+    VideoInfo,
+    digest_video,
+    read_frames,
+    read_mask,
+)
 from psotrack.support import Advance, atomic_write, digest_file, digest_record, identify
+
+#: Name of the seal in a folder of stored silhouettes. zarr ignores the file.
+SEAL_FILE = "seal"
+
+#: Folder of the chunks of a zarr array.
+CHUNKS = "c"
+
+
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Content of the files of the array in a folder, and of its seal, by their paths in the folder.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    paths = [folder / ARRAY_FILE, folder / SEAL_FILE, *(folder / CHUNKS).rglob("*")]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths if path.is_file()}
+
+
+def seal_of(files: Mapping[str, bytes]) -> bytes:
+    """The seal of the files of an array."""
+    array = {name: content for name, content in files.items() if name != SEAL_FILE}
+    return digest_record({name: hashlib.blake2b(array[name]).hexdigest() for name in array}).encode()
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether a folder has a seal, and no byte of the folder was changed since; every byte is read."""
+    try:
+        files = read_files(folder)
+    except OSError:
+        return False
+    return files.get(SEAL_FILE) == seal_of(files)
+
 
 #: Part of every key; raise it when the same settings give other silhouettes than before.
 SCHEMA = 1

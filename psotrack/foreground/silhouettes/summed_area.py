@@ -71,8 +71,7 @@ def box_sum(
 ) -> Float[Array, "*boxes"]:
     """Sums over fractional boxes, each box in the table of its camera.
 
-    Boxes are clipped at the image's border. A box outside the image, or with edges in the wrong order, has sum 0. The
-    sums are differentiable in the corners almost everywhere.
+    Boxes are clipped at the image's border. A box outside the image, or with edges in the wrong order, has sum 0.
 
     Boxes about the same middles in several sizes are faster one size at a time, in several calls: with an axis of
     sizes, XLA on a CPU computes all indices again for each of the sixteen reads.
@@ -126,9 +125,6 @@ def _box_sums(
 
     def read(j: Array, i: Array, steps: tuple[tuple[int, int], ...]) -> list[Array]:
         """The table at some corners, by their steps down and right from the corner (j, i)."""
-        if isinstance(tables, jax.Ref):
-            of_box = jnp.broadcast_to(camera, j.shape)
-            return [tables[j + down, of_box, i + right] for down, right in steps]
         # Indices are in bounds by construction, and a check in the tracker's innermost loop would cost time.
         flat, row = jnp.reshape(tables, -1), num_cameras * width1
         index = camera * width1 + j * row + i

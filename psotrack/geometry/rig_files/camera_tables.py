@@ -18,7 +18,7 @@ from typing import Any
 
 from psotrack.geometry import Rig
 from psotrack.geometry.rig_files.fields import CameraFields, camera_values, stated_unit_m
-from psotrack.support import atomic_write, read_toml, toml_text
+from psotrack.support import read_toml, write_toml
 
 Tables = dict[tuple[str, ...], dict[str, Any]]
 #: Keys that only caliscope writes into the table of a camera.
@@ -55,13 +55,13 @@ def write_anipose(path: Path, rig: Rig) -> None:
     # Numbers have leading zeros, because anipose sorts the tables by name: cam_10 would come before cam_2.
     digits = len(str(len(rig) - 1))
     tables: Tables = {(f"cam_{index:0{digits}d}",): _values(rig, index) for index in range(len(rig))}
-    _write(path, {**tables, ("metadata",): {"unit": "m"}})
+    write_toml(path, {**tables, ("metadata",): {"unit": "m"}})
 
 
 def write_caliscope(path: Path, rig: Rig) -> None:
     """Write a camera_array.toml of caliscope, in metres."""
     own = {"rotation_count": 0, "fisheye": False}
-    _write(
+    write_toml(
         path,
         {("cameras", f"{index}"): {"cam_id": index} | own | _values(rig, index) for index in range(len(rig))},
     )
@@ -98,8 +98,3 @@ def _values(rig: Rig, index: int) -> dict[str, Any]:
         "rotation": values["rvec"],
         "translation": values["tvec"],
     } | ({"fisheye": True} if values["model"] == "fisheye" else {})
-
-
-def _write(path: Path, tables: Tables) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(toml_text(tables), encoding="utf-8")

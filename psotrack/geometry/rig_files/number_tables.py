@@ -36,6 +36,7 @@ from scipy.linalg import rq
 
 from psotrack.errors import InputError
 from psotrack.geometry.rig_files.fields import CameraFields
+from psotrack.support import are_numbers
 
 _COEFFICIENTS = 11
 #: Largest condition number of the 3 x 3 part. That of a camera is below the square of its focal length in pixels.
@@ -121,15 +122,8 @@ def _numbers(text: str) -> tuple[Float[np.ndarray, "rows columns"], Sequence[str
         if line.strip() and not line.lstrip().startswith("#")
     ]
     header: list[str] = []
-    if rows and not _are_numbers(rows[0]):
+    if rows and not are_numbers(rows[0]):
         header, *rows = rows
-    if not rows or len({len(row) for row in rows}) > 1 or not all(map(_are_numbers, rows)):
+    if not rows or len({len(row) for row in rows}) > 1 or not all(map(are_numbers, rows)):
         return np.zeros((0, 0)), header
     return np.array(rows, np.float64), header
-
-
-def _are_numbers(words: list[str]) -> bool:
-    try:
-        return bool([float(word) for word in words])
-    except ValueError:
-        return False

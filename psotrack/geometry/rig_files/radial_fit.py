@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.geometry import LensNumbers, distort
+
 #: Points of the grid along each side of the image.
 _GRID = 41
 #: Largest error of five coefficients for which the rational model is not tried, pixels.
@@ -47,70 +49,33 @@ def fit_distortion(
     if not (np.isfinite(slope) & (slope > 0)).all():
         return None
     points = centre + arm * gain[:, None]
-    fits = [_polynomial(points, distorted)]
-    errors = [_largest_error_px(K, points, distorted, fits[0])]
-    if errors[0] > _EXACT_PX:
-        fits.append(_rational(points, distorted))
-        errors.append(_largest_error_px(K, points, distorted, fits[1]))
-    best = int(np.argmin(errors))
-    return fits[best], errors[best]
+    fit = _fitted(K, points, distorted, rational=False)
+    if fit[1] > _EXACT_PX:
+        fit = min(fit, _fitted(K, points, distorted, rational=True), key=lambda each: each[1])
+    return fit
 
 
-def _polynomial(
-    points: Float[np.ndarray, "n 2"], distorted: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "5"]:
-    """k1, k2, p1, p2, k3."""
-    design = np.concatenate([_columns(points, axis) for axis in (0, 1)])
-    return _solved(design, (distorted - points).T.ravel())
-
-
-def _rational(
-    points: Float[np.ndarray, "n 2"], distorted: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "8"]:
-    """k1, k2, p1, p2, k3, k4, k5, k6."""
-    r2 = (points**2).sum(axis=-1)
-    below = np.stack([r2, r2**2, r2**3], axis=-1)
-    design = np.concatenate(
-        [
-            np.hstack([_columns(points, axis), -distorted[:, axis : axis + 1] * below])
-            for axis in (0, 1)
-        ]
-    )  # fmt: skip
-    return _solved(design, (distorted - points).T.ravel())
-
-
-def _solved(
-    design: Float[np.ndarray, "rows columns"], values: Float[np.ndarray, " rows"]
-) -> Float[np.ndarray, " columns"]:
-    """The least-squares solution; no distortion where there is none, and the error of the fit is then large."""
-    try:
-        return np.linalg.lstsq(design, values, rcond=None)[0]
-    except np.linalg.LinAlgError:
-        return np.zeros(design.shape[1])
-
-
-def _columns(points: Float[np.ndarray, "n 2"], axis: int) -> Float[np.ndarray, "n 5"]:
-    """Derivatives of one distorted coordinate by k1, k2, p1, p2, k3."""
-    x, y = points.T
-    r2 = x * x + y * y
-    along = points[:, axis]
-    p1, p2 = (2 * x * y, r2 + 2 * x * x) if axis == 0 else (r2 + 2 * y * y, 2 * x * y)
-    return np.stack([along * r2, along * r2**2, p1, p2, along * r2**3], axis=-1)
-
-
-def _largest_error_px(
+def _fitted(
     K: Float[np.ndarray, "3 3"],
     points: Float[np.ndarray, "n 2"],
     distorted: Float[np.ndarray, "n 2"],
-    dist: Float[np.ndarray, " coefficients"],
-) -> float:
+    *,
+    rational: bool,
+) -> tuple[Float[np.ndarray, " opencv"], float]:
+    """k1, k2, p1, p2, k3 by least squares, and of the rational model k4, k5, k6; and the largest error, pixels."""
     x, y = points.T
     r2 = x * x + y * y
-    radial = 1 + r2 * (dist[0] + r2 * (dist[1] + r2 * dist[4]))
-    if len(dist) > 5:
-        radial = radial / (1 + r2 * (dist[5] + r2 * (dist[6] + r2 * dist[7])))
-    bent = points * radial[:, None] + np.stack(
-        [2 * dist[2] * x * y + dist[3] * (r2 + 2 * x * x), dist[2] * (r2 + 2 * y * y) + 2 * dist[3] * x * y],
-        axis=-1,
-    )
-    return float(np.linalg.norm((bent - distorted) * K[[0, 1], [0, 1]], axis=-1).max())
+    powers = np.stack([r2, r2**2, r2**3], axis=-1)
+    tangential = ((2 * x * y, r2 + 2 * x * x), (r2 + 2 * y * y, 2 * x * y))
+    design = []
+    for axis in (0, 1):
+        radial = points[:, axis : axis + 1] * powers
+        below = [-distorted[:, axis : axis + 1] * powers] if rational else []
+        design.append(np.hstack([radial[:, :2], np.column_stack(tangential[axis]), radial[:, 2:], *below]))
+    try:
+        dist = np.linalg.lstsq(np.concatenate(design), (distorted - points).T.ravel(), rcond=None)[0]
+    except np.linalg.LinAlgError:
+        # No distortion, whose error is large.
+        dist = np.zeros(8 if rational else 5)
+    off = np.stack(distort(LensNumbers(dist), x, y), axis=-1) - distorted
+    return dist, float(np.linalg.norm(off * K[[0, 1], [0, 1]], axis=-1).max())

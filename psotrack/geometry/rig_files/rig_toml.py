@@ -23,7 +23,7 @@ from typing import Any
 from psotrack.errors import InputError
 from psotrack.geometry import Rig
 from psotrack.geometry.rig_files.fields import CameraFields, camera_values
-from psotrack.support import atomic_write, nearest, read_toml, toml_text
+from psotrack.support import nearest, read_toml, write_toml
 
 #: Newest version of the layout.
 VERSION = 1
@@ -95,5 +95,4 @@ def write(path: Path, rig: Rig, *, placed: bool = True) -> None:
     tables: dict[tuple[str, ...], Mapping[str, Any]] = {(): {"version": VERSION}}
     for index, name in enumerate(rig.names):
         tables["cameras", name] = camera_values(rig.cameras[index], placed=placed)
-    with atomic_write(path) as temporary:
-        temporary.write_text(toml_text(tables), encoding="utf-8")
+    write_toml(path, tables)

@@ -51,6 +51,11 @@ class Found:
         own = self.path.name if self.path.is_dir() else self.path.stem
         return f"{self.alone_in} {own}" if self.alone_in else own
 
+    @property
+    def is_video_file(self) -> bool:
+        """Whether it is a video, and no folder of pictures."""
+        return self.kind == "video" and self.path.is_file()
+
 
 def look_into(folder: Path) -> list[Found]:
     """Everything in a folder, in its folders of detections, and in folders that hold one video, by name.

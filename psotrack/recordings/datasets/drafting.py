@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -23,9 +23,12 @@ from psotrack.recordings import (
     Recording,
     RecordingFile,
     ReferenceTable,
+    recording_file_text,
+    write_recording_file,
 )
 from psotrack.recordings.datasets._folder_content import OF_CAMERA, Found, Kind, kind_of, look_into, videos_in
 from psotrack.recordings.datasets.recording_files import recording_of
+from psotrack.support import atomic_write
 
 _WORDS: Mapping[Kind, str] = {
     "video": "video",
@@ -60,19 +63,92 @@ class DraftOptions:
 
 @dataclass(frozen=True)
 class Draft:
-    """A draft of a `recording.toml`.
+    """A draft of a `recording.toml`; as text, what a user needs to know of it.
 
     Attributes:
+        path: where the file will be.
         content: content of the file.
         recording: the recording that it describes.
         without_files: calibrated cameras of which the folder has no file.
         unused: files that belong to no camera.
     """
 
+    path: Path
     content: RecordingFile
     recording: Recording
     without_files: tuple[str, ...]
     unused: tuple[Path, ...]
+
+    def write(self) -> Path | None:
+        """Write the file. Returns the place of the one that was there, which may have been edited; None without one.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        older = None
+        if self.path.is_file() and self.path.read_bytes() != recording_file_text(self.content).encode():
+            older = self.path.with_name(f"{self.path.name}.bak")
+            with atomic_write(older) as temporary:
+                temporary.write_bytes(self.path.read_bytes())
+        write_recording_file(self.path, self.content)
+        return older
+
+    def to_dict(self) -> dict[str, Any]:
+        """The draft, fit for JSON."""
+        return {
+            "recording": str(self.path),
+            "calibration": self.content.calibration,
+            **self.recording.to_dict(),
+            "without_files": list(self.without_files),
+            "unused": [str(file) for file in self.unused],
+        }
+
+    def __str__(self) -> str:
+        lines = []
+        if self.without_files:
+            lines.append(f"cameras without any file, left out: {', '.join(self.without_files)}")
+        if self.unused:
+            lines.append(f"files that are not used: {', '.join(file.name for file in self.unused)}")
+        unplaced = [each.name for each in self.recording.cameras if each.camera is None]
+        if unplaced:
+            lines.append(
+                f"cameras without place: {', '.join(unplaced)}; `psotrack calibrate rig` makes the rig "
+                f"file, then `psotrack init {self.path.parent} --calibration rig.toml --force`"
+            )
+        count = len(self.content.cameras)
+        return "\n".join([*lines, f"{self.path}: {count} camera{'s' if count > 1 else ''}"])
+
+
+@dataclass(frozen=True)
+class Unmatched:
+    """A file of a camera, whose name does not say of which one.
+
+    Attributes:
+        file: path of the file relative to the folder, as `DraftOptions` takes it.
+        found: what its name says instead.
+        error: what `draft_recording` raises.
+        needed: whether there is no draft without an answer; else the file is not used.
+    """
+
+    file: str
+    found: str
+    error: InputError
+    needed: bool
+
+
+@dataclass(frozen=True)
+class Unclear:
+    """What a user must say of a folder, for all files together.
+
+    Attributes:
+        cameras: names of the cameras.
+        calibration: rig file that has these cameras; None where files give the names, and more may be named.
+        files: the files; each becomes a part of `DraftOptions.match` or of `DraftOptions.leave_out`.
+    """
+
+    cameras: tuple[str, ...]
+    calibration: Path | None
+    files: tuple[Unmatched, ...]
 
 
 @dataclass
@@ -83,14 +159,20 @@ class _Matching:
     cameras: list[str]
     files: dict[str, dict[Kind, Path | str]] = field(default_factory=dict)
     unused: list[Path] = field(default_factory=list)
+    unmatched: dict[Path, Unmatched] = field(default_factory=dict)
+
+    def taken(self, camera: str, kind: Kind) -> Path | str | None:
+        """The file of this kind that a camera has already."""
+        return self.files.get(camera, {}).get(kind)
 
     def put(self, camera: str, kind: Kind, file: Path | str) -> None:
         """Give a file to a camera."""
-        of_camera = self.files.setdefault(camera, {})
-        if kind in of_camera:
-            expected, found = f"one {_WORDS[kind]} of camera {camera}", f"{_short(of_camera[kind])} as well"
-            raise _unclear(self.folder, file, expected, found)
-        of_camera[kind] = file
+        self.files.setdefault(camera, {})[kind] = file
+
+    def ask(self, file: Path, expected: str, found: str, *, needed: bool = True) -> None:
+        """Keep a file for which the user must say whose it is."""
+        error = _unclear(self.folder, file, expected, found)
+        self.unmatched[file] = Unmatched(os.path.relpath(file, self.folder), found, error, needed)
 
 
 def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions | None = None) -> Draft:
@@ -107,15 +189,10 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         SettingsError: an option names a file or camera that does not exist.
     """
     folder, out, options = Path(folder), Path(out), options or DraftOptions()
-    _check_by_hand(folder, options)
-    by_hand = [*options.leave_out, *(file for _, file in options.match)]
-    found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
-    calibration = options.calibration or _calibration_of(folder, found)
-    known = _known_cameras(calibration, options.unit)
-    matching = _Matching(folder, list(known) or _names_of_files(folder, found, options))
-    for name, file in options.match:
-        _put_by_hand(matching, name, file, calibration)
-    _match(matching, found, calibration)
+    found, calibration, known, matching = _matched(folder, out, options)
+    for unmatched in matching.unmatched.values():
+        if unmatched.needed:
+            raise unmatched.error
     tables = {
         name: _table(matching, name, known.get(name), out.parent, options)
         for name in matching.cameras
@@ -140,11 +217,44 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
     # Paths with `..` in them lead through the folder of the draft.
     out.parent.mkdir(parents=True, exist_ok=True)
     return Draft(
+        out,
         content,
         recording_of(out, content),
         tuple(name for name in matching.cameras if name not in tables),
         tuple(matching.unused),
     )
+
+
+def unclear_files(folder: Path | str, out: Path | str, options: DraftOptions | None = None) -> Unclear:
+    """The files of a folder of which a user must say whose they are, because their names do not.
+
+    Args:
+        folder: folder of the files.
+        out: path at which the draft will be written.
+        options: what the user has said about the files.
+
+    Raises:
+        InputError: the folder, or the rig file in it, cannot be read.
+        SettingsError: an option names a file or camera that does not exist.
+    """
+    _, calibration, _, matching = _matched(Path(folder), Path(out), options or DraftOptions())
+    return Unclear(tuple(matching.cameras), calibration, tuple(matching.unmatched.values()))
+
+
+def _matched(
+    folder: Path, out: Path, options: DraftOptions
+) -> tuple[list[Found], Path | None, dict[str, tuple[int, int] | None], _Matching]:
+    """Files that are not named by hand, the rig file, the sizes of its cameras, and which file is whose."""
+    _check_by_hand(folder, options)
+    by_hand = [*options.leave_out, *(file for _, file in options.match)]
+    found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
+    calibration = options.calibration or _calibration_of(folder, found)
+    known = _known_cameras(calibration, options.unit)
+    matching = _Matching(folder, list(known) or _names_of_files(found, options))
+    for name, file in options.match:
+        _put_by_hand(matching, name, file, calibration)
+    _match(matching, found, calibration)
+    return found, calibration, known, matching
 
 
 def _check_by_hand(folder: Path, options: DraftOptions) -> None:
@@ -190,21 +300,14 @@ def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tupl
     return {name: fields.size_wh for name, fields in read_cameras(calibration).items()}
 
 
-def _names_of_files(folder: Path, found: Sequence[Found], options: DraftOptions) -> list[str]:
+def _names_of_files(found: Sequence[Found], options: DraftOptions) -> list[str]:
     """Names of cameras without a calibration: those that the user gives, and those of videos, images or detections."""
     given = list(dict.fromkeys(name for name, _ in options.match))
     videos, detections = ([each for each in found if each.kind == kind] for kind in ("video", "detections"))
-    keys = {camera_key(name): name for name in given}
-    names = []
-    for file in videos or detections:
-        name = _name_of(file)
-        if camera_key(name) in keys and keys[camera_key(name)] not in given:
-            raise _unclear(
-                folder, file.path, "files of different cameras", f"{keys[camera_key(name)]} as well"
-            )
-        keys.setdefault(camera_key(name), name)
-        names.append(keys[camera_key(name)])
-    return list(dict.fromkeys([*given, *names]))
+    names: dict[str, str] = {}
+    for name in [*given, *map(_name_of, videos or detections)]:
+        names.setdefault(camera_key(name), name)
+    return list(names.values())
 
 
 def _name_of(file: Found) -> str:
@@ -229,51 +332,61 @@ def _put_by_hand(matching: _Matching, name: str, file: str, calibration: Path | 
     if kind not in OF_CAMERA:
         expected = f"a {', a '.join(_WORDS[each] for each in OF_CAMERA)}"
         raise SettingsError("--match", expected=expected, found=file)
-    try:
-        matching.put(camera, kind, path)
-    except InputError:
+    if matching.taken(camera, kind) is not None:
         expected = f"one {_WORDS[kind]} of camera {camera}"
-        raise SettingsError("--match", expected=expected, found="two") from None
+        raise SettingsError("--match", expected=expected, found="two")
+    matching.put(camera, kind, path)
 
 
 def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None) -> None:
     """Give each file of a camera to the camera that its name says."""
+    by_hand = {file for files in matching.files.values() for file in files.values()}
     for kind in OF_CAMERA:
-        given = [name for name in matching.cameras if kind in matching.files.get(name, {})]
-        for each in found:
-            if each.kind != kind:
-                continue
-            fitting = cameras_of(each.name, matching.cameras)
-            if len(fitting) > 1:
-                raise _unclear(
-                    matching.folder,
-                    each.path,
-                    "the name of one camera",
-                    f"{' and '.join(fitting)} in its name",
-                )
-            if fitting and fitting[0] not in given:
-                matching.put(fitting[0], kind, each.path)
-            elif kind == "video" and (fitting or (each.path.is_file() and not each.alone_in)):
-                raise _video_of_no_camera(matching, each.path, calibration, fitting)
-            else:
+        rest = [each for each in found if each.kind == kind and not _match_by_name(matching, each, by_hand)]
+        of_rig = "" if calibration is None else f" of {calibration.name}"
+        expected = f"the {_WORDS[kind]} of a camera{of_rig}, {', '.join(matching.cameras)}"
+        for each in rest:
+            needed = each.is_video_file and not each.alone_in
+            if needed or any(matching.taken(name, kind) is None for name in matching.cameras):
+                matching.ask(each.path, expected, "none of these names in its name", needed=needed)
+            if not needed:
                 matching.unused.append(each.path)
     for each in found:
         if each.kind == "other":
-            _check_folder_of_camera(matching, each)
+            _look_for_videos_of_a_camera(matching, each)
             matching.unused.append(each.path)
 
 
-def _check_folder_of_camera(matching: _Matching, found: Found) -> None:
-    """Raise `InputError` for a folder with the name of a camera without files that holds several videos."""
+def _match_by_name(matching: _Matching, each: Found, by_hand: Collection[Path | str]) -> bool:
+    """Give a file to the camera that its name says, or keep it for the user; False if it says none, or says in vain."""
+    names = cameras_of(each.name, matching.cameras)
+    if len(names) > 1:
+        matching.ask(each.path, "the name of one camera", f"{' and '.join(names)} in its name")
+    if len(names) != 1:
+        return bool(names)
+    taken = matching.taken(names[0], each.kind)
+    if taken is None:
+        matching.put(names[0], each.kind, each.path)
+        return True
+    if taken in by_hand and not each.is_video_file:
+        return False
+    expected = f"one {_WORDS[each.kind]} of camera {names[0]}"
+    matching.ask(each.path, expected, f"{_short(taken)} as well")
+    if isinstance(taken, Path) and taken not in by_hand:
+        # The user may want the other one.
+        matching.ask(taken, expected, f"{each.path.name} as well")
+    return True
+
+
+def _look_for_videos_of_a_camera(matching: _Matching, found: Found) -> None:
+    """Keep for the user the videos in a folder that has the name of a camera without files."""
     fitting = [name for name in cameras_of(found.name, matching.cameras) if name not in matching.files]
     videos = videos_in(found.path)
-    if len(fitting) == 1 and videos:
-        raise InputError(
-            found.path,
-            expected=f"one video of camera {fitting[0]}",
-            found=", ".join(video.name for video in videos),
-            remedy=f"say which with --match {shlex.quote(f'{fitting[0]}={found.path.name}/{videos[0].name}')}",
-        )
+    if len(fitting) != 1 or not videos:
+        return
+    names = ", ".join(video.name for video in videos)
+    for video in videos:
+        matching.ask(video, f"one video of camera {fitting[0]}", f"{names} in {found.path.name}")
 
 
 def _table(
@@ -308,22 +421,10 @@ def _written(file: Path | str, base: Path) -> str:
         return file.absolute().as_posix()
 
 
-def _video_of_no_camera(
-    matching: _Matching, path: Path, calibration: Path | None, fitting: Sequence[str]
-) -> InputError:
-    if fitting:
-        video = _short(matching.files[fitting[0]]["video"])
-        return _unclear(matching.folder, path, f"one video of camera {fitting[0]}", f"{video} as well")
-    where = "" if calibration is None else f" of {calibration.name}"
-    expected = f"the video of a camera{where}, {', '.join(matching.cameras)}"
-    return _unclear(matching.folder, path, expected, "none of these names in its name")
-
-
-def _unclear(folder: Path, file: Path | str, expected: str, found: str) -> InputError:
-    name = shlex.quote(file if isinstance(file, str) else os.path.relpath(file, folder))
+def _unclear(folder: Path, file: Path, expected: str, found: str) -> InputError:
+    name = shlex.quote(os.path.relpath(file, folder))
     remedy = f"say whose it is with --match CAMERA={name}, or leave it out with --leave-out {name}"
-    where = file if isinstance(file, Path) else folder
-    return InputError(where, expected=expected, found=found, remedy=remedy)
+    return InputError(file, expected=expected, found=found, remedy=remedy)
 
 
 def _short(file: Path | str) -> str:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.exchange.camera_boxes import Footage
-from psotrack.recordings.exchange.formats import COVARIANCES, FORMATS, NAMES, ORIENTATIONS, TIMES, TrackFormat
+from psotrack.recordings.exchange.formats import FORMATS, NAMES, QUANTITIES, STATUS, TIMES, TrackFormat
 from psotrack.recordings.exchange.timed_paths import interval_s
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 from psotrack.trajectories import Status, Trajectories
@@ -59,7 +58,7 @@ def export_tracks(
     if not form.needs_all:
         if not len(kept):
             raise InputError("tracks", expected="a drone that is seen in some frame", found="none")
-        trajectories = _of_drones(trajectories, kept.tolist())
+        trajectories = trajectories.of_drones(kept.tolist())
         if footage is not None and footage.size_m is not None:
             footage = replace(footage, size_m=footage.size_m[kept])
     with atomic_write(out) as temporary:
@@ -69,21 +68,17 @@ def export_tracks(
 
 def _lost_quantities(trajectories: Trajectories, form: TrackFormat) -> list[str]:
     """What these trajectories have and the format cannot hold, as noun phrases."""
-    frame, time_s, status = trajectories.frame, trajectories.time_s, trajectories.status
+    frame, time_s = trajectories.frame, trajectories.time_s
+    values = trajectories.quantities()
     known = {
         NAMES: trajectories.drones != tuple(str(k + 1) for k in range(trajectories.num_drones)),
         # Frame numbers and a rate say the same as times of equal distance.
         TIMES: len(frame) > 0 and np.abs(time_s - frame * interval_s(trajectories)).max() > 1e-6,
-        ORIENTATIONS: _any_known(trajectories.orientation_wxyz),
-        COVARIANCES: _any_known(trajectories.covariance_m2),
-        "covariances without constant errors": _any_known(trajectories.relative_covariance_m2),
-        "velocities": _any_known(trajectories.velocity_m_s),
-        "fitness": _any_known(trajectories.fitness),
-        "numbers of cameras": trajectories.num_cameras is not None,
-        "status": status is not None and (status == Status.COASTING).any(),
+        **{name: bool(np.isfinite(values.get(key, np.nan)).any()) for name, key in QUANTITIES.items()},
+        STATUS: bool((values.get("status", np.array(Status.LOST)) == Status.COASTING).any()),
     }
     lost = [name for name, is_known in known.items() if is_known and name not in form.holds]
-    if "status" in form.holds:
+    if STATUS in form.holds:
         return lost
     seen = trajectories.seen
     hidden = int((np.isfinite(trajectories.position_m).all(axis=-1) & ~seen).sum())
@@ -93,21 +88,6 @@ def _lost_quantities(trajectories: Trajectories, form: TrackFormat) -> list[str]
     if never and not form.needs_all:
         lost.append(f"drones that are never seen ({', '.join(never)})")
     return lost
-
-
-def _any_known(values: np.ndarray | None) -> bool:
-    return values is not None and bool(np.isfinite(values).any())
-
-
-def _of_drones(trajectories: Trajectories, kept: list[int]) -> Trajectories:
-    """The trajectories of some drones, by their indices."""
-    names = (
-        "position_m", "velocity_m_s", "orientation_wxyz", "fitness", "num_cameras", "status", "covariance_m2",
-        "relative_covariance_m2",
-    )  # fmt: skip
-    known: dict[str, Any] = {name: getattr(trajectories, name) for name in names}
-    of_kept = {name: value[:, kept] for name, value in known.items() if value is not None}
-    return replace(trajectories, drones=tuple(trajectories.drones[index] for index in kept), **of_kept)
 
 
 def _check_name(out: Path, to: str, num_seen: int, footage: Footage | None) -> None:

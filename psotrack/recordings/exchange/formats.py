@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from psotrack.errors import InputError
+from psotrack.errors import InputError, errors_name
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.c3d_files import read_c3d_tracks, write_c3d_tracks
 from psotrack.recordings.exchange.camera_boxes import Footage
@@ -14,23 +14,23 @@ from psotrack.recordings.exchange.json_files import read_json_tracks, write_json
 from psotrack.recordings.exchange.kitti_files import POSES, read_kitti, write_kitti
 from psotrack.recordings.exchange.mcap_files import read_mcap, write_mcap
 from psotrack.recordings.exchange.mot_files import TRACKS, WORLD, read_mot_positions, write_mot
-from psotrack.recordings.exchange.number_lines import are_numbers, first_line, number_words
 from psotrack.recordings.exchange.timed_paths import joined, timed_path
-from psotrack.support import Report
+from psotrack.support import Report, are_numbers, first_line, number_words
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 from psotrack.trajectories.tum import read_tum, tum_text, write_tum
 
-#: Quantities that some formats cannot hold, as messages name them.
-NAMES, TIMES, ORIENTATIONS, COVARIANCES = "names of drones", "times", "orientations", "covariances"
-_POSES = frozenset({NAMES, TIMES, ORIENTATIONS})
-_ALL = _POSES | {
-    COVARIANCES,
-    "covariances without constant errors",
-    "velocities",
-    "fitness",
-    "numbers of cameras",
-    "status",
+#: What some formats cannot hold, as messages name it: quantities of `Trajectories`, and what is no such quantity.
+QUANTITIES = {
+    "orientations": "orientation_wxyz",
+    "covariances": "covariance_m2",
+    "covariances without constant errors": "relative_covariance_m2",
+    "velocities": "velocity_m_s",
+    "fitness": "fitness",
+    "numbers of cameras": "num_cameras",
 }
+NAMES, TIMES, STATUS = "names of drones", "times", "status"
+_POSES = frozenset({NAMES, TIMES, "orientations"})
+_ALL = frozenset({NAMES, TIMES, *QUANTITIES, STATUS})
 #: Numbers per line of a TUM file and of a KITTI file; more than 6 with commas are MOT.
 _TUM, _KITTI = 8, 12
 #: Writes tracks to a path, and returns what is missing in it as noun phrases.
@@ -79,14 +79,43 @@ FORMATS = {
     "kitti": TrackFormat(_POSES, write_kitti, entries=("poses", "sequences")),
     "mot": TrackFormat(frozenset(), write_mot, (".txt",), ("3d", "gt", "trackers")),
     "c3d": TrackFormat(frozenset({NAMES}), write_c3d_tracks, (".c3d",), needs_all=True),
-    "mcap": TrackFormat(_POSES | {COVARIANCES}, write_mcap, (".mcap",), ("*.mcap", "metadata.yaml")),
+    "mcap": TrackFormat(_POSES | {"covariances"}, write_mcap, (".mcap",), ("*.mcap", "metadata.yaml")),
     "csv": TrackFormat(_ALL, _write_table, (".csv",), needs_all=True),
     "parquet": TrackFormat(_ALL, _write_table, (".parquet",), needs_all=True),
     "json": TrackFormat(_ALL, write_json_tracks, (".json",), needs_all=True),
 }
 
 
-def read_folder(path: Path, recording: Recording | None) -> Trajectories:
+def read_tracks(path: Path | str, *, recording: Recording | None = None) -> Trajectories:
+    """Read tracks of psotrack or of another program, from a file or a folder.
+
+    CSV and Parquet (see `read_trajectories`), JSON, TUM, KITTI, MOT 3D, C3D and MCAP are recognised by ending and
+    content. Poses that have times only get the frame numbers of the recording's instants, if all their times are
+    instants; a rate of their own, if all times are multiples of an interval; else they are interpolated at the
+    instants, never across a missing sample.
+
+    Args:
+        path: file or folder.
+        recording: the recording that was tracked; None if unknown. Without it, files that have neither times nor a rate
+            cannot be read.
+
+    Raises:
+        InputError: there is no such file, its format is unknown, or it cannot be read.
+        SettingsError: the libraries for MCAP are not installed.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(path, expected="a file or folder of tracks", found="no such file or folder")
+    read = _read_folder if path.is_dir() else _READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(path, expected=_KINDS, found=repr(path.name))
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(path, expected="tracks", found="an empty file")
+    with errors_name(path):
+        return read(path, recording)
+
+
+def _read_folder(path: Path, recording: Recording | None) -> Trajectories:
     """Read a folder of TUM, KITTI or MCAP files, or the one that an export to MOT wrote."""
     if (path / WORLD / TRACKS).is_file():
         return read_mot_positions(path / WORLD / TRACKS, recording)
@@ -102,17 +131,7 @@ def read_folder(path: Path, recording: Recording | None) -> Trajectories:
     if counts == {_KITTI}:
         return joined(path, [read_kitti(file, recording) for file in files], recording)
     found = "files of boxes alone" if (path / "trackers").is_dir() else "a folder without them"
-    raise InputError(path, expected=KINDS, found=found)
-
-
-def read_file(path: Path, recording: Recording | None) -> Trajectories:
-    """Read a file by its ending; a text by its first line."""
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
-        raise InputError(path, expected=KINDS, found=repr(path.name))
-    if path.stat().st_size == 0:
-        raise InputError(path, expected="tracks", found="an empty file")
-    return read(path, recording)
+    raise InputError(path, expected=_KINDS, found=found)
 
 
 def _read_tum(where: Path, files: Sequence[Path], recording: Recording | None) -> Trajectories:
@@ -160,6 +179,6 @@ _READERS: dict[str, Read] = {
     ".c3d": read_c3d_tracks,
     ".mcap": read_mcap,
 }
-KINDS = (
+_KINDS = (
     f"tracks as {', '.join(_READERS)} (.txt: TUM, KITTI or MOT), or a folder of TUM, KITTI, MOT or MCAP files"
 )

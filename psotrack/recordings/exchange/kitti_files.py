@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage
-from psotrack.recordings.exchange.number_lines import read_numbers
 from psotrack.recordings.exchange.timed_paths import instants_s, timed_path
-from psotrack.support import Report, check_file_name, first_repeat
+from psotrack.support import Report, check_file_name, first_repeat, first_true, read_numbers
 from psotrack.trajectories import Trajectories
 
 POSES, SEQUENCES, TIMES = "poses", "sequences", "times.txt"
@@ -66,31 +65,27 @@ def read_kitti(file: Path, recording: Recording | None) -> Trajectories:
         InputError: a file cannot be read, a line is no pose, or poses and times differ in number; there are no times
             and no recording, or a recording of another length.
     """
-    table = read_numbers(file, 12, "12 finite numbers: the rows of [R | t]")
-    poses = table.reshape(-1, 3, 4)
-    off = np.abs(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    mirrored = np.linalg.det(poses[:, :, :3]) < 0
-    if (off > _ROTATION).any() or mirrored.any():
-        line = int(np.argmax((off > _ROTATION) | mirrored)) + 1
-        raise InputError(f"{file}, pose {line}", expected="a rotation matrix", found="another matrix")
-    orientation = Rotation.from_matrix(poses[:, :, :3]).as_quat(scalar_first=True, canonical=True)
+    read = read_numbers(file, 12, "12 finite numbers: the rows of [R | t]")
+    poses = read.values.reshape(-1, 3, 4)
+    R = poses[:, :, :3]
+    off = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    if (row := first_true((off > _ROTATION) | (np.linalg.det(R) < 0))) is not None:
+        raise read.error(row, expected="a rotation matrix", found="another matrix")
+    orientation = Rotation.from_matrix(R).as_quat(scalar_first=True, canonical=True)
     return timed_path(file.stem, _times(file, len(poses), recording), poses[:, :, 3], orientation)
 
 
 def _times(file: Path, count: int, recording: Recording | None) -> Float[np.ndarray, "rows"]:
     beside = find_times(file)
     if beside is not None:
-        time_s = read_numbers(beside, 1, "one time in seconds per line")[:, 0]
+        read = read_numbers(beside, 1, "one time in seconds per line")
+        time_s = read.values[:, 0]
         if len(time_s) != count:
-            raise InputError(
-                beside, expected=f"{count} times, as many as {file.name} has poses", found=f"{len(time_s)}"
-            )
-        again = first_repeat(time_s)
-        if again is not None:
-            raise InputError(
-                f"{beside}, line {again + 1}",
-                expected="times that increase from line to line",
-                found=f"{time_s[again]:g} s",
+            expected = f"{count} times, as many as {file.name} has poses"
+            raise InputError(beside, expected=expected, found=f"{len(time_s)}")
+        if (row := first_repeat(time_s)) is not None:
+            raise read.error(
+                row, expected="times that increase from line to line", found=f"{time_s[row]:g} s"
             )
         return time_s
     instant_s = instants_s(recording)

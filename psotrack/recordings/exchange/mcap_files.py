@@ -19,7 +19,7 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 
 from psotrack.errors import InputError, SettingsError, install_command
+from psotrack.geometry import Rig
 from psotrack.recordings import Recording, read_frames
 from psotrack.recordings.exchange import ros_messages as ros
 from psotrack.recordings.exchange.camera_boxes import CameraFrames, Footage, camera_frames
@@ -39,6 +40,8 @@ from psotrack.trajectories import Trajectories
 WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
 _JPEG_QUALITY = 90
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+#: Types of messages whose poses are read.
+_READ = (ros.POSE, "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 #: Time in nanoseconds, topic, type and content of a message.
 _Message = tuple[int, str, str, dict[str, Any]]
 #: Time in seconds, position, orientation and the 36 numbers of the covariance of a pose.
@@ -66,26 +69,24 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
             found=f"{trajectories.time_s.min():g} s",
         )
     names = _ros_names(trajectories.drones, "drone")
-    cameras = [] if footage is None else camera_frames(footage.recording, trajectories)
-    shown = [camera.name for camera in cameras]
-    camera_names = dict(zip(shown, _ros_names(shown, "cam"), strict=True))
-    _check_different([WORLD, *names, *camera_names.values()])
-    filmed = []
+    frames = [] if footage is None else camera_frames(footage.recording, trajectories)
+    camera_names = _ros_names([camera.name for camera in frames], "cam")
+    _check_different([WORLD, *names, *camera_names])
+    cameras = dict(zip(camera_names, frames, strict=True))
+    filmed = {}
     if footage is not None and footage.images:
-        filmed = [camera for camera in cameras if camera.name in footage.recording.videos]
-    missing: list[str] = []
+        filmed = {name: each for name, each in cameras.items() if each.name in footage.recording.videos}
     counts: Counter[tuple[str, str]] = Counter()
     first_ns, last_ns = 2**63 - 1, 0
     file = path if path.suffix == ".mcap" else path / f"{path.name.lstrip('.').partition('.')[0]}_0.mcap"
     file.parent.mkdir(parents=True, exist_ok=True)
-    total = trajectories.num_frames + sum(len(camera.time_s) for camera in filmed)
+    total = trajectories.num_frames + sum(len(camera.time_s) for camera in filmed.values())
     with report("messages", total) as advance, file.open("wb") as stream:
-        streams: list[Iterator[_Message]] = [_drone_messages(trajectories, names, advance)]
+        streams = [_drone_messages(trajectories, names, advance)]
         if footage is not None:
-            infos, missing = _camera_infos(footage, cameras, camera_names)
-            places = _camera_places(footage, cameras, camera_names, float(trajectories.time_s[-1]))
-            images = [_image_messages(footage, each, camera_names[each.name], advance) for each in filmed]
-            streams = [iter(infos), places, *streams, *images]
+            places = _camera_messages(footage.recording.rig, cameras, float(trajectories.time_s[-1]))
+            images = [_image_messages(footage, each, name, advance) for name, each in filmed.items()]
+            streams = [places, *streams, *images]
         writer = writer_class(stream)
         schemas = {name: writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
         drones = dict(zip((f"/{name}/pose" for name in names), trajectories.drones, strict=True))
@@ -97,7 +98,11 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
         writer.finish()
     if file != path:
         _write_bag_file(path, file.name, counts, first_ns, last_ns)
-    return missing
+    if footage is None:
+        return []
+    lenses = [(camera.name, footage.recording.rig.cameras[camera.index]) for camera in frames]
+    lost = [name for name, lens in lenses if ros.camera_message({}, lens) is None]
+    return [f"the lens of {name}, for which ROS has no model" for name in lost]
 
 
 def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
@@ -132,16 +137,12 @@ def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
                     names = json.loads(record.metadata["drones"])
             kinds = {each.topic: summary.schemas[each.schema_id].name for each in summary.channels.values()}
             topics = [topic for topic, kind in kinds.items() if kind in _READ]
-            for schema, channel, _, message in reader.iter_decoded_messages(topics=topics) if topics else ():
-                rows.setdefault(channel.topic, []).append(
-                    _row(message.header.stamp, *_READ[schema.name](message))
-                )
+            for _, channel, _, message in reader.iter_decoded_messages(topics=topics) if topics else ():
+                rows.setdefault(channel.topic, []).append(_row(message))
     except OSError as error:
         raise InputError(
             path, expected="a file to read", found=(error.strerror or f"{error}").lower()
         ) from error
-    except InputError:
-        raise
     except Exception as error:  # The library raises whatever a damaged byte leads to.
         found = f"a damaged or shortened file ({type(error).__name__}: {error})".partition("\n")[0]
         raise InputError(path, expected="an MCAP file", found=found, remedy="copy it again") from error
@@ -155,14 +156,16 @@ def read_mcap(path: Path, recording: Recording | None) -> Trajectories:
     return joined(path, paths, recording)
 
 
-def _row(stamp: Any, pose: Any, covariance: Any) -> _Row:
+def _row(message: Any) -> _Row:
+    """Time, position, orientation and covariance of a message; a pose alone states no covariance."""
+    stated = hasattr(message.pose, "pose")
+    stamp, pose = message.header.stamp, message.pose.pose if stated else message.pose
     place, turn = pose.position, pose.orientation
-    known = np.zeros(36) if covariance is None else np.asarray(covariance, float)
     return (
         stamp.sec + stamp.nanosec * 1e-9,
         [place.x, place.y, place.z],
         [turn.w, turn.x, turn.y, turn.z],
-        known,
+        np.asarray(message.pose.covariance, float) if stated else np.zeros(36),
     )
 
 
@@ -184,14 +187,6 @@ def _path(where: str, name: str, rows: list[_Row]) -> Trajectories:
     stated = block.any(axis=(1, 2)) & (block[:, 0, 0] >= 0)
     block = np.where(stated[:, None, None], (block + block.swapaxes(1, 2)) / 2, np.nan)
     return timed_path(name, time_s, position_m, orientation, block if stated.any() else None)
-
-
-#: The functions that take pose and covariance from a message, by its type.
-_READ: dict[str, Callable[[Any], tuple[Any, Any]]] = {
-    ros.POSE: lambda message: (message.pose.pose, message.pose.covariance),
-    "nav_msgs/msg/Odometry": lambda message: (message.pose.pose, message.pose.covariance),
-    "geometry_msgs/msg/PoseStamped": lambda message: (message.pose, None),
-}
 
 
 def _drone_of(topic: str, topics: dict[str, Any]) -> str:
@@ -239,31 +234,16 @@ def _drone_messages(trajectories: Trajectories, names: list[str], advance: Advan
             yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": transforms}
 
 
-def _camera_infos(
-    footage: Footage, cameras: list[CameraFrames], names: dict[str, str]
-) -> tuple[list[_Message], list[str]]:
-    """Lenses of the cameras at time 0, and what ROS cannot hold of them."""
-    infos: list[_Message] = []
-    missing = []
-    for camera in cameras:
-        name = names[camera.name]
-        info = ros.camera_message(ros.header(0, name), footage.recording.rig.cameras[camera.index])
-        if info is None:
-            missing.append(f"the lens of {camera.name}, for which ROS has no model")
-        else:
-            infos.append((0, f"/{name}/camera_info", ros.CAMERA_INFO, info))
-    return infos, missing
-
-
-def _camera_places(
-    footage: Footage, cameras: list[CameraFrames], names: dict[str, str], last_s: float
-) -> Iterator[_Message]:
-    """Places of the cameras at each whole second, and at the end."""
-    poses = [
-        (names[each.name], *ros.camera_pose(footage.recording.rig.cameras[each.index])) for each in cameras
-    ]
-    times_ns = [*range(0, round(last_s * 1e9), 10**9), round(last_s * 1e9)]
-    for time_ns in times_ns:
+def _camera_messages(rig: Rig, cameras: dict[str, CameraFrames], last_s: float) -> Iterator[_Message]:
+    """Lenses of the cameras at time 0, and their places at each whole second and at the end."""
+    lenses = {name: rig.cameras[each.index] for name, each in cameras.items()}
+    for name, lens in lenses.items():
+        info = ros.camera_message(ros.header(0, name), lens)
+        if info is not None:
+            yield 0, f"/{name}/camera_info", ros.CAMERA_INFO, info
+    poses = [(name, *ros.camera_pose(lens)) for name, lens in lenses.items()]
+    last_ns = round(last_s * 1e9)
+    for time_ns in (*range(0, last_ns, 10**9), last_ns):
         head = ros.header(time_ns, WORLD)
         yield time_ns, "/tf", ros.TRANSFORMS, {"transforms": [ros.transform(head, *pose) for pose in poses]}
 

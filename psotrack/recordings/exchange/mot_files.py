@@ -17,15 +17,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage, boxes_in_camera, camera_frames
-from psotrack.recordings.exchange.number_lines import read_numbers
 from psotrack.recordings.exchange.timed_paths import interval_s
-from psotrack.support import Report, check_file_name
-from psotrack.trajectories import UNASSIGNED, Trajectories, check_cells
+from psotrack.support import Report, check_file_name, first_true, read_numbers
+from psotrack.trajectories import UNASSIGNED, DroneRows, Trajectories, from_rows
 from psotrack.trajectories.association import align, fixed_identity
 
 #: The folder of TrackEval: with the benchmark MOT15, TrackEval leaves nothing out.
@@ -113,55 +112,37 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
     Raises:
         InputError: the file cannot be read, has boxes only, has a drone twice in a frame, or there is no rate.
     """
-    table = read_numbers(path, 7, f"at least 7 numbers: {_COLUMNS}", more=True)
-    numbers = table[:, :2]
-    wrong = (table[:, 0] < 1) | ((numbers != np.floor(numbers)) | (np.abs(numbers) > _LARGEST)).any(axis=1)
-    if wrong.any():
-        first = int(np.argmax(wrong))
-        raise InputError(
-            f"{path}, row {first + 1}", expected="whole frame numbers from 1", found=f"{table[first, 0]:g}"
-        )
-    position_m = _positions(path)
-    frame, row = np.unique(table[:, 0].astype(np.int64) - 1, return_inverse=True)
-    identities, drone = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
-    check_cells(path, len(frame), len(identities), len(row))
-    cell = row * len(identities) + drone
-    if len(np.unique(cell)) < len(cell):
-        again = int(np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0])
-        raise InputError(
-            f"{path}, row {again + 1}",
-            expected="one row per frame and identity",
-            found=f"a second row for frame {frame[row[again]] + 1} and identity {identities[drone[again]]}",
-        )
-    values = np.full((len(frame) * len(identities), 3), np.nan)
-    values[cell] = position_m
-    return Trajectories(
-        frame, _times(path, frame, recording), tuple(map(str, identities)), values.reshape(len(frame), -1, 3)
-    )
+    read = read_numbers(path, 7, f"at least 7 numbers: {_COLUMNS}", more=True)
+    number = read.values[:, :2]
+    wrong = (number[:, 0] < 1) | ((number != np.floor(number)) | (np.abs(number) > _LARGEST)).any(axis=1)
+    if (row := first_true(wrong)) is not None:
+        raise read.error(row, expected="whole frame numbers from 1", found=f"{number[row, 0]:g}")
+    frame = number[:, 0] - 1
+    columns = {
+        "frame": frame,
+        "time_s": _times(path, frame, recording),
+        "drone": number[:, 1].astype(int).astype(str).astype(object),
+        **dict(zip(("x_m", "y_m", "z_m"), _positions(path).T, strict=True)),
+    }
+    return from_rows(path, DroneRows(columns, lambda row: f"{path}, line {read.lines[row]}"))
 
 
 def _positions(path: Path) -> Float[np.ndarray, "rows 3"]:
-    remedy = "name a file with 3D columns, or the folder that `psotrack export --to mot` wrote"
     try:
-        position_m = read_numbers(path, 10, f"10 numbers: {_COLUMNS}", more=True)[:, 7:]
+        position_m = read_numbers(path, 10, f"10 numbers: {_COLUMNS}", more=True).values[:, 7:]
+        found = "boxes alone: x, y and z are -1 in every row" if (position_m == -1).all() else ""
     except InputError as error:
         found = f"boxes alone ({error})"
-        raise InputError(
-            path, expected="positions in MOT15's 3D columns", found=found, remedy=remedy
-        ) from None
-    if (position_m == -1).all():
-        raise InputError(
-            path,
-            expected="positions in MOT15's 3D columns",
-            found="boxes alone: x, y and z are -1 in every row",
-            remedy=remedy,
-        )
+    if found:
+        remedy = "name a file with 3D columns, or the folder that `psotrack export --to mot` wrote"
+        raise InputError(path, expected="positions in MOT15's 3D columns", found=found, remedy=remedy)
     return position_m
 
 
 def _times(
-    path: Path, frame: Int[np.ndarray, "frames"], recording: Recording | None
-) -> Float[np.ndarray, "frames"]:
+    path: Path, frame: Float[np.ndarray, "rows"], recording: Recording | None
+) -> Float[np.ndarray, "rows"]:
+    """(rows,), times of the rows' frames, seconds."""
     info = path.with_name(INFO)
     fps = None
     if info.is_file():
@@ -175,9 +156,8 @@ def _times(
             raise InputError(info, expected=f"a frameRate above {_SLOWEST_HZ:g}", found=f"{fps:g}")
     if recording is not None and (fps is None or abs(fps / recording.fps - 1) < 1e-3):
         time_s = recording.timeline().time_s
-        return np.where(
-            frame < len(time_s), time_s[np.minimum(frame, len(time_s) - 1)], frame / recording.fps
-        )
+        instant = np.minimum(frame, len(time_s) - 1).astype(int)
+        return np.where(frame < len(time_s), time_s[instant], frame / recording.fps)
     if fps is None:
         raise InputError(
             path, expected=f"a rate, in {INFO} beside the file", found="none", remedy="name SEQ, too"

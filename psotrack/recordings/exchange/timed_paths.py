@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
 from psotrack.recordings import Recording
-from psotrack.trajectories import Trajectories, resample
+from psotrack.trajectories import QUANTITIES, Trajectories, resample
 
 #: Largest number of a frame.
 _LARGEST_FRAME = 2**31
@@ -163,39 +164,21 @@ def _on_frames(
 ) -> Trajectories:
     """Trajectories in the frames that some path has."""
     frame = np.unique(np.concatenate(frames)).astype(np.int64)
-
-    def grid(name: str, *shape: int) -> np.ndarray | None:
-        values = np.full((len(frame), len(paths), *shape), np.nan)
-        known = False
+    quantities: dict[str, Any] = {}
+    for name in {name for path in paths for name in path.quantities()}:
+        quantities[name] = np.full((len(frame), len(paths), *QUANTITIES[name]), np.nan)
         for drone, (path, number) in enumerate(zip(paths, frames, strict=True)):
-            value = getattr(path, name)
-            if value is not None:
-                values[np.searchsorted(frame, number), drone], known = value[:, 0], True
-        return values if known else None
-
-    position_m = grid("position_m", 3)
-    assert position_m is not None
-    return Trajectories(
-        frame=frame,
-        time_s=time_of(frame).astype(np.float64),
-        drones=tuple(name for path in paths for name in path.drones),
-        position_m=position_m,
-        orientation_wxyz=grid("orientation_wxyz", 4),
-        covariance_m2=grid("covariance_m2", 3, 3),
-    )
+            if name in path.quantities():
+                quantities[name][np.searchsorted(frame, number), drone] = path.quantities()[name][:, 0]
+    drones = tuple(name for path in paths for name in path.drones)
+    return Trajectories(frame, time_of(frame).astype(np.float64), drones, **quantities)
 
 
 def _interpolated(
     where: object, paths: Sequence[Trajectories], instant_s: Float[np.ndarray, "instants"]
 ) -> Trajectories:
     frame = np.arange(len(instant_s))
-    nowhere = np.full((len(frame), 1, 3), np.nan)
-    parts = [
-        resample(path, frame, instant_s, gap_s=_GAP * _usual_interval_s(path.time_s))
-        if path.num_frames > 1
-        else Trajectories(frame, instant_s, path.drones, nowhere)
-        for path in paths
-    ]
+    parts = [resample(path, frame, instant_s, gap_s=_GAP * _usual_interval_s(path.time_s)) for path in paths]
     if not any(np.isfinite(part.position_m).any() for part in parts):
         expected = "two samples of a drone with an instant of the recording between them"
         raise InputError(where, expected=expected, found="none")

@@ -13,8 +13,17 @@ from .flight import (
     split_sequence,
 )
 from .image_views import ImageViews, ellipse_outlines_px, view_in_images
-from .quality import QUANTITIES, Quantity, camera_quality, drone_quality, quantities
-from .run_record import LearnedDrone, MeetingRecord, RunRecord, read_run_record, recording_beside
+from .quality import QUANTITIES, Quantity, camera_quality, deviations_mm, drone_quality, quantities
+from .run_record import (
+    LearnedDrone,
+    MeetingRecord,
+    RunRecord,
+    read_run_record,
+    record_files,
+    recording_beside,
+    write_tracked,
+)
+from .run_summary import RunSummary, run_summary
 
 __all__ = [
     "QUANTITIES",
@@ -28,9 +37,11 @@ __all__ = [
     "MeetingRecord",
     "Quantity",
     "RunRecord",
+    "RunSummary",
     "TrackedFlight",
     "camera_quality",
     "colour_rgb",
+    "deviations_mm",
     "drone_quality",
     "ellipse_outlines_px",
     "ellipsoids_90",
@@ -43,10 +54,13 @@ __all__ = [
     "read_flight",
     "read_run_record",
     "read_tracks_file",
+    "record_files",
     "recording_beside",
     "rows_at",
+    "run_summary",
     "split_sequence",
     "status_rgb",
     "statuses",
     "view_in_images",
+    "write_tracked",
 ]

@@ -98,7 +98,7 @@ class TrackedFlight:
 
 def read_flight(
     tracks: Sequence[Path | str] = (),
-    sequence: Path | str | None = None,
+    sequence: Recording | Path | str | None = None,
     *,
     cameras: Sequence[str] | None = None,
 ) -> TrackedFlight:
@@ -106,8 +106,8 @@ def read_flight(
 
     Args:
         tracks: files of tracks.
-        sequence: the recording, as for `open_recording`; None: the one that the record of the first tracks names, as
-            far as it is there.
+        sequence: the recording, or its path as for `open_recording`; None: the one that the record of the first tracks
+            names, as far as it is there.
         cameras: names of the cameras to keep; None: all.
 
     Raises:
@@ -121,7 +121,10 @@ def read_flight(
             remedy = "name the recording last, TRACKS [SEQ]"
             raise InputError(path, expected="a file of tracks", found="a recording", remedy=remedy)
     sequence = find_recording(paths[0]) if sequence is None and paths else sequence
-    recording = None if sequence is None else open_recording(sequence)
+    if sequence is None or isinstance(sequence, Recording):
+        recording = sequence
+    else:
+        recording = open_recording(sequence)
     if recording is not None and cameras is not None:
         recording = recording.usable(cameras, videos=False)
     if recording is None and cameras is not None:

@@ -61,15 +61,17 @@ def quantities(flight: TrackedFlight, tracks: FlightTracks) -> Iterator[Quantity
             tracks.colours[0] if tracks.group else drone_colour(index) for index in range(len(names))
         )
         yield Quantity("error_mm", frame, time_s, 1e3 * table.to_numpy(float), names, colours)
-    deviation_mm = None
-    if flown.covariance_m2 is not None:
-        variance_m2 = np.trace(flown.covariance_m2, axis1=-2, axis2=-1)
-        deviation_mm = 1e3 * np.sqrt(np.maximum(variance_m2, 0.0))
+    deviation_mm = None if flown.covariance_m2 is None else deviations_mm(flown.covariance_m2)
     found = {"score": flown.fitness, "deviation_mm": deviation_mm, "cameras": flown.num_cameras}
     for key, values in found.items():
         if values is not None:
             shown = np.where(flown.seen, values, np.nan).astype(np.float64)
             yield Quantity(key, flown.frame, flown.time_s, shown, flown.drones, tracks.colours)
+
+
+def deviations_mm(covariance_m2: Float[np.ndarray, "*points 3 3"]) -> Float[np.ndarray, "*points"]:
+    """Standard deviations of positions in space, mm: roots of the sums of their variances along the axes."""
+    return 1e3 * np.sqrt(np.maximum(np.trace(covariance_m2, axis1=-2, axis2=-1), 0.0))
 
 
 def drone_quality(tracks: FlightTracks) -> DataFrame:

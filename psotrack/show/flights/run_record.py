@@ -9,7 +9,9 @@ from typing import Any
 import msgspec
 
 from psotrack.errors import InputError
-from psotrack.support import convert, read_json
+from psotrack.pipeline import TrackedRecording
+from psotrack.support import atomic_write_all, convert, json_text, read_json, refuse_files
+from psotrack.trajectories import write_ambiguity, write_trajectories
 
 
 class LearnedDrone(msgspec.Struct, frozen=True):
@@ -78,6 +80,36 @@ def recording_beside(recording: Path | str, tracks: Path | str) -> str:
     path, folder = Path(recording).absolute(), Path(tracks).absolute().parent
     together = path.is_relative_to(folder) or folder.is_relative_to(path if path.is_dir() else path.parent)
     return Path(os.path.relpath(path, folder)).as_posix() if together else str(path)
+
+
+def record_files(tracks: Path) -> tuple[Path, Path]:
+    """Paths of the record of a run, and of which drones may be confused, beside a file of tracks."""
+    return tracks.with_suffix(".json"), tracks.with_suffix(".ambiguity.csv")
+
+
+def write_tracked(
+    path: Path | str, tracked: TrackedRecording, recording: Path | str | None = None, *, force: bool = False
+) -> None:
+    """Write tracks, and beside them their record (.json) and which drones may be confused (.ambiguity.csv).
+
+    Args:
+        path: file of the tracks; it ends in .csv or .parquet.
+        tracked: result of the run.
+        recording: the recording, as a user names it for `open_recording`; the record names it. None: it names none.
+        force: replace existing files.
+
+    Raises:
+        OutputError: a file exists and `force` is not set, or it cannot be written.
+    """
+    path = Path(path)
+    files = *record_files(path), path
+    refuse_files(*files, force=force)
+    named = {} if recording is None else {"recording": recording_beside(recording, path)}
+    tracks, identities = tracked.trajectories, tracked.identities
+    with atomic_write_all(*files) as (record_file, ambiguity_file, tracks_file):
+        write_trajectories(tracks_file, tracks)
+        write_ambiguity(ambiguity_file, tracks.time_s, identities.pairs, identities.ambiguity)
+        record_file.write_text(json_text({**tracked.record, **named}) + "\n", encoding="utf-8")
 
 
 def read_run_record(path: Path | str) -> RunRecord | None:

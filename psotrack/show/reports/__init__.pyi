@@ -1,3 +1,4 @@
+from .any_report import WrittenPage, write_report
 from .calibration_report import is_calibration_record, write_calibration_report
 from .flight_report import write_flight_report
 from .page import MOST_BYTES, write_page
@@ -9,11 +10,13 @@ __all__ = [
     "MOST_ROWS",
     "PointCloud",
     "Scene3D",
+    "WrittenPage",
     "is_calibration_record",
     "scene_of_flight",
     "view_3d",
     "write_calibration_report",
     "write_flight_report",
     "write_page",
+    "write_report",
     "write_sweep_report",
 ]

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from psotrack.show.flights import FlightTracks, status_rgb, statuses
 from psotrack.show.viewer.camera_images import CameraKey
@@ -104,24 +104,6 @@ class EntityLog:
             ]
             found = found if counts is None else found.partition(np.diff(own))
             rr.send_columns(path, times, found, recording=self._stream, strict=True)
-
-    def rows_where(
-        self,
-        path: str,
-        at: Instants,
-        there: Bool[np.ndarray, " rows"],
-        columns: Callable[[Int[np.ndarray, " some"]], Any],
-    ) -> None:
-        """Log one value in each row that has a value.
-
-        Args:
-            path: path of the entity.
-            at: the instants of the rows.
-            there: (rows,), whether a row has a value.
-            columns: makes the columns of rows with these numbers, all of which have a value.
-        """
-        numbers = np.flatnonzero(there)
-        self.rows(path, at, lambda values: columns(numbers[values]), there.astype(int))
 
     def boxes(self, path: str, at: Instants, marks: Marks, boxes_px: Float[np.ndarray, "boxes 4"]) -> None:
         """Log boxes in images over time; without names, they have thin lines."""

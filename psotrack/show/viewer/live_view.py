@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from dataclasses import replace
-from functools import partial
 from types import TracebackType
 from typing import Any
 
@@ -14,11 +13,18 @@ import rerun as rr
 from jaxtyping import Float
 
 from psotrack.recordings import Recording
-from psotrack.show.flights import TrackedFlight, flight_of, statuses
-from psotrack.show.viewer.entity_log import EntityLog, Instants, instants, part, shown_rgb
+from psotrack.show.flights import (
+    FlightTracks,
+    TrackedFlight,
+    colour_rgb,
+    deviations_mm,
+    flight_of,
+    statuses,
+)
+from psotrack.show.viewer.entity_log import EntityLog, Instants, instants, shown_rgb
 from psotrack.show.viewer.flight_file import APPLICATION
 from psotrack.show.viewer.layout import live_blueprint
-from psotrack.show.viewer.plots import log_quantities, log_status
+from psotrack.show.viewer.plots import log_status
 from psotrack.show.viewer.programs import viewer_program
 from psotrack.show.viewer.space import log_drones, log_world
 from psotrack.support import drone_colour, whole_number
@@ -49,6 +55,7 @@ class LiveView:
         self._trails: dict[str, deque[Float[np.ndarray, "3"]]] = {}
         self._status: dict[str, int] = {}
         self._colours: dict[str, str] = {}
+        self._num_lines = 0
         self._ends = contextlib.ExitStack()
         self._now = Instants(np.zeros(1, int), np.zeros(1))
         self.page = ""
@@ -67,7 +74,7 @@ class LiveView:
         return self
 
     def write(self, rows: Trajectories) -> None:
-        """Show the rows of an instant."""
+        """Show the rows of an instant: what belongs together is one entity, because each costs half a millisecond."""
         (tracks,) = flight_of(rows).tracks
         for name in rows.drones:
             number = whole_number(name)
@@ -75,30 +82,43 @@ class LiveView:
             self._colours.setdefault(name, drone_colour(number))
         tracks = replace(tracks, colours=tuple(self._colours[name] for name in rows.drones))
         self._now = instants(tracks)
-        log_drones(self._log, tracks)
-        log_quantities(self._log, TrackedFlight("", (), None), tracks, ("deviation_mm",))
+        log_drones(self._log, "world/drones", tracks, range(len(rows.drones)))
         log_status(self._log, tracks, self._status)
         self._status |= dict(zip(rows.drones, statuses(rows)[0].tolist(), strict=True))
-        self._show_trails(rows, shown_rgb(tracks)[0].tolist())
+        self._show_trails(tracks)
+        self._show_deviations(rows)
 
-    def _show_trails(self, rows: Trajectories, rgb: list[list[int]]) -> None:
-        known = dict(zip(rows.drones, np.isfinite(rows.position_m[0]).all(axis=-1).tolist(), strict=True))
-        for name in [name for name in self._trails if not known.get(name)]:
-            path = f"world/drones/{part(name)}"
-            self._log.rows(path, self._now, partial(_only, rr.Clear.columns(is_recursive=[True])))
-            del self._trails[name]
-        for index, name in enumerate(rows.drones):
-            if known[name]:
-                trail = self._trails.setdefault(name, deque(maxlen=_TRAIL_ROWS))
-                trail.append(rows.position_m[0, index].astype(np.float64))
-                line = rr.LineStrips3D.columns(strips=[np.stack(trail)], colors=[rgb[index]])
-                self._log.rows(f"world/drones/{part(name)}/trail", self._now, partial(_only, line))
+    def _show_trails(self, tracks: FlightTracks) -> None:
+        rows, trails = tracks.trajectories, self._trails
+        position_m = dict(zip(rows.drones, rows.position_m[0].astype(np.float64), strict=True))
+        known = [name for name, at_m in position_m.items() if np.isfinite(at_m).all()]
+        self._trails = {name: trails.get(name, deque(maxlen=_TRAIL_ROWS)) for name in known}
+        for name, trail in self._trails.items():
+            trail.append(position_m[name])
+        rgb = shown_rgb(tracks)[0, [rows.drones.index(name) for name in known]]
+        strips_m = [np.stack(trail) for trail in self._trails.values()]
+        self._show("world/drones/trail", rr.LineStrips3D.columns(strips=strips_m, colors=rgb), len(known))
+
+    def _show_deviations(self, rows: Trajectories) -> None:
+        if rows.covariance_m2 is None:
+            return
+        path, names = "plots/deviation_mm", list(self._colours)
+        if len(names) > self._num_lines:
+            self._num_lines = len(names)
+            colours = [colour_rgb(colour) for colour in self._colours.values()]
+            self._stream.log(path, rr.SeriesLines(colors=colours, names=names, widths=[1.5]), static=True)
+        values_mm = np.full(len(names), np.nan)
+        own_mm = np.where(rows.seen[0], deviations_mm(rows.covariance_m2[0]), np.nan)
+        values_mm[[names.index(name) for name in rows.drones]] = own_mm
+        self._show(path, rr.Scalars.columns(scalars=values_mm), len(names))
 
     def show_delay(self, delay_s: float) -> None:
         """Show the delay of the instant whose rows were written last, seconds."""
-        self._log.rows(
-            "plots/delay_ms", self._now, partial(_only, rr.Scalars.columns(scalars=[1e3 * delay_s]))
-        )
+        self._show("plots/delay_ms", rr.Scalars.columns(scalars=[1e3 * delay_s]), 1)
+
+    def _show(self, path: str, values: Any, count: int) -> None:
+        """Show some values of one entity at this instant."""
+        self._log.rows(path, self._now, lambda _: values, np.array([count]))
 
     def __exit__(
         self,
@@ -113,8 +133,3 @@ class LiveView:
         with contextlib.suppress(Exception):
             self._stream.flush(timeout_sec=_LAST_ROWS_S)
         self._stream.disconnect()
-
-
-def _only(columns: Any, _: slice) -> Any:
-    """Columns of a single row, for `EntityLog.rows`."""
-    return columns

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,6 @@ import rerun as rr
 from jaxtyping import Float
 
 from psotrack.show.flights import (
-    QUANTITIES,
     EventKind,
     FlightTracks,
     TrackedFlight,
@@ -32,17 +31,15 @@ _STATUS_RGB = [(60, 160, 90), (230, 170, 40), (200, 60, 60)]
 def log_plots(log: EntityLog, flight: TrackedFlight) -> None:
     """Log the quantities, the status and the events of all tracks."""
     for tracks in flight.tracks:
-        log_quantities(log, flight, tracks)
+        _log_quantities(log, flight, tracks)
         log_status(log, tracks)
     if flight.tracks:
         _log_events(log, flight)
 
 
-def log_quantities(
-    log: EntityLog, flight: TrackedFlight, tracks: FlightTracks, keys: Container[str] = QUANTITIES
-) -> None:
-    """Log a line of each quantity with one of some keys per drone."""
-    for quantity in (each for each in quantities(flight, tracks) if each.key in keys):
+def _log_quantities(log: EntityLog, flight: TrackedFlight, tracks: FlightTracks) -> None:
+    """Log a line of each quantity per drone."""
+    for quantity in quantities(flight, tracks):
         at = Instants(quantity.frame, quantity.time_s)
         for name, colour, values in zip(quantity.names, quantity.colours, quantity.values.T, strict=True):
             path, shown = drone_path(f"plots/{quantity.key}", tracks, name), f"{tracks.group} {name}".strip()

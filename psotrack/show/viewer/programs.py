@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-import urllib.parse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,8 @@ _START = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _START_S, _END_S = 30.0, 0.5
 #: Time between two looks whether a program has ended, seconds.
 _LOOK_S = 0.1
+#: Levels of Rerun's log at which it says where it listens, and nothing else.
+_SAYS_WHERE = "off,re_grpc_server=info,re_sdk::web_viewer=info"
 #: Share of the memory up to which the server keeps a flight.
 _MEMORY = "75%"
 _WITHOUT_WINDOW = (
@@ -117,11 +118,10 @@ def viewer_program(path: Path | None = None, *, web: bool = False) -> Iterator[V
     Raises:
         OutputError: the program cannot start.
     """
-    port, page_port = _free_port(), _free_port()
-    page = f"http://{_HOST}:{page_port}" if web else ""
-    arguments = ["--bind", _HOST, "--port", f"{port}", "--server-memory-limit", _MEMORY]
+    # Port 0 is one that the system chooses; a port that was looked for beforehand may be taken meanwhile.
+    arguments = ["--bind", _HOST, "--port", "0", "--server-memory-limit", _MEMORY]
     if web:
-        arguments += ["--serve-web", "--web-viewer-port", f"{page_port}"]
+        arguments += ["--serve-web", "--web-viewer-port", "0"]
     arguments += ["--expect-data-soon"] if path is None and not web else []
     arguments += [] if path is None else [str(path)]
     with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
@@ -133,36 +133,32 @@ def viewer_program(path: Path | None = None, *, web: bool = False) -> Iterator[V
                 stdin=subprocess.DEVNULL,
                 stdout=said,
                 stderr=said,
+                env=os.environ | {"RUST_LOG": _SAYS_WHERE, "NO_COLOR": "1"},
                 start_new_session=True,
             )
         try:
-            address = f"rerun+http://{_HOST}:{port}/proxy"
-            query = urllib.parse.urlencode({"url": f"rerun+http://localhost:{port}/proxy"})
-            program = ViewerProgram(process, address, f"{page}?{query}" if web else "", log)
-            _until_listening(program, [port, page_port] if web else [port])
-            yield program
+            address = _address(process, log, "--connect ([^ `]+)")
+            page = _address(process, log, r"connect at (\S+)") if web else ""
+            yield ViewerProgram(process, address, page, log)
         finally:
             # The other program must not outlive this one.
             with unhurried_end():
                 _end(process)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((_HOST, 0))
-        return int(probe.getsockname()[1])
-
-
-def _until_listening(program: ViewerProgram, ports: list[int]) -> None:
+def _address(process: subprocess.Popen[bytes], log: Path, pattern: str) -> str:
+    """An address at which a program says that it listens, as soon as its log has it."""
     end_s = time.monotonic() + _START_S
-    for port in ports:
-        while program.process.poll() is None:
-            with contextlib.suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
-                break
-            if time.monotonic() > end_s:
-                raise _failed(f"nothing at port {port} after {_START_S:.0f} s")
-            time.sleep(_LOOK_S)
-    _check_runs(program)
+    while (found := re.search(pattern, _said(log))) is None:
+        _check_runs(process, log)
+        if time.monotonic() > end_s:
+            raise _failed(f"no address after {_START_S:.0f} s")
+        time.sleep(_LOOK_S)
+    return found[1]
+
+
+def _said(log: Path) -> str:
+    return log.read_text("utf-8", errors="replace")
 
 
 def _wait(program: ViewerProgram) -> None:
@@ -170,13 +166,13 @@ def _wait(program: ViewerProgram) -> None:
     with contextlib.suppress(KeyboardInterrupt):
         while program.process.poll() is None:
             time.sleep(_LOOK_S)
-        _check_runs(program)
+        _check_runs(program.process, program.log)
 
 
-def _check_runs(program: ViewerProgram) -> None:
-    """Raise `OutputError` where the program has ended with an error."""
-    if program.process.poll():
-        lines = program.log.read_text("utf-8", errors="replace").splitlines()
+def _check_runs(process: subprocess.Popen[bytes], log: Path) -> None:
+    """Raise `OutputError` where a program has ended with an error."""
+    if process.poll():
+        lines = _said(log).splitlines()
         errors = [line for line in lines if line.startswith("Error")] or lines or ["no message"]
         # Sources of Rerun are named before the last colon.
         raise _failed(errors[-1].removeprefix("Error: ").rpartition(": ")[2])

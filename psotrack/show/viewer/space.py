@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.inside_out import MarkerMap, read_marker_table
@@ -58,26 +59,70 @@ def log_world(log: EntityLog, flight: TrackedFlight) -> None:
 def log_flight(log: EntityLog, flight: TrackedFlight) -> None:
     """Log the drones of all tracks with their trails and paths, and the reference."""
     for tracks in flight.tracks:
-        log_drones(log, tracks)
         for drone, name in enumerate(tracks.trajectories.drones):
-            _log_path(log, tracks, drone, drone_path("world/drones", tracks, name))
+            path = drone_path("world/drones", tracks, name)
+            log_drones(log, path, tracks, [drone])
+            _log_path(log, tracks, drone, path)
     truth = flight.truth
     for drone, name in enumerate(() if truth is None else truth.drones):
         assert truth is not None
         position_m, path = truth.position_m[:, drone], f"world/truth/{part(name)}"
         known = np.isfinite(position_m).all(axis=-1)
         log.static(f"{path}/point", rr.Points3D.from_fields(colors=[_TRUTH_RGBA], radii=[0.03]))
-        log.rows_where(
-            f"{path}/point", Instants(truth.frame, truth.time_s), known, partial(_points, position_m)
-        )
+        at = Instants(truth.frame, truth.time_s)
+        log.rows(f"{path}/point", at, partial(_points, position_m[known]), known.astype(int))
         log.static(f"{path}/path", rr.LineStrips3D([position_m[known]], colors=[_TRUTH_RGBA], radii=[0.004]))
 
 
-def log_drones(log: EntityLog, tracks: FlightTracks) -> None:
-    """Log the bodies and ellipsoids of drones."""
-    rgb = shown_rgb(tracks)
-    for drone, name in enumerate(tracks.trajectories.drones):
-        _log_drone(log, tracks, drone, rgb[:, drone], drone_path("world/drones", tracks, name))
+def log_drones(log: EntityLog, path: str, tracks: FlightTracks, drones: Sequence[int]) -> None:
+    """Log the bodies and ellipsoids of some drones as one entity.
+
+    Args:
+        log: receives the values.
+        path: path of the entity.
+        tracks: the tracks.
+        drones: indices of the drones.
+    """
+    flown, at = tracks.trajectories, instants(tracks)
+    position_m, status = flown.position_m[:, drones], statuses(flown)[:, drones]
+    rgb, half_m = shown_rgb(tracks)[:, drones], np.broadcast_to(tracks.size_m[drones] / 2, position_m.shape)
+    known = np.isfinite(position_m).all(axis=-1)
+    names = [tracks.names[drones[each]] for each in np.nonzero(known)[1].tolist()]
+    labels = [
+        name if each == Status.TRACKED else f"{name} {Status(each).label}"
+        for name, each in zip(names, status[known].tolist(), strict=True)
+    ]
+    log.rows(
+        f"{path}/body",
+        at,
+        lambda part: rr.Boxes3D.columns(
+            centers=position_m[known][part],
+            half_sizes=half_m[known][part],
+            colors=rgb[known][part],
+            labels=labels[part],
+        ),
+        known.sum(axis=1),
+    )
+    if flown.covariance_m2 is None:
+        return
+    ellipsoids = ellipsoids_90(flown.covariance_m2[:, drones])
+    # The ellipsoid of a lost drone grows to the size of the room.
+    shown = known & np.isfinite(ellipsoids.half_axes_m).all(axis=-1) & (status != Status.LOST)
+    turned = Rotation.from_matrix(ellipsoids.rotation[shown]).as_quat()
+    # A large ellipsoid must not hide what is behind.
+    fill = rr.components.FillMode.TransparentFillMajorWireframe
+    log.static(f"{path}/ellipsoid", rr.Ellipsoids3D.from_fields(fill_mode=fill))
+    log.rows(
+        f"{path}/ellipsoid",
+        at,
+        lambda part: rr.Ellipsoids3D.columns(
+            centers=position_m[shown][part],
+            half_sizes=ellipsoids.half_axes_m[shown][part],
+            quaternions=turned[part],
+            colors=rgb[shown][part],
+        ),
+        shown.sum(axis=1),
+    )
 
 
 def pinhole(K: Float[np.ndarray, "3 3"], image_size_wh: np.ndarray, distance_m: float) -> rr.Pinhole:
@@ -101,62 +146,23 @@ def pinhole(K: Float[np.ndarray, "3 3"], image_size_wh: np.ndarray, distance_m: 
     )
 
 
-def _points(position_m: Float[np.ndarray, "rows 3"], rows: Int[np.ndarray, " some"]) -> Any:
+def _points(position_m: Float[np.ndarray, "rows 3"], rows: slice) -> Any:
     return rr.Points3D.columns(positions=position_m[rows])
-
-
-def _log_drone(
-    log: EntityLog, tracks: FlightTracks, drone: int, rgb: UInt8[np.ndarray, "rows 3"], path: str
-) -> None:
-    flown, at, name = tracks.trajectories, instants(tracks), tracks.names[drone]
-    position_m, status = flown.position_m[:, drone], statuses(flown)[:, drone]
-    known = np.isfinite(position_m).all(axis=-1)
-    words = [name if each == Status.TRACKED else f"{name} {each.label}" for each in Status]
-    log.rows_where(
-        f"{path}/body",
-        at,
-        known,
-        lambda rows: rr.Boxes3D.columns(
-            centers=position_m[rows],
-            half_sizes=np.broadcast_to(tracks.size_m[drone] / 2, (len(rows), 3)),
-            colors=rgb[rows],
-            labels=[words[each] for each in status[rows]],
-        ),
-    )
-    if flown.covariance_m2 is None:
-        return
-    ellipsoids = ellipsoids_90(flown.covariance_m2[:, drone])
-    stated = np.isfinite(ellipsoids.half_axes_m).all(axis=-1)
-    # A large ellipsoid must not hide what is behind; that of a lost drone grows to the size of the room.
-    fill = rr.components.FillMode.TransparentFillMajorWireframe
-    log.static(f"{path}/ellipsoid", rr.Ellipsoids3D.from_fields(fill_mode=fill))
-    log.rows_where(
-        f"{path}/ellipsoid",
-        at,
-        known & stated & (status != Status.LOST),
-        lambda rows: rr.Ellipsoids3D.columns(
-            centers=position_m[rows],
-            half_sizes=ellipsoids.half_axes_m[rows],
-            quaternions=Rotation.from_matrix(ellipsoids.rotation[rows]).as_quat(),
-            colors=rgb[rows],
-        ),
-    )
 
 
 def _log_path(log: EntityLog, tracks: FlightTracks, drone: int, path: str) -> None:
     """Log the trail of a drone, from each row before to this one, and the whole path where it is not lost."""
     position_m, rgb = tracks.trajectories.position_m[:, drone], shown_rgb(tracks)[:, drone]
     known = np.isfinite(position_m).all(axis=-1)
-    before_m = np.roll(position_m, 1, axis=0)
-    log.rows_where(
+    follows = known & np.roll(known, 1) & (np.arange(len(known)) > 0)
+    strips_m = np.stack([np.roll(position_m, 1, axis=0), position_m], axis=1)[follows]
+    log.rows(
         f"{path}/trail",
         instants(tracks),
-        known & np.roll(known, 1) & (np.arange(len(known)) > 0),
-        lambda rows: rr.LineStrips3D.columns(
-            strips=np.stack([before_m[rows], position_m[rows]], axis=1), colors=rgb[rows]
-        ),
+        lambda part: rr.LineStrips3D.columns(strips=strips_m[part], colors=rgb[follows][part]),
+        follows.astype(int),
     )
     flown = intervals(known & (statuses(tracks.trajectories)[:, drone] != Status.LOST))
     own = (*colour_rgb(tracks.colours[drone]), _PATH_OPACITY)
-    strips_m = [position_m[start:stop] for start, stop in flown]
-    log.static(f"{path}/path", rr.LineStrips3D(strips_m, colors=[own], radii=[0.006]))
+    whole_m = [position_m[start:stop] for start, stop in flown]
+    log.static(f"{path}/path", rr.LineStrips3D(whole_m, colors=[own], radii=[0.006]))

@@ -15,9 +15,9 @@ from psotrack.errors import SettingsError
 from psotrack.simulation.scenarios import Mesh
 from psotrack.simulation.world.meshes import load
 from psotrack.simulation.world.models import DroneModel as DroneModel
+from psotrack.simulation.world.models import Triangles, beam, box, cylinder, pitch, turn
 from psotrack.simulation.world.models import disc_fans as disc_fans
 from psotrack.simulation.world.models import marker_cross as marker_cross
-from psotrack.simulation.world.shapes import Triangles, beam, box, cylinder, pitch, turn
 
 
 def model(name: str | Mesh) -> DroneModel:

@@ -11,8 +11,7 @@ import numpy as np
 
 from psotrack.errors import InputError
 from psotrack.simulation.scenarios import Mesh
-from psotrack.simulation.world.models import DroneModel
-from psotrack.simulation.world.shapes import Triangles
+from psotrack.simulation.world.models import DroneModel, Triangles
 from psotrack.support import LARGEST
 
 _SUFFIXES = (".obj", ".ply")

@@ -4,12 +4,12 @@ from .births import (
     WINDOW_FRAMES,
     BirthRules,
     Births,
+    FlightLimits,
     KnownDrones,
     TrackCandidate,
     state_at,
 )
-from .common_sightings import CommonSightings, count_common
-from .cut_off import find_cut_off, find_outside
+from .cut_off import count_common, find_cut_off, find_outside
 from .initial_state import (
     InitialState,
     StartSource,
@@ -20,7 +20,7 @@ from .initial_state import (
     start_source,
     state_at_first_frame,
 )
-from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_blobs, moving_detections
+from .moving_volume import FlightVolume, MovingPoints, flight_volume, moving_points
 from .reidentification import (
     NEW,
     NO_DRONE,
@@ -41,7 +41,7 @@ __all__ = [
     "WINDOW_FRAMES",
     "BirthRules",
     "Births",
-    "CommonSightings",
+    "FlightLimits",
     "FlightVolume",
     "FrameBlobs",
     "InitialState",
@@ -59,8 +59,7 @@ __all__ = [
     "flight_volume",
     "given_state",
     "known_motion",
-    "moving_blobs",
-    "moving_detections",
+    "moving_points",
     "reidentify",
     "room_bounds",
     "start_source",

@@ -210,30 +210,34 @@ class BirthRules:
         return min(SPANS_M[0], span_m / SIZE_RATIO), max(SPANS_M[1], span_m * SIZE_RATIO)
 
 
-class Births:
-    """Follows places until they are drones.
+@dataclass(frozen=True)
+class FlightLimits:
+    """Where and how fast drones may fly, and how often they are seen.
 
-    Args:
-        cameras: cameras with one leading axis, float64.
-        rules: what is asked of a drone.
+    Attributes:
         fps: instants per second.
         bounds_m: (2, 3), corners of the room, metres; the lowest z is the floor, on which shadows lie.
         max_speed_m_s: largest speed of a drone, m/s.
     """
 
-    def __init__(
-        self,
-        cameras: Camera,
-        rules: BirthRules = BirthRules(),
-        *,
-        fps: float,
-        bounds_m: Float[np.ndarray, "2 3"],
-        max_speed_m_s: float,
-    ) -> None:
-        self._cameras, self._rules, self._fps, self._max_speed_m_s = cameras, rules, fps, max_speed_m_s
+    fps: float
+    bounds_m: Float[np.ndarray, "2 3"]
+    max_speed_m_s: float
+
+
+class Births:
+    """Follows places until they are drones.
+
+    Args:
+        cameras: cameras with one leading axis, float64.
+        limits: where and how fast drones may fly.
+        rules: what is asked of a drone.
+    """
+
+    def __init__(self, cameras: Camera, limits: FlightLimits, rules: BirthRules = BirthRules()) -> None:
+        self._cameras, self._limits, self._rules = cameras, limits, rules
         self._viewpoint = viewpoints(cameras)
-        self._clear_m = bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
-        self._floor_z_m = float(bounds_m[0, 2])
+        self._clear_m = limits.bounds_m + np.array([[0.0, 0.0, FLOOR_CLEARANCE_M], [0.0, 0.0, 0.0]])
         self._paths: list[_Path] = []
         self._mean, self._covariance = np.empty((0, 6)), np.empty((0, 6, 6))
         self._instant = self._frame = self._num_begun = 0
@@ -295,7 +299,7 @@ class Births:
 
     def _predict(self, instant: int) -> None:
         """Go on to an instant, at constant velocity."""
-        step_s = (instant - self._instant) / self._fps
+        step_s = (instant - self._instant) / self._limits.fps
         self._instant = instant
         ahead = np.eye(6) + step_s * np.eye(6, k=3)
         pushed = np.vstack([step_s**2 / 2 * np.eye(3), step_s * np.eye(3)]) * ACCELERATION_STD_M_S2
@@ -307,7 +311,7 @@ class Births:
     def _find(
         self, instant: int, view: Sightings, known: KnownDrones, usual_dispersion: float
     ) -> Int[np.ndarray, "crossings cameras"]:
-        speed_std_m_s, covariance = SPEED_SHARE * self._max_speed_m_s, self._covariance[:, 3:, 3:]
+        speed_std_m_s, covariance = SPEED_SHARE * self._limits.max_speed_m_s, self._covariance[:, 3:, 3:]
         view = moved_to_instant(
             self._cameras, view, self._mean[:, :3], self._mean[:, 3:], covariance, speed_std_m_s
         )
@@ -463,7 +467,8 @@ class Births:
         if len(path.found) < least or path.num_seeing < MIN_SEEING_SHARE * path.num_should_see:
             return False
         way_m = float(np.linalg.norm(path.places_m[-1] - path.places_m[0]))
-        return way_m * self._fps <= FASTER * self._max_speed_m_s * (max(path.found) - min(path.found))
+        fastest_m_s = FASTER * self._limits.max_speed_m_s
+        return way_m * self._limits.fps <= fastest_m_s * (max(path.found) - min(path.found))
 
     def _may_be_known(self, path: _Path) -> bool:
         """Whether a place was found often enough to be of a drone that was lost."""
@@ -472,7 +477,7 @@ class Births:
 
     def _candidate(self, path: _Path, is_sure: bool) -> TrackCandidate:
         first, ghosts_from = next(iter(path.found.values())), self._rules.ghosts_from
-        position_m, velocity_m_s = state_at(path.found, path.first, self._fps, self._max_speed_m_s)
+        position_m, velocity_m_s = state_at(path.found, path.first, self._limits)
         return TrackCandidate(
             path.first,
             position_m,
@@ -496,7 +501,7 @@ class Births:
         ray_m = place_m - self._cameras.centre_world
         sin2 = float(np.median((ray_m[:, 2] / np.linalg.norm(ray_m, axis=-1)) ** 2))
         upright2 = (height**2 - width**2 * sin2) / max(1 - sin2, 0.1)
-        highest = MAX_HEIGHT_SHARE if place_m[2] - self._floor_z_m < width else np.inf
+        highest = MAX_HEIGHT_SHARE if place_m[2] - self._limits.bounds_m[0, 2] < width else np.inf
         height = np.clip(np.sqrt(max(upright2, 0.0)), MIN_HEIGHT_SHARE * width, highest * width)
         return np.array([width, width, height])
 
@@ -507,7 +512,7 @@ class Births:
 
 
 def state_at(
-    path: dict[int, Measurement], instant: int, fps: float, max_speed_m_s: float
+    path: dict[int, Measurement], instant: int, limits: FlightLimits
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Position and velocity at an instant, from the ten measurements nearest to it.
 
@@ -517,9 +522,10 @@ def state_at(
     near = np.sort(np.argsort(np.abs(instants - instant), kind="stable")[:WINDOW_FRAMES])
     places_m = np.array([one.position_m for one in path.values()])[near]
     degree = 2 if len(near) >= MIN_FOUND else min(1, len(near) - 1)
-    terms = np.polyfit((instants[near] - instant) / fps, places_m, degree)
+    terms = np.polyfit((instants[near] - instant) / limits.fps, places_m, degree)
     velocity = terms[-2] if degree else np.zeros(3)
-    return terms[-1], velocity * min(1.0, max_speed_m_s / max(float(np.linalg.norm(velocity)), 1e-9))
+    speed_m_s = max(float(np.linalg.norm(velocity)), 1e-9)
+    return terms[-1], velocity * min(1.0, limits.max_speed_m_s / speed_m_s)
 
 
 def _hidden(

@@ -1,11 +1,14 @@
-"""Tracks that the bounds of the room or the speed limit cut off."""
+"""What a user should know of a run: tracks that bounds or speed limit cut off, and detections that never meet."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.foreground.silhouettes import Silhouettes
+from psotrack.geometry import Rig, viewpoints
 from psotrack.tracking.births.moving_volume import FlightVolume
+from psotrack.tracking.matching import Sightings, from_silhouettes, match, wide_bounds
 from psotrack.trajectories import Status, Tracks
 
 #: A drone was lost at a bound if it flew towards it this fast, m/s, and would have passed it within this time, seconds.
@@ -85,3 +88,32 @@ def find_outside(volume: FlightVolume) -> str | None:
             f"{volume.max_speed_m_s:g} m/s; pass a higher --max-speed to track it"
         )
     return None
+
+
+#: Largest number of frames that are looked at, and of detections per image: the largest ones count.
+_FRAMES, _MOST_SIGHTINGS = 60, 12
+
+
+def count_common(rig: Rig, found: Sightings | Silhouettes) -> tuple[int, int]:
+    """Count the frames in which two viewpoints have detections, and those in which enough viewpoints' detections meet.
+
+    Three are enough where three have the place in view, else two. At most 60 frames are looked at.
+
+    Args:
+        rig: the cameras.
+        found: detections, or silhouettes whose blobs are the detections.
+    """
+    viewpoint, wide_m = viewpoints(rig.cameras), wide_bounds(rig)
+    seen = met = 0
+    spread = np.linspace(0, found.num_frames - 1, min(found.num_frames, _FRAMES))
+    for frame in np.unique(spread.round().astype(int)).tolist():
+        if isinstance(found, Sightings):
+            sightings = found[frame]
+        else:
+            sightings = from_silhouettes(found, first=frame, stop=frame + 1)[0]
+        view = sightings.largest(_MOST_SIGHTINGS)
+        if len(np.unique(viewpoint[np.isfinite(view.noise_px).any(axis=-1)])) < 2:
+            continue
+        seen += 1
+        met += bool(len(match(rig.cameras, view.centre_px, view.noise_px, bounds_m=wide_m).position_m))
+    return seen, met

@@ -13,7 +13,14 @@ from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, looking_depths_m, project_visible, sizes_m, to_camera
 from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
-from psotrack.tracking.births.births import NO_DRONES, WINDOW_FRAMES, BirthRules, Births, state_at
+from psotrack.tracking.births.births import (
+    NO_DRONES,
+    WINDOW_FRAMES,
+    BirthRules,
+    Births,
+    FlightLimits,
+    state_at,
+)
 from psotrack.tracking.matching import from_silhouettes
 from psotrack.trajectories import Tracks, Trajectories, read_trajectories
 
@@ -71,9 +78,7 @@ def start_source(recording: Recording, init: str) -> StartSource:
     return StartSource(init, recording.folder, recording.truth)
 
 
-def room_bounds(
-    rig: Rig, bounds_m: tuple[float, float, float, float, float, float] | None = None
-) -> Float[np.ndarray, "2 3"]:
+def room_bounds(rig: Rig, bounds_m: tuple[float, ...] | None = None) -> Float[np.ndarray, "2 3"]:
     """Lowest and highest corner of the room, metres.
 
     Without given bounds, the room is the space into which the cameras look: from each camera along its optical axis, to
@@ -197,17 +202,13 @@ def first_drones(
     """
     count = min(_FRAMES, silhouettes.num_frames)
     sightings = from_silhouettes(silhouettes, stop=count)
-    births = Births(
-        rig.cameras,
-        BirthRules(num_frames=silhouettes.num_frames, size_m=drones.size_m),
-        fps=fps,
-        bounds_m=bounds_m,
-        max_speed_m_s=max_speed_m_s,
-    )
+    limits = FlightLimits(fps, bounds_m, max_speed_m_s)
+    rules = BirthRules(num_frames=silhouettes.num_frames, size_m=drones.size_m)
+    births = Births(rig.cameras, limits, rules)
     for frame in range(count):
         births.step(frame, sightings[frame], NO_DRONES)
     found = [each for each in births.candidates() if each.instant < WINDOW_FRAMES][: drones.count]
-    states = [state_at(each.path, 0, fps, max_speed_m_s) for each in found]
+    states = [state_at(each.path, 0, limits) for each in found]
     sizes = [each.size_m if drones.size_m is None else np.array(drones.size_m) for each in found]
     return InitialState(
         np.array([position for position, _ in states]).reshape(-1, 3),

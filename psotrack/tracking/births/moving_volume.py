@@ -6,17 +6,16 @@ of frames, drones are therefore looked for in a region so wide that no drone is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, viewpoints
 from psotrack.settings import USUAL_SPEED_M_S
-from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, TrackCandidate
+from psotrack.tracking.births.births import NO_DRONES, BirthRules, Births, FlightLimits, TrackCandidate
 from psotrack.tracking.births.initial_state import room_bounds
 from psotrack.tracking.matching import Sightings, from_silhouettes, wide_bounds
 
@@ -114,10 +113,8 @@ def flight_volume(
         max_speed_m_s: given speed limit, m/s.
     """
     found = points if points is not None and len(points) else None
-    room_m, bounds_from = room_bounds(rig), "cameras"
-    if bounds_m is not None:
-        room_m, bounds_from = np.array(bounds_m, np.float64).reshape(3, 2).T, "given"
-    elif found is not None:
+    room_m, bounds_from = room_bounds(rig, bounds_m), "cameras" if bounds_m is None else "given"
+    if bounds_m is None and found is not None:
         extended_m = _extended(rig, room_m, found)
         if (extended_m != room_m).any():
             room_m, bounds_from = extended_m, "cameras and moving points"
@@ -155,68 +152,38 @@ def _extended(rig: Rig, room_m: Float[np.ndarray, "2 3"], points: MovingPoints) 
     return np.stack([low_m, high_m])
 
 
-def moving_detections(
-    rig: Rig, sightings: Sightings, fps: float, size_m: tuple[float, ...] | None = None
-) -> MovingPoints:
-    """Points that move, from detections; windows begin where at least two viewpoints have detections.
-
-    Args:
-        rig: the cameras.
-        sightings: the detections of all frames.
-        fps: frames per second.
-        size_m: full lengths of the drones, metres, where they are given.
-    """
-    seen = np.isfinite(sightings.noise_px).any(axis=-1)
-    viewpoint = viewpoints(rig.cameras)
-    by_viewpoint = np.stack([seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)], axis=-1)
-    frames = np.flatnonzero(by_viewpoint.sum(axis=-1) >= 2)
-    # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
-    return _find(rig, lambda some: sightings[some], frames, fps, BirthRules(2, size_m=size_m))
-
-
-def moving_blobs(
-    rig: Rig, silhouettes: Silhouettes, fps: float, size_m: tuple[float, ...] | None = None
-) -> MovingPoints:
-    """Points that move, from the blobs of silhouettes; arguments as for `moving_detections`."""
-
-    def read(frames: Int[np.ndarray, "chosen"]) -> Sightings:
-        first, last = int(frames[0]), int(frames[-1])
-        return from_silhouettes(silhouettes, first=first, stop=last + 1)[frames - first]
-
-    return _find(rig, read, np.arange(silhouettes.num_frames), fps, BirthRules(size_m=size_m))
-
-
-def _find(
-    rig: Rig,
-    read: Callable[[Int[np.ndarray, "chosen"]], Sightings],
-    frames: Int[np.ndarray, "frames"],
-    fps: float,
-    rules: BirthRules,
+def moving_points(
+    rig: Rig, found: Sightings | Silhouettes, fps: float, size_m: tuple[float, ...] | None = None
 ) -> MovingPoints:
     """Points that move, in windows that are spread over the frames: drones that are born there.
 
     Args:
         rig: the cameras.
-        read: gives the sightings of frames.
-        frames: (frames,), numbers of the frames from which windows may begin, ascending; the last window ends at the
-            last of them.
+        found: detections of all frames, or silhouettes, whose blobs are the detections. Windows begin where at least
+            two viewpoints have detections; of silhouettes, anywhere.
         fps: frames per second.
-        rules: what is asked of a drone.
+        size_m: full lengths of the drones, metres, where they are given.
     """
+    frames, rules = np.arange(found.num_frames), BirthRules(size_m=size_m)
+    if isinstance(found, Sightings):
+        seen, viewpoint = np.isfinite(found.noise_px).any(axis=-1), viewpoints(rig.cameras)
+        by_viewpoint = [seen[:, viewpoint == one].any(axis=1) for one in np.unique(viewpoint)]
+        frames = np.flatnonzero(np.sum(by_viewpoint, axis=0) >= 2)
+        # Two views that agree in nearly all frames are enough: something may hide the drone from a third camera.
+        rules = BirthRules(2, size_m=size_m)
     step = max(1, round(STEP_S * fps))
     last = 0 if not len(frames) else int(frames[-1])
     starts = frames[frames <= max(last - step * (WINDOW_FRAMES - 1), 0)]
     chosen = np.linspace(0, len(starts) - 1, min(WINDOWS, len(starts))).round().astype(int)
-    points = []
+    points, limits = [], FlightLimits(fps / step, wide_bounds(rig), FASTEST_M_S)
     for first in starts[np.unique(chosen)].tolist():
-        sightings = read(np.arange(first, min(first + step * WINDOW_FRAMES, last + 1), step))
-        births = Births(
-            rig.cameras,
-            rules,
-            fps=fps / step,
-            bounds_m=wide_bounds(rig),
-            max_speed_m_s=FASTEST_M_S,
-        )
+        # The last window ends at the last of the frames.
+        stop = min(first + step * WINDOW_FRAMES, last + 1)
+        if isinstance(found, Sightings):
+            sightings = found[first:stop:step]
+        else:
+            sightings = from_silhouettes(found, first=first, stop=stop)[::step]
+        births = Births(rig.cameras, limits, rules)
         for number in range(sightings.num_frames):
             births.step(number, sightings[number].largest(MOST_SIGHTINGS), NO_DRONES)
         points += [_point(rig, candidate, step / fps) for candidate in births.candidates()]

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
+from scipy.special import logsumexp
 
-from psotrack.tracking.births.births import SPANS_M, SPEED_SHARE, TrackCandidate
-from psotrack.tracking.births.ornstein_uhlenbeck import POSITION_STD_M, log_normal, log_transition
+from psotrack.tracking.births.births import SPANS_M, SPEED_SHARE, FlightLimits, TrackCandidate
 
 #: Value of an assignment: the candidate is a new drone.
 NEW = -1
@@ -171,24 +171,20 @@ def _standing_place(
 def reidentify(
     candidates: tuple[TrackCandidate, ...],
     lost: LostTracks,
+    limits: FlightLimits,
     *,
-    fps: float,
-    bounds_m: Float[np.ndarray, "2 3"],
-    max_speed_m_s: float,
     max_births: int | None = None,
 ) -> Int[np.ndarray, "candidates"]:
     """Assign candidates to lost drones with the largest total likelihood.
 
-    A drone's velocity is an Ornstein-Uhlenbeck process (see `ornstein_uhlenbeck`): after a short gap a drone is
+    A drone's velocity is an Ornstein-Uhlenbeck process (see `log_transition`): after a short gap a drone is
     expected on its course, after a long gap anywhere within reach. A drone that stood still most probably stayed. The
     alternative is a new drone anywhere in the room.
 
     Args:
         candidates: the candidates.
         lost: drones that may be found again.
-        fps: instants per second.
-        bounds_m: (2, 3), corners of the room.
-        max_speed_m_s: largest speed of a drone.
+        limits: where and how fast drones may fly.
         max_births: largest number of new drones; None for any number. If it is 0, a candidate that moves is assigned to
             a lost drone even if that is unlikely.
 
@@ -196,26 +192,25 @@ def reidentify(
         (candidates,), a row of `lost`, or `NEW`, or `NO_DRONE`. Never new are a candidate that is not sure, one that
         does not move, and a slow one at a place where a drone stood still.
     """
-    count = len(lost.drone)
-    log_volume = float(np.log(np.prod(bounds_m[1] - bounds_m[0])))
+    count, (low_m, high_m) = len(lost.drone), limits.bounds_m
+    log_volume = float(np.log(np.prod(high_m - low_m)))
+    variance = (SPEED_SHARE * limits.max_speed_m_s) ** 2
     is_ghost = [any(_departs_from(other, one) for other in candidates) for one in candidates]
-    is_dying = [_is_dying_ghost(one, lost, fps) for one in candidates]
+    is_dying = [_is_dying_ghost(one, lost, limits.fps) for one in candidates]
     may_be_new = [
         one.moves and one.is_sure and not ghost and not dying
         for one, ghost, dying in zip(candidates, is_ghost, is_dying, strict=True)
     ]
     scores = np.full((len(candidates), count + len(candidates)), _IMPOSSIBLE)
     for row, candidate in enumerate(candidates):
-        log_anywhere = log_normal(candidate.velocity_m_s, (SPEED_SHARE * max_speed_m_s) ** 2) - log_volume
+        log_anywhere = log_normal(candidate.velocity_m_s, variance) - log_volume
         odds = NEW_ODDS if candidate.moves else NO_DRONE_ODDS
         log_new = log_anywhere + np.log(odds / np.log(SPANS_M[1] / SPANS_M[0]))
         scores[row, count + row] = _NEW_NOT_ALLOWED if candidate.moves and max_births == 0 else log_new
         for column in range(0 if is_ghost[row] else count):
             # What may be a ghost is no drone that was lost elsewhere.
-            if not is_dying[row] or _may_have_stayed(candidate, lost, column, bounds_m):
-                scores[row, column] = _log_likelihood(
-                    candidate, lost, column, fps, log_anywhere, max_speed_m_s, bounds_m
-                )
+            if not is_dying[row] or _may_have_stayed(candidate, lost, column, limits):
+                scores[row, column] = _log_likelihood(candidate, lost, column, log_anywhere, limits)
     chosen = np.full(len(candidates), NO_DRONE)
     births = 0
     for row, column in zip(
@@ -230,55 +225,47 @@ def reidentify(
 
 
 def _log_likelihood(
-    candidate: TrackCandidate,
-    lost: LostTracks,
-    row: int,
-    fps: float,
-    log_anywhere: float,
-    max_speed_m_s: float,
-    bounds_m: Float[np.ndarray, "2 3"],
+    candidate: TrackCandidate, lost: LostTracks, row: int, log_anywhere: float, limits: FlightLimits
 ) -> float:
     """Log likelihood of a lost drone being the candidate: a density over position, velocity and span."""
     place, velocity, span = lost.position_m[row], lost.velocity_m_s[row], float(lost.size_m[row].max())
     if not np.isfinite(span):
         span = float(candidate.size_m.max())
     log_span = log_normal(np.log(candidate.size_m.max(keepdims=True) / span), SPAN_STD**2)
-    variance = (SPEED_SHARE * max_speed_m_s) ** 2
+    variance = (SPEED_SHARE * limits.max_speed_m_s) ** 2
     log_stayed = -np.inf
     near_m = STAYED_SPANS * span
-    if _may_have_stayed(candidate, lost, row, bounds_m):
+    if _may_have_stayed(candidate, lost, row, limits):
         log_stayed = np.log(STAYED_PROBABILITY / (4 / 3 * np.pi * near_m**3))
         log_stayed += log_normal(candidate.velocity_m_s, variance)
     if lost.doubtful[row]:
         return log_stayed + log_span if candidate.moves and log_stayed > -np.inf else _IMPOSSIBLE
-    gap_s = (candidate.instant - int(lost.instant[row])) / fps
+    gap_s = (candidate.instant - int(lost.instant[row])) / limits.fps
     if gap_s < -MAX_OVERLAP_S:
         return _IMPOSSIBLE
     gap_s = max(gap_s, 0.0)
     distance = float(np.linalg.norm(candidate.position_m - place))
-    if distance > max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
+    if distance > limits.max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
         return _UNREACHABLE - distance
     before = np.stack([place, velocity])
     after = np.stack([candidate.position_m, candidate.velocity_m_s])
-    log_flown = max(log_transition(before, after, gap_s, variance, bounds_m), log_anywhere)
-    log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, bounds_m) else 0.0
+    log_flown = max(log_transition(before, after, gap_s, variance, limits.bounds_m), log_anywhere)
+    log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, limits) else 0.0
     return max(log_stayed, log_flown) + log_span
 
 
-def _stands(lost: LostTracks, row: int, bounds_m: Float[np.ndarray, "2 3"]) -> bool:
+def _stands(lost: LostTracks, row: int, limits: FlightLimits) -> bool:
     """Whether a drone stood still when it was lost, or was at the floor, where it lands."""
-    height_m = float(lost.position_m[row, 2] - bounds_m[0, 2])
+    height_m = float(lost.position_m[row, 2] - limits.bounds_m[0, 2])
     slow = float(np.linalg.norm(lost.velocity_m_s[row])) < STILL_M_S
     return slow or height_m < STAYED_SPANS * float(lost.size_m[row].max())
 
 
-def _may_have_stayed(
-    candidate: TrackCandidate, lost: LostTracks, row: int, bounds_m: Float[np.ndarray, "2 3"]
-) -> bool:
+def _may_have_stayed(candidate: TrackCandidate, lost: LostTracks, row: int, limits: FlightLimits) -> bool:
     """Whether a lost drone stood where the candidate is, or where it comes from."""
     near_m = STAYED_SPANS * float(lost.size_m[row].max())
     is_near = _smallest_distance(candidate, lost.position_m[row]) < near_m
-    return is_near and _stands(lost, row, bounds_m)
+    return is_near and _stands(lost, row, limits)
 
 
 def _departs_from(candidate: TrackCandidate, ghost: TrackCandidate) -> bool:
@@ -311,3 +298,59 @@ def _smallest_distance(candidate: TrackCandidate, place_m: Float[np.ndarray, "3"
     offset = candidate.position_m - place_m
     ago_s = np.clip(offset @ candidate.velocity_m_s / max(speed2, 1e-9), 0.0, DEPARTURE_S)
     return float(np.linalg.norm(offset - ago_s * candidate.velocity_m_s))
+
+
+#: Time constant of the velocity, seconds: after this time the last velocity says little about the position.
+VELOCITY_TIME_S = 1.0
+#: Standard deviations of measured positions and velocities along each axis.
+POSITION_STD_M, VELOCITY_STD_M_S = 0.1, 0.3
+#: Number of reflected images of the room on either side; a drone that is reflected more often may be anywhere.
+NUM_WALLS = 3
+
+#: Position (metres) and velocity (metres per second).
+Motion = Float[np.ndarray, "2 3"]
+
+
+def log_transition(
+    before: Motion, after: Motion, gap_s: float, variance: float, bounds_m: Float[np.ndarray, "2 3"]
+) -> float:
+    """Log density of a measured state after a gap, over position and velocity: an Ornstein-Uhlenbeck process.
+
+    The velocity returns to 0 on average (G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion,
+    Physical Review 36, 1930). After a short gap the drone is expected on its course, after a long gap anywhere in the
+    room. The walls of the room reflect the drone.
+
+    Args:
+        before, after: (2, 3), measured positions and velocities, in the room.
+        gap_s: time between them, at least 0.
+        variance: stationary variance of the velocity along each axis, m2/s2.
+        bounds_m: (2, 3), corners of the room.
+    """
+    time = VELOCITY_TIME_S
+    decay = np.exp(-gap_s / time)
+    transition = np.array([[1.0, time * (1 - decay)], [0.0, decay]])
+    process = variance * np.array(
+        [
+            [time**2 * (2 * gap_s / time - 3 + 4 * decay - decay**2), time * (1 - decay) ** 2],
+            [time * (1 - decay) ** 2, 1 - decay**2],
+        ]
+    )
+    measured = np.diag([POSITION_STD_M**2, VELOCITY_STD_M_S**2])
+    covariance = transition @ measured @ transition.T + process + measured
+    error = _reflect(after, bounds_m) - (transition @ before)[:, None]
+    distance2 = np.einsum("iwa,ij,jwa->wa", error, np.linalg.inv(covariance), error)
+    per_axis = logsumexp(-distance2 / 2, axis=0)
+    return float(per_axis.sum() - 3 * np.log(np.linalg.det(2 * np.pi * covariance)) / 2)
+
+
+def log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
+    """Log density of a Gaussian with mean 0 and the same variance along each axis."""
+    return float(-(value @ value / variance + len(value) * np.log(2 * np.pi * variance)) / 2)
+
+
+def _reflect(motion: Motion, bounds_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 images 3"]:
+    """Position and velocity along each axis, and their images after reflections at the walls."""
+    (place, velocity), (low, high) = motion, bounds_m
+    away = 2 * (high - low) * np.arange(-NUM_WALLS, NUM_WALLS + 1)[:, None]
+    places = np.concatenate([place + away, 2 * low - place + away])
+    return np.stack([places, np.repeat([velocity, -velocity], len(away), axis=0)])

@@ -1,8 +1,13 @@
 from .constant_errors import ConstantErrors, fit_constant_errors
-from .covariances import LastingCovariances, lasting_covariances, noise_covariance, noise_ratios
-from .fading import Fading, fading_of
-from .filtered_variance import MeasurementErrors, filtered_variances
-from .learning import CameraErrors, learn_camera_errors
+from .covariances import (
+    LastingCovariances,
+    MeasurementErrors,
+    filtered_variances,
+    lasting_covariances,
+    noise_covariance,
+    noise_ratios,
+)
+from .learning import CameraErrors, Fading, fading_of, learn_camera_errors
 from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
 from .views import CameraViews, views_of_middles, views_of_places, views_of_sightings

@@ -111,7 +111,8 @@ def fit_constant_errors(
     # Directions and columns of A in units of the noise.
     noise = np.sqrt(inflation * values)
     seen = g / noise
-    shares = [_outer((values / noise)[:, None] * vectors.T[:, which]) for which in (~of_clock, of_clock)]
+    columns = [(values / noise)[:, None] * vectors.T[:, which] for which in (~of_clock, of_clock)]
+    shares = [each @ each.T for each in columns]
     variances = _likeliest(seen, shares)
     prior = np.where(of_clock, variances[1], variances[0])
     weighted_seen = np.linalg.solve(_total(shares, variances), seen)
@@ -143,10 +144,6 @@ def _covariance(
     unseen = (vectors / (1 + np.maximum(values, 0.0))) @ vectors.T
     more = np.sqrt(np.maximum(wide - likeliest, 0.0))
     return np.diag(likeliest) + more[:, None] * unseen * more
-
-
-def _outer(columns: Float[np.ndarray, "seen all"]) -> Float[np.ndarray, "seen seen"]:
-    return columns @ columns.T
 
 
 def _total(

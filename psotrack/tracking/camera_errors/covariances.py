@@ -24,14 +24,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.tracking.camera_errors.filtered_variance import MeasurementErrors, filtered_variances
+from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors.learning import CameraErrors
 from psotrack.tracking.camera_errors.views import CameraViews
+from psotrack.tracking.motion import white_jerk_noise
 
 #: Time over which stated and found noise are compared, seconds, and number of levels of the stated noise.
 _WINDOW_S, _NUM_LEVELS = 1.0, 8
-#: Sum over cameras of gain x variances of their places x gain transposed.
-_MOVED_BY_PLACES = "fdcik,ck,fdcjk->fdij"
+#: Nothing is known of the cameras' errors beforehand.
+NO_ERRORS = ErrorSettings()
 
 
 def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarray, "frames drones 3 3"]:
@@ -40,10 +41,9 @@ def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarr
     NaN where the noise is not known, or where the cameras do not determine a position.
     """
     noise_px = np.where(np.isnan(errors.noise_px), _mean(errors.noise_px), errors.noise_px)
-    covariance_m2 = np.empty((*views.shown.shape[:2], 3, 3))
-    for frames, part in views.parts():
-        gain = part.gain
-        covariance_m2[frames] = np.einsum(_MOVED_BY_PLACES, gain, np.square(noise_px), gain, optimize=True)
+    covariance_m2 = np.concatenate(
+        [_moved_by_places(part.gain, np.square(noise_px)) for part in views.parts()]
+    )
     return np.where((np.trace(covariance_m2, axis1=-2, axis2=-1) > 0)[..., None, None], covariance_m2, np.nan)
 
 
@@ -61,11 +61,7 @@ class LastingCovariances:
 
 
 def lasting_covariances(
-    views: CameraViews,
-    errors: CameraErrors,
-    *,
-    rig_error_deg: float = 0.0,
-    pixel_error_px: float = 0.0,
+    views: CameraViews, errors: CameraErrors, given: ErrorSettings = NO_ERRORS
 ) -> LastingCovariances:
     """Covariances of the positions by errors of the cameras that last.
 
@@ -75,35 +71,40 @@ def lasting_covariances(
     Args:
         views: the views of all drones.
         errors: the cameras' errors.
-        rig_error_deg: angle by which each camera is turned at least, about a random axis, degrees.
-        pixel_error_px: standard deviation of each camera's lasting error along either axis at least, pixels.
+        given: what is known of the errors beforehand: at least so much.
     """
-    lasting_px2 = np.maximum(np.square(errors.lasting_px), pixel_error_px**2)
+    lasting_px2 = np.maximum(np.square(errors.lasting_px), given.pixel_px**2)
     constant = errors.constant_covariance.copy()
     of_turns = np.arange(len(constant)) % 4 < 3
-    given_rad2 = float(np.radians(rig_error_deg)) ** 2 / 3
+    given_rad2 = float(np.radians(given.rig_deg)) ** 2 / 3
     constant[of_turns, of_turns] += max(0.0, given_rad2 - float(np.diag(constant)[of_turns].mean()))
-    mean = _mean_turned(views)
-    found = np.empty(views.shown.shape[:2], bool)
-    absolute_m2, relative_m2 = (np.empty((*found.shape, 3, 3)) for _ in range(2))
-    for frames, part in views.parts():
+    mean, parts = _mean_turned(views), []
+    for part in views.parts():
         gain = part.gain
-        by_place = np.einsum(_MOVED_BY_PLACES, gain, lasting_px2, gain, optimize=True)
-        turned = gain @ part.turn_px
-        found[frames] = turned.any(axis=(-3, -2, -1))
+        by_place, turned = _moved_by_places(gain, lasting_px2), gain @ part.turn_px
         late = -np.einsum("fdcik,fdck->fdci", gain, part.flow_px_s)[..., None]
-        for total_m2, offset in ((absolute_m2, 0.0), (relative_m2, mean)):
+        totals_m2 = []
+        for offset in (0.0, mean):
             moved = np.concatenate([turned - offset, late], axis=-1).swapaxes(2, 3)
             moved = moved.reshape(*moved.shape[:3], -1)
-            total_m2[frames] = by_place + moved @ constant @ moved.swapaxes(-1, -2)
+            totals_m2.append(by_place + moved @ constant @ moved.swapaxes(-1, -2))
+        parts.append((turned.any(axis=(-3, -2, -1)), *totals_m2))
+    found, absolute_m2, relative_m2 = map(np.concatenate, zip(*parts, strict=True))
     return LastingCovariances(_filled(absolute_m2, found, 0.0), _filled(relative_m2, found, 0.0))
+
+
+def _moved_by_places(
+    gain: Float[np.ndarray, "frames drones cameras 3 2"], variance_px2: Float[np.ndarray, "cameras 2"]
+) -> Float[np.ndarray, "frames drones 3 3"]:
+    """Covariances of positions by errors of the places: sum over cameras of gain x variances x gain transposed."""
+    return np.einsum("fdcik,ck,fdcjk->fdij", gain, variance_px2, gain, optimize=True)
 
 
 def _mean_turned(views: CameraViews) -> Float[np.ndarray, "drones cameras 3 3"]:
     """Mean of the derivatives of the positions by the cameras' turns, over the frames in which there are any."""
     total = np.zeros((*views.shown.shape[1:], 3, 3))
     count = np.zeros(views.shown.shape[1], int)
-    for _, part in views.parts():
+    for part in views.parts():
         turned = part.gain @ part.turn_px
         # Where nothing was found, the derivatives are 0.
         total += turned.sum(axis=0)
@@ -126,10 +127,8 @@ def noise_ratios(
     measured_m2: Float[np.ndarray, "frames drones 3 3"],
     noise_m2: Float[np.ndarray, "frames drones 3 3"],
     errors: CameraErrors,
-    assumed: MeasurementErrors,
-    *,
-    dt_s: float,
-    jerk_density_m2_s5: float,
+    motion: MotionSettings,
+    fps: float,
 ) -> tuple[Float[np.ndarray, "frames drones"], Float[np.ndarray, "frames drones"]]:
     """Ratios of found and stated variances around each frame: of measured positions, and of filtered positions.
 
@@ -141,34 +140,33 @@ def noise_ratios(
             where a drone was not measured.
         noise_m2: (frames, drones, 3, 3), from `noise_covariance`.
         errors: the cameras' errors.
-        assumed: how the filter takes errors to fade; its variance does not count.
-        dt_s: time between frames, seconds.
-        jerk_density_m2_s5: spectral density of the white jerk of the filter.
+        motion: the filter's motion model, and how it takes errors to fade.
+        fps: frames per second.
     """
     stated, found = (np.trace(value, axis1=-2, axis2=-1) / 3 for value in (measured_m2, noise_m2))
     known = (stated > 0) & np.isfinite(stated) & np.isfinite(found)
     if not known.any():
         return np.ones(known.shape), np.ones(known.shape)
+    dt_s, fading = 1 / fps, errors.fading
     window = 1 + 2 * round(_WINDOW_S / dt_s / 2)
     stated, found = (_local_medians(np.where(known, value, np.nan), window) for value in (stated, found))
     # The filter's gain depends on the stated variance; with the gain, the variance is linear in the found variance.
     levels_m2 = np.geomspace(stated[known].min(), stated[known].max(), _NUM_LEVELS)
 
-    def filtered(level_m2: float, share: float) -> tuple[float, float]:
-        return filtered_variances(
-            MeasurementErrors(level_m2, assumed.fading_share, assumed.time_s),
-            MeasurementErrors(share * level_m2, errors.fading.fading_share, errors.fading.time_s),
-            dt_s=dt_s,
-            jerk_density_m2_s5=jerk_density_m2_s5,
-        )
+    def ratio(level_m2: float, share: float) -> float:
+        assumed = MeasurementErrors(level_m2, motion.error_share, motion.error_time_s)
+        real = MeasurementErrors(share * level_m2, fading.fading_share, fading.time_s)
+        before, after = filtered_variances(assumed, real, dt_s=dt_s, jerk_density_m2_s5=motion.jerk_density)
+        return after / before
 
-    by_motion = np.array([after / before for before, after in (filtered(level, 0.0) for level in levels_m2)])
-    by_both = np.array([after / before for before, after in (filtered(level, 1.0) for level in levels_m2)])
     level = np.where(known, stated, levels_m2[0])
     measured = np.where(known, found / level, 1.0)
-    motion, both = (np.interp(np.log(level), np.log(levels_m2), each) for each in (by_motion, by_both))
-    ratios = (measured, motion + (both - motion) * measured)
-    return _filled(ratios[0], known, 1.0), _filled(ratios[1], known, 1.0)
+    by_motion, by_both = (
+        np.interp(np.log(level), np.log(levels_m2), [ratio(each, share) for each in levels_m2])
+        for share in (0.0, 1.0)
+    )
+    filtered = by_motion + (by_both - by_motion) * measured
+    return _filled(measured, known, 1.0), _filled(filtered, known, 1.0)
 
 
 def _local_medians(
@@ -187,3 +185,92 @@ def _local_medians(
 
 def _mean(values: np.ndarray) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+
+
+#: Largest number of frames until the filter's covariance has settled.
+_MAX_FRAMES = 2000
+#: The filter has settled when its variance changes by less than this share per frame.
+_SETTLED = 1e-6
+
+
+@dataclass(frozen=True)
+class MeasurementErrors:
+    """Errors of measured positions along one axis.
+
+    Attributes:
+        variance_m2: variance, m².
+        fading_share: share of the variance that fades exponentially; the rest is white.
+        time_s: time constant of the fading errors, seconds.
+    """
+
+    variance_m2: float
+    fading_share: float
+    time_s: float
+
+
+def filtered_variances(
+    assumed: MeasurementErrors, found: MeasurementErrors, *, dt_s: float, jerk_density_m2_s5: float
+) -> tuple[float, float]:
+    """Variance of the filtered position as the filter states it, and as it is with the errors that were found, m².
+
+    The filter of `psotrack.tracking.motion` assumes how much of the measurements' variance lasts, and for how long.
+    What the errors of a recording are like is known only when all of it has been seen. Here the filter keeps its gain,
+    and the variance of its error follows from the errors that were found (the Lyapunov equation of the joint error of
+    state and filter; A. Gelb, Applied Optimal Estimation, 1974, section 7.2). One axis is enough, because the filter
+    treats the axes alike.
+
+    Args:
+        assumed: errors that the filter assumes.
+        found: errors of the measurements.
+        dt_s: time between frames, seconds.
+        jerk_density_m2_s5: spectral density of the white jerk.
+    """
+    F = np.eye(4)
+    F[:3, :3] += np.array([[0, dt_s, dt_s**2 / 2], [0, 0, dt_s], [0, 0, 0]])
+    F[3, 3] = np.exp(-dt_s / assumed.time_s)
+    motion_noise = np.zeros((4, 4))
+    motion_noise[:3, :3] = jerk_density_m2_s5 * white_jerk_noise(float(dt_s))
+    fading_m2 = assumed.fading_share * assumed.variance_m2
+    noise = motion_noise + np.diag([0, 0, 0, fading_m2 * (1 - F[3, 3] ** 2)])
+    # A measurement is the position plus the fading error plus white noise.
+    H = np.array([1.0, 0.0, 0.0, 1.0])
+    white_m2 = (1 - assumed.fading_share) * assumed.variance_m2
+    P, gain = np.diag([assumed.variance_m2, 1.0, 1.0, fading_m2]), np.zeros(4)
+    stated_m2 = np.inf
+    for _ in range(_MAX_FRAMES):
+        P = F @ P @ F.T + noise
+        gain = P @ H / (H @ P @ H + white_m2)
+        P = (np.eye(4) - np.outer(gain, H)) @ P
+        P = (P + P.T) / 2
+        if abs(P[0, 0] - stated_m2) < _SETTLED * P[0, 0]:
+            break
+        stated_m2 = P[0, 0]
+    return float(P[0, 0]), _real_variance(F, motion_noise, gain, found, dt_s)
+
+
+def _real_variance(
+    F: Float[np.ndarray, "4 4"],
+    motion_noise: Float[np.ndarray, "4 4"],
+    gain: Float[np.ndarray, "4"],
+    found: MeasurementErrors,
+    dt_s: float,
+) -> float:
+    """Variance of the filtered position's error with a fixed gain."""
+    # State: true minus estimated position, velocity, acceleration; the filter's fading error; the real fading error.
+    decay = np.exp(-dt_s / found.time_s)
+    ahead = np.zeros((5, 5))
+    ahead[:4, :4], ahead[4, 4] = F, decay
+    fading_m2 = found.fading_share * found.variance_m2
+    noise = np.zeros((5, 5))
+    noise[:4, :4] = motion_noise
+    noise[4, 4] = fading_m2 * (1 - decay**2)
+    # Innovation: error of the position + real fading error - the filter's fading error + white noise.
+    innovation = np.array([1.0, 0.0, 0.0, -1.0, 1.0])
+    corrects = np.array([-gain[0], -gain[1], -gain[2], gain[3], 0.0])
+    correct = np.eye(5) + np.outer(corrects, innovation)
+    white_m2 = (1 - found.fading_share) * found.variance_m2
+    step = correct @ ahead
+    driven = correct @ noise @ correct.T + white_m2 * np.outer(corrects, corrects)
+    # X = step X stepᵀ + driven, as linear equations.
+    solved = np.linalg.solve(np.eye(25) - np.kron(step, step), driven.ravel())
+    return float(solved[0])

@@ -6,7 +6,7 @@ The place that a camera shows of a drone errs by the sum of
 - an error of its clock times the drone's velocity in the image,
 - a lasting error, that stays for as long as the drone flies in one part of the image: a wrong lens or place of the
   camera, a detector's habit,
-- noise, a part of which fades over some frames (`fading`).
+- noise, a part of which fades over some frames (`Fading`).
 
 Noise and lasting errors are learned per camera (`variance_components`), turns and clocks for all cameras together
 (`constant_errors`).
@@ -18,16 +18,103 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import nnls
 
 from psotrack.tracking.camera_errors.constant_errors import ConstantErrors, fit_constant_errors
-from psotrack.tracking.camera_errors.fading import Fading, fading_of
 from psotrack.tracking.camera_errors.variance_components import (
     FittedPlaces,
     camera_variances,
     weighted_residuals,
 )
 from psotrack.tracking.camera_errors.views import CameraViews
+
+#: Shortest and longest time constant that is tried for errors that fade, seconds, and number of time constants. What
+#: fades more slowly counts as lasting.
+_SHORTEST_S, _SLOWEST_S, _NUM_TIMES = 0.04, 1.5, 24
+#: Longest lag of the autocorrelation, seconds, and as a share of the recording.
+_LONGEST_S, _LONGEST_SHARE = 4.0, 0.5
+#: Least number of pairs of residuals at a lag, and least number of lags.
+_LEAST_PAIRS, _LEAST_LAGS = 30, 5
+
+
+@dataclass(frozen=True)
+class Fading:
+    """Autocorrelation of errors: the sum of the white share at lag 0, fading share x exp(-lag / time), lasting share.
+
+    Attributes:
+        white_share, fading_share, lasting_share: shares of the variance; the sum is 1.
+        time_s: time constant of the fading errors, seconds.
+    """
+
+    white_share: float
+    fading_share: float
+    lasting_share: float
+    time_s: float
+
+    def without_lasting(self) -> Fading:
+        """The errors that do not last, alone."""
+        rest = self.white_share + self.fading_share
+        if not rest > 0:
+            return Fading(1.0, 0.0, 0.0, self.time_s)
+        return Fading(self.white_share / rest, self.fading_share / rest, 0.0, self.time_s)
+
+    def inflation(self, step_s: float) -> float:
+        """How much more the variance of a long sum over frames `step_s` apart is than that of a sum of white noise."""
+        decay = np.exp(-step_s / self.time_s)
+        return float(self.white_share + self.fading_share * (1 + decay) / (1 - decay))
+
+    def variance_of_mean(
+        self, num_frames: Int[np.ndarray, "*shape"], dt_s: float
+    ) -> Float[np.ndarray, "*shape"]:
+        """Variance of means over a number of neighbouring frames, as a share of the variance in one frame."""
+        longest = max(1, int(num_frames.max(initial=1)))
+        lag = np.arange(1, longest)
+        n = np.arange(1, longest + 1)
+        # The sum over lags k below n of (1 - k / n) rho_k, for every n at once.
+        rho = np.exp(-lag * dt_s / self.time_s)
+        first = np.concatenate([[0.0], np.cumsum(rho)])
+        second = np.concatenate([[0.0], np.cumsum(lag * rho)])
+        fading = (1 + 2 * (first - second / n)) / n
+        share = self.white_share / n + self.fading_share * fading + self.lasting_share
+        return share[np.maximum(num_frames, 1) - 1]
+
+
+def fading_of(
+    residual: Float[np.ndarray, "frames drones cameras 2"],
+    shown: Bool[np.ndarray, "frames drones cameras"],
+    dt_s: float,
+    usual: Fading,
+) -> Fading:
+    """Fit the autocorrelation of the residuals of all drones and cameras together.
+
+    A fit of positions shrinks residuals at all lags alike, so that the shares do not change.
+
+    Args:
+        residual: (frames, drones, cameras, 2), residuals in standard deviations of their cameras; any value where not
+            shown.
+        shown: (frames, drones, cameras), which residuals count.
+        dt_s: time between frames, seconds.
+        usual: the result where too few frames show it.
+    """
+    num_frames = len(residual)
+    values = np.where(shown[..., None], residual, 0.0)
+    lags = np.arange(int(min(_LONGEST_SHARE * num_frames, _LONGEST_S / dt_s)) + 1)
+    pairs = np.array([(shown[: num_frames - lag] & shown[lag:]).sum() for lag in lags])
+    sums = np.array([(values[: num_frames - lag] * values[lag:]).sum() for lag in lags])
+    enough = pairs >= _LEAST_PAIRS
+    if enough.sum() < _LEAST_LAGS or not enough[0] or not sums[0] > 0:
+        return usual
+    correlation = sums[enough] / pairs[enough] / (sums[0] / pairs[0])
+    lags, weight = lags[enough], np.sqrt(pairs[enough])
+    fits = []
+    for time_s in np.geomspace(max(_SHORTEST_S, dt_s), max(_SLOWEST_S, 2 * dt_s), _NUM_TIMES):
+        parts = np.stack([lags == 0, np.exp(-lags * dt_s / time_s), np.ones(len(lags))], axis=-1)
+        shares, cost = nnls(parts * weight[:, None], correlation * weight)
+        fits.append((cost, float(time_s), shares / max(shares.sum(), 1e-12)))
+    _, time_s, shares = min(fits, key=lambda fit: fit[0])
+    return Fading(float(shares[0]), float(shares[1]), float(shares[2]), time_s)
+
 
 #: Errors are learned from frames that are this far apart, seconds, because errors of neighbouring frames are alike;
 #: from nearer ones where there are fewer rows (frames x drones), and from fewer where there are more: more rows add
@@ -78,7 +165,7 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: Fading) -> Camera
         usual: how noise fades, where too few frames show it.
     """
     num_cameras, dt_s = views.num_cameras, 1 / fps
-    found = np.concatenate([_rows(part).determined for _, part in views.parts()])
+    found = np.concatenate([_rows(part).determined for part in views.parts()])
     found = found.reshape(views.shown.shape[:2])
     num_rows = int(found.sum())
     step = max(1, min(round(_STEP_S * fps), num_rows // _MIN_ROWS), -(-num_rows // _MAX_ROWS))
@@ -150,8 +237,8 @@ def _total_variances(
 
 def _without(views: CameraViews, constant: ConstantErrors) -> CameraViews:
     """The views without the fitted turns and clocks, with residuals of positions that are fitted anew."""
-    residual_px = np.empty_like(views.residual_px)
-    for frames, part in views.parts():
+    residuals_px = []
+    for part in views.parts():
         turned_px = np.einsum("fdcip,cp->fdci", part.turn_px, constant.turn_rad)
         late_px = -part.flow_px_s * constant.clock_s[:, None]
         rows = _rows(replace(part, residual_px=part.residual_px - turned_px - late_px))
@@ -160,8 +247,8 @@ def _without(views: CameraViews, constant: ConstantErrors) -> CameraViews:
         weight = np.repeat(rows.shown[determined][..., None].astype(float), 2, axis=-1)
         refitted_px = weighted_residuals(rows.only(determined), weight)[0]
         fitted_px[determined] = np.where(rows.shown[determined][..., None], refitted_px, np.nan)
-        residual_px[frames] = fitted_px.reshape(part.residual_px.shape)
-    return replace(views, residual_px=residual_px)
+        residuals_px.append(fitted_px.reshape(part.residual_px.shape))
+    return replace(views, residual_px=np.concatenate(residuals_px))
 
 
 def _blocks(views: CameraViews, length: int) -> tuple[FittedPlaces, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors.covariances import (
@@ -17,9 +17,7 @@ from psotrack.tracking.camera_errors.covariances import (
     noise_covariance,
     noise_ratios,
 )
-from psotrack.tracking.camera_errors.fading import Fading
-from psotrack.tracking.camera_errors.filtered_variance import MeasurementErrors
-from psotrack.tracking.camera_errors.learning import CameraErrors, learn_camera_errors
+from psotrack.tracking.camera_errors.learning import CameraErrors, Fading, learn_camera_errors
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.trajectories import Status, Tracks, Trajectories
 
@@ -42,11 +40,8 @@ class TrackErrors:
     def smoothing(self, motion: MotionSettings) -> MotionSettings:
         """Settings of the motion model with noise that fades as it was found to."""
         fading = self.cameras.fading
-        return msgspec.structs.replace(
-            motion,
-            error_share=min(fading.fading_share, _MOST_FADING),
-            error_time_s=fading.time_s,
-        )
+        share = min(fading.fading_share, _MOST_FADING)
+        return msgspec.structs.replace(motion, error_share=share, error_time_s=fading.time_s)
 
     def added_to(
         self, trajectories: Trajectories, order: Int[np.ndarray, "frames drones"] | None
@@ -58,21 +53,13 @@ class TrackErrors:
             order: (frames, drones), index of each drone's track (see `Identities.order`); None where labels stay.
         """
         assert trajectories.covariance_m2 is not None
-        covariance_m2 = trajectories.covariance_m2
-
-        def added(
-            lasting_m2: Float[np.ndarray, "frames drones 3 3"],
-        ) -> Float[np.ndarray, "frames drones 3 3"]:
+        covariances = []
+        for lasting_m2 in (self.lasting.absolute_m2, self.lasting.relative_m2):
             if order is not None:
                 lasting_m2 = np.take_along_axis(lasting_m2, order[..., None, None], axis=1)
-            total_m2 = covariance_m2 + lasting_m2
-            return (total_m2 + total_m2.swapaxes(-1, -2)) / 2
-
-        return replace(
-            trajectories,
-            covariance_m2=added(self.lasting.absolute_m2),
-            relative_covariance_m2=added(self.lasting.relative_m2),
-        )
+            total_m2 = trajectories.covariance_m2 + lasting_m2
+            covariances.append((total_m2 + total_m2.swapaxes(-1, -2)) / 2)
+        return replace(trajectories, covariance_m2=covariances[0], relative_covariance_m2=covariances[1])
 
     def record(self, names: Sequence[str]) -> dict[str, Any]:
         """The cameras' errors, fit for JSON; None for what is not known."""
@@ -114,23 +101,12 @@ def with_camera_errors(
         np.where(found, measured_m2, np.nan),
         noise_covariance(views, errors),
         errors,
-        MeasurementErrors(1.0, motion.error_share, motion.error_time_s),
-        dt_s=1 / fps,
-        jerk_density_m2_s5=motion.jerk_density,
+        motion,
+        fps,
     )
     corrected = replace(
         tracks,
         measured_covariance_m2=measured_m2 * measured[..., None, None],
         covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    return corrected, TrackErrors(errors, lasting_of(views, errors, given))
-
-
-def lasting_of(views: CameraViews, errors: CameraErrors, given: ErrorSettings) -> LastingCovariances:
-    """Covariances of the positions by errors that last."""
-    return lasting_covariances(
-        views,
-        errors,
-        rig_error_deg=given.rig_deg,
-        pixel_error_px=given.pixel_px,
-    )
+    return corrected, TrackErrors(errors, lasting_covariances(views, errors, given))

@@ -68,14 +68,9 @@ class CameraViews:
             self.weight[frames],
         )
 
-    def parts(self) -> Iterator[tuple[slice, CameraViews]]:
-        """The views of some frames after the other, with the frames."""
-        return ((frames, self[frames]) for frames in _blocks(self.num_frames))
-
-    @property
-    def num_frames(self) -> int:
-        """Number of frames."""
-        return self.weight.shape[0]
+    def parts(self) -> Iterator[CameraViews]:
+        """The views of some frames after the other."""
+        return (self[frames] for frames in _blocks(len(self.weight)))
 
     @property
     def num_cameras(self) -> int:
@@ -136,17 +131,15 @@ def views_of_places(
         position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
         exposures: exposures of the cameras' frames; None where all were exposed at the instant.
     """
-    residual_px = np.empty(place_px.shape)
-    jacobian = np.empty((*place_px.shape, 3))
-    counted = np.empty(place_px.shape)
+    parts = []
     for frames in _blocks(len(place_px)):
         seen_m = _seen(position_m[frames], velocity_m_s[frames], _at(exposures, frames))
         pixels = _visible(cameras, position_m[frames], seen_m)
         ahead = np.isfinite(pixels).all(axis=-1)[..., None]
-        residual_px[frames] = place_px[frames] - pixels
-        jacobian[frames] = np.where(ahead[..., None], project_with_jacobian(cameras, seen_m)[2], 0.0)
-        counted[frames] = np.where(ahead, weight[frames], 0.0)
-    return CameraViews(cameras, exposures, position_m, velocity_m_s, residual_px, jacobian, counted)
+        jacobian = np.where(ahead[..., None], project_with_jacobian(cameras, seen_m)[2], 0.0)
+        parts.append((place_px[frames] - pixels, jacobian, np.where(ahead, weight[frames], 0.0)))
+    linear = map(np.concatenate, zip(*parts, strict=True))
+    return CameraViews(cameras, exposures, position_m, velocity_m_s, *linear)
 
 
 def views_of_sightings(
@@ -162,16 +155,15 @@ def views_of_sightings(
         sightings: detections of all cameras.
         position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
     """
-    num_frames, num_cameras = sightings.centre_px.shape[:2]
-    place_px = np.empty((num_frames, position_m.shape[1], num_cameras, 2))
-    noise_px, distance = np.empty(place_px.shape[:3]), np.empty(place_px.shape[:3])
-    for frames in _blocks(num_frames):
-        seen_m = _seen(position_m[frames], velocity_m_s[frames], _at(sightings.exposures, frames))
-        pixels = _visible(cameras, position_m[frames], seen_m)
-        box, distance[frames] = _nearest(sightings.centre_px[frames], sightings.noise_px[frames], pixels)
-        frame, camera = np.ogrid[: len(box), :num_cameras]
+    parts = []
+    for frames in _blocks(sightings.num_frames):
+        view = sightings[frames]
+        seen_m = _seen(position_m[frames], velocity_m_s[frames], view.exposures)
+        box, distance = _nearest(view, _visible(cameras, position_m[frames], seen_m))
+        frame, camera = np.ogrid[: len(box), : box.shape[2]]
         at = (frame[:, None], camera[:, None], box)
-        place_px[frames], noise_px[frames] = sightings.centre_px[frames][at], sightings.noise_px[frames][at]
+        parts.append((view.centre_px[at], view.noise_px[at], distance))
+    place_px, noise_px, distance = map(np.concatenate, zip(*parts, strict=True))
     # Most detections are of the drones: their median distance shows the real noise, which may exceed the stated noise.
     # Both axes together have a Rayleigh distribution, whose median is 1.18 standard deviations.
     of_drone = np.isfinite(distance)
@@ -179,28 +171,20 @@ def views_of_sightings(
     of_drone &= distance <= _GATE * max(1.0, float(usual))
     place_px = np.where(of_drone[..., None], place_px, np.nan)
     weight = np.where(of_drone, np.nan_to_num(noise_px, nan=np.inf) ** -2.0, 0.0)
-    views = views_of_places(
-        cameras,
-        place_px,
-        np.repeat(weight[..., None], 2, axis=-1),
-        position_m,
-        velocity_m_s,
-        sightings.exposures,
-    )
+    weight = np.repeat(weight[..., None], 2, axis=-1)
+    views = views_of_places(cameras, place_px, weight, position_m, velocity_m_s, sightings.exposures)
     return _without_outliers(views)
 
 
 def _nearest(
-    centre_px: Float[np.ndarray, "frames cameras boxes 2"],
-    noise_px: Float[np.ndarray, "frames cameras boxes"],
-    pixels: Float[np.ndarray, "frames drones cameras 2"],
+    view: Sightings, pixels: Float[np.ndarray, "frames drones cameras 2"]
 ) -> tuple[Int[np.ndarray, "frames drones cameras"], Float[np.ndarray, "frames drones cameras"]]:
     """Number of the detection that is nearest to each drone, and its distance in standard deviations.
 
     The distance is infinite where another drone is nearer to the detection, or where the camera has none.
     """
-    off_px = centre_px[:, None] - pixels[..., None, :]
-    distance = np.linalg.norm(off_px, axis=-1) / noise_px[:, None]
+    off_px = view.centre_px[:, None] - pixels[..., None, :]
+    distance = np.linalg.norm(off_px, axis=-1) / view.noise_px[:, None]
     distance = np.where(np.isfinite(distance), distance, np.inf)
     box = distance.argmin(axis=-1)
     nearest = np.take_along_axis(distance, box[..., None], axis=-1)[..., 0]

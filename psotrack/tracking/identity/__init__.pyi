@@ -1,5 +1,5 @@
+from .encounters import Encounter, Identities, LabelOutcome, relabelled
 from .postprocessing import postprocess
-from .records import Encounter, Identities, LabelOutcome, relabelled
 from .resolving import resolve
 
 __all__ = [

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.settings import IdentitySettings, MotionSettings
-from psotrack.tracking.identity.records import Identities, relabelled
+from psotrack.tracking.identity.encounters import Identities, relabelled
 from psotrack.tracking.identity.resolving import resolve
 from psotrack.tracking.motion import Measurements, estimate_jerk_density, motion_params, smooth
 from psotrack.trajectories import Status, Tracks, Trajectories

@@ -9,8 +9,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.tracking.identity.encounters import FollowedEncounter, follow
-from psotrack.tracking.identity.records import Encounter, Identities, LabelOutcome, relabelled
+from psotrack.tracking.identity.encounters import (
+    Encounter,
+    FollowedEncounter,
+    Identities,
+    LabelOutcome,
+    follow,
+    relabelled,
+)
 from psotrack.tracking.motion import Measurements, MotionParams
 
 #: Ratio of the jerk density during encounters to the usual jerk density, because drones avoid each other. A larger

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from psotrack.settings import MotionSettings
 from psotrack.support.array_types import Array
+from psotrack.tracking.births import FlightLimits
 from psotrack.tracking.matching import Measurement
 from psotrack.tracking.motion import MotionParams, MotionState, kalman, motion_params
 
@@ -26,12 +27,12 @@ class TrackMotion:
         state: states of all slots, on the host.
     """
 
-    def __init__(self, settings: MotionSettings, fps: float, bounds_m: Float[np.ndarray, "2 3"]) -> None:
+    def __init__(self, settings: MotionSettings, limits: FlightLimits) -> None:
         self._settings = settings
         self._limits = {
-            "dt_s": np.array(1 / fps),
-            "bounds_m": bounds_m,
-            "max_speed_m_s": np.array(settings.speed_limit_m_s),
+            "dt_s": np.array(1 / limits.fps),
+            "bounds_m": limits.bounds_m,
+            "max_speed_m_s": np.array(limits.max_speed_m_s),
         }
         self._params = _params(settings, 0)
         self.state = _states_at_origin(0, self._params)

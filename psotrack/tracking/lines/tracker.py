@@ -18,6 +18,7 @@ from psotrack.tracking.births import (
     TRUSTED_VIEWPOINTS,
     BirthRules,
     Births,
+    FlightLimits,
     KnownDrones,
     TrackCandidate,
     reidentify,
@@ -99,20 +100,17 @@ class _Tracker:
         bounds_m: Float[np.ndarray, "2 3"],
     ) -> None:
         self._cameras, self._sightings, self._settings = cameras, sightings, settings
-        self._fps, self._bounds_m = fps, bounds_m
         self._density_px2 = _density_px2(cameras, sightings)
-        self._max_speed_m_s = settings.motion.speed_limit_m_s
-        self._motion = TrackMotion(settings.motion, fps, bounds_m)
+        self._limits = FlightLimits(fps, bounds_m, settings.motion.speed_limit_m_s)
+        self._motion = TrackMotion(settings.motion, self._limits)
         self._births = Births(
             cameras,
+            self._limits,
             BirthRules(
                 settings.status.min_cameras_to_begin,
                 num_frames=sightings.num_frames,
                 size_m=settings.drones.size_m,
             ),
-            fps=fps,
-            bounds_m=bounds_m,
-            max_speed_m_s=self._max_speed_m_s,
         )
         self._max_coasting_frames = round(settings.status.max_coasting_s * fps)
         self._history = History(sightings.num_frames)
@@ -125,7 +123,7 @@ class _Tracker:
         covariance_m2 = np.square(self._settings.swarm.spread_m) * np.eye(3)
         for position, velocity in zip(position_m, velocity_m_s, strict=True):
             std_m_s = self._settings.motion.velocity_std_m_s
-            before_m, number = position - velocity / self._fps, self._new_drone()
+            before_m, number = position - velocity / self._limits.fps, self._new_drone()
             self._motion.place(number, before_m, velocity, covariance_m2, std_m_s)
             self._history.note((0, number), position, velocity, covariance_m2, None, 0)
 
@@ -163,7 +161,7 @@ class _Tracker:
         expected_px = _boxes_px(self._cameras, expected.position_m, span_m)
         shown, view = view, split_merged_boxes(self._at_instant(view, numbers), expected_px)
         required = self._settings.status.min_cameras_to_begin
-        crossed = crossings(self._cameras, view, self._bounds_m, expected, required)
+        crossed = crossings(self._cameras, view, self._limits.bounds_m, expected, required)
         measured: dict[int, Measurement] = {}
         taken: list[int] = []
         # Expected drones first: an unexpected position may be a part of an expected drone.
@@ -247,7 +245,7 @@ class _Tracker:
         for number, one in measured.items():
             if one.surprising:
                 # The filter would treat the position as an outlier for a second, but all viewpoints agree on it.
-                speed_m_s = SPEED_SHARE * self._max_speed_m_s
+                speed_m_s = SPEED_SHARE * self._limits.max_speed_m_s
                 place = one.position_m, predicted_m_s[number], one.covariance_m2
                 self._motion.place(number, *place, speed_m_s)
 
@@ -273,15 +271,9 @@ class _Tracker:
             self._births.take(())
             return
         count, known = self._settings.drones.count, len(self._drones)
-        lost = self._history.lost(known, frame, self._fps)
-        assignment = reidentify(
-            candidates,
-            lost,
-            fps=self._fps,
-            bounds_m=self._bounds_m,
-            max_speed_m_s=self._max_speed_m_s,
-            max_births=None if count is None else max(count - known, 0),
-        )
+        lost = self._history.lost(known, frame, self._limits.fps)
+        most = None if count is None else max(count - known, 0)
+        assignment = reidentify(candidates, lost, self._limits, max_births=most)
         begun = [each for each in zip(candidates, assignment.tolist(), strict=True) if each[1] != NO_DRONE]
         self._births.take(candidate for candidate, _ in begun)
         for candidate, row in begun:
@@ -292,7 +284,7 @@ class _Tracker:
     def _start(self, candidate: TrackCandidate, number: int, frame: int) -> None:
         """Start a track at the frame in which the candidate was first seen, and follow it to the present frame."""
         first = candidate.path[candidate.instant]
-        motion = TrackMotion(self._settings.motion, self._fps, self._bounds_m)
+        motion = TrackMotion(self._settings.motion, self._limits)
         motion.grow()
         std_m_s = self._settings.motion.velocity_std_m_s
         motion.place(0, first.position_m, candidate.velocity_m_s, first.covariance_m2, std_m_s)

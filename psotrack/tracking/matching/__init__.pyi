@@ -1,9 +1,8 @@
 from .assignment import SEPARATION_M
 from .crossings import Crossings, Expected, Measurement, crossings
-from .epipolar import epipolar_distance
 from .groups import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST
-from .instants import moved_to_instant
 from .matching import Matches, match, wide_bounds
+from .proposals import epipolar_distance
 from .sightings import (
     BORDER_PX,
     CUT_SHARE,
@@ -14,6 +13,7 @@ from .sightings import (
     from_boxes,
     from_detections,
     from_silhouettes,
+    moved_to_instant,
 )
 
 __all__ = [

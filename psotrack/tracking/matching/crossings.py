@@ -142,7 +142,7 @@ def crossings(
     )
     shown = view.grouped(groups.detection)
     centre_px, size_px = shown.centre_px, shown.size_px
-    several = _shared(groups.detection)
+    several = ((groups.detection[:, None] == groups.detection) & (groups.detection >= 0)).sum(axis=1) > 1
     hidden_px = np.where(several, SHARED_SHARE * np.sqrt(size_px.prod(axis=-1)), 0.0)
     noise_px = np.hypot(shown.noise_px, hidden_px)
     # The dispersion of a drone alone in its box says nothing about a box that it shares.
@@ -189,8 +189,3 @@ def _surplus_px(
     ratio = np.ones_like(span_m)
     ratio[there] = span_m[there] / np.nanmedian(span_m[there], axis=-1, keepdims=True)
     return np.where(ratio > SEVERAL_SIZE, size_px.max(axis=-1) * (1 - 1 / ratio) / 2, 0.0)
-
-
-def _shared(detection: Int[np.ndarray, "groups cameras"]) -> Bool[np.ndarray, "groups cameras"]:
-    """(groups, cameras), whether several groups share the detection."""
-    return ((detection[:, None] == detection) & (detection >= 0)).sum(axis=1) > 1

@@ -5,18 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Float
 
-from psotrack.settings import (
-    DroneSettings,
-    MotionSettings,
-    ScoreSettings,
-    StatusSettings,
-    SwarmSettings,
-    TrackSettings,
-)
+from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
 from psotrack.support import make_plugin
+from psotrack.tracking.births import FlightLimits
 from psotrack.tracking.motion import motion_params
 from psotrack.tracking.swarm import tracker
 from psotrack.tracking.swarm.fitness import PAPER_SCORE, Score, SoftIoU
@@ -28,29 +20,23 @@ KERNEL = "pso-kernel"
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """The parts of the settings that the tracker reads (see `psotrack.settings`), and its search and score.
+    """The settings of a run, and its search and score.
 
     Attributes:
-        swarm, score, motion, drones, status: parts of `TrackSettings`.
+        of_run: the settings.
         search: the search in one frame.
         camera_score: the score of positions in single cameras.
-        seed: seed of the random numbers.
     """
 
-    swarm: SwarmSettings
-    score: ScoreSettings
-    motion: MotionSettings
-    drones: DroneSettings
-    status: StatusSettings
+    of_run: TrackSettings
     search: Search
     camera_score: Score
-    seed: int = 0
 
 
 def tracker_settings(
     settings: TrackSettings, *, search: Search | None = None, score: Score | None = None
 ) -> TrackerSettings:
-    """The tracker's parts of the settings of a run.
+    """The settings of a run with its search and score.
 
     Args:
         settings: settings of the run.
@@ -66,14 +52,9 @@ def tracker_settings(
 
         check_kernel(settings.swarm.kind, camera_score)
     return TrackerSettings(
-        settings.swarm,
-        settings.score,
-        settings.motion,
-        settings.drones,
-        settings.status,
+        settings,
         search=find_search(settings.swarm) if search is None else search,
         camera_score=camera_score,
-        seed=settings.seed,
     )
 
 
@@ -118,44 +99,42 @@ def tracker_program(settings: TrackerSettings, reduction: int, *, on_cpu: bool =
     """What is compiled in: runs whose programs are equal can be one batch.
 
     Args:
-        settings: the tracker's parts of the settings.
+        settings: settings of the run, with search and score.
         reduction: image pixels per silhouette pixel, along each side.
         on_cpu: whether a CPU computes: there, the number of iterations needs no compilation of its own.
     """
     # The paper's score has neither occlusion nor a slope from which a vertex could be found.
-    hard = settings.camera_score == PAPER_SCORE
+    of_run, hard = settings.of_run, settings.camera_score == PAPER_SCORE
     return tracker.Program(
-        num_particles=settings.swarm.particles,
-        num_iterations=None if on_cpu else settings.swarm.iterations,
-        joint=settings.swarm.kind == "joint",
-        occlusion=settings.score.occlusion and not hard,
-        vertex=settings.score.vertex and not hard,
+        num_particles=of_run.swarm.particles,
+        num_iterations=None if on_cpu else of_run.swarm.iterations,
+        joint=of_run.swarm.kind == "joint",
+        occlusion=of_run.score.occlusion and not hard,
+        vertex=of_run.score.vertex and not hard,
         score=settings.camera_score,
         reduction=reduction,
     )
 
 
-def tracker_params(
-    settings: TrackerSettings, num_slots: int, *, fps: float, bounds_m: Float[np.ndarray, "2 3"]
-) -> tracker.TrackerParams:
+def tracker_params(settings: TrackerSettings, num_slots: int, limits: FlightLimits) -> tracker.TrackerParams:
     """The numbers with which the tracker is called.
 
     Args:
-        settings: the tracker's parts of the settings.
+        settings: settings of the run, with search and score.
         num_slots: number of slots for drones.
-        fps: instants per second.
-        bounds_m: (2, 3), lowest and highest corner of the room, metres.
+        limits: where and how fast drones may fly.
     """
+    of_run = settings.of_run
     return tracker.TrackerParams(
-        num_iterations=jnp.int32(settings.swarm.iterations),
-        bounds_m=jnp.asarray(bounds_m, jnp.float32),
-        dt_s=jnp.float32(1 / fps),
-        max_speed_m_s=jnp.float32(settings.motion.speed_limit_m_s),
-        spread_m=jnp.float32(settings.swarm.spread_m),
+        num_iterations=jnp.int32(of_run.swarm.iterations),
+        bounds_m=jnp.asarray(limits.bounds_m, jnp.float32),
+        dt_s=jnp.float32(1 / limits.fps),
+        max_speed_m_s=jnp.float32(limits.max_speed_m_s),
+        spread_m=jnp.float32(of_run.swarm.spread_m),
         search=settings.search,
-        motion=motion_params(settings.motion, num_slots),
-        min_fitness=jnp.float32(settings.status.min_fitness),
-        min_cameras=jnp.int32(settings.status.min_cameras),
-        max_coasting_frames=jnp.int32(round(settings.status.max_coasting_s * fps)),
-        learns_sizes=jnp.bool_(settings.drones.learn_sizes and settings.drones.size_m is None),
+        motion=motion_params(of_run.motion, num_slots),
+        min_fitness=jnp.float32(of_run.status.min_fitness),
+        min_cameras=jnp.int32(of_run.status.min_cameras),
+        max_coasting_frames=jnp.int32(round(of_run.status.max_coasting_s * limits.fps)),
+        learns_sizes=jnp.bool_(of_run.drones.learn_sizes and of_run.drones.size_m is None),
     )

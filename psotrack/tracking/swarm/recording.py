@@ -75,7 +75,10 @@ def track_silhouettes(
     setting = Setting(rig, silhouettes.reduction, silhouettes.borders, fps)
     engine = Engine(setting, side_by_side=side_by_side)
     on_cpu = not engine.side_by_side
-    progress = [_begin(setting, inputs, silhouettes.num_frames, on_cpu=on_cpu) for inputs in runs]
+    progress = []
+    for inputs in runs:
+        run = SwarmRun(setting, inputs, on_cpu=on_cpu, num_frames=silhouettes.num_frames)
+        progress.append(_Progress(run, [] if inputs.given is None else run.given_starts(inputs.given, 0)))
     last: Block | None = None
     with report("track", silhouettes.num_frames) as advance:
         for block in _blocks(setting, silhouettes):
@@ -110,11 +113,6 @@ def track_silhouettes(
     return [_results(each) for each in progress], engine.compile_s
 
 
-def _begin(setting: Setting, inputs: RunInputs, num_frames: int, *, on_cpu: bool) -> _Progress:
-    run = SwarmRun(setting, inputs, on_cpu=on_cpu, num_frames=num_frames)
-    return _Progress(run, [] if inputs.given is None else run.given_starts(inputs.given, 0))
-
-
 def _planned(
     each: _Progress, block: Block, last: Block | None, slots: Slots, rows: Rows, *, again: bool
 ) -> list[Start]:
@@ -124,7 +122,7 @@ def _planned(
 
     def begin(candidate: TrackCandidate) -> tuple[int, np.ndarray, np.ndarray]:
         instant = max(candidate.instant, oldest)
-        return instant, *state_at(candidate.path, instant, run.fps, run.max_speed_m_s)
+        return instant, *state_at(candidate.path, instant, run.limits)
 
     starts = run.plan(run.search(block, rows, slots, again=again), block, rows, begin)
     for start in starts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
@@ -20,6 +20,7 @@ from psotrack.tracking.births import (
     WINDOW_FRAMES,
     BirthRules,
     Births,
+    FlightLimits,
     InitialState,
     KnownDrones,
     LostTracks,
@@ -43,7 +44,7 @@ class RunInputs:
 
     Attributes:
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
-        settings: the tracker's parts of the settings.
+        settings: settings of the run, with search and score.
         given: the drones at frame 0, where they are given instead of found.
     """
 
@@ -95,51 +96,27 @@ class Flights:
 
 @dataclass
 class _Past:
-    """What is remembered of the drone in each slot.
+    """What is remembered of the drone in a slot.
 
     Attributes:
-        low_m, high_m: (slots, 3), corners of the box about all places where it was found, metres.
-        last: (slots,), last instant in which it was found.
-        missed: (slots,), whether it was missed since it was first found.
-        now: the last instant.
+        low_m, high_m: (3,), corners of the box about all places where it was found, metres.
+        last: last instant in which it was found.
+        missed: whether it was missed since it was first found.
     """
 
-    low_m: Float[np.ndarray, "slots 3"]
-    high_m: Float[np.ndarray, "slots 3"]
-    last: Int[np.ndarray, "slots"]
-    missed: Bool[np.ndarray, "slots"]
-    now: int = -1
+    last: int = -1
+    low_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, np.inf))
+    high_m: Float[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, -np.inf))
+    missed: bool = False
 
-    @classmethod
-    def of(cls, count: int) -> _Past:
-        """Slots without a past."""
-        beyond = np.full((count, 3), np.inf)
-        return cls(beyond, -beyond, np.full(count, -1), np.zeros(count, bool))
-
-    def joined(self, other: _Past) -> _Past:
-        """These slots, and after them others."""
-        return _Past(
-            np.concatenate([self.low_m, other.low_m]),
-            np.concatenate([self.high_m, other.high_m]),
-            np.concatenate([self.last, other.last]),
-            np.concatenate([self.missed, other.missed]),
-            self.now,
-        )
-
-    def clear(self, slot: int, instant: int) -> None:
-        """A new drone is found in a slot."""
-        self.low_m[slot], self.high_m[slot] = np.inf, -np.inf
-        self.last[slot], self.missed[slot] = instant, False
-
-    def add(self, flights: Flights) -> None:
+    def add(self, flights: Flights, slot: int) -> None:
         """Take further frames."""
-        tracked, self.now = flights.tracked, int(flights.instant[-1])
-        found = tracked[..., None]
-        self.low_m = np.minimum(self.low_m, np.where(found, flights.position_m, np.inf).min(axis=0))
-        self.high_m = np.maximum(self.high_m, np.where(found, flights.position_m, -np.inf).max(axis=0))
-        self.last = np.maximum(self.last, np.where(tracked, flights.instant[:, None], -1).max(axis=0))
-        there = np.isfinite(flights.position_m).all(axis=-1)
-        self.missed |= (there & ~tracked).any(axis=0)
+        tracked, position_m = flights.tracked[:, slot], flights.position_m[:, slot]
+        found_m = position_m[tracked]
+        self.low_m = np.minimum(self.low_m, found_m.min(axis=0, initial=np.inf))
+        self.high_m = np.maximum(self.high_m, found_m.max(axis=0, initial=-np.inf))
+        self.last = max(self.last, int(flights.instant[tracked].max(initial=-1)))
+        self.missed |= bool((np.isfinite(position_m).all(axis=-1) & ~tracked).any())
 
 
 class SwarmRun:
@@ -156,8 +133,7 @@ class SwarmRun:
     Attributes:
         slots: the drones after the last block.
         drone: (slots,), number of the drone in each slot; -1 for an empty slot.
-        fps: instants per second.
-        max_speed_m_s: largest speed of a drone, m/s.
+        limits: where and how fast drones may fly.
     """
 
     def __init__(
@@ -170,14 +146,15 @@ class SwarmRun:
         memory_frames: int | None = None,
         num_frames: int | None = None,
     ) -> None:
-        settings = inputs.settings
-        self._setting, self._settings, self._bounds_m = setting, settings, inputs.bounds_m
-        self.fps, self.max_speed_m_s = setting.fps, settings.motion.speed_limit_m_s
-        self.program = tracker_program(settings, setting.reduction, on_cpu=on_cpu)
+        settings = self._settings = inputs.settings.of_run
+        self._setting, self._tracker_settings = setting, inputs.settings
+        self.limits = FlightLimits(setting.fps, inputs.bounds_m, settings.motion.speed_limit_m_s)
+        self.program = tracker_program(inputs.settings, setting.reduction, on_cpu=on_cpu)
         self._most = settings.drones.count or most_drones
         # What is followed now, and what was followed before the block that was searched last.
         self._births = self._births_before = Births(
             setting.rig.cameras,
+            self.limits,
             BirthRules(
                 settings.status.min_cameras_to_begin,
                 # A recording's background is known from the start, that of a stream is learned from its first frames.
@@ -185,9 +162,6 @@ class SwarmRun:
                 num_frames=num_frames,
                 size_m=settings.drones.size_m,
             ),
-            fps=setting.fps,
-            bounds_m=inputs.bounds_m,
-            max_speed_m_s=settings.motion.speed_limit_m_s,
         )
         self._key = jax.random.key(settings.seed)
         self._num_born = 0
@@ -201,14 +175,12 @@ class SwarmRun:
         """Make slots for some drones, empty ones, and forget those that there were."""
         self.slots = self._empty(capacity(num_drones))
         self.drone = np.full(len(self.slots), -1)
-        self._past = _Past.of(len(self.slots))
+        self._past = [_Past() for _ in self.drone]
 
     def _params(self, count: int) -> TrackerParams:
         """The tracker's parameters for a number of slots."""
         if count not in self._known_params:
-            self._known_params[count] = tracker_params(
-                self._settings, count, fps=self.fps, bounds_m=self._bounds_m
-            )
+            self._known_params[count] = tracker_params(self._tracker_settings, count, self.limits)
         return self._known_params[count]
 
     def _empty(self, count: int) -> Slots:
@@ -265,11 +237,11 @@ class SwarmRun:
             before = len(self.drone)
             more = capacity(before + 1) - before
             self.drone = np.append(self.drone, np.full(more, -1))
-            self._past = self._past.joined(_Past.of(more))
+            self._past += [_Past() for _ in range(more)]
             free = np.array([before])
         slot = int(free[0])
         self.drone[slot], self._num_born = self._num_born, self._num_born + 1
-        self._past.clear(slot, instant)
+        self._past[slot] = _Past(instant)
         self._clear_memory(slot)
         given = self._settings.drones.size_m
         return Start(
@@ -296,7 +268,7 @@ class SwarmRun:
             self._births_before = self._births
         is_first = not self._memory and not self._num_born
         rules = self._settings.status.min_cameras_to_begin, self._settings.drones.size_m
-        key = self._bounds_m.tobytes(), self.max_speed_m_s, *rules
+        key = self.limits.bounds_m.tobytes(), self.limits.max_speed_m_s, *rules
         if is_first and key in block.births:
             # Before the first drone, all runs that look for the same drones find the same.
             found, births = block.births[key]
@@ -335,14 +307,7 @@ class SwarmRun:
             return []
         lost, known = self._lost(block, rows), self.known
         most = None if self._most is None else max(self._most - len(known), 0)
-        assignment = reidentify(
-            candidates,
-            lost,
-            fps=self.fps,
-            bounds_m=self._bounds_m,
-            max_speed_m_s=self.max_speed_m_s,
-            max_births=most,
-        )
+        assignment = reidentify(candidates, lost, self.limits, max_births=most)
         # What is no drone yet, because it does not move for instance, is followed on.
         taken = [each for each, row in zip(candidates, assignment, strict=True) if row >= 0 or row == NEW]
         self._births.take(taken)
@@ -366,7 +331,9 @@ class SwarmRun:
         self.slots = slots
         flights = Flights.of(block.instant, rows)
         self._memory.append(flights)
-        self._past.add(flights)
+        for slot in self.known:
+            if slot < flights.tracked.shape[1]:
+                self._past[slot].add(flights, slot)
         self._drop_false_tracks()
 
     def take_back(self) -> None:
@@ -375,19 +342,17 @@ class SwarmRun:
 
     def forget(self, oldest: int) -> None:
         """Empty the slots of drones that were not seen since an instant, and of tracks that follow no drone."""
-        known = np.array(self.known, int)
-        # A track that waits to begin may stand in a slot that the next block will add.
-        known = known[known < len(self.slots.present)]
-        gone = known[(self._past.last[known] < oldest) | ~np.asarray(self.slots.present)[known]]
-        # A track that is to begin is not there yet.
-        gone = gone[self._past.last[gone] < self._past.now]
-        for slot in gone.tolist():
-            logger.info("drone %d is forgotten", self.drone[slot])
-        if len(gone):
-            self.drone[gone] = -1
-            self._leave(gone)
+        present = np.asarray(self.slots.present)
+        now = int(self._memory[-1].instant[-1]) if self._memory else -1
+        for slot in self.known:
+            # A track that is to begin is not there yet, and may stand in a slot that the next block will add.
+            last = self._past[slot].last
+            if slot < len(present) and last < now and (last < oldest or not present[slot]):
+                logger.info("drone %d is forgotten", self.drone[slot])
+                self.drone[slot] = -1
+                self._leave(slot)
 
-    def _leave(self, gone: Int[np.ndarray, "gone"]) -> None:
+    def _leave(self, gone: int | Int[np.ndarray, "gone"]) -> None:
         """Track nothing in some slots any more."""
         present = np.array(self.slots.present)
         present[gone] = False
@@ -399,8 +364,8 @@ class SwarmRun:
         if self._most is None or len(known) < self._most:
             return False
         found = np.equal(np.asarray(rows.status)[:, known], Status.TRACKED)
-        was_missed = self._past.missed[known] | ~found.all(axis=0)
-        return not was_missed.any() or not len(self._lost(block, rows).drone)
+        was_missed = any(self._past[slot].missed for slot in known) or not found.all()
+        return not was_missed or not len(self._lost(block, rows).drone)
 
     def _lost(self, block: Block, rows: Rows) -> LostTracks:
         """The drones that were lost, by their place among the known ones."""
@@ -420,7 +385,8 @@ class SwarmRun:
     def _drop_false_tracks(self) -> None:
         """Empty the slots of tracks that turned out to follow no drone; their rows stay."""
         known = np.array(self.known, int)
-        way_m = np.linalg.norm(self._past.high_m - self._past.low_m, axis=-1)[known]
+        pasts = [self._past[slot] for slot in known]
+        way_m = np.array([np.linalg.norm(past.high_m - past.low_m) for past in pasts])
         # Mostly all drones have moved: the frames that are remembered are looked at only where one has not.
         if not (way_m < STAYED_SPANS * self._sizes_m()[known].max(axis=-1)).any():
             return

@@ -99,21 +99,11 @@ class ParticleSwarm:
         num_iterations: Int[Array, ""],
     ) -> Float[Array, "groups dims"]:
         """See `Search`."""
-        params = optimiser.SwarmParams(
-            inertia=self.inertia,
-            cognitive=self.cognitive,
-            social=self.social,
-            max_step=region.max_step,
-            low=region.low,
-            high=region.high,
-        )
+        params = optimiser.SwarmParams(**vars(self), **vars(region))
         return optimiser.run(key, objective, first, params, num_iterations).gbest_position
 
 
 def particle_swarm(settings: SwarmSettings) -> ParticleSwarm:
     """The particle swarm with the coefficients of the settings."""
-    return ParticleSwarm(
-        inertia=jnp.float32(settings.inertia),
-        cognitive=jnp.float32(settings.cognitive),
-        social=jnp.float32(settings.social),
-    )
+    coefficients = (settings.inertia, settings.cognitive, settings.social)
+    return ParticleSwarm(*map(jnp.float32, coefficients))

@@ -34,7 +34,7 @@ class StepwiseTracker:
 
     Args:
         rig: calibrated cameras.
-        settings: the tracker's parts of the settings; `drones.count` limits the number of drones at one time.
+        settings: settings of the run, with search and score; `drones.count` limits the number of drones at one time.
         fps: instants per second.
         bounds_m: (2, 3), lowest and highest corner of the room, metres.
         reduction: image pixels per silhouette pixel, along each side.
@@ -55,8 +55,8 @@ class StepwiseTracker:
     ) -> None:
         self._setting = Setting(rig, reduction, border_cells(rig.cameras.image_size_wh, reduction), fps)
         self._engine = Engine(self._setting)
-        self._shape, self._drones = shape, settings.drones
-        self._most = settings.drones.count or most_drones
+        self._shape, self._drones = shape, settings.of_run.drones
+        self._most = self._drones.count or most_drones
         self._run = SwarmRun(
             self._setting,
             RunInputs(bounds_m, settings),
@@ -135,12 +135,12 @@ class StepwiseTracker:
 
         def begin(candidate: TrackCandidate) -> tuple[int, np.ndarray, np.ndarray]:
             last = max(candidate.path)
-            position_m, velocity_m_s = state_at(candidate.path, last, run.fps, run.max_speed_m_s)
-            ago_s = (instant + 1 - last) / run.fps
+            position_m, velocity_m_s = state_at(candidate.path, last, run.limits)
+            ago_s = (instant + 1 - last) / run.limits.fps
             return instant + 1, position_m + ago_s * velocity_m_s, velocity_m_s
 
         self._starts = run.plan(run.search(block, rows, run.slots), block, rows, begin)
-        run.forget(instant - round(FORGOTTEN_S * run.fps))
+        run.forget(instant - round(FORGOTTEN_S * run.limits.fps))
         if len(run.known) == self._most and not self._was_full and self._drones.count is None:
             logger.warning("%d drones are tracked; further drones are left out (--most-drones)", self._most)
             self._was_full = True

@@ -225,12 +225,6 @@ def empty_slots(key: Key, count: int, params: TrackerParams) -> Slots:
     )
 
 
-def no_track_starts(count: int) -> TrackStarts:
-    """No track starts."""
-    zero = jnp.zeros((count, 3), jnp.float32)
-    return TrackStarts(jnp.full(count, -1, jnp.int32), zero, zero, zero)
-
-
 def step(
     slots: Slots, frame: Frames, cameras: Camera, params: TrackerParams, program: Program
 ) -> tuple[Slots, Rows]:
@@ -484,7 +478,6 @@ def _search(
         return joint_fitness(inputs, position.reshape(first.shape), slots.present)[:, None]
 
     objective = together if program.joint else DroneFitness(inputs)
-
     of_groups = SearchRegion(
         low=region.low.reshape(groups),
         high=region.high.reshape(groups),

@@ -1,0 +1,117 @@
+"""What the doctor found: findings, and what was measured of each camera, as records, tables and JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.calibration.doctor.agreement import Agreement
+from psotrack.calibration.doctor.findings import Finding
+from psotrack.calibration.doctor.reference_fit import ReferenceFit
+from psotrack.support import finite_or_none, html_block, html_table, text_table
+
+_HEADINGS = ("camera", "detections/frame", "explained", "median (px)", "(noise)", "late (ms)")
+_SOUND = "nothing disagrees"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of an examination; its text is what `psotrack doctor` prints.
+
+    Attributes:
+        cameras: names of the cameras.
+        fps: frames per second of the videos.
+        findings: disagreements; empty for a correct rig.
+        found: agreement of the rig with its sightings, after a wrong unit or interpretation was corrected.
+        late_frames: (cameras,), how late each camera's video shows the scene, relative to the median camera, frames:
+            frame i of a video that is late by k shows what the others show in frame i - k; NaN if it cannot be found.
+        late_std_frames: (cameras,), standard deviations of `late_frames`.
+        epipolar_px: (cameras, cameras), median distances of sightings from each other's epipolar lines, pixels; NaN for
+            pairs of cameras without common points.
+        reference: fit of the reference; None without a reference.
+    """
+
+    cameras: tuple[str, ...]
+    fps: float
+    findings: tuple[Finding, ...]
+    found: Agreement
+    late_frames: Float[np.ndarray, "cameras"]
+    late_std_frames: Float[np.ndarray, "cameras"]
+    epipolar_px: Float[np.ndarray, "cameras cameras"]
+    reference: ReferenceFit | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The findings and measurements, with None for missing numbers."""
+        return {
+            "findings": [
+                {
+                    **vars(finding),
+                    "cameras": list(finding.cameras),
+                    "nearly_as_likely": list(finding.nearly_as_likely),
+                }
+                for finding in self.findings
+            ],
+            "frames": self.found.num_frames,
+            "explained": self.found.share,
+            "cameras": self._measured(),
+            "epipolar_px": [[finite_or_none(value) for value in row] for row in self.epipolar_px],
+            "reference_m": None if self.reference is None else self.reference.before_m,
+        }
+
+    def __str__(self) -> str:
+        """Tables of the cameras and of their pairs, and the findings."""
+        pairs = (
+            (name, *("" if np.isnan(value) else f"{value:.1f}" for value in values))
+            for name, values in zip(self.cameras, self.epipolar_px, strict=True)
+        )
+        title = "median distance from epipolar lines (px)"
+        tables = [text_table(_HEADINGS, self._rows()), text_table(("", *self.cameras), pairs, title)]
+        return "\n".join([*tables, *(map(str, self.findings) if self.findings else [_SOUND])])
+
+    def __repr__(self) -> str:
+        return f"Diagnosis({'; '.join(map(str, self.findings)) or _SOUND})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the findings, and the table of the cameras."""
+        return html_block("; ".join(map(str, self.findings)) or _SOUND, html_table(_HEADINGS, self._rows()))
+
+    def _measured(self) -> list[dict[str, Any]]:
+        """Measurements of each camera."""
+        found, rows = self.found, []
+        for index, name in enumerate(self.cameras):
+            residual_px = found.residual_px[:, index][found.used[:, index]]
+            noise_px = found.noise_px[:, index][found.used[:, index]]
+            rows.append(
+                {
+                    "camera": name,
+                    "detections_per_frame": float(found.num_sightings[index] / max(found.num_frames, 1)),
+                    "explained": float(found.share_of_camera[index]),
+                    "residual_px": float(np.median(residual_px)) if len(residual_px) else None,
+                    "residual_std": float(np.median(residual_px / noise_px)) if len(residual_px) else None,
+                    "late_frames": finite_or_none(self.late_frames[index]),
+                    "late_std_frames": finite_or_none(self.late_std_frames[index]),
+                }
+            )
+        return rows
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        """The same as texts of a table."""
+        rows, to_ms = [], 1e3 / self.fps
+        for row in self._measured():
+            late, std = row["late_frames"], row["late_std_frames"]
+            rows.append(
+                (
+                    row["camera"],
+                    f"{row['detections_per_frame']:.2f}",
+                    f"{row['explained']:.0%}",
+                    *(
+                        "" if row[key] is None else f"{row[key]:.1f}"
+                        for key in ("residual_px", "residual_std")
+                    ),
+                    "" if late is None else f"{late * to_ms:+.0f} ± {std * to_ms:.0f}",
+                )
+            )
+        return rows

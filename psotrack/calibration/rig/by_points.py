@@ -1,0 +1,221 @@
+"""A rig from points instead of a board: one that moves, the two ends of a stick, or points of known place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from psotrack.calibration.image_points import find_markers_in, read_image_points
+from psotrack.calibration.placed_cameras import PlacedCameras, place_cameras, row_of
+from psotrack.calibration.rig.images import open_images
+from psotrack.calibration.rig.moving_point import (
+    LOOSE,
+    PointRig,
+    PointViews,
+    calibrate_by_point,
+    covariance_of_centres,
+)
+from psotrack.calibration.rig.point_files import (
+    check_two_cameras,
+    distance_between,
+    fit_world,
+    read_point_views,
+    read_world,
+    stick_length,
+    views_of_detections,
+    world_in_words,
+)
+from psotrack.calibration.rig.point_shifts import find_point_shifts
+from psotrack.calibration.rig.settings import RigSettings
+from psotrack.calibration.rig.world import Similarity, world_of_camera
+from psotrack.errors import InputError, SettingsError, errors_name
+from psotrack.geometry import Rig, chosen_camera
+from psotrack.geometry.rig_files import read_lenses
+from psotrack.recordings import read_detections
+from psotrack.recordings.datasets import open_recording
+
+#: Share of the sightings below which the user is told how few are used.
+_FEW_USED = 0.5
+
+
+def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> PlacedCameras:
+    """Place the cameras of a rig by a moving point, or by the two ends of a moving stick.
+
+    Args:
+        sources: one recording with detections, or one CSV file (see `read_point_views`).
+        settings: the lenses, and what fixes the unit of length.
+
+    Raises:
+        InputError: a file cannot be read, or the sightings do not determine the rig.
+        SettingsError: not one length is given, or no lenses.
+    """
+    distance, stick_m = settings.distance, settings.stick_m
+    lengths = sum(value is not None for value in (distance, stick_m, settings.world))
+    if lengths != 1:
+        raise SettingsError(
+            "length",
+            expected="one of --distance NAME,NAME=METRES, --stick METRES and --world FILE",
+            found="none" if not lengths else f"{lengths}",
+        )
+    views = _read_views(sources)
+    with errors_name(sources[0]):
+        if distance is not None:
+            check_two_cameras(views.names, *distance[:2])
+        if stick_m is not None and not views.point.any():
+            expected = "the two ends of a stick, told apart by a column named point"
+            raise InputError(sources[0], expected=expected, found="one point")
+    lenses = _lenses_of(views.names, settings.lenses)
+    with errors_name(sources[0]):
+        found = calibrate_by_point(lenses, views)
+    stated = None if settings.world is None else read_world(settings.world)
+
+    def world_of(found: PointRig) -> Similarity:
+        rig = found.adjusted.rig
+        if stated is not None:
+            return fit_world(rig, stated, _numbered(found), with_scale=True)[0]
+        if distance is not None:
+            return world_of_camera(rig, 0, distance[2] / distance_between(rig, *distance[:2]))
+        return world_of_camera(rig, 0, (stick_m or 1.0) / stick_length(found))
+
+    with errors_name(settings.world or sources[0]):
+        change = world_of(found)
+    covariance_m2 = covariance_of_centres(found, world_of)
+    if stated is not None:
+        _, left_m = fit_world(found.adjusted.rig, stated, _numbered(found), with_scale=True)
+        place = world_in_words(stated.path, left_m)
+    else:
+        place = f"camera {views.names[0]}: x right, y down, z forward; --world places it elsewhere"
+    rig, rows = change.rig(found.adjusted.rig), {}
+    for index, name in enumerate(rig.names):
+        seen = np.isfinite(found.adjusted.residual_px[:, index])
+        rows[name] = row_of(
+            np.asarray(rig.cameras.centre_world[index]),
+            covariance_m2[index],
+            found.adjusted.residual_px[seen, index],
+            found.adjusted.used[seen, index],
+            found.views.number[seen],
+        )
+    shifts = map(str, find_point_shifts(found.adjusted.rig, views))
+    notes = [*_left_out(found, views), f"the world is {place}", *shifts]
+    return PlacedCameras(rig, rows, [*notes, *_unused(found), *_undetermined(rig, covariance_m2)])
+
+
+def calibrate_by_known_points(
+    sources: Sequence[Path],
+    settings: RigSettings,
+    marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]] | None = None,
+) -> PlacedCameras:
+    """Place the cameras of a rig by points of known place, or by ArUco markers in their images.
+
+    Args:
+        sources: with markers, the video of each camera; with points none.
+        settings: the points, and the lenses.
+        marker_corners_m: corners of the markers by number, metres; None for points.
+
+    Raises:
+        InputError: a file cannot be read, or the points do not determine a camera's place.
+        SettingsError: a video or a world is given where the points stand for it, or there are no lenses.
+    """
+    if settings.world is not None:
+        expected = "none with points of known place, which are the world"
+        raise SettingsError("--world", expected=expected, found=f"{settings.world}")
+    if marker_corners_m is not None:
+        marks = {
+            camera.name: find_markers_in(
+                (grey for _, grey in camera.read(camera.spread(15))), marker_corners_m, settings.dictionary
+            )
+            for camera in open_images(sources)
+        }
+    elif sources:
+        raise SettingsError("--pairs", expected="no video", found=f"{sources[0]}")
+    else:
+        marks = read_image_points(settings.pairs or "")
+    lenses, world = _lenses_of(tuple(marks), settings.lenses), settings.pairs or settings.markers
+    by_name = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
+    with errors_name(world):
+        placed = place_cameras(marks, by_name, settings.noise_px)
+    return PlacedCameras(placed.rig, placed.cameras, [f"the world is that of {world}"])
+
+
+def _numbered(found: PointRig) -> dict[int, np.ndarray]:
+    """Positions of the moving point, of the first end of a stick, by the number of the instant."""
+    first = found.views.point == 0
+    return dict(zip(found.views.number[first].tolist(), found.adjusted.points_m[first], strict=True))
+
+
+def _left_out(found: PointRig, views: PointViews) -> list[str]:
+    """A sentence on sightings of a long recording that were left out."""
+    both = np.isfinite(views.points_px[..., 0]).sum(axis=1) >= 2
+    used, seen = len(np.unique(found.views.number)), len(np.unique(views.number[both]))
+    if used == seen:
+        return []
+    return [f"{used} of {seen} instants at which two cameras see the point are used, evenly spread"]
+
+
+def _unused(found: PointRig) -> list[str]:
+    """A sentence on sightings of two cameras, if the rig explains few of them."""
+    used, seen = int(found.adjusted.used.any(axis=1).sum()), len(found.views.number)
+    if used >= _FEW_USED * seen:
+        return []
+    return [
+        f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of one "
+        "instant, that the cameras see the same thing, and the lenses"
+    ]
+
+
+def _undetermined(rig: Rig, covariance_m2: np.ndarray) -> list[str]:
+    """A sentence on cameras whose places the sightings hardly determine."""
+    centres = np.asarray(rig.cameras.centre_world)
+    apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    std_m = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
+    loose = [
+        f"{name} (± {std:.2g} m, {apart:.2g} m from the farthest camera)"
+        for name, std, apart in zip(rig.names, std_m, apart_m.max(axis=1), strict=True)
+        if std > LOOSE * apart
+    ]
+    if not loose:
+        return []
+    return [
+        f"the sightings hardly determine the places of {', '.join(loose)}: move the point nearer to the cameras, "
+        "check the lenses, add a camera, or give points of known place with --pairs"
+    ]
+
+
+def _lenses_of(names: Sequence[str], path: Path | None) -> Rig:
+    """Lenses of the cameras from a calibration; a file with one camera has the lens of all."""
+    if path is None:
+        raise SettingsError(
+            "--lenses",
+            expected="a calibration with the lens of each camera",
+            found="none",
+            remedy="calibrate intrinsics",
+        )
+    lenses = read_lenses(path)
+    if len(lenses) == 1:
+        return Rig(tuple(names), lenses.cameras[np.zeros(len(names), np.int64)])
+    chosen = [chosen_camera(name, lenses.names) for name in names]
+    for name, found in zip(names, chosen, strict=True):
+        if found is None:
+            raise InputError(path, expected=f"the lens of {name}", found=f"only {', '.join(lenses.names)}")
+    rows = np.array([lenses.names.index(found) for found in chosen if found is not None])
+    return Rig(tuple(names), lenses.cameras[rows])
+
+
+def _read_views(sources: Sequence[Path]) -> PointViews:
+    """Sightings from a CSV file, or from the detections of a recording."""
+    if len(sources) != 1:
+        expected = "one recording or one CSV file"
+        raise SettingsError("--points", expected=expected, found=f"{len(sources)} paths")
+    if sources[0].suffix.lower() == ".csv":
+        return read_point_views(sources[0])
+    recording = open_recording(sources[0])
+    if not recording.detections:
+        raise InputError(sources[0], expected="detections of a moving point", found="none")
+    boxes = {name: read_detections(path) for name, path in recording.detections.items()}
+    times = {each.name: each.times for each in recording.cameras if each.times}
+    line_time_s = {each.name: each.line_time_s for each in recording.cameras}
+    with errors_name(sources[0]):
+        return views_of_detections(boxes, times, line_time_s)

@@ -1,0 +1,125 @@
+"""What is known before a rig is calibrated: the board, the lenses, points instead of a board, and the world.
+
+Commands make their options of these records, so this module imports nothing that takes long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from psotrack.errors import SettingsError
+from psotrack.support import check_records
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """The board that is moved before the cameras.
+
+    Attributes:
+        kind: kind of the board; a grid is one of ArUco markers or AprilTags; None: grid with --separation or --squares
+            1x1, charuco with --marker, else chessboard.
+        squares: number of squares of the board, of markers for a grid, such as 4x5.
+        square_m: side of a square in metres.
+        marker_m: side of a marker in metres.
+        separation_m: gap between the markers of a grid in metres.
+        dictionary: dictionary of the markers; any dictionary of OpenCV.
+        first_marker: number of the first marker of a grid; the others count on from it, row by row.
+    """
+
+    kind: Literal["charuco", "chessboard", "grid"] | None = None
+    squares: Annotated[tuple[int, int], Meta(extra={"metavar": "COLUMNSxROWS"})] | None = None
+    square_m: float | None = None
+    marker_m: float | None = None
+    separation_m: float | None = None
+    dictionary: str = "4x4_1000"
+    first_marker: Annotated[int, Meta(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class LensSettings:
+    """The lenses of the cameras.
+
+    Attributes:
+        lens: number of distortion coefficients of OpenCV's lens model, or its fisheye model; auto chooses by views that
+            are left out.
+        same_lens: all cameras have one lens, as equal cameras at equal zoom nearly do.
+        lenses: calibration whose lenses are kept; a camera that is not in the file gets a lens from the board.
+    """
+
+    lens: Annotated[str, Meta(extra={"metavar": "auto|0|4|5|8|12|14|fisheye"})] = "auto"
+    same_lens: bool = False
+    lenses: Path | None = None
+
+
+@dataclass(frozen=True)
+class PointSettings:
+    """What is seen instead of a board.
+
+    Attributes:
+        points: a single moving point instead of a board: the detections of the recording, or a CSV file with
+            camera,frame,x_px,y_px (and point, for the two ends of a stick). Needs --lenses.
+        distance: distance between two cameras' centres in metres, for --points: a,b=4.20.
+        stick_m: distance of the two points in metres, for --points.
+        pairs: points of known place instead of a board: camera,point,x_px,y_px,x_m,y_m,z_m. Needs --lenses.
+        markers: ArUco markers of known place instead of a board: a map of their corners. Needs --lenses.
+        noise_px: standard deviation of a point in the image, along x and along y, in pixels, with --pairs or --markers.
+    """
+
+    points: bool = False
+    distance: tuple[str, str, float] | None = None
+    stick_m: float | None = None
+    pairs: Path | None = None
+    markers: Path | None = None
+    noise_px: float = 1.0
+
+
+@dataclass(frozen=True)
+class RigSettings(PointSettings, LensSettings, BoardSettings):
+    """What is known before a rig is calibrated; of a board, the side of a square is enough.
+
+    The fields of `BoardSettings`, `LensSettings` and `PointSettings`, and:
+
+    Attributes:
+        names: names of the cameras; None: from the files' names.
+        floor: frame in which the board lies on the floor: its first corner is the origin, and z points up; None: the
+            first camera is the world.
+        world: file with three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a
+            frame of the moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.
+    """
+
+    names: Sequence[str] | None = None
+    floor: int | None = None
+    world: Path | None = None
+
+    def __post_init__(self) -> None:
+        chosen = {
+            "--squares": self.squares is not None,
+            "--points": self.points,
+            "--pairs": self.pairs is not None,
+            "--markers": self.markers is not None,
+        }
+        used = [name for name, is_chosen in chosen.items() if is_chosen]
+        if not used and self.square_m is not None:
+            used = ["--square"]
+        if len(used) != 1:
+            found = " and ".join(used) or "none"
+            raise SettingsError("rig", expected=f"one of --square, {', '.join(chosen)}", found=found)
+        if (self.distance or self.stick_m is not None) and not self.points:
+            raise SettingsError("rig", expected="--distance and --stick with --points", found=used[0])
+        if self.floor is not None and not self.by_board:
+            raise SettingsError("rig", expected="--floor with --squares", found=used[0])
+        if self.floor is not None and self.world is not None:
+            raise SettingsError("rig", expected="--floor or --world", found="both")
+
+    @property
+    def by_board(self) -> bool:
+        """Whether a board is moved before the cameras, and not points."""
+        return not (self.points or self.pairs or self.markers)
+
+
+check_records(RigSettings)
