@@ -76,6 +76,11 @@ def _of_camera(name, fields):
     return {field: values[name] for field, values in fields.items() if name in values}
 
 
+def read_mocap_markers(path):
+    """The positions (frames, 4, 3) in a file of `write_mocap_markers`, metres."""
+    return np.loadtxt(path, delimiter=";", skiprows=1)[:, 1:].reshape(-1, 4, 3)
+
+
 def make_unnamed_rig(*cameras):
     """Rig of the given cameras, which are named "0", "1" and so on."""
     return make_rig({str(i): camera for i, camera in enumerate(cameras)})

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from helpers import read_mocap_markers
 from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 
@@ -30,7 +31,6 @@ from psotrack.recordings import (
 from psotrack.recordings.datasets import (
     CALIBRATION,
     DETECTIONS,
-    read_mocap_markers,
     read_sequence,
 )
 from psotrack.recordings.mocap import Markers, write_c3d

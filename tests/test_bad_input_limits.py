@@ -26,7 +26,6 @@ from psotrack.recordings.datasets import (
     open_recording,
     read_marker_corners,
     read_masks,
-    read_mocap_markers,
     read_poses,
 )
 from psotrack.recordings.exchange import read_tracks
@@ -133,14 +132,6 @@ def test_a_huge_frame_in_poses(frame, tmp_path, little_memory):
     path = write(tmp_path / "dron1_pos_25.csv", f"id;pos_x[m];pos_y[m];pos_z[m]\n0;0;0;0\n{frame};1;2;3\n")
     with pytest.raises(InputError, match=rf"line 3, column id: expected a frame number .* found {frame}"):
         read_poses(path)
-
-
-def test_a_huge_frame_in_measured_markers(tmp_path, little_memory):
-    names = ";".join(f"marker_{letter}_{axis}[m]" for letter in "abcd" for axis in "xyz")
-    text = f"id;{names}\n2000000000;{';'.join(['0'] * 12)}\n"
-    path = write(tmp_path / "dron1_markers_25.csv", text)
-    with pytest.raises(InputError, match=r"dron1_markers_25\.csv"):
-        read_mocap_markers(path)
 
 
 def test_a_huge_frame_in_detections_of_a_camera_without_video(flight, run_psotrack, tmp_path, little_memory):

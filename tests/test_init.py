@@ -138,7 +138,7 @@ def test_everything_in_a_folder_is_found(folder):
                 detections="dl_data/left.csv",
                 timestamps="left_times.csv",
             ),
-            "right": CameraTable(images="Right/*.png", fps=30.0),
+            "right": CameraTable(video="Right", fps=30.0),
             "top": CameraTable(detections="dl_data/top.csv", size=(64, 48), fps=30.0),
         },
         reference=content.reference,
@@ -320,7 +320,7 @@ class TestRefusals:
         path = folder("cam1.avi", cameras=("cam1",))
         (path / "cam1").mkdir()
         cv2.imwrite(str(path / "cam1" / "0.png"), np.zeros((48, 64), np.uint8))
-        assert "expected one folder of images of camera cam1, found cam1.avi as well" in refusal(path)
+        assert "expected one video of camera cam1, found cam1 as well" in refusal(path)
 
     def test_a_video_with_the_names_of_two_cameras(self, folder):
         line = refusal(folder("take_a_b.avi", cameras=("a", "b")))

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from helpers import read_mocap_markers
 from real_form import SERIALS, write_as_real
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import project
 from psotrack.recordings import read_detections
-from psotrack.recordings.datasets import read_mocap_markers, read_poses, read_sequence
+from psotrack.recordings.datasets import read_poses, read_sequence
 from psotrack.recordings.mocap import marker_bodies, read_c3d
 from psotrack.simulation import (
     SimulationSettings,

@@ -16,6 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from helpers import read_mocap_markers
 from placed_drones import drone_masks
 
 from psotrack import __version__
@@ -27,7 +28,6 @@ from psotrack.recordings.datasets import (
     MARKER_CORNERS,
     read_marker_corners,
     read_masks,
-    read_mocap_markers,
     read_sequence,
 )
 from psotrack.simulation import (

@@ -11,7 +11,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 import pytest
-from helpers import sphere_points
+from helpers import read_mocap_markers, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from placed_drones import drone_masks
@@ -24,7 +24,6 @@ from psotrack.recordings.datasets import (
     MaskWriter,
     join_archives,
     read_masks,
-    read_mocap_markers,
     write_mocap_markers,
 )
 from psotrack.simulation import CameraRenderer, build, change_scenario, scenario
@@ -620,17 +619,3 @@ def test_markers_are_fixed_to_the_body_and_differ_between_drones(scene, tmp_path
         np.testing.assert_array_equal(read_mocap_markers(path), markers[:, drone])
     for first, second in combinations(distances, 2):
         assert np.abs(np.subtract(first, second)).max() > 0.015, "crosses differ clearly"
-
-
-def test_marker_files_with_gaps_and_faults(tmp_path):
-    path = tmp_path / "dron1_markers_25.csv"
-    write_mocap_markers(path, np.arange(36.0).reshape(3, 4, 3))
-    header, _, second, third = path.read_text().splitlines()
-    assert header.startswith("id;A_x[m];A_y[m];A_z[m];B_x[m]")
-    path.write_text("\n".join([header.replace("[m]", "[mm]"), third]))
-    markers = read_mocap_markers(path)
-    assert np.isnan(markers[:2]).all()
-    np.testing.assert_allclose(markers[2], np.arange(24, 36).reshape(4, 3) / 1000)
-    path.write_text("\n".join([header, second, second]))
-    with pytest.raises(InputError, match=r"line 3, column id: expected each frame once, found 1 again"):
-        read_mocap_markers(path)

@@ -293,7 +293,7 @@ def filmed_recording(source: Path, extent: Extent) -> Recording:
         raise InputError(
             source, expected="a video, a folder of pictures, or a recording", found="no such file or folder"
         )
-    if not is_recording(source):
+    if not is_recording(source) and (source.is_file() or is_picture_folder(source)):
         # Nothing that is made from the pictures depends on their rate.
         recording = recording_of_video(open_video(source, 1.0 if is_picture_folder(source) else None))
     else:

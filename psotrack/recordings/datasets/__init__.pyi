@@ -1,3 +1,4 @@
+from ._folder_content import videos_in
 from ._marker_corners import (
     MarkerRow,
     read_marker_centres,
@@ -7,7 +8,7 @@ from ._marker_corners import (
     write_marker_corners,
 )
 from ._masks import MASKS, Masks, MaskWriter, join_archives, read_masks
-from ._mocap_markers import mocap_markers_file, read_mocap_markers, write_mocap_markers
+from ._mocap_markers import mocap_markers_file, write_mocap_markers
 from ._onboard import (
     ONBOARD_CALIBRATION,
     onboard_pose_file,
@@ -19,12 +20,7 @@ from ._onboard import (
 from ._poses import pose_file, read_poses, unit_quaternion, write_poses
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
 from .drafting import Draft, DraftOptions, Unclear, Unmatched, draft_recording, unclear_files
-from .opening import (
-    find_marker_corners,
-    is_recording,
-    open_recording,
-    videos_in,
-)
+from .opening import find_marker_corners, is_recording, open_recording
 
 __all__ = [
     "CALIBRATION",
@@ -53,7 +49,6 @@ __all__ = [
     "read_marker_corners",
     "read_marker_rows",
     "read_masks",
-    "read_mocap_markers",
     "read_onboard",
     "read_onboard_calibration",
     "read_poses",

@@ -9,16 +9,14 @@ from pathlib import Path
 from typing import Literal
 
 from psotrack.errors import InputError
-from psotrack.recordings import IMAGE_SUFFIXES, image_files
+from psotrack.recordings import IMAGE_SUFFIXES, image_files, natural_key
 from psotrack.recordings.datasets._onboard import is_onboard_video
 from psotrack.recordings.datasets.dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS
 
-#: Kinds of files of a recording; "other" is none of them.
-Kind = Literal[
-    "video", "images", "ignore", "detections", "timestamps", "reference", "corners", "calibration", "other"
-]
+#: Kinds of files of a recording; "other" is none of them. A folder of pictures is a video.
+Kind = Literal["video", "ignore", "detections", "timestamps", "reference", "corners", "calibration", "other"]
 #: Kinds of which a camera has one file.
-OF_CAMERA: tuple[Kind, ...] = ("video", "images", "ignore", "detections", "timestamps")
+OF_CAMERA: tuple[Kind, ...] = ("video", "ignore", "detections", "timestamps")
 
 VIDEO_SUFFIXES = {
     ".avi", ".mp4", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mjpeg",
@@ -53,6 +51,11 @@ class Found:
         own = self.path.name if self.path.is_dir() else self.path.stem
         return f"{self.alone_in} {own}" if self.alone_in else own
 
+    @property
+    def is_video_file(self) -> bool:
+        """Whether it is a video, and no folder of pictures."""
+        return self.kind == "video" and self.path.is_file()
+
 
 def look_into(folder: Path) -> list[Found]:
     """Everything in a folder, in its folders of detections, and in folders that hold one video, by name.
@@ -72,7 +75,7 @@ def kind_of(path: Path) -> Kind:
     """What a file or a folder is, by its name and its first line."""
     suffix, stem = path.suffix.lower(), path.stem.lower()
     if path.is_dir():
-        return "images" if image_files(path) else "other"
+        return "video" if image_files(path) else "other"
     if suffix in VIDEO_SUFFIXES:
         return "other" if is_onboard_video(path) else "video"
     if suffix in IMAGE_SUFFIXES:
@@ -99,9 +102,11 @@ def _look_at(path: Path) -> Iterator[Found]:
         yield Found(path, kind)
 
 
-def videos_in(path: Path) -> list[Path]:
-    """Videos that lie in a folder, by name; none for a file."""
-    return [inner for inner in sorted(path.iterdir()) if kind_of(inner) == "video"] if path.is_dir() else []
+def videos_in(folder: Path | str) -> list[Path]:
+    """The videos that lie in a folder, in the order of their names; none where the path is no folder."""
+    folder = Path(folder)
+    files = sorted(folder.iterdir(), key=natural_key) if folder.is_dir() else ()
+    return [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and not is_onboard_video(path)]
 
 
 def _kind_of_text(path: Path) -> Kind:

@@ -8,7 +8,6 @@ S05_D8 has ten drones.
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -61,7 +60,6 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
         InputError: the folder does not belong to the dataset, or one of its files cannot be used.
     """
     folder = Path(folder)
-    _check_folder(folder)
     calibration = folder / CALIBRATION
     names = tuple(read_cameras(calibration, file_format="dpjait"))
     files = sorted(folder.iterdir())
@@ -126,21 +124,6 @@ def _detection_files(folder: Path) -> list[Path]:
     except OSError as error:
         found = (error.strerror or str(error)).lower()
         raise InputError(folder, expected="a folder of detections, or none", found=found) from error
-
-
-def _check_folder(folder: Path) -> None:
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        remedy = "unpack it first" if folder.suffix.lower() == ".zip" and folder.exists() else ""
-        raise InputError(folder, expected="the folder of a sequence", found=found, remedy=remedy)
-    if not os.access(folder, os.R_OK | os.X_OK):
-        raise InputError(
-            folder, expected="the folder of a sequence", found="a folder without read permission"
-        )
-    if not (folder / CALIBRATION).exists():
-        below = sorted(path.parent for path in folder.glob(f"*/{CALIBRATION}"))
-        remedy = f"did you mean {below[0]}?" if below else "is it a folder of the DPJAIT dataset?"
-        raise InputError(folder, expected=f"the file {CALIBRATION} in it", found="none", remedy=remedy)
 
 
 def _onboard(folder: Path) -> Mapping[str, OnboardVideo]:

@@ -23,7 +23,6 @@ from psotrack.recordings import (
     Recording,
     RecordingFile,
     ReferenceTable,
-    image_files,
     recording_file_text,
     write_recording_file,
 )
@@ -33,7 +32,6 @@ from psotrack.support import atomic_write
 
 _WORDS: Mapping[Kind, str] = {
     "video": "video",
-    "images": "folder of images",
     "ignore": "image of what is ignored",
     "detections": "file of detections",
     "timestamps": "file of frame times",
@@ -164,9 +162,8 @@ class _Matching:
     unmatched: dict[Path, Unmatched] = field(default_factory=dict)
 
     def taken(self, camera: str, kind: Kind) -> Path | str | None:
-        """The file of this kind that a camera has already; a camera has a video or images."""
-        both: tuple[Kind, ...] = ("video", "images") if kind in ("video", "images") else (kind,)
-        return next((file for each, file in self.files.get(camera, {}).items() if each in both), None)
+        """The file of this kind that a camera has already."""
+        return self.files.get(camera, {}).get(kind)
 
     def put(self, camera: str, kind: Kind, file: Path | str) -> None:
         """Give a file to a camera."""
@@ -306,12 +303,9 @@ def _known_cameras(calibration: Path | None, unit: str | None) -> dict[str, tupl
 def _names_of_files(found: Sequence[Found], options: DraftOptions) -> list[str]:
     """Names of cameras without a calibration: those that the user gives, and those of videos, images or detections."""
     given = list(dict.fromkeys(name for name, _ in options.match))
-    for kinds in (("video", "images"), ("detections",)):
-        files = [each for each in found if each.kind in kinds]
-        if files:
-            break
+    videos, detections = ([each for each in found if each.kind == kind] for kind in ("video", "detections"))
     names: dict[str, str] = {}
-    for name in [*given, *map(_name_of, files)]:
+    for name in [*given, *map(_name_of, videos or detections)]:
         names.setdefault(camera_key(name), name)
     return list(names.values())
 
@@ -352,7 +346,7 @@ def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None
         of_rig = "" if calibration is None else f" of {calibration.name}"
         expected = f"the {_WORDS[kind]} of a camera{of_rig}, {', '.join(matching.cameras)}"
         for each in rest:
-            needed = kind == "video" and not each.alone_in
+            needed = each.is_video_file and not each.alone_in
             if needed or any(matching.taken(name, kind) is None for name in matching.cameras):
                 matching.ask(each.path, expected, "none of these names in its name", needed=needed)
             if not needed:
@@ -374,7 +368,7 @@ def _match_by_name(matching: _Matching, each: Found, by_hand: Collection[Path | 
     if taken is None:
         matching.put(names[0], each.kind, each.path)
         return True
-    if taken in by_hand and each.kind != "video":
+    if taken in by_hand and not each.is_video_file:
         return False
     expected = f"one {_WORDS[each.kind]} of camera {names[0]}"
     matching.ask(each.path, expected, f"{_short(taken)} as well")
@@ -401,28 +395,20 @@ def _table(
     """Table of one camera."""
     files = matching.files[name]
     fps = size = None
-    if "video" not in files and "timestamps" not in files:
+    video = files.get("video")
+    pictures = isinstance(video, Path) and video.is_dir()
+    if (video is None or pictures) and "timestamps" not in files:
         fps = options.fps
         if fps is None:
             expected = f"frames per second of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
-    if "images" not in files and not isinstance(files.get("video"), Path):
+    if not isinstance(video, Path):
         size = size_wh or options.size_wh
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
     written: dict[str, Any] = {kind: _written(file, base) for kind, file in files.items()}
-    if "images" in files:
-        written["images"] += _pattern(matching.folder, Path(files["images"]))
     return CameraTable(size=size, fps=fps, **written)
-
-
-def _pattern(folder: Path, images: Path) -> str:
-    """Pattern of the images in a folder, such as `/*.png`."""
-    suffixes = sorted({path.suffix for path in image_files(images)})
-    if len(suffixes) > 1:
-        raise _unclear(folder, images, "images of one kind", " and ".join(suffixes), match=False)
-    return f"/*{suffixes[0]}"
 
 
 def _written(file: Path | str, base: Path) -> str:
@@ -435,13 +421,10 @@ def _written(file: Path | str, base: Path) -> str:
         return file.absolute().as_posix()
 
 
-def _unclear(folder: Path, file: Path | str, expected: str, found: str, *, match: bool = True) -> InputError:
-    name = shlex.quote(file if isinstance(file, str) else os.path.relpath(file, folder))
-    remedy = f"leave it out with --leave-out {name}"
-    if match:
-        remedy = f"say whose it is with --match CAMERA={name}, or {remedy}"
-    where = file if isinstance(file, Path) else folder
-    return InputError(where, expected=expected, found=found, remedy=remedy)
+def _unclear(folder: Path, file: Path, expected: str, found: str) -> InputError:
+    name = shlex.quote(os.path.relpath(file, folder))
+    remedy = f"say whose it is with --match CAMERA={name}, or leave it out with --leave-out {name}"
+    return InputError(file, expected=expected, found=found, remedy=remedy)
 
 
 def _short(file: Path | str) -> str:

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from psotrack.errors import InputError
-from psotrack.recordings import RECORDING_FILE, Recording, natural_key, read_recording_file
-from psotrack.recordings.datasets._folder_content import VIDEO_SUFFIXES
+from psotrack.recordings import RECORDING_FILE, Recording, read_recording_file
 from psotrack.recordings.datasets.dpjait import CALIBRATION, MARKER_CORNERS, read_sequence
 from psotrack.recordings.datasets.recording_files import read_recording_toml
 from psotrack.support import ARCHIVE_SUFFIX
@@ -41,16 +40,6 @@ def is_recording(path: Path | str) -> bool:
     path = Path(path)
     return path.suffix.lower() == ".toml" or any(
         (path / name).is_file() for name in (RECORDING_FILE, CALIBRATION)
-    )
-
-
-def videos_in(folder: Path | str) -> list[Path]:
-    """The videos of a folder, in the order of their names; none where the path is no folder."""
-    folder = Path(folder)
-    files = folder.iterdir() if folder.is_dir() else ()
-    return sorted(
-        (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES),
-        key=lambda path: natural_key(path),
     )
 
 
