@@ -118,6 +118,8 @@ def errors_m(built, truth=ROOM):
 
 # Tables
 
+NAMES = ("tl", "tr", "br", "bl")
+
 
 def wide_table(header, *, scale=1.0, separator=";"):
     lines = [separator.join(header)] if header else []
@@ -142,6 +144,16 @@ def long_table(header, corner_names, *, scale=1.0, separator=","):
     return "\n".join(lines) + "\n"
 
 
+def labelled_table(pattern):
+    lines = ["label;x[mm];y[mm];z[mm]"]
+    for marker, corners in ROOM.items():
+        for number, corner in enumerate(1000 * corners, start=1):
+            lines.append(
+                ";".join([pattern.format(marker, number), *(repr(float(value)) for value in corner)])
+            )
+    return "\n".join(lines) + "\n"
+
+
 LAYOUTS = {
     "ours": wide_table(column_names("{axis}{corner}[m]")),
     "millimetres": wide_table(column_names("{axis}{corner}[mm]"), scale=1e3),
@@ -149,10 +161,19 @@ LAYOUTS = {
     "commas": wide_table(column_names("{axis}_{corner}"), separator=","),
     "tabs": wide_table(column_names("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
     "from 0": wide_table(column_names("p{corner}.{axis} [m]", "0123")),
+    "corner names": wide_table(["Marker ID", *column_names("{corner}_{axis}", NAMES)[1:]], separator=","),
+    "numbers alone": wide_table(None, separator=","),
     "long": long_table(["id", "corner", "x_m", "y_m", "z_m"], "1234"),
     "long from 0": long_table(
         ["marker", "corner_id", "X [mm]", "Y [mm]", "Z [mm]"], "0123", scale=1e3, separator=";"
     ),
+    "long with names": long_table(
+        ["aruco_id", "corner", "x", "y", "z"], ["Top-left", "TR", "bottom right", "bl"]
+    ),
+    "long numbers": long_table(None, "1234", separator=";"),
+    "labels": labelled_table("Marker{}:{}"),
+    "short labels": labelled_table("M{}_{}"),
+    "numbers as labels": labelled_table("{}.{}"),
     "a spreadsheet's": "\ufeff" + wide_table(column_names("{axis}{corner}[m]")).replace("\n", ";\r\n"),
     "words in ids": wide_table(column_names("{axis}{corner}[m]")).replace("\n", "\nMarker_")[
         : -len("Marker_")
@@ -254,11 +275,11 @@ BAD_TEXTS = {
     ),
     "an empty cell at the end": (
         STANDARD.replace(THIRD, THIRD.rpartition(";")[0] + ";"),
-        r"line 4: expected 13 values as in the header, found 12",
+        r"line 4, column z4\[m\]: expected a value, found nothing",
     ),
     "three corners": (
         STANDARD.replace(THIRD, ";".join(THIRD.split(";")[:10])),
-        r"line 4: expected 13 values as in the header, found 10",
+        r"line 4: expected 13 values, found 10; a marker has four corners",
     ),
     "three corners in a header": (
         "\n".join(";".join(line.split(";")[:10]) for line in STANDARD.splitlines()),
@@ -278,7 +299,7 @@ BAD_TEXTS = {
     ),
     "corners from 0 to 4": (
         LONG.replace("\n3,1,", "\n3,0,"),
-        r"line 5, column corner: expected a corner, 0 to 3, found 4",
+        r"line 5, column corner: .* because line 10 has corner 0",
     ),
     "no number": (
         STANDARD.replace("\n3;", "\nthree;"),
@@ -291,11 +312,15 @@ BAD_TEXTS = {
     "another unit": (STANDARD.replace("x1[m]", "x1[in]"), r"expected a column x1\[m\].* found x1\[in\]"),
     "a column twice": (
         STANDARD.replace("y2[m]", "x_2[m]"),
-        r"expected each column once, found x2\[m\] and x_2\[m\]",
+        r"line 1: expected each column once, found x2\[m\] and x_2\[m\]",
     ),
     "no rows": (STANDARD.splitlines()[0], "expected rows below the header, found none"),
-    "nothing": ("\n", "found an empty file"),
-    "other numbers": ("1;2;3;4\n5;6;7;8\n", "expected a column x1, found only 1, 2, 3, 4"),
+    "nothing": ("\n", "expected a table of marker corners, found an empty file"),
+    "other numbers": ("1;2;3;4\n5;6;7;8\n", "line 1: expected a header, or numbers in rows of 13"),
+    "another label": (
+        LAYOUTS["labels"].replace("Marker3:2", "Dron3:Dron32"),
+        r"line 11, column label: .* found 'Dron3:Dron32'",
+    ),
 }
 
 
