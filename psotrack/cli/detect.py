@@ -35,7 +35,7 @@ MASKS_REDUCTION = 1
 
 
 @dataclass(frozen=True)
-class What:
+class DetectOptions:
     """What is written.
 
     Attributes:
@@ -54,7 +54,7 @@ class What:
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkOptions:
     """Settings of a network, as `psotrack.foreground.detection.DetectorSettings`, whose import takes long.
 
     Attributes:
@@ -70,18 +70,18 @@ class Network:
 
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
-@options_of(What, "what")
+@options_of(DetectOptions, "what")
 @out_option("Folder of the detections.  [default: SEQ/results/detections]")
-@options_of(Network, "network", heading="With --detector")
+@options_of(NetworkOptions, "network", heading="With --detector")
 @settings_options("silhouettes.background", "silhouettes.drone_px", part="silhouettes.")
 @extent_options
 @running()
 def detect(
     output: Output,
     sequence: Path,
-    what: What,
+    what: DetectOptions,
     out: Path | None,
-    network: Network,
+    network: NetworkOptions,
     settings: dict[str, Any],
     extent: Extent,
 ) -> None:
@@ -143,7 +143,7 @@ def _write(output: Output, sequence: Path, recording: Recording, out: Path | Non
     )
 
 
-def _by_network(output: Output, recording: Recording, chosen: str, network: Network) -> Any:
+def _by_network(output: Output, recording: Recording, chosen: str, network: NetworkOptions) -> Any:
     """Detections of each camera by a network, one camera after the other."""
     from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
 

@@ -34,7 +34,7 @@ _SHOWN_S = 0.5
 
 
 @dataclass(frozen=True)
-class Targets:
+class TargetOptions:
     """Where rows go.
 
     Attributes:
@@ -54,7 +54,7 @@ class Targets:
 
 
 @dataclass(frozen=True)
-class Session:
+class SessionOptions:
     """What is filmed, and how long.
 
     Attributes:
@@ -76,7 +76,7 @@ class Session:
 
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
-@options_of(Targets, "targets")
+@options_of(TargetOptions, "targets")
 @click.option(
     "--view",
     "viewer",
@@ -86,7 +86,7 @@ class Session:
     help="Show drones in space and their values over time, in a window of Rerun or on a page for a browser.  [without "
     "a value: window]",
 )
-@options_of(Session, "chosen", rare=("most_drones",))
+@options_of(SessionOptions, "chosen", rare=("most_drones",))
 @settings_options(
     "swarm.particles",
     "swarm.iterations",
@@ -103,9 +103,9 @@ class Session:
 def live(
     output: Output,
     sequence: Path,
-    targets: Targets,
+    targets: TargetOptions,
     viewer: str | None,
-    chosen: Session,
+    chosen: SessionOptions,
     cache: Path | None,
     settings: dict[str, Any],
 ) -> None:
@@ -141,7 +141,7 @@ def live(
     from psotrack.trajectories import RowStream
 
     out, record = targets.out, targets.record
-    if viewer is None and targets == Targets(record=record):
+    if viewer is None and targets == TargetOptions(record=record):
         expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None:

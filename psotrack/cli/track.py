@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class How:
+class TrackOptions:
     """How a recording is tracked, apart from the settings.
 
     Attributes:
@@ -77,12 +77,17 @@ class _Run:
     "swarm.iterations",
     "seed",
 )
-@options_of(How, "how", rare=("detector_size", "most_drones"))
+@options_of(TrackOptions, "how", rare=("detector_size", "most_drones"))
 @extent_options
 @config_options
 @running()
 def track(
-    output: Output, sequence: Path, out: Path | None, settings: dict[str, Any], how: How, extent: Extent
+    output: Output,
+    sequence: Path,
+    out: Path | None,
+    settings: dict[str, Any],
+    how: TrackOptions,
+    extent: Extent,
 ) -> None:
     """Track the drones of SEQ from its videos, or from detections in them.
 

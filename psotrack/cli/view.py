@@ -21,7 +21,7 @@ from psotrack.support import ARCHIVE_SUFFIX
 
 
 @dataclass(frozen=True)
-class Viewing:
+class ViewOptions:
     """What is shown, and where.
 
     Attributes:
@@ -43,10 +43,10 @@ class Viewing:
 
 @click.command(cls=HelpfulCommand)
 @click.argument("tracks", nargs=-1, metavar="TRACKS... [SEQ]", type=click.Path(path_type=Path))
-@options_of(Viewing, "shown")
+@options_of(ViewOptions, "shown")
 @extent_options
 @running(json=False)
-def view(output: Output, tracks: tuple[Path, ...], shown: Viewing, extent: Extent) -> None:
+def view(output: Output, tracks: tuple[Path, ...], shown: ViewOptions, extent: Extent) -> None:
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
 
     SEQ is the recording, with its cameras, their images and its reference; the record beside TRACKS names it. Several

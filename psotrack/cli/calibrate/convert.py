@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Conversion:
+class ConvertOptions:
     """How a calibration is read and written.
 
     Attributes:
@@ -43,9 +43,9 @@ class Conversion:
 @click.command(cls=HelpfulCommand)
 @click.argument("source", metavar="IN", type=click.Path(path_type=Path))
 @click.argument("out", metavar="OUT", type=click.Path(path_type=Path))
-@options_of(Conversion, "how")
+@options_of(ConvertOptions, "how")
 @running(progress=False)
-def convert(output: Output, source: Path, out: Path, how: Conversion) -> None:
+def convert(output: Output, source: Path, out: Path, how: ConvertOptions) -> None:
     """Convert the calibration IN, of any program in the list below, to OUT.
 
     \b

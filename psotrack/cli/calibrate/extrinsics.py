@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Points:
+class PointOptions:
     """Points whose positions are known.
 
     Attributes:
@@ -59,11 +59,11 @@ class LensOptions:
 
 
 @click.command(cls=HelpfulCommand)
-@options_of(Points, "known")
+@options_of(PointOptions, "known")
 @options_of(LensOptions, "lens", heading="Lenses")
 @OUT
 @running(progress=False)
-def extrinsics(output: Output, known: Points, lens: LensOptions, out: Path) -> None:
+def extrinsics(output: Output, known: PointOptions, lens: LensOptions, out: Path) -> None:
     """Find the poses of cameras, from points whose positions in the world and in the images are known.
 
     At least four points that are not on one line are needed. Twelve points that are spread over the image and in depth

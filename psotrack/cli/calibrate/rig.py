@@ -17,8 +17,8 @@ from psotrack.cli.types import Names
 
 @click.command(cls=HelpfulCommand)
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
-@options_of(BoardSettings, "board", names=BOARD_NAMES, heading="Board")
-@options_of(LensSettings, "lens", heading="Lenses")
+@options_of(BoardSettings, "board", names=BOARD_NAMES, heading="Board", rare=("separation_m", "first_marker"))
+@options_of(LensSettings, "lens", heading="Lenses", rare=("same_lens",))
 @click.option("--names", type=Names(), help="Names of the cameras.  [default: from the files' names]")
 @click.option(
     "--floor",
@@ -34,7 +34,7 @@ from psotrack.cli.types import Names
     help="Three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a frame of the "
     "moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.",
 )
-@options_of(PointSettings, "points", heading="Instead of a board")
+@options_of(PointSettings, "points", heading="Instead of a board", rare=("stick_m",))
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
 @OUT
 @FORCE

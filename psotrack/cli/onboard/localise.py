@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 from msgspec import Meta
 
-from psotrack.cli.onboard.shutter import Shutter, shutter_content, shutter_sentence
-from psotrack.cli.onboard.sources import LENS_NAMES, Lenses
+from psotrack.cli.onboard.shutter import ShutterOptions, shutter_content, shutter_sentence
+from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions
 from psotrack.cli.options import frames_option, out_option, plot_option, running
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand, options_of
@@ -42,7 +42,7 @@ class _Input:
 
 
 @dataclass(frozen=True)
-class Given:
+class SourceOptions:
     """What is known of the video and of the markers in it.
 
     Attributes:
@@ -65,7 +65,7 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Poses:
+class PoseOptions:
     """How poses are estimated.
 
     Attributes:
@@ -86,10 +86,10 @@ class Poses:
 @click.command(cls=HelpfulCommand)
 @click.argument("video")
 @out_option("CSV file of the poses, one row per frame.  [default: NAME.csv, by the drone's name]")
-@options_of(Given, "given", names={"side_m": "marker-size"})
-@options_of(Lenses, "lenses", names=LENS_NAMES, heading="Lens", rare=("names", "scale"))
-@options_of(Poses, "poses", heading="Poses")
-@options_of(Shutter, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
+@options_of(SourceOptions, "given", names={"side_m": "marker-size"})
+@options_of(OnboardLensOptions, "lenses", names=LENS_NAMES, heading="Lens", rare=("names", "scale"))
+@options_of(PoseOptions, "poses", heading="Poses")
+@options_of(ShutterOptions, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
 @plot_option("the path from above, and the height over time", "beside --out, as .png")
 @frames_option
 @running()
@@ -99,7 +99,7 @@ def localise(
     out: Path | None,
     plot: Path | None,
     num_frames: int | None,
-    given: Given,
+    given: SourceOptions,
     **known: Any,
 ) -> None:
     """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.
@@ -145,7 +145,7 @@ def localise(
     )
     from psotrack.inside_out import localise_video as localise_camera
 
-    poses: Poses = known["poses"]
+    poses: PoseOptions = known["poses"]
     filmed = _input(video, given.drone, given.fps, given.live)
     drone_name = given.name or filmed.name
     out = out or Path(f"{drone_name}.csv")
@@ -248,7 +248,7 @@ def _nothing_to_localise(folder: Path) -> InputError:
     )
 
 
-def _lens(given: _Input, lenses: Lenses) -> Camera:
+def _lens(given: _Input, lenses: OnboardLensOptions) -> Camera:
     from psotrack.inside_out import lens_from_matrix
 
     K = None if given.onboard is None else given.onboard.K

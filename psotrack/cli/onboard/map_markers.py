@@ -11,8 +11,8 @@ import click
 from msgspec import Meta
 
 from psotrack.cli.onboard.shown import show_built, show_check, show_measured
-from psotrack.cli.onboard.shutter import Shutter
-from psotrack.cli.onboard.sources import LENS_NAMES, Lenses, known_corners, leading, videos_of
+from psotrack.cli.onboard.shutter import ShutterOptions
+from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, known_corners, leading, videos_of
 from psotrack.cli.options import frames_option, out_option, running
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand, options_of
@@ -25,7 +25,7 @@ _MEASURED = {".c3d", ".csv", ".txt", ".tsv"}
 
 
 @dataclass(frozen=True)
-class World:
+class WorldOptions:
     """The markers that define the world, and how large markers are.
 
     Attributes:
@@ -44,7 +44,7 @@ class World:
 
 
 @dataclass(frozen=True)
-class Videos:
+class VideoOptions:
     """Which videos show the markers, and how they are searched.
 
     Attributes:
@@ -69,10 +69,10 @@ class Videos:
     metavar="MAP",
     help="Check the table MAP instead of writing one.",
 )
-@options_of(World, "world", heading="World")
-@options_of(Videos, "given")
-@options_of(Lenses, "lenses", names=LENS_NAMES, heading="Lenses", rare=("names", "scale"))
-@options_of(Shutter, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
+@options_of(WorldOptions, "world", heading="World")
+@options_of(VideoOptions, "given")
+@options_of(OnboardLensOptions, "lenses", names=LENS_NAMES, heading="Lenses", rare=("names", "scale"))
+@options_of(ShutterOptions, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
 @frames_option
 @running()
 def map_markers(
@@ -80,7 +80,7 @@ def map_markers(
     sources: tuple[Path, ...],
     out: Path | None,
     checked: Path | None,
-    world: World,
+    world: WorldOptions,
     num_frames: int | None,
     **filmed: Any,
 ) -> None:
@@ -138,7 +138,7 @@ def map_markers(
     # Errors of small files are found before the videos are read, which takes long.
     marker_map = None if checked is None else read_marker_map(checked)
     known = {} if out is None else known_corners(world.known, world.markers, world.side_m, sources)
-    given: Videos = filmed["given"]
+    given: VideoOptions = filmed["given"]
     videos = videos_of(sources, given.drone, filmed["lenses"], given.fps)
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
     shutter = None

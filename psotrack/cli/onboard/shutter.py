@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Shutter:
+class ShutterOptions:
     """The rolling shutter of a camera.
 
     Attributes:

@@ -52,7 +52,7 @@ def known_corners(
 
 
 @dataclass(frozen=True)
-class Lenses:
+class OnboardLensOptions:
     """Options that give the lenses of the videos.
 
     Attributes:
@@ -84,7 +84,10 @@ LENS_NAMES = {"file": "camera", "names": "camera-name", "scale": "scale-camera"}
 
 
 def videos_of(
-    sources: tuple[Path, ...], drones: tuple[str, ...] | None, lenses: Lenses, fps: float | None = None
+    sources: tuple[Path, ...],
+    drones: tuple[str, ...] | None,
+    lenses: OnboardLensOptions,
+    fps: float | None = None,
 ) -> dict[str, tuple[VideoInfo, Camera]]:
     """Videos with their lenses, by name; a folder of pictures is a video of `fps` frames per second."""
     from psotrack.recordings import is_picture_folder, open_video
@@ -105,7 +108,7 @@ def videos_of(
 
 
 def _of_sequence(
-    folder: Path, drones: tuple[str, ...] | None, lenses: Lenses
+    folder: Path, drones: tuple[str, ...] | None, lenses: OnboardLensOptions
 ) -> dict[str, tuple[VideoInfo, Camera]]:
     from psotrack.inside_out import lens_from_matrix
     from psotrack.recordings.datasets import open_recording

@@ -17,7 +17,7 @@ from psotrack.support.interrupts import unhurried_end
 
 
 @dataclass(frozen=True)
-class Piloting:
+class PilotingOptions:
     """How a drone is flown.
 
     Attributes:
@@ -38,9 +38,9 @@ class Piloting:
 
 
 @click.command(cls=HelpfulCommand)
-@options_of(Piloting, "flight")
+@options_of(PilotingOptions, "flight")
 @running(progress=False, json=False)
-def fly(output: Output, flight: Piloting) -> None:
+def fly(output: Output, flight: PilotingOptions) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in

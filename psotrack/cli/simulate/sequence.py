@@ -19,7 +19,7 @@ from psotrack.errors import SettingsError, errors_name
 
 
 @dataclass(frozen=True)
-class Simulated:
+class ScenarioOptions:
     """What is simulated.
 
     Attributes:
@@ -35,7 +35,7 @@ class Simulated:
 
 
 @dataclass(frozen=True)
-class Made:
+class SequenceOptions:
     """What of a sequence is made.
 
     Attributes:
@@ -56,7 +56,7 @@ class Made:
 
 
 @dataclass(frozen=True)
-class Shown:
+class PreviewOptions:
     """What is shown instead of a sequence.
 
     Attributes:
@@ -73,7 +73,7 @@ class Shown:
 @click.command(cls=HelpfulCommand)
 @click.argument("name", required=False)
 @out_option("Root folder of the data.  [default: data]")
-@options_of(Simulated, "chosen")
+@options_of(ScenarioOptions, "chosen")
 @click.option(
     "--set",
     "changes",
@@ -81,17 +81,17 @@ class Shown:
     metavar="FIELD=VALUE",
     help="Change a field of the scenario, e.g. imaging.reflections=0; may be repeated.",
 )
-@options_of(Shown, "shown")
-@options_of(Made, "made", names={"num_frames": "frames"})
+@options_of(PreviewOptions, "shown")
+@options_of(SequenceOptions, "made", names={"num_frames": "frames"})
 @running()
 def sequence(
     output: Output,
     name: str | None,
     out: Path | None,
-    chosen: Simulated,
+    chosen: ScenarioOptions,
     changes: tuple[str, ...],
-    shown: Shown,
-    made: Made,
+    shown: PreviewOptions,
+    made: SequenceOptions,
 ) -> None:
     """Simulate a sequence: videos, calibration, ground truth, masks and detections.
 
