@@ -76,7 +76,7 @@ class Recognised:
         return BoardFinder(self.board, self.inverted)
 
 
-def recognise_board(board: Board, images: Iterable[UInt8[np.ndarray, "height width"]]) -> Recognised:
+def recognise_board(board: Board, images: Iterable[UInt8[np.ndarray, "_ _"]]) -> Recognised:
     """Find out how a board was printed, from as few images as are certain.
 
     Args:
@@ -103,7 +103,7 @@ def recognise_board(board: Board, images: Iterable[UInt8[np.ndarray, "height wid
     return Recognised(best.board, best.inverted, int(views.max()))
 
 
-def detect_board(square_m: float, images: Sequence[UInt8[np.ndarray, "height width"]]) -> Board:
+def detect_board(square_m: float, images: Sequence[UInt8[np.ndarray, "_ _"]]) -> Board:
     """Find out what board images show, of which only the side of a square is known: a ChArUco board or a chessboard.
 
     Args:
@@ -149,7 +149,7 @@ def describe_board(board: Board) -> str:
     return f"a ChArUco board of {squares} with markers of {1e3 * board.marker_m:g} mm, dictionary {board.dictionary}"
 
 
-def _small(images: Sequence[UInt8[np.ndarray, "height width"]]) -> list[UInt8[np.ndarray, "height width"]]:
+def _small(images: Sequence[UInt8[np.ndarray, "_ _"]]) -> list[UInt8[np.ndarray, "_ _"]]:
     """Images in which markers are found quickly."""
     return [
         cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA)
@@ -158,7 +158,7 @@ def _small(images: Sequence[UInt8[np.ndarray, "height width"]]) -> list[UInt8[np
     ]
 
 
-def _size_of_chessboard(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[int, int]:
+def _size_of_chessboard(images: Sequence[UInt8[np.ndarray, "_ _"]]) -> tuple[int, int]:
     """Columns and rows of the squares of the chessboard that most images show.
 
     Raises:
@@ -182,9 +182,7 @@ def _size_of_chessboard(images: Sequence[UInt8[np.ndarray, "height width"]]) -> 
     return size
 
 
-def measure_marker_share(
-    recognised: Recognised, images: Iterable[UInt8[np.ndarray, "height width"]]
-) -> float | None:
+def measure_marker_share(recognised: Recognised, images: Iterable[UInt8[np.ndarray, "_ _"]]) -> float | None:
     """The side of a ChArUco board's marker in sides of a square, as images show it; None where they do not show enough.
 
     The middles of the markers, which are whole squares apart whatever their size, give the homography from the image to
@@ -222,7 +220,7 @@ def number_of_first_images(cameras: int) -> int:
 
 
 def explain_markers_on_chessboard(
-    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]
+    board: Board, images: Sequence[UInt8[np.ndarray, "_ _"]]
 ) -> tuple[str, str] | None:
     """Say which markers are on a board that is stated as a chessboard, from a few images; None if there are none.
 
@@ -264,7 +262,7 @@ def _any_inside(
     return any(cv2.pointPolygonTest(hull, (float(u), float(v)), False) > 0 for u, v in points_px)
 
 
-def missing_board(board: Board, images: Sequence[UInt8[np.ndarray, "height width"]]) -> InputError:
+def missing_board(board: Board, images: Sequence[UInt8[np.ndarray, "_ _"]]) -> InputError:
     """The error for a board that is not found in any image: it says what is seen instead."""
     if board.num_markers == 1:
         found, remedy = _other_marker(images)
@@ -290,7 +288,7 @@ def _family(board: Board) -> str:
     return "" if board.marker_m is None else board.dictionary.lower().removeprefix("dict_").rpartition("_")[0]
 
 
-def _other_marker(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[str, str]:
+def _other_marker(images: Sequence[UInt8[np.ndarray, "_ _"]]) -> tuple[str, str]:
     """The marker that most images show, in words, and what to do."""
     seen = Counter[tuple[str, int]]()
     for grey, inverted, mirrored in product(images, (False, True), (False, True)):
@@ -312,7 +310,7 @@ def _other_marker(images: Sequence[UInt8[np.ndarray, "height width"]]) -> tuple[
 
 
 def _markers_of_all_dictionaries(
-    images: Sequence[UInt8[np.ndarray, "height width"]],
+    images: Sequence[UInt8[np.ndarray, "_ _"]],
 ) -> list[tuple[str, bool, np.ndarray]]:
     """Family of a dictionary, whether white on black, and the markers of the image that shows most of them.
 
@@ -339,7 +337,7 @@ def _markers_of_all_dictionaries(
 
 
 def _seen_markers(
-    family: str, images: Sequence[UInt8[np.ndarray, "height width"]], *, both_prints: bool = False
+    family: str, images: Sequence[UInt8[np.ndarray, "_ _"]], *, both_prints: bool = False
 ) -> list[_Markers]:
     """The markers of a family in each image; if `both_prints`, also those printed white on black."""
     dictionary = marker_dictionary(f"{family}_1000" if _FAMILIES[family] else family)
@@ -384,7 +382,7 @@ def _most(seen: Sequence[_Markers]) -> Int[np.ndarray, " markers"]:
 
 
 def _size_by_markers(
-    board: Board, images: Sequence[UInt8[np.ndarray, "height width"]], inverted: bool
+    board: Board, images: Sequence[UInt8[np.ndarray, "_ _"]], inverted: bool
 ) -> tuple[int, int] | None:
     """Columns and rows of a ChArUco board whose markers lie as they do in the images; None if no board fits."""
     detector = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary))

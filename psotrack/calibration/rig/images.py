@@ -233,7 +233,7 @@ def _open(name: str, path: Path) -> CameraImages:
     )
 
 
-def first_images(cameras: Sequence[CameraImages], count: int = 10) -> list[UInt8[np.ndarray, "height width"]]:
+def first_images(cameras: Sequence[CameraImages], count: int = 10) -> list[UInt8[np.ndarray, "_ _"]]:
     """About `count` grey images of each camera, evenly spread over the recording, of the cameras in turn."""
     readers = [camera.read(camera.spread(count)) for camera in cameras]
     return [one[1] for of_all in zip_longest(*readers) for one in of_all if one is not None]
