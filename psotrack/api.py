@@ -1,4 +1,8 @@
-"""Functions that are defined for the public face only: reading a recording, tracking it, and single steps."""
+"""Functions that are defined for the public face only: reading a recording, tracking it, and single steps.
+
+What only some functions need is reached through its room (`calibration.save_coverage`), which loads it at its first
+use.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +17,11 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import UInt8
 
-from psotrack.calibration import (
-    PlacedCameras,
-    RigCalibration,
-    RigSettings,
-    calibrate_by_board,
-    calibrate_by_known_points,
-    calibrate_by_moving_point,
-    save_coverage,
-)
-from psotrack.calibration.doctor import Diagnosis, examine
+from psotrack import calibration, inside_out
+from psotrack.calibration import doctor as examination
 from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes import ForegroundSettings, Living, SilhouetteSettings, compute
 from psotrack.geometry.rig_files import write_rig
-from psotrack.inside_out import read_marker_map
 from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.pipeline import (
     Parts,
@@ -46,18 +41,8 @@ from psotrack.recordings.datasets import (
     videos_in,
 )
 from psotrack.settings import BLOBS, YOLO, TrackSettings, full_name
-from psotrack.show.flights import (
-    RunSummary,
-    TrackedFlight,
-    first_instants,
-    flight_of,
-    read_flight,
-    run_summary,
-    write_tracked,
-)
-from psotrack.show.overlay import OverlayOptions, WrittenOverlays, write_overlays
-from psotrack.show.overlay import save_picture as draw_picture
-from psotrack.show.reports import WrittenPage, write_report
+from psotrack.show import flights, reports
+from psotrack.show import overlay as overlays
 from psotrack.support import (
     Report,
     atomic_write,
@@ -154,7 +139,7 @@ def calibrate_rig(
     force: bool = False,
     progress: bool | Report = False,
     **more: Any,
-) -> RigCalibration | PlacedCameras:
+) -> calibration.RigCalibration | calibration.PlacedCameras:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
         calibrated = pt.calibrate_rig("my_lab/board", square_m=0.04, floor=0)
@@ -176,9 +161,9 @@ def calibrate_rig(
         SettingsError: a value does not exist, or does not fit the others.
         OutputError: a file exists and `force` is not set.
     """
-    bind("calibrate_rig()", inspect.signature(RigSettings), (), more)
+    bind("calibrate_rig()", inspect.signature(calibration.RigSettings), (), more)
     files = {name: Path(more[name]) for name in _RIG_FILES if isinstance(more.get(name), str)}
-    settings = RigSettings(**{**more, **files})
+    settings = calibration.RigSettings(**{**more, **files})
     paths = _paths(sources) if sources else []
     if not paths and settings.pairs is None:
         raise SettingsError("rig", expected="a video, a folder or a pattern for each camera", found="none")
@@ -188,16 +173,18 @@ def calibrate_rig(
     if plot is not None and not settings.by_board:
         raise SettingsError("rig", expected="--plot with --squares", found="points")
     refuse_files(*(Path(path) for path in (out, plot) if path is not None), force=force)
-    found: RigCalibration | PlacedCameras
+    found: calibration.RigCalibration | calibration.PlacedCameras
     if settings.points:
-        found = calibrate_by_moving_point(paths, settings)
+        found = calibration.calibrate_by_moving_point(paths, settings)
     elif settings.by_board:
-        found = calibrate_by_board(paths, settings, report_of(progress))
+        found = calibration.calibrate_by_board(paths, settings, report_of(progress))
         if plot is not None:
-            save_coverage(Path(plot), found.calibrated, force=force)
+            calibration.save_coverage(Path(plot), found.calibrated, force=force)
     else:
-        corners_m = None if settings.markers is None else read_marker_map(settings.markers).corners_m
-        found = calibrate_by_known_points(paths, settings, corners_m)
+        corners_m = (
+            None if settings.markers is None else inside_out.read_marker_map(settings.markers).corners_m
+        )
+        found = calibration.calibrate_by_known_points(paths, settings, corners_m)
     if out is not None:
         write_rig(out, found.rig, force=force)
         found = replace(found, path=Path(out))
@@ -212,7 +199,7 @@ def doctor(
     cache: Path | str | None = None,
     jobs: int | None = None,
     progress: bool | Report = False,
-) -> Diagnosis:
+) -> examination.Diagnosis:
     """Check the calibration of a recording against the detections of its cameras, before tracking.
 
     The result's text is what `psotrack doctor` prints: which camera, pair of cameras or file disagrees, by how much,
@@ -245,7 +232,7 @@ def doctor(
         longest = max((each.times.num_frames for each in recording.cameras if each.times), default=0)
         sightings = from_detections(boxes, recording.rig, longest)
     room_m = recording.bounds_m if bounds_m is None else cast(Any, tuple(bounds_m))
-    return examine(
+    return examination.examine(
         recording.rig,
         sightings.at_instants(recording.timeline()),
         fps=recording.fps,
@@ -263,7 +250,7 @@ def report(
     jobs: int | None = None,
     force: bool = False,
     progress: bool | Report = False,
-) -> WrittenPage:
+) -> reports.WrittenPage:
     """Write one HTML page about tracks, the results of a sweep, or a calibration.
 
     Args:
@@ -280,7 +267,7 @@ def report(
         InputError: a file cannot be used.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    return write_report(
+    return reports.write_report(
         _flight(source, recording) if isinstance(source, Tracks) else _paths(source),
         None if out is None else Path(out),
         recording=recording,
@@ -301,7 +288,7 @@ def overlay(
     jobs: int | None = None,
     progress: bool | Report = False,
     **more: Any,
-) -> WrittenOverlays:
+) -> overlays.WrittenOverlays:
     """Draw tracks into the videos of their recording: boxes, names, trails, 90 % ellipses and time.
 
     Finished videos of the same tracks are kept.
@@ -321,14 +308,16 @@ def overlay(
         SettingsError: a value is wrong.
         OutputError: the folder has other videos and `force` is not set, or a video cannot be written.
     """
-    bind("overlay()", inspect.signature(OverlayOptions), (), more)
+    bind("overlay()", inspect.signature(overlays.OverlayOptions), (), more)
     if out is None and isinstance(tracks, Tracks):
         raise SettingsError("overlay, out", expected="a folder", found="none")
     flight = _flight(tracks, recording, cameras)
     if num_frames is not None:
-        flight = first_instants(flight, num_frames)
+        flight = flights.first_instants(flight, num_frames)
     folder = flight.tracks[0].path.parent / "overlay" if out is None else Path(out)
-    return write_overlays(folder, flight, OverlayOptions(**more), jobs=jobs, report=report_of(progress))
+    return overlays.write_overlays(
+        folder, flight, overlays.OverlayOptions(**more), jobs=jobs, report=report_of(progress)
+    )
 
 
 def save_picture(
@@ -352,7 +341,7 @@ def save_picture(
         InputError: a file cannot be used, or the recording has no video.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    draw_picture(Path(path), _flight(tracks, recording), most_cameras=most_cameras, force=force)
+    overlays.save_picture(Path(path), _flight(tracks, recording), most_cameras=most_cameras, force=force)
 
 
 def _paths(given: Path | str | Sequence[Path | str]) -> list[Path]:
@@ -367,15 +356,15 @@ def _flight(
     tracks: Tracks | Path | str | Sequence[Path | str],
     recording: Recording | Path | str | None,
     cameras: Sequence[str] | None = None,
-) -> TrackedFlight:
+) -> flights.TrackedFlight:
     """Tracks in memory or in files, with their recording."""
     if isinstance(tracks, Tracks):
         if not isinstance(recording, Recording | None):
             recording = open_recording(recording)
         if recording is not None and cameras is not None:
             recording = recording.usable(cameras, videos=False)
-        return flight_of(tracks, recording)
-    return read_flight(_paths(tracks), recording, cameras=cameras)
+        return flights.flight_of(tracks, recording)
+    return flights.read_flight(_paths(tracks), recording, cameras=cameras)
 
 
 def run(
@@ -388,7 +377,7 @@ def run(
     progress: bool | Report = True,
     say: Callable[[str], object] = print,
     **more: Any,
-) -> RunSummary:
+) -> flights.RunSummary:
     """Calibrate, check, track and show the videos of a rig, from board to report.
 
     The folder has a video of each camera, and a folder `board` with videos of the same cameras in which a board is
@@ -478,7 +467,7 @@ def run(
     # Finished videos are kept.
     videos = results / "overlay"
     step(["overlay", tracks, folder, "--out", videos], None, lambda: overlay(tracks, videos, **shown))
-    return run_summary(folder)
+    return flights.run_summary(folder)
 
 
 def _option(name: str, value: object) -> tuple[object, ...]:
@@ -492,7 +481,7 @@ def _drafted(folder: Path, options: DraftOptions) -> Draft:
     return draft
 
 
-def _written(path: Path, diagnosis: Diagnosis) -> Diagnosis:
+def _written(path: Path, diagnosis: examination.Diagnosis) -> examination.Diagnosis:
     with atomic_write(path) as temporary:
         temporary.write_text(json_text(diagnosis.to_dict()) + "\n", encoding="utf-8")
     return diagnosis
@@ -507,7 +496,7 @@ def _tracked(folder: Path, path: Path, settings: Mapping[str, Any], progress: bo
     tracked = track(recording, settings, progress=progress)
     record = with_real_time(tracked.record, time.perf_counter() - began)
     # A record without tracks was left by a run that was killed.
-    write_tracked(path, replace(tracked, record=record), folder, force=True)
+    flights.write_tracked(path, replace(tracked, record=record), folder, force=True)
     found = tracked.trajectories
     return f"{path}: {found.num_drones} drones, {found.num_frames} frames, {found.seen.mean():.1%} seen"
 
