@@ -67,7 +67,7 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
     assert commands_in(done) == ["calibrate", "init", "doctor", "track", "report", "overlay"]
     results = lab / "results"
     summary = done.out[done.out.rindex("\nlab\n") :]
-    for words in (
+    for line in (
         "drones      4",
         "frames      100, in 2.0 s",
         "tracked in",
@@ -75,7 +75,7 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
         "clocks",
         "report.html",
     ):
-        assert words in summary
+        assert line in summary
     assert find_recording(results / "tracks.csv").resolve() == lab.resolve()
     assert {"report.html", "tracks.csv", "doctor.json", "overlay"} <= {
         path.name for path in results.iterdir()
@@ -89,7 +89,7 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
     # The summary comes also where nothing was left to do, and is the same in Python.
     said: list[str] = []
     found = pt.run(lab, say=said.append, progress=False)
-    assert [words.split()[2] for words in said if words.startswith("$")] == ["overlay"]
+    assert [line.split()[2] for line in said if line.startswith("$")] == ["overlay"]
     assert str(found) in again.out
     assert found.to_dict()["drones"] == 4
     assert (results / "tracks.csv").stat().st_mtime_ns == before
