@@ -2,20 +2,18 @@ from .board_corners import BoardFinder
 from .board_page import save_board
 from .board_recognition import describe_board, detect_board
 from .boards import Board
-from .derivatives import centre_by_pose, reproject
+from .derivatives import reproject
 from .extrinsics import Located, locate_camera
 from .image_points import (
     ImagePoints,
     find_markers,
-    find_markers_in,
     read_image_points,
 )
 from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
 from .lens_models import LensModel, known_lenses, parse_lens_model
-from .placed_cameras import PlacedCameras, place_cameras, row_of
-from .pose_search import MIN_POINTS
-from .residuals import GATE, UNLIKELY, inflation, spread_px
-from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
+from .placed_cameras import PlacedCameras, place_cameras
+from .residuals import GATE, inflation, spread_px
+from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
 from .rig.by_board import RigCalibration, calibrate_by_board
 from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
@@ -28,13 +26,12 @@ from .rig.findings import (
     say_searched,
     worst_views,
 )
-from .rig.images import CameraImages, first_images, instants_of_numbers, open_images, open_recorded
+from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
 from .rig.lens_choice import ModelComparison, choose_lens_model, say_not_compared
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.plots import save_coverage
 from .rig.point_files import (
     GivenWorld,
-    check_two_cameras,
     distance_between,
     fit_world,
     read_point_views,
@@ -50,8 +47,6 @@ from .rig.world import Similarity, align, world_of_camera
 __all__ = [
     "GATE",
     "LOOSE",
-    "MIN_POINTS",
-    "UNLIKELY",
     "Board",
     "BoardFinder",
     "BoardSettings",
@@ -83,8 +78,6 @@ __all__ = [
     "calibrate_by_moving_point",
     "calibrate_by_point",
     "calibrate_rig",
-    "centre_by_pose",
-    "check_two_cameras",
     "choose_lens_model",
     "covariance_of_centres",
     "coverage",
@@ -93,13 +86,10 @@ __all__ = [
     "distance_between",
     "figures_of",
     "find_markers",
-    "find_markers_in",
     "find_point_shifts",
     "find_shifts",
     "find_views",
-    "first_images",
     "fit_world",
-    "in_new_world",
     "inflation",
     "instants_of_numbers",
     "known_lenses",
@@ -115,7 +105,6 @@ __all__ = [
     "read_point_views",
     "read_world",
     "reproject",
-    "row_of",
     "save_board",
     "save_coverage",
     "say_not_compared",
