@@ -33,7 +33,7 @@ from evosax.algorithms import CMA_ES, DifferentialEvolution
 import psotrack as pt
 from psotrack.geometry import project_boxes
 from psotrack.support import keep_compiled
-from psotrack.sweep import sweep
+from psotrack.sweeps import sweep
 from psotrack.tracking.swarm import camera_weights, foreground_and_area
 
 # %%

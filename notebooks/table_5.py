@@ -26,8 +26,8 @@ import pandas as pd
 from IPython.display import Markdown
 
 from psotrack.support import COLOURS
-from psotrack.sweep import pivot, render_table
-from psotrack.sweep.figures import error_against_work
+from psotrack.sweeps import pivot, render_table
+from psotrack.sweeps.figures import error_against_work
 
 # %%
 TABLE_5 = Path("../experiments/table5")

@@ -55,7 +55,6 @@ JAX is changed. Every part of the package is a room with its own documentation: 
 import inspect as _inspect
 from dataclasses import is_dataclass as _is_dataclass
 from importlib.metadata import version as _version
-from sys import modules as _modules
 from typing import Any as _Any
 
 import lazy_loader
@@ -69,10 +68,7 @@ _load, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> _Any:
     """A public name; calls of functions and of records are checked (`psotrack.support.calls`)."""
     value = _load(name)
-    if room := _modules.get(f"{__name__}.{name}"):
-        # The room `sweep` may be called like its function, which must not stand in the room's place.
-        value = globals()[name] = room
-    elif name in globals():
+    if name in globals():
         from psotrack.support import check_records, checked
 
         if _inspect.isfunction(value):

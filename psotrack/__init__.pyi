@@ -34,7 +34,7 @@ from .settings import (
 from .show.reports import view_3d
 from .simulation import SimulationSettings, simulate
 from .support import register_plugin
-from .sweep import sweep
+from .sweeps import sweep
 from .tracking.swarm import Score, ScoreInputs, Search, SearchRegion
 from .trajectories import Trajectories, read_trajectories, write_trajectories
 

@@ -30,7 +30,7 @@ from psotrack.recordings.datasets import (
 )
 from psotrack.recordings.exchange import read_tracks
 from psotrack.settings import DroneSettings, SwarmSettings, TrackSettings
-from psotrack.sweep import Store
+from psotrack.sweeps import Store
 from psotrack.trajectories import read_trajectories
 
 simulated_folder = test_dpjait.simulated_folder

@@ -10,7 +10,7 @@ from sweeps import SETTINGS, small_sequence
 
 from psotrack.pipeline import running, speed_in_words
 from psotrack.support import measured_compiling
-from psotrack.sweep import sweep
+from psotrack.sweeps import sweep
 
 #: Time that JAX needs to trace a function of these tests, seconds.
 TRACING_S = 1.5

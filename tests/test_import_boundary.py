@@ -73,7 +73,7 @@ ORDER = [
     "pipeline.archives",
     "live",
     "simulation",
-    "sweep",
+    "sweeps",
     "show",
     "show.flights",
     "show.overlay",

@@ -16,7 +16,7 @@ from psotrack.geometry.rig_files import read_rig
 from psotrack.recordings.datasets import open_recording
 from psotrack.recordings.exchange import read_tracks
 from psotrack.simulation import load
-from psotrack.sweep import read_grid
+from psotrack.sweeps import read_grid
 from psotrack.trajectories import read_trajectories
 
 PACKAGE = Path(psotrack.__file__).parent

@@ -31,8 +31,8 @@ def test_help_of_the_package_fits_ten_screens():
 
 
 def test_a_sweep_may_be_called_before_and_after_its_room_is_loaded():
-    """The room stands at `psotrack.sweep` once it is loaded, and must not hide the function."""
-    for before in ("", "import psotrack.sweep.store; "):
+    """The room stands at `psotrack.sweeps` once it is loaded, and must not hide the function."""
+    for before in ("", "import psotrack.sweeps.store; "):
         said = python(
             f"import psotrack as pt; {before}\ntry: pt.sweep(3, 'out')\nexcept Exception as error: print(error)"
         )

@@ -32,7 +32,7 @@ from psotrack.show.reports import (
     write_page,
 )
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.sweep import Store
+from psotrack.sweeps import Store
 from psotrack.trajectories import Status, write_trajectories
 
 FRAMES = 24

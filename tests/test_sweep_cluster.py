@@ -15,8 +15,8 @@ from helpers import listening_at
 from sweeps import all_rows, environment, grid_file, psotrack, small_sequence
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.sweep import Cluster, Inputs, Store, read_grid
-from psotrack.sweep.cluster import run_on_cluster
+from psotrack.sweeps import Cluster, Inputs, Store, read_grid
+from psotrack.sweeps.cluster import run_on_cluster
 
 pytest.importorskip("distributed")
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from psotrack.errors import OutputError, SettingsError
 from psotrack.evaluation import errors_over_time, evaluate
-from psotrack.sweep import figures
+from psotrack.sweeps import figures
 from psotrack.trajectories import Status, Trajectories
 
 NUM_FRAMES = 50

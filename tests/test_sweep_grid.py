@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.settings import ScoreSettings, SwarmSettings, TrackSettings
-from psotrack.sweep import Perturbation, cell_key, grid, read_grid
-from psotrack.sweep.grid_files import SETTINGS
+from psotrack.sweeps import Perturbation, cell_key, grid, read_grid
+from psotrack.sweeps.grid_files import SETTINGS
 
 FILE = """
 sequences = ["S01_D2_A", "S04_D10"]

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sweeps import all_rows, grid_file, psotrack, python, small_sequence, stamps
 
-from psotrack.sweep import Store
+from psotrack.sweeps import Store
 
 logger = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.recordings import Recording, VideoInfo
-from psotrack.sweep import Perturbation, perturb
-from psotrack.sweep.perturbations import choose_cameras
+from psotrack.sweeps import Perturbation, perturb
+from psotrack.sweeps.perturbations import choose_cameras
 
 FRAMES, REDUCTION = 70, 4
 EVERYTHING = Perturbation(extrinsics_deg=0.3, clock_frames=1.5, flipped=0.05)

@@ -27,10 +27,10 @@ from psotrack.cli import main
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
 from psotrack.support import compiled, register_plugin
-from psotrack.sweep import Inputs, Store, cell_key, estimate, machine, runner, sweep
-from psotrack.sweep import grid as grid_of
-from psotrack.sweep import inputs as inputs_of_cells
-from psotrack.sweep.locks import Locks
+from psotrack.sweeps import Inputs, Store, cell_key, estimate, machine, runner, sweep
+from psotrack.sweeps import grid as grid_of
+from psotrack.sweeps import inputs as inputs_of_cells
+from psotrack.sweeps.locks import Locks
 
 METHODS = """
 [methods.usual]
@@ -388,10 +388,10 @@ def test_the_code_of_a_cell_is_everything_that_can_compute_a_row(tmp_path: Path,
     assert digest(package) != before
     monkeypatch.undo()
     machine.code_digest.cache_clear()
-    program = "import sys; from psotrack.sweep import runner, perturbations; print(*sys.modules)"
+    program = "import sys; from psotrack.sweeps import runner, perturbations; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     names = [name.replace(".", "/") for name in done.stdout.split() if name.startswith("psotrack.")]
-    needless = ("sweep/locks", "sweep/tables")
+    needless = ("sweeps/locks", "sweeps/tables")
     left_out = tuple(f"psotrack/{name}" for name in machine.COMPUTES_NO_ROW if name not in needless)
     assert [name for name in names if f"{name}/".startswith(left_out)] == []
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.errors import InputError
-from psotrack.sweep import Store, locks
+from psotrack.sweeps import Store, locks
 
 KEY = "0" * 40
 #: A run in a manifest.
@@ -52,7 +52,7 @@ def test_reading_starts_no_threads(tmp_path: Path) -> None:
     program = """
 import os, sys
 import pandas, pyarrow.parquet
-from psotrack.sweep import Store
+from psotrack.sweeps import Store
 store, before = Store(sys.argv[1]), len(os.listdir("/proc/self/task"))
 assert store.finished_seeds(sys.argv[2]) == {0, 2}
 print(len(os.listdir("/proc/self/task")) - before)
@@ -180,7 +180,7 @@ def test_a_lock_is_released_when_the_work_fails(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="process start times are read from /proc")
 def test_the_lock_of_a_killed_process_of_this_machine_lapses_at_once(tmp_path: Path) -> None:
-    code = "import sys; from pathlib import Path; from psotrack.sweep import Store\n"
+    code = "import sys; from pathlib import Path; from psotrack.sweeps import Store\n"
     code += "with Store(Path(sys.argv[1])).lock(sys.argv[2]):\n"
     code += "    print('locked', flush=True)\n    sys.stdin.read()"
     store = Store(tmp_path)

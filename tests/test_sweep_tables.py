@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psotrack.errors import SettingsError
-from psotrack.sweep import pivot, render_table
+from psotrack.sweeps import pivot, render_table
 
 #: Two methods at two swarm sizes, three runs each; errors in metres.
 ERRORS_M = {

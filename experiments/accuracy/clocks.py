@@ -4,7 +4,7 @@
     python experiments/accuracy/clocks.py --data data --quick
 
 S02_D4_A, per-drone swarm of 30 x 20. Each camera's silhouettes are late by 0 to 1 or 0 to 2 frames
-(`psotrack.sweep.perturb`), three flights with two draws each; --quick takes one flight and one draw. No video shows by
+(`psotrack.sweeps.perturb`), three flights with two draws each; --quick takes one flight and one draw. No video shows by
 how much all cameras are late together: positions are compared with the reference at the cameras' median delay.
 """
 
@@ -23,7 +23,7 @@ from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.pipeline import TrackedRecording, track_runs
 from psotrack.recordings import Recording
 from psotrack.settings import Clocks, TrackSettings
-from psotrack.sweep import Perturbation, delays_frames, perturb
+from psotrack.sweeps import Perturbation, delays_frames, perturb
 from psotrack.trajectories import resample
 
 NAME = "S02_D4_A"

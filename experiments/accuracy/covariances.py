@@ -37,7 +37,7 @@ from psotrack.pipeline import track_runs
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.simulation import build, scenario
-from psotrack.sweep import Perturbation, perturb
+from psotrack.sweeps import Perturbation, perturb
 from psotrack.tracking.camera_errors import views_of_sightings, with_camera_errors
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.support import atomic_write, keep_compiled
-from psotrack.sweep import read_grid, sweep
+from psotrack.sweeps import read_grid, sweep
 
 GRIDS = Path(__file__).parent / "studies"
 #: Study -> column that varies, and label of its axis.

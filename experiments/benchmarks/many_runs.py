@@ -43,7 +43,7 @@ from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled, progress_bar, use_device
-from psotrack.sweep import Grid, read_grid, sweep
+from psotrack.sweeps import Grid, read_grid, sweep
 from psotrack.tracking.swarm import track_silhouettes
 from psotrack.tracking.swarm.block import Block, Engine, Job
 from psotrack.tracking.swarm.run import SwarmRun

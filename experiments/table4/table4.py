@@ -18,7 +18,7 @@ import pandas as pd
 
 from psotrack.errors import PsotrackError
 from psotrack.recordings.datasets import CALIBRATION
-from psotrack.sweep import grid, pivot, render_table, sweep
+from psotrack.sweeps import grid, pivot, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results

@@ -18,7 +18,7 @@ from pathlib import Path
 import pandas as pd
 
 from psotrack.errors import PsotrackError
-from psotrack.sweep import Grid, Store, pivot, read_grid, render_table, sweep
+from psotrack.sweeps import Grid, Store, pivot, read_grid, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
@@ -133,7 +133,7 @@ def show(rows: pd.DataFrame, out: Path) -> None:
 
 def draw(rows: pd.DataFrame, published: dict[str, tuple[float, float]], out: Path) -> None:
     """Draw the pictures; pictures of single frames show the largest swarm."""
-    from psotrack.sweep import figures
+    from psotrack.sweeps import figures
 
     figures.save(
         out / "error_against_work.png", figures.error_against_work(rows, published=published), force=True

@@ -104,7 +104,7 @@ def report(
 
 def _table(folder: Path, layout: str, rows: str, columns: str | None, value: str, scale: float) -> str:
     """A table of the results of a sweep."""
-    from psotrack.sweep import Store, pivot, render_table
+    from psotrack.sweeps import Store, pivot, render_table
 
     rows_by = [name for name in rows.split(",") if name]
     if columns is None:

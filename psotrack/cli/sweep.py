@@ -101,8 +101,8 @@ def sweep(
     if where.workers is not None and where.cluster is None:
         raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
     from psotrack.support import keep_compiled, share_processors, use_device
-    from psotrack.sweep import Cluster, Inputs, Store, plan, read_grid
-    from psotrack.sweep import sweep as run
+    from psotrack.sweeps import Cluster, Inputs, Store, plan, read_grid
+    from psotrack.sweeps import sweep as run
 
     def say(address: str) -> None:
         if not output.quiet:
@@ -134,7 +134,7 @@ def sweep(
 
 def _status(output: Output, folder: Path) -> None:
     """Print the numbers of finished, failed and locked cells in a folder, and the processes at work."""
-    from psotrack.sweep import Store
+    from psotrack.sweeps import Store
 
     content = Store(folder).status()
     output.json(content)

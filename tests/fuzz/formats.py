@@ -39,7 +39,7 @@ from psotrack.show import flights
 from psotrack.show.reports import write_calibration_report
 from psotrack.simulation.flights.piloting import read_sticks
 from psotrack.simulation.flights.recordings import read_recorded_flight
-from psotrack.sweep import Store, read_grid
+from psotrack.sweeps import Store, read_grid
 from psotrack.trajectories import read_trajectories
 
 Read = Callable[[Path], object]

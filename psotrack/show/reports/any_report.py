@@ -14,7 +14,7 @@ from psotrack.show.reports.calibration_report import is_calibration_record, writ
 from psotrack.show.reports.flight_report import write_flight_report
 from psotrack.show.reports.sweep_report import write_sweep_report
 from psotrack.support import Report, no_progress
-from psotrack.sweep import is_results_folder
+from psotrack.sweeps import is_results_folder
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from psotrack.errors import SettingsError
 from psotrack.show.reports.charts import figure_svg
 from psotrack.show.reports.page import check_page_path, render, write_page
 from psotrack.show.reports.tables import PageColumn, PageTable, make_table, percent
-from psotrack.sweep import Store
-from psotrack.sweep.figures import error_against_work, error_per_drone, pareto_front
+from psotrack.sweeps import Store
+from psotrack.sweeps.figures import error_against_work, error_per_drone, pareto_front
 
 #: Figures of the table of cells.
 _FIGURES = (

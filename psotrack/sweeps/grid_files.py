@@ -19,7 +19,7 @@ from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings, flatten, setting_names
 from psotrack.support import assign, convert, nearest, read_toml
-from psotrack.sweep.cells import Cell, Perturbation, cameras_label
+from psotrack.sweeps.cells import Cell, Perturbation, cameras_label
 
 #: Dotted names that the tables [settings] and [methods.NAME] may contain.
 SETTINGS = tuple(name for name in setting_names() if name != "seed")

@@ -19,7 +19,7 @@ from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig
 from psotrack.recordings import Recording
-from psotrack.sweep.cells import Perturbation
+from psotrack.sweeps.cells import Perturbation
 
 #: Random stream of each kind of perturbation; these numbers decide the results.
 _CAMERAS, _EXTRINSICS, _CLOCKS, _FLIPS = range(4)

@@ -15,10 +15,10 @@ from psotrack.recordings import Recording
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import YOLO
 from psotrack.support import PluginKind, digest_file, digest_record, plain, plugin_source
-from psotrack.sweep.cells import Cell, input_digest
-from psotrack.sweep.locks import Locks
-from psotrack.sweep.machine import code_digest
-from psotrack.sweep.perturbations import perturb
+from psotrack.sweeps.cells import Cell, input_digest
+from psotrack.sweeps.locks import Locks
+from psotrack.sweeps.machine import code_digest
+from psotrack.sweeps.perturbations import perturb
 from psotrack.trajectories import Trajectories, resample
 
 #: Folders below the data's root in which a sequence is looked for.

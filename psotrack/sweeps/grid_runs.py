@@ -13,17 +13,17 @@ import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.support import Report, html_block, html_table, report_of, user_cache
-from psotrack.sweep.cells import Cell, cameras_label, cell_key, cell_name, input_digest, title
-from psotrack.sweep.cluster import Cluster, run_on_cluster
-from psotrack.sweep.grid_files import Grid, read_grid
-from psotrack.sweep.grid_files import grid as grid_of
-from psotrack.sweep.inputs import Inputs, folder_of, source_of
-from psotrack.sweep.locks import POLL_S
-from psotrack.sweep.machine import provenance
-from psotrack.sweep.manifest import note_input, note_run
-from psotrack.sweep.runner import Result, finished_before, run_cell, store_failure
-from psotrack.sweep.store import Store
-from psotrack.sweep.tables import DESCRIBING
+from psotrack.sweeps.cells import Cell, cameras_label, cell_key, cell_name, input_digest, title
+from psotrack.sweeps.cluster import Cluster, run_on_cluster
+from psotrack.sweeps.grid_files import Grid, read_grid
+from psotrack.sweeps.grid_files import grid as grid_of
+from psotrack.sweeps.inputs import Inputs, folder_of, source_of
+from psotrack.sweeps.locks import POLL_S
+from psotrack.sweeps.machine import provenance
+from psotrack.sweeps.manifest import note_input, note_run
+from psotrack.sweeps.runner import Result, finished_before, run_cell, store_failure
+from psotrack.sweeps.store import Store
+from psotrack.sweeps.tables import DESCRIBING
 
 
 @dataclass(frozen=True)

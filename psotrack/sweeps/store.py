@@ -28,9 +28,9 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.sweep.locks import Locks
-from psotrack.sweep.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
-from psotrack.sweep.tables import DESCRIBING, natural
+from psotrack.sweeps.locks import Locks
+from psotrack.sweeps.sealed_files import DamagedError, read_json, read_parquet, write_json, write_parquet
+from psotrack.sweeps.tables import DESCRIBING, natural
 
 logger = logging.getLogger(__name__)
 

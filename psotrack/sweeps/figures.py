@@ -29,7 +29,7 @@ from psotrack.support import (
     drone_colour,
     refuse_to_overwrite,
 )
-from psotrack.sweep.tables import natural
+from psotrack.sweeps.tables import natural
 
 _MARKERS = "osD^vP"
 #: Width of all boxes of a drone, as a share of the distance between drones.

@@ -18,10 +18,10 @@ from psotrack.evaluation import Evaluation, errors_over_time, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
 from psotrack.settings import flatten
 from psotrack.support import drop_programs_if_many
-from psotrack.sweep.cells import Cell, cell_key, cell_name, describe, input_digest, title
-from psotrack.sweep.inputs import Input, Inputs
-from psotrack.sweep.machine import provenance
-from psotrack.sweep.store import Store
+from psotrack.sweeps.cells import Cell, cell_key, cell_name, describe, input_digest, title
+from psotrack.sweeps.inputs import Input, Inputs
+from psotrack.sweeps.machine import provenance
+from psotrack.sweeps.store import Store
 
 logger = logging.getLogger(__name__)
 

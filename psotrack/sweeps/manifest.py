@@ -18,8 +18,8 @@ from typing import Any
 
 import msgspec
 
-from psotrack.sweep.cells import Cell, input_digest
-from psotrack.sweep.grid_files import Grid
+from psotrack.sweeps.cells import Cell, input_digest
+from psotrack.sweeps.grid_files import Grid
 
 
 def note_run(manifest: dict[str, Any], grid: Grid, origin: Mapping[str, Any]) -> None:

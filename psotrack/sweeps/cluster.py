@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Any
 from psotrack.errors import InputError, PsotrackError, SettingsError, install_command
 from psotrack.foreground.silhouettes import compute
 from psotrack.support import Device, keep_compiled, processors, share_processors, use_device
-from psotrack.sweep.cells import Cell
-from psotrack.sweep.inputs import Inputs, source_of
-from psotrack.sweep.locks import POLL_S
-from psotrack.sweep.runner import Result, run_cell, store_failure
-from psotrack.sweep.store import Store
+from psotrack.sweeps.cells import Cell
+from psotrack.sweeps.inputs import Inputs, source_of
+from psotrack.sweeps.locks import POLL_S
+from psotrack.sweeps.runner import Result, run_cell, store_failure
+from psotrack.sweeps.store import Store
 
 if TYPE_CHECKING:
     from distributed import Client
