@@ -241,6 +241,15 @@ def test_names_by_hand_without_a_calibration(folder):
     assert (recording.placed, tuple(recording.by_name)) == ((), ("left", "right"))
 
 
+#: `psotrack`, also where the tests run in the background, which ignores Ctrl-C.
+HEEDS_CTRL_C = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from psotrack.cli import main
+main()
+"""
+
+
 class TestQuestions:
     """At a terminal, `init` asks once whose the files are that their names do not say."""
 
@@ -250,7 +259,7 @@ class TestQuestions:
 
         def run(folder, *answers):
             ours, theirs = pty.openpty()
-            program = [sys.executable, "-m", "psotrack", "init", str(folder)]
+            program = [sys.executable, "-c", HEEDS_CTRL_C, "init", str(folder)]
             shown = ""
             with subprocess.Popen(program, stdin=theirs, stdout=theirs, stderr=theirs) as process:
                 os.close(theirs)

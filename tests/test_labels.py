@@ -384,11 +384,16 @@ def test_a_broken_video_leaves_nothing_behind(data, tmp_path):
 def test_without_a_reference(data, tmp_path):
     first, second = (read_sequence(data / name) for name in ("S01_D2_A", "S12_D3"))
     with pytest.raises(InputError, match=r"S01_D2_A: expected a reference .*, found none"):
-        write_data_set([replace(first, truth=None), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1)
+        write_data_set(
+            [replace(first, reference=None), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
+        )
     unknown = replace(first.truth, position_m=np.full_like(first.truth.position_m, np.nan))
     with pytest.raises(InputError, match="expected a frame in which the poses of all drones are known"):
         write_data_set(
-            [replace(first, truth=unknown), second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
+            [replace(first, reference=Reference(unknown)), second],
+            tmp_path / "set",
+            LabelSettings(SIZE_M),
+            jobs=1,
         )
 
 
