@@ -245,7 +245,7 @@ def test_names_by_hand_without_a_calibration(folder):
 HEEDS_CTRL_C = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from psotrack.cli import main
+from psotrack.__main__ import main
 main()
 """
 
