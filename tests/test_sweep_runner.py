@@ -261,7 +261,7 @@ def test_in_python_the_rows_are_the_rows_of_the_grid(root: Path, tracker: Tracke
     rows = sweep(varied(3, 4, runs=2), out, **folders).rows()
     assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[3, 0], [3, 1], [4, 0], [4, 1]]
     assert (rows["missed_rate"] == 1).all()
-    rows = sweep(grid_of(varied(5, 4)), out, **folders)
+    rows = sweep(grid_of(varied(5, 4)), out, **folders).rows()
     assert rows[["settings.swarm.iterations", "seed"]].to_numpy().tolist() == [[5, 0], [4, 0]]
     # More runs of a finished cell only add rows.
     (tmp_path / "grid.toml").write_text(grid_file(tmp_path, [3], runs=3).read_text())
