@@ -382,7 +382,7 @@ def run(
 
     The folder has a video of each camera, and a folder `board` with videos of the same cameras in which a board is
     moved, or a rig file. The results are in the folder `results` in it. A run that was stopped goes on where it was;
-    to repeat a step, remove what it made.
+    to repeat a step and those after it, remove what it made.
 
     Args:
         folder: the folder.
@@ -407,14 +407,18 @@ def run(
     tracks, page, found = results / "tracks.csv", results / "report.html", results / "doctor.json"
     common: dict[str, Any] = {"progress": progress}
 
-    def step(words: Sequence[object], made: Path | None, do: Callable[[], object]) -> None:
-        if made is not None and made.exists() and not again:
+    # What follows from a step that was done is done again, too.
+    anew = again
+
+    def step(words: Sequence[object], made: Path | None, do: Callable[[], object]) -> bool:
+        if made is not None and made.exists() and not anew:
             say(f"{made}: there already")
-            return
+            return False
         say(f"$ psotrack {shlex.join(map(str, words))}")
         done = do()
         if done is not None:
             say(f"{done}")
+        return True
 
     is_drafted = (folder / RECORDING_FILE).exists()
     if not is_drafted or again or not open_recording(folder).is_placed:
@@ -440,7 +444,7 @@ def run(
             more = {"calibration": rig, **more}
         words = ["init", folder, *_option("--calibration", more.get("calibration"))]
         # A recording whose cameras have no places yet is drafted anew; the old file is kept beside the new one.
-        step(words + ["--force"] * is_drafted, None, lambda: _drafted(folder, DraftOptions(**more)))
+        anew = step(words + ["--force"] * is_drafted, None, lambda: _drafted(folder, DraftOptions(**more)))
     if not open_recording(folder).is_placed:
         raise InputError(
             folder,
@@ -448,7 +452,8 @@ def run(
             found="neither",
             remedy="`psotrack board` draws a board",
         )
-    step(["doctor", folder, "--json", found], found, lambda: _written(found, doctor(folder, **common)))
+    words = ["doctor", folder, "--json", found]
+    anew |= step(words, found, lambda: _written(found, doctor(folder, **common)))
     kinds = [(each["kind"], *each["nearly_as_likely"]) for each in read_json(found)["findings"]]
     is_late = any("clock" in of_one for of_one in kinds)
     chosen = {"clocks": "auto"} if is_late else {}
@@ -461,10 +466,10 @@ def run(
         tracks,
     ]
     settings = {**chosen, "drones.count": drones}
-    step(words, tracks, lambda: _tracked(folder, tracks, settings, **common))
-    shown: dict[str, Any] = {"recording": folder, "force": again, **common}
+    anew |= step(words, tracks, lambda: _tracked(folder, tracks, settings, **common))
+    shown: dict[str, Any] = {"recording": folder, "force": anew, **common}
     step(["report", tracks, folder, "--out", page], page, lambda: report(tracks, page, **shown))
-    # Finished videos are kept.
+    # Finished videos of the same tracks are kept.
     videos = results / "overlay"
     step(["overlay", tracks, folder, "--out", videos], None, lambda: overlay(tracks, videos, **shown))
     return flights.run_summary(folder)

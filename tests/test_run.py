@@ -1,6 +1,7 @@
 """`psotrack run`: from the videos of a rig to a report, and on from where it was stopped."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,3 +94,10 @@ def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -
     assert str(found) in again.out
     assert found.to_dict()["drones"] == 4
     assert (results / "tracks.csv").stat().st_mtime_ns == before
+    assert "tracked in  not recorded" in str(replace(found, record={}))
+    # What follows from a step that is done again is done again, too.
+    (results / "tracks.csv").unlink()
+    renewed = run_psotrack(*words)
+    assert renewed.code == 0, renewed.err
+    assert commands_in(renewed) == ["track", "report", "overlay"]
+    assert "4 videos" in renewed.out

@@ -38,8 +38,8 @@ def run(
 
     FOLDER has a video of each camera, and a folder `board` with videos of the same cameras in which a board is moved
     (`psotrack board` draws one), or a rig file. Each step's command is printed before it, so that it can be typed with
-    other options. The results are in FOLDER/results. A run that was stopped goes on where it was; to repeat a step,
-    remove what it made.
+    other options. The results are in FOLDER/results. A run that was stopped goes on where it was; to repeat a step
+    and those after it, remove what it made.
 
     \b
     Examples:

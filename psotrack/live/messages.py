@@ -136,7 +136,6 @@ class WebSocketLines:
 
     Args:
         address: PORT, which programs on this computer reach, or HOST:PORT, where HOST is an address of this computer.
-
         asked_s: how often a client is asked whether it is there, and time that it has to answer, seconds.
 
     Attributes:

@@ -89,16 +89,16 @@ def _start(
 ) -> BoardBundle:
     """The adjustment's first state, with a robust loss."""
     models, lenses = zip(*known_lenses(rig).values(), strict=True)
-    count = np.arange(len(rig))
+    index = np.arange(len(rig))
     problem = BoardProblem(
         models=models,
-        lens_of=count,
+        lens_of=index,
         image_size_wh=np.asarray(rig.cameras.image_size_wh).astype(np.int64),
         corners_m=np.zeros((1, 3)),
-        seen=tuple(CameraCorners.of(points_px[:, index, None]) for index in count),
+        seen=tuple(CameraCorners.of(points_px[:, camera, None]) for camera in index),
         noise_px=np.full(len(rig), noise_px),
         free_lens=tuple(np.zeros(model.size, bool) for model in models),
-        free_camera=count > 0,
+        free_camera=index > 0,
         free_board=np.ones(len(points_m), bool),
     )
     boards = np.tile(np.eye(4), (len(points_m), 1, 1))

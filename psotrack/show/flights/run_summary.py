@@ -27,7 +27,7 @@ class RunSummary:
         name: name of the recording.
         results: folder of the results: `tracks.csv`, `report.html`, `doctor.json`, and `overlay` with the videos.
         trajectories: the tracks.
-        record: the record of the run, as `track` writes it.
+        record: the record of the run, as `track` writes it; empty where its file is gone.
         findings: what the doctor found, a sentence each.
         evaluation: errors; None where the recording has no reference.
     """
@@ -47,7 +47,7 @@ class RunSummary:
             "drones": tracks.num_drones,
             "frames": tracks.num_frames,
             "seen": float(tracks.seen.mean()),
-            "seconds": self.record["seconds"]["total"],
+            "seconds": self.record.get("seconds", {}).get("total"),
             "real_time_factor": self.record.get("real_time_factor"),
             "camera_clocks": dict(self.record.get("camera_clocks", {})),
             "findings": list(self.findings),
@@ -79,7 +79,7 @@ class RunSummary:
         lines = {
             "drones": f"{tracks.num_drones}",
             "frames": f"{tracks.num_frames}, in {filmed_s:.1f} s; drones are seen in {told['seen']:.1%}",
-            "tracked in": f"{told['seconds']:.1f} s{speed}",
+            "tracked in": "not recorded" if told["seconds"] is None else f"{told['seconds']:.1f} s{speed}",
             "clocks": ", ".join(clocks) or "not corrected",
             "doctor": "; ".join(self.findings) or "nothing disagrees",
         }

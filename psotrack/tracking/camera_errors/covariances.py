@@ -71,7 +71,7 @@ def lasting_covariances(
     Args:
         views: the views of all drones.
         errors: the cameras' errors.
-        given: what is known of the errors beforehand: at least so much.
+        given: smallest errors that the settings state.
     """
     lasting_px2 = np.maximum(np.square(errors.lasting_px), given.pixel_px**2)
     constant = errors.constant_covariance.copy()
