@@ -70,24 +70,24 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     lenses = _lenses_of(views.names, settings.lenses)
     with errors_name(sources[0]):
         found = calibrate_by_point(lenses, views)
-    stated = None if settings.world is None else read_world(settings.world)
+    given = None if settings.world is None else read_world(settings.world)
 
-    def world_of(found: PointRig) -> Similarity:
+    def world_of(found: PointRig) -> tuple[Similarity, str]:
         rig = found.adjusted.rig
-        if stated is not None:
-            return fit_world(rig, stated, _numbered(found), with_scale=True)[0]
-        if distance is not None:
-            return world_of_camera(rig, 0, distance[2] / distance_between(rig, *distance[:2]))
-        return world_of_camera(rig, 0, (stick_m or 1.0) / stick_length(found))
+        if given is not None:
+            change, left_m = fit_world(rig, given, _numbered(found), with_scale=True)
+            return change, world_in_words(given.path, left_m)
+        factor = (
+            (stick_m or 1.0) / stick_length(found)
+            if distance is None
+            else distance[2] / distance_between(rig, *distance[:2])
+        )
+        words = f"camera {rig.names[0]}: x right, y down, z forward; --world places it elsewhere"
+        return world_of_camera(rig, 0, factor), words
 
     with errors_name(settings.world or sources[0]):
-        change = world_of(found)
-    covariance_m2 = covariance_of_centres(found, world_of)
-    if stated is not None:
-        _, left_m = fit_world(found.adjusted.rig, stated, _numbered(found), with_scale=True)
-        place = world_in_words(stated.path, left_m)
-    else:
-        place = f"camera {views.names[0]}: x right, y down, z forward; --world places it elsewhere"
+        change, place = world_of(found)
+    covariance_m2 = covariance_of_centres(found, lambda found: world_of(found)[0])
     rig, rows = change.rig(found.adjusted.rig), {}
     for index, name in enumerate(rig.names):
         seen = np.isfinite(found.adjusted.residual_px[:, index])
@@ -99,8 +99,8 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
             found.views.number[seen],
         )
     shifts = map(str, find_point_shifts(found.adjusted.rig, views))
-    notes = [*_left_out(found, views), f"the world is {place}", *shifts]
-    return PlacedCameras(rig, rows, [*notes, *_unused(found), *_undetermined(rig, covariance_m2)])
+    notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
+    return PlacedCameras(rig, rows, notes)
 
 
 def calibrate_by_known_points(
@@ -155,33 +155,29 @@ def _left_out(found: PointRig, views: PointViews) -> list[str]:
     return [f"{used} of {seen} instants at which two cameras see the point are used, evenly spread"]
 
 
-def _unused(found: PointRig) -> list[str]:
-    """A sentence on sightings of two cameras, if the rig explains few of them."""
+def _weak(found: PointRig, rig: Rig, covariance_m2: Float[np.ndarray, "cameras 3 3"]) -> list[str]:
+    """Sentences on sightings that the rig does not explain, and on cameras that they hardly determine."""
+    sentences = []
     used, seen = int(found.adjusted.used.any(axis=1).sum()), len(found.views.number)
-    if used >= _FEW_USED * seen:
-        return []
-    return [
-        f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of one "
-        "instant, that the cameras see the same thing, and the lenses"
-    ]
-
-
-def _undetermined(rig: Rig, covariance_m2: np.ndarray) -> list[str]:
-    """A sentence on cameras whose places the sightings hardly determine."""
+    if used < _FEW_USED * seen:
+        sentences.append(
+            f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of "
+            "one instant, that the cameras see the same thing, and the lenses"
+        )
     centres = np.asarray(rig.cameras.centre_world)
-    apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1).max(axis=1)
     std_m = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
     loose = [
         f"{name} (± {std:.2g} m, {apart:.2g} m from the farthest camera)"
-        for name, std, apart in zip(rig.names, std_m, apart_m.max(axis=1), strict=True)
+        for name, std, apart in zip(rig.names, std_m, apart_m, strict=True)
         if std > LOOSE * apart
     ]
-    if not loose:
-        return []
-    return [
-        f"the sightings hardly determine the places of {', '.join(loose)}: move the point nearer to the cameras, "
-        "check the lenses, add a camera, or give points of known place with --pairs"
-    ]
+    if loose:
+        sentences.append(
+            f"the sightings hardly determine the places of {', '.join(loose)}: move the point nearer to the cameras, "
+            "check the lenses, add a camera, or give points of known place with --pairs"
+        )
+    return sentences
 
 
 def _lenses_of(names: Sequence[str], path: Path | None) -> Rig:

@@ -162,45 +162,36 @@ def find_shifts(calibrated: CalibratedRig) -> dict[str, int]:
 
     The camera is placed again by where the other cameras have the board a few instants before and after.
     """
-    board = calibrated.board
-    number = calibrated.views.number
     shifts = {}
-    for index, row in enumerate(figures_of(calibrated).values()):
+    for index, (name, row) in enumerate(figures_of(calibrated).items()):
         if row.median_px < _SHIFT_PX or row.median_px < _SHIFT_FACTOR * row.own_median_px:
             continue
-        camera = calibrated.rig.cameras[index]
-        others = np.asarray(np.delete(calibrated.used, index, axis=0).any(axis=(0, 2)))
-        error_px = {}
-        instants = np.flatnonzero(calibrated.views.seen[index])
-        rays = undistort(camera, calibrated.views.corners_px[index, instants].reshape(-1, 2))
-        rays = rays.reshape(len(instants), -1, 2)
-        focal_px = float(np.asarray(camera.K)[0, 0])
-        for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1):
-            place = {int(n): k for k, n in enumerate(number) if others[k]}
-            rows = [
-                (k, place[int(number[i]) + shift])
-                for k, i in enumerate(instants)
-                if number[i] + shift in place
-            ]
-            if len(rows) >= _SHARED // 2:
-                views, boards = np.array(rows).T
-                T = calibrated.T_world_board[boards]
-                points_m = np.einsum("vij,nj->vni", T[:, :3, :3], board.corners_m) + T[:, None, :3, 3]
-                error_px[shift] = focal_px * _misplaced(points_m, rays[views], np.asarray(camera.T_cam_world))
-        best = min(error_px, key=lambda shift: error_px[shift], default=0)
-        if best and 0 in error_px and error_px[best] < error_px[0] / _SHIFT_FACTOR:
-            shifts[calibrated.rig.names[index]] = best
+        errors = {
+            shift: _error_of(calibrated, index, shift) for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1)
+        }
+        best = min(errors, key=lambda shift: errors[shift])
+        if best and errors[best] < errors[0] / _SHIFT_FACTOR and np.isfinite(errors[0]):
+            shifts[name] = best
     return shifts
 
 
-def _misplaced(
-    points_m: Float[np.ndarray, "views corners 3"],
-    rays: Float[np.ndarray, "views corners 2"],
-    T_cam_world: Float[np.ndarray, "4 4"],
-) -> float:
-    """Median distance x / z, y / z of points from where a camera sees them, if it stands where they fit best."""
-    points_m, rays = points_m.reshape(-1, 3), rays.reshape(-1, 2)
-    return float(np.nanmedian(ray_distances(points_m, rays, refine_pnp(points_m, rays, T_cam_world))))
+def _error_of(calibrated: CalibratedRig, index: int, shift: int) -> float:
+    """Median distance x / z, y / z of corners from where a camera sees them, if its frames count more by `shift`.
+
+    The boards are those of the other cameras, and the camera stands where they fit best; infinite for few views.
+    """
+    views, camera = calibrated.views, calibrated.rig.cameras[index]
+    others = np.asarray(np.delete(calibrated.used, index, axis=0).any(axis=(0, 2)))
+    is_one = (views.number[:, None] + shift == views.number) & views.seen[index][:, None] & others
+    here, there = np.nonzero(is_one)
+    if len(here) < _SHARED // 2:
+        return np.inf
+    T = calibrated.T_world_board[there]
+    points_m = np.einsum("vij,nj->vni", T[:, :3, :3], calibrated.board.corners_m) + T[:, None, :3, 3]
+    points_m = points_m.reshape(-1, 3)
+    rays = undistort(camera, views.corners_px[index, here].reshape(-1, 2))
+    T_cam_world = refine_pnp(points_m, rays, np.asarray(camera.T_cam_world))
+    return float(np.nanmedian(ray_distances(points_m, rays, T_cam_world)))
 
 
 def advise(calibrated: CalibratedRig) -> list[str]:

@@ -5,7 +5,6 @@ Commands make their options of these records, so this module imports nothing tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -79,22 +78,28 @@ class PointSettings:
 
 
 @dataclass(frozen=True)
-class RigSettings(PointSettings, LensSettings, BoardSettings):
-    """What is known before a rig is calibrated; of a board, the side of a square is enough.
-
-    The fields of `BoardSettings`, `LensSettings` and `PointSettings`, and:
+class WorldSettings:
+    """The names of the cameras, and the world.
 
     Attributes:
         names: names of the cameras; None: from the files' names.
         floor: frame in which the board lies on the floor: its first corner is the origin, and z points up; None: the
             first camera is the world.
-        world: file with three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a
-            frame of the moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.
+        world: three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a frame of the
+            moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.
     """
 
-    names: Sequence[str] | None = None
-    floor: int | None = None
-    world: Path | None = None
+    names: tuple[str, ...] | None = None
+    floor: Annotated[int, Meta(extra={"metavar": "FRAME"})] | None = None
+    world: Annotated[Path, Meta(extra={"metavar": "FILE"})] | None = None
+
+
+@dataclass(frozen=True)
+class RigSettings(WorldSettings, PointSettings, LensSettings, BoardSettings):
+    """What is known before a rig is calibrated; of a board, the side of a square is enough.
+
+    Its fields are those of `BoardSettings`, `LensSettings`, `PointSettings` and `WorldSettings`.
+    """
 
     def __post_init__(self) -> None:
         chosen = {
