@@ -42,7 +42,7 @@ def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Floa
             break
         points_m = board.corners_m[order]
         for T in solve_pnp(points_m, rays, "ippe"):
-            found.append((float(np.nanmean(ray_distances(points_m, rays, T))), T))
+            found.append((float(np.nanmean(ray_distances(points_m, rays, T) ** 2)), T))
     found.sort(key=lambda one: one[0])
     return np.array([T for _, T in found]).reshape(-1, 4, 4)
 

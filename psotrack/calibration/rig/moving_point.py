@@ -29,6 +29,7 @@ from psotrack.calibration.rig.point_adjustment import AdjustedRig, adjust
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, triangulate_linearly, undistort
+from psotrack.support import block_jackknife
 
 #: Distance in the image up to which a detection may be of the point, while the cameras are not yet adjusted, pixels.
 _WIDE_PX = 15.0
@@ -153,8 +154,9 @@ def _jackknife(
         if again is None:
             again = replace(found, adjusted=_adjust_near(found.adjusted.rig, kept_px, found.noise_px))
         centres.append(world_of(again).points(np.asarray(again.adjusted.rig.cameras.centre_world)))
-    off = np.array(centres) - np.mean(centres, axis=0)
-    return (_PARTS - 1) / _PARTS * np.einsum("pci,pcj->cij", off, off)
+    own = world_of(found).points(np.asarray(found.adjusted.rig.cameras.centre_world))
+    covariance = block_jackknife(own.ravel(), np.reshape(centres, (_PARTS, -1)))
+    return np.einsum("cicj->cij", covariance.reshape(len(own), 3, len(own), 3))
 
 
 def _thinned(views: PointViews) -> PointViews:
