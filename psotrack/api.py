@@ -59,7 +59,7 @@ from psotrack.tracking.matching import from_detections, from_silhouettes
 from psotrack.trajectories import Trajectories
 
 #: Fields of `RigSettings` that are files.
-_RIG_FILES = ("lenses", "pairs", "markers", "world")
+_RIG_FILES = ("lenses", "pairs", "places", "markers", "world")
 #: Tracks in memory.
 Tracks = TrackedRecording | Trajectories
 

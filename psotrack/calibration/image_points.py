@@ -69,7 +69,7 @@ def read_image_points(path: str | Path, places: str | Path | None = None) -> dic
                 point,
                 f"{', '.join(_WORLD)} in one of its rows, or in a file of places",
                 f"none for {name}",
-                "pass --points",
+                "pass --places",
             )
         of_camera[name] = [row.number(column) for column in pixels]
     return {

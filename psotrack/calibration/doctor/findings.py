@@ -23,7 +23,7 @@ ALMOST = 0.9
 SAME_SCALE = 0.03
 #: What to do about a camera's place, and about its lens.
 _PLACE_ANEW = (
-    "place it anew with `psotrack calibrate extrinsics --pairs`, or all cameras with `psotrack calibrate rig`"
+    "place it anew with `psotrack calibrate rig --pairs`, or all cameras with `psotrack calibrate rig`"
 )
 _LENS_ANEW = "calibrate its lens anew with `psotrack calibrate intrinsics`"
 _LENSES_ANEW = "calibrate each lens anew with `psotrack calibrate intrinsics`"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration.image_points import find_markers_in, read_image_points
+from psotrack.calibration.image_points import find_markers, read_image_points
+from psotrack.calibration.intrinsics import lens_of_sensor, lens_of_view
 from psotrack.calibration.placed_cameras import PlacedCameras, place_cameras, row_of
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
@@ -32,10 +34,10 @@ from psotrack.calibration.rig.point_shifts import find_point_shifts
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
-from psotrack.geometry import Rig, chosen_camera
+from psotrack.geometry import Rig, chosen_camera, make_rig
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings import read_detections
-from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.datasets import is_recording, open_recording
 
 #: Share of the sightings below which the user is told how few are used.
 _FEW_USED = 0.5
@@ -67,7 +69,7 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
         if stick_m is not None and not views.point.any():
             expected = "the two ends of a stick, told apart by a column named point"
             raise InputError(sources[0], expected=expected, found="one point")
-    lenses = _lenses_of(views.names, settings.lenses)
+    lenses = _lenses_of(views.names, settings)
     with errors_name(sources[0]):
         found = calibrate_by_point(lenses, views)
     given = None if settings.world is None else read_world(settings.world)
@@ -111,7 +113,7 @@ def calibrate_by_known_points(
     """Place the cameras of a rig by points of known place, or by ArUco markers in their images.
 
     Args:
-        sources: with markers, the video of each camera; with points none.
+        sources: with markers, a recording or the video of each camera; with points none.
         settings: the points, and the lenses.
         marker_corners_m: corners of the markers by number, metres; None for points.
 
@@ -123,21 +125,22 @@ def calibrate_by_known_points(
         expected = "none with points of known place, which are the world"
         raise SettingsError("--world", expected=expected, found=f"{settings.world}")
     if marker_corners_m is not None:
+        if len(sources) == 1 and is_recording(sources[0]):
+            videos = open_recording(sources[0]).videos
+        else:
+            videos = {camera.name: camera.video for camera in open_images(sources, settings.names)}
         marks = {
-            camera.name: find_markers_in(
-                (grey for _, grey in camera.read(camera.spread(15))), marker_corners_m, settings.dictionary
-            )
-            for camera in open_images(sources)
+            name: find_markers(video, marker_corners_m, settings.dictionary) for name, video in videos.items()
         }
     elif sources:
         raise SettingsError("--pairs", expected="no video", found=f"{sources[0]}")
     else:
-        marks = read_image_points(settings.pairs or "")
-    lenses, world = _lenses_of(tuple(marks), settings.lenses), settings.pairs or settings.markers
+        marks = read_image_points(settings.pairs or "", settings.places)
+    lenses, world = _lenses_of(tuple(marks), settings), settings.pairs or settings.markers
     by_name = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
     with errors_name(world):
         placed = place_cameras(marks, by_name, settings.noise_px)
-    return PlacedCameras(placed.rig, placed.cameras, [f"the world is that of {world}"])
+    return replace(placed, notes=[f"the world is that of {world}"])
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
@@ -180,22 +183,33 @@ def _weak(found: PointRig, rig: Rig, covariance_m2: Float[np.ndarray, "cameras 3
     return sentences
 
 
-def _lenses_of(names: Sequence[str], path: Path | None) -> Rig:
-    """Lenses of the cameras from a calibration; a file with one camera has the lens of all."""
-    if path is None:
+def _lenses_of(names: Sequence[str], settings: RigSettings) -> Rig:
+    """Lenses of the cameras, from a calibration or a data sheet; a file with one camera has the lens of all."""
+    path, fov_deg, focal_mm = settings.lenses, settings.fov_deg, settings.focal_length_mm
+    ways = sum(value is not None for value in (path, fov_deg, focal_mm))
+    if ways != 1 or (focal_mm is None) != (settings.sensor_mm is None):
         raise SettingsError(
             "--lenses",
-            expected="a calibration with the lens of each camera",
-            found="none",
-            remedy="calibrate intrinsics",
+            expected="a calibration with the lens of each camera, or --fov H,V, or --focal-length with --sensor",
+            found="another combination" if ways else "none",
         )
-    lenses = read_lenses(path)
+    if path is not None:
+        lenses = read_lenses(path, settings.size)
+    elif settings.size is None:
+        raise SettingsError("--size", expected="width and height of the images", found="none")
+    elif fov_deg is not None:
+        lenses = make_rig({"all": lens_of_view(*fov_deg, settings.size)})
+    else:
+        sensor_mm = settings.sensor_mm or (0.0, 0.0)
+        lenses = make_rig({"all": lens_of_sensor(focal_mm or 0.0, sensor_mm, settings.size)})
     if len(lenses) == 1:
         return Rig(tuple(names), lenses.cameras[np.zeros(len(names), np.int64)])
     chosen = [chosen_camera(name, lenses.names) for name in names]
     for name, found in zip(names, chosen, strict=True):
         if found is None:
-            raise InputError(path, expected=f"the lens of {name}", found=f"only {', '.join(lenses.names)}")
+            raise InputError(
+                path or "lenses", expected=f"the lens of {name}", found=f"only {', '.join(lenses.names)}"
+            )
     rows = np.array([lenses.names.index(found) for found in chosen if found is not None])
     return Rig(tuple(names), lenses.cameras[rows])
 

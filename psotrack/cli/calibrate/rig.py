@@ -7,7 +7,13 @@ from typing import Any
 
 import click
 
-from psotrack.calibration.rig.settings import BoardSettings, LensSettings, PointSettings, WorldSettings
+from psotrack.calibration.rig.settings import (
+    BoardSettings,
+    LensSettings,
+    PointSettings,
+    SheetSettings,
+    WorldSettings,
+)
 from psotrack.cli.calibrate.options import BOARD_NAMES, OUT
 from psotrack.cli.options import plot_option, running
 from psotrack.cli.output import Output
@@ -18,6 +24,7 @@ from psotrack.cli.records import HelpfulCommand, options_of
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
 @options_of(BoardSettings, "board", names=BOARD_NAMES, heading="Board", rare=("separation_m", "first_marker"))
 @options_of(LensSettings, "lens", heading="Lenses", rare=("same_lens",))
+@options_of(SheetSettings, "sheet", heading="Lenses", rare=("focal_length_mm", "sensor_mm"))
 @options_of(WorldSettings, "world")
 @options_of(PointSettings, "points", heading="Instead of a board", rare=("stick_m",))
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
@@ -33,6 +40,9 @@ def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path,
     markers and dictionary are found in the images; --squares states them. With --points, VIDEO is a recording with
     detections, or a CSV file; with --pairs there is none.
 
+    Of points of known place, each camera needs at least four that are not on one line. Twelve that are spread over the
+    image and in depth are good. Points that disagree with the others are left out, and shown.
+
     \b
     Examples:
       psotrack calibrate rig my_lab/board --square 0.04 --out my_lab/rig.toml
@@ -42,6 +52,8 @@ def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path,
       psotrack calibrate rig a b --squares 1x1 --marker 0.2 --first-marker 7 --lenses lenses.toml --out rig.toml
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
+      psotrack calibrate rig --pairs pairs.csv --places points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
+      psotrack calibrate rig SEQ --markers SEQ/aruco_corners.csv --lenses lenses.toml --out rig.toml
     """
     from psotrack import api
 
