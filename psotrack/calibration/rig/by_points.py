@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.image_points import find_markers, read_image_points
 from psotrack.calibration.intrinsics import lens_of_sensor, lens_of_view
-from psotrack.calibration.placed_cameras import PlacedCameras, place_cameras, row_of
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
@@ -31,6 +31,7 @@ from psotrack.calibration.rig.point_files import (
     world_in_words,
 )
 from psotrack.calibration.rig.point_shifts import find_point_shifts
+from psotrack.calibration.rig.result import PointFit, RigCalibration, calibration_by_points
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
@@ -43,7 +44,7 @@ from psotrack.recordings.datasets import is_recording, open_recording
 _FEW_USED = 0.5
 
 
-def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> PlacedCameras:
+def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> RigCalibration:
     """Place the cameras of a rig by a moving point, or by the two ends of a moving stick.
 
     Args:
@@ -90,26 +91,21 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     with errors_name(settings.world or sources[0]):
         change, place = world_of(found)
     covariance_m2 = covariance_of_centres(found, lambda found: world_of(found)[0])
-    rig, rows = change.rig(found.adjusted.rig), {}
+    rig, adjusted, fits = change.rig(found.adjusted.rig), found.adjusted, {}
     for index, name in enumerate(rig.names):
-        seen = np.isfinite(found.adjusted.residual_px[:, index])
-        rows[name] = row_of(
-            np.asarray(rig.cameras.centre_world[index]),
-            covariance_m2[index],
-            found.adjusted.residual_px[seen, index],
-            found.adjusted.used[seen, index],
-            found.views.number[seen],
-        )
-    shifts = map(str, find_point_shifts(found.adjusted.rig, views))
+        seen = np.isfinite(adjusted.residual_px[:, index])
+        residual_px, used = adjusted.residual_px[seen, index], adjusted.used[seen, index]
+        fits[name] = PointFit(found.views.number[seen].tolist(), covariance_m2[index], residual_px, used)
+    shifts = map(str, find_point_shifts(adjusted.rig, views))
     notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
-    return PlacedCameras(rig, rows, notes)
+    return calibration_by_points(rig, fits, notes)
 
 
 def calibrate_by_known_points(
     sources: Sequence[Path],
     settings: RigSettings,
     marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]] | None = None,
-) -> PlacedCameras:
+) -> RigCalibration:
     """Place the cameras of a rig by points of known place, or by ArUco markers in their images.
 
     Args:
@@ -137,10 +133,23 @@ def calibrate_by_known_points(
     else:
         marks = read_image_points(settings.pairs or "", settings.places)
     lenses, world = _lenses_of(tuple(marks), settings), settings.pairs or settings.markers
-    by_name = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
-    with errors_name(world):
-        placed = place_cameras(marks, by_name, settings.noise_px)
-    return replace(placed, notes=[f"the world is that of {world}"])
+    cameras, fits = {}, {}
+    for index, (name, mark) in enumerate(marks.items()):
+        lens = lenses.cameras[index]
+        with errors_name(world):
+            located = locate_camera(
+                mark.points_m,
+                mark.points_px,
+                np.asarray(lens.K),
+                np.asarray(lens.dist),
+                settings.noise_px,
+                fisheye=bool(lens.fisheye),
+                name=f"camera {name}",
+            )
+        cameras[name] = replace(lens, T_cam_world=located.T_cam_world)
+        covariance_m2 = located.centre_covariance_m2
+        fits[name] = PointFit(mark.points, covariance_m2, located.residual_px, located.used)
+    return calibration_by_points(make_rig(cameras), fits, [f"the world is that of {world}"])
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:

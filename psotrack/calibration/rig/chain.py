@@ -146,15 +146,15 @@ def _transform(
             for there in seen.poses[second][instant]
         ]
     )
-    errors = np.full((len(candidates), len(some)), 1.0)
     most = max(len(seen.poses[first][instant]) for instant in some)
-    for rank in range(most):
-        # The rank-th pose of each instant; instants with fewer poses repeat their last one.
-        here = np.array(
+    # All poses of each instant; instants with fewer poses repeat their last one.
+    here = np.array(
+        [
             [seen.poses[first][instant][min(rank, len(seen.poses[first][instant]) - 1)] for instant in some]
-        )
-        found, _ = seen.errors(second, some, candidates[:, None] @ here)
-        errors = np.minimum(errors, found)
+            for rank in range(most)
+        ]
+    )
+    errors = seen.errors(second, some, candidates[:, None, None] @ here)[0].min(axis=1)
     total = np.minimum(errors, 5 * _FITS).mean(axis=1)
     best = int(total.argmin())
     # All shared instants count, not only those that gave candidates.
