@@ -70,6 +70,11 @@ class CameraFigures:
     best_partner: str
     shared: int
 
+    @property
+    def slip_px(self) -> float:
+        """How far the board is from where the other cameras have it, typically, pixels."""
+        return float(np.sqrt(max(self.median_px**2 - self.own_median_px**2, 0)))
+
 
 def figures_of(calibrated: CalibratedRig) -> dict[str, CameraFigures]:
     """Figures of each camera, by name."""
@@ -204,36 +209,29 @@ def advise(calibrated: CalibratedRig) -> list[str]:
         for name, row in rows.items()
         if len(rows) > 1 and row.shared < _SHARED
     ]
-    bare = [f"{name} ({row.covered:.0%})" for name, row in rows.items() if row.covered < _COVERED]
-    if bare:
-        sentences.append(
-            f"the board was seen in small parts of the images of {', '.join(bare)}: move it into their corners"
-        )
-    open_focal = [
-        f"{name} (± {row.focal_std_px[0] / row.focal_px[0]:.1%})"
-        for name, row in rows.items()
-        if row.focal_std_px[0] > _FOCAL_STD * row.focal_px[0]
-    ]
-    if open_focal:
-        sentences.append(
-            f"the focal lengths of {', '.join(open_focal)} are not well known: tilt the board more, and film it nearer"
-        )
-    shifts = find_shifts(calibrated)
-    sentences_of_shifts = [
+    named = {
+        "the board was seen in small parts of the images of {}: move it into their corners": {
+            name: f"{row.covered:.0%}" for name, row in rows.items() if row.covered < _COVERED
+        },
+        "the focal lengths of {} are not well known: tilt the board more, and film it nearer": {
+            name: f"± {row.focal_std_px[0] / row.focal_px[0]:.1%}"
+            for name, row in rows.items()
+            if row.focal_std_px[0] > _FOCAL_STD * row.focal_px[0]
+        },
+        "the board is not where the other cameras see it for {}: hold it still, "
+        "or check that frames of equal number are of one instant": {
+            name: f"{row.slip_px:.1f} px"
+            for name, row in rows.items()
+            if row.median_px > _SLIP_FACTOR * row.own_median_px and row.slip_px > _SLIP_PX
+        },
+    }
+    for words, cameras in named.items():
+        if cameras:
+            sentences.append(words.format(", ".join(f"{name} ({value})" for name, value in cameras.items())))
+    number = int(calibrated.views.number[0])
+    return sentences + [
         f"{name} fits the others better if its frame {number} is their frame {number + shift}: it shows the scene "
         f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'early' if shift > 0 else 'late'}; write "
         f"time_offset_s = {shift} / fps for it in a recording.toml, and pass the recording.toml instead of the videos"
-        for name, shift in shifts.items()
-        for number in [int(calibrated.views.number[0])]
+        for name, shift in find_shifts(calibrated).items()
     ]
-    slipping = []
-    for name, row in rows.items():
-        slip_px = float(np.sqrt(max(row.median_px**2 - row.own_median_px**2, 0)))
-        if row.median_px > _SLIP_FACTOR * row.own_median_px and slip_px > _SLIP_PX:
-            slipping.append(f"{name} ({slip_px:.1f} px)")
-    if slipping:
-        sentences.append(
-            f"the board is not where the other cameras see it for {', '.join(slipping)}: hold it still, "
-            "or check that frames of equal number are of one instant"
-        )
-    return sentences + sentences_of_shifts

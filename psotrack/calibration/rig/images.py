@@ -67,11 +67,6 @@ class CameraImages:
         for row, image in read_frames_at(self.video, rows):
             yield int(self.frames[row]), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
-    def spread(self, count: int) -> Int[np.ndarray, " chosen"]:
-        """Numbers of frames, evenly spread: at least `count` and fewer than twice `count`, or all."""
-        step = max(1, len(self.frames) // count)
-        return self.frames[::step]
-
 
 def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None) -> tuple[CameraImages, ...]:
     """Open the images of each camera: videos, folders of images, or patterns such as left*.png.
@@ -211,7 +206,7 @@ def _open(name: str, path: Path) -> CameraImages:
     return CameraImages(name, path, probe_images(list(ordered.values()), 1.0), np.array(list(ordered)))
 
 
-def first_images(cameras: Sequence[CameraImages], count: int = 10) -> list[UInt8[np.ndarray, "_ _"]]:
+def first_images(cameras: Sequence[CameraImages], count: int) -> list[UInt8[np.ndarray, "_ _"]]:
     """About `count` grey images of each camera, evenly spread over the recording, of the cameras in turn."""
-    readers = [camera.read(camera.spread(count)) for camera in cameras]
+    readers = [camera.read(camera.frames[:: max(1, len(camera.frames) // count)]) for camera in cameras]
     return [one[1] for of_all in zip_longest(*readers) for one in of_all if one is not None]
