@@ -35,7 +35,7 @@ from psotrack.geometry.estimation import (
 
 #: Largest median residual of a usable pose, in units of the stated σ; points within it may be inliers.
 _MAX_MEDIAN_SIGMAS = 10.0
-#: Points have no extent in a direction if the extent is below this share of the largest extent, and are nearly in a
+#: Points have no extent in a direction if the extent is below this fraction of the largest extent, and are nearly in a
 #: plane below that: nearly planar points often fit a second pose.
 _FLAT, _NEARLY_FLAT = 1e-3, 0.1
 #: A pose is unique if it is this many times as likely as every other pose.
@@ -174,9 +174,9 @@ class _Fit:
     def equations(self) -> NormalEquations:
         """Normal equations of a small turn about the camera's axes (rad) and of the translation (m)."""
         weight = self.used * (cauchy_weight(self.squares) if self.is_robust else 1.0)
-        off, slopes = self._linear
+        residuals, slopes = self._linear
         weighted = (weight[:, None, None] * slopes).reshape(-1, 6)
-        return NormalEquations(weighted.T @ slopes.reshape(-1, 6), weighted.T @ off.ravel())
+        return NormalEquations(weighted.T @ slopes.reshape(-1, 6), weighted.T @ residuals.ravel())
 
     def moved(self, step: Step) -> _Fit:
         """Turn and shift the camera."""

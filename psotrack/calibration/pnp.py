@@ -144,9 +144,9 @@ def _seen(
 
 def _flattened(points_m: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
     """Points moved into the plane that is nearest to them."""
-    off_m = points_m - points_m.mean(axis=0)
-    normal = np.linalg.svd(off_m, full_matrices=False)[2][2]
-    return points_m - (off_m @ normal)[:, None] * normal
+    centred_m = points_m - points_m.mean(axis=0)
+    normal = np.linalg.svd(centred_m, full_matrices=False)[2][2]
+    return points_m - (centred_m @ normal)[:, None] * normal
 
 
 def _pose(turn: np.ndarray, shift: np.ndarray) -> Float[np.ndarray, "4 4"]:

@@ -105,7 +105,7 @@ def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], worl
     }
     after = [
         f"lens models (distortion coefficients): {models}",
-        f"worst views (camera, frame, px): {', '.join(f'{name} {frame} {off:.2f}' for name, frame, off in worst)}",
+        f"worst views (camera, frame, px): {', '.join(f'{name} {frame} {px:.2f}' for name, frame, px in worst)}",
         *advice,
         f"the world is {world}",
     ]

@@ -40,7 +40,7 @@ from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings import read_detections
 from psotrack.recordings.datasets import is_recording, open_recording
 
-#: Share of the sightings below which the user is told how few are used.
+#: Fraction of the sightings below which the user is told how few are used.
 _FEW_USED = 0.5
 
 

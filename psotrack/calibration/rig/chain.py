@@ -22,7 +22,7 @@ from psotrack.errors import InputError
 
 #: Largest number of shared instants that give candidates, and that the candidates are compared on.
 _MOST_INSTANTS = 40
-#: Distance in the image, as a share of its width, up to which a first transform fits an instant.
+#: Distance in the image, as a fraction of its width, up to which a first transform fits an instant.
 _FITS = 0.02
 
 

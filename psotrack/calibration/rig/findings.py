@@ -16,11 +16,11 @@ from psotrack.geometry import undistort
 
 #: Columns and rows of cells of an image; a cell with a corner is covered.
 CELLS = (8, 6)
-#: Smallest share of an image that the board should have covered.
+#: Smallest fraction of an image that the board should have covered.
 _COVERED = 0.5
 #: Smallest number of views that a camera should share with another one.
 _SHARED = 12
-#: Largest standard deviation of a focal length, as a share of it, that needs no advice.
+#: Largest standard deviation of a focal length, as a fraction of it, that needs no advice.
 _FOCAL_STD = 0.005
 #: A camera's views slip if the residuals are larger by this factor, and by this many pixels, than within the views.
 _SLIP_FACTOR, _SLIP_PX = 2.0, 0.3
@@ -42,7 +42,7 @@ class CameraFigures:
         rms_px: root mean square of the residuals of the corners that count, pixels.
         median_px: median residual of all corners found, pixels.
         own_median_px: median residual within the views, pixels: errors of the corners and of the lens alone.
-        covered: share of the image in which corners were found.
+        covered: fraction of the image in which corners were found.
         coverage: number of corners in each part of the image, row by row.
         image_size_wh: width and height of the images, pixels.
         focal_px: focal lengths along x and y, pixels.

@@ -6,7 +6,7 @@ placed by points that are known already (perspective-n-point), and after each ca
 (`point_adjustment`). Detections of other things are left out by random sampling, first with a wide gate. Scale, axes
 and origin of the world stay open: see `world`.
 
-How well the cameras are known depends on what fixes the world, and on errors that last: of the lens, of a detector, of
+How well the cameras are known depends on what fixes the world, and on correlated errors: of the lens, of a detector, of
 GPS. So the covariances are those of a jackknife: the adjustment and the fit of the world again without each tenth of
 the recording (J. W. Tukey 1958; H. R. Künsch 1989 for parts of a series). Where it shows that the sightings hardly
 determine a camera, the rigs without each tenth are found from nothing, because others may fit as well.
@@ -47,7 +47,7 @@ _FAR = (10.0, 4.0, 2.0, 1.5)
 _LEAST_NOISE_PX = 0.2
 #: Number of parts of the recording for the jackknife.
 _PARTS = 10
-#: A camera's place is hardly determined if its standard deviation is above this share of the rig's size.
+#: A camera's place is hardly determined if its standard deviation is above this fraction of the rig's size.
 LOOSE = 0.1
 
 

@@ -21,7 +21,7 @@ _SEPARATOR = ","
 #: Longest time between two frames between which a point is interpolated, in intervals of the camera: one frame in which
 #: the point was missed lies between them.
 _LONGEST_GAP = 2.5
-#: Shares of an interval below this are rounding.
+#: Fractions of an interval below this are rounding.
 _SAME = 1e-6
 #: Largest number of a frame.
 _LARGEST_FRAME = 2**31
@@ -134,11 +134,11 @@ def _at_times(
     time_s, point_px = time_s[order], point_px[order]
     after = np.clip(np.searchsorted(time_s, wanted_s), 1, len(time_s) - 1)
     gap_s = time_s[after] - time_s[after - 1]
-    share = (wanted_s - time_s[after - 1]) / np.maximum(gap_s, 1e-9)
+    fraction = (wanted_s - time_s[after - 1]) / np.maximum(gap_s, 1e-9)
     # Where the wanted time is that of a frame, the gap beside the frame does not matter.
-    is_exact = np.minimum(np.abs(share), np.abs(share - 1)) < _SAME
-    usable = is_exact | ((np.abs(share - 0.5) < 0.5) & (gap_s <= longest_s))
-    pixel = point_px[after - 1] + share[:, None] * (point_px[after] - point_px[after - 1])
+    is_exact = np.minimum(np.abs(fraction), np.abs(fraction - 1)) < _SAME
+    usable = is_exact | ((np.abs(fraction - 0.5) < 0.5) & (gap_s <= longest_s))
+    pixel = point_px[after - 1] + fraction[:, None] * (point_px[after] - point_px[after - 1])
     return np.where(usable[:, None], pixel, np.nan)
 
 
