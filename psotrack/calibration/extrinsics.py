@@ -1,7 +1,7 @@
 """The pose of a camera, from points whose positions in the world and in the image are known, in float64.
 
 The perspective-n-point problem is solved in three steps. Random sampling and solvers in closed form give first poses
-(`pnp`); of points that are nearly in a plane both poses of IPPE. Least squares of the reprojection error with a Cauchy
+(`pnp`), both poses of IPPE among them. Least squares of the reprojection error with a Cauchy
 loss finds the outliers. Least squares without the outliers gives the pose and its covariance,
 
     C = σ² (JᵀJ)⁻¹,
@@ -35,9 +35,8 @@ from psotrack.geometry.estimation import (
 
 #: Largest median residual of a usable pose, in units of the stated σ; points within it may be inliers.
 _MAX_MEDIAN_SIGMAS = 10.0
-#: Points have no extent in a direction if the extent is below this fraction of the largest extent, and are nearly in a
-#: plane below that: nearly planar points often fit a second pose.
-_FLAT, _NEARLY_FLAT = 1e-3, 0.1
+#: Points have no extent in a direction if the extent is below this fraction of the largest extent.
+_FLAT = 1e-3
 #: A pose is unique if it is this many times as likely as every other pose.
 _ODDS = 100.0
 #: Poses are the same if the camera's orientations differ by less than this, radians.
@@ -97,12 +96,12 @@ def locate_camera(
     check_positive("noise_px", noise_px)
     extent_m = _check_points(points_m, points_px, name)
     lens = Camera(np.eye(4), K, dist, np.zeros(2), np.array(True) if fisheye else None)
-    fits = _likely_poses(points_m, points_px, lens, noise_px, extent_m)
+    fits = _likely_poses(points_m, points_px, lens, noise_px)
     typical_px = float(np.median(fits[0].distance_px)) if fits else np.inf
     if typical_px > _MAX_MEDIAN_SIGMAS * noise_px:
         mirrored_m = points_m * np.array([1.0, 1.0, -1.0])
         is_flat = extent_m[2] <= _FLAT * extent_m[0]
-        twins = [] if is_flat else _likely_poses(mirrored_m, points_px, lens, noise_px, extent_m)
+        twins = [] if is_flat else _likely_poses(mirrored_m, points_px, lens, noise_px)
         is_mirrored = any(np.median(twin.distance_px) < 0.2 * typical_px for twin in twins[:1])
         raise _no_pose(typical_px, noise_px, name, is_mirrored=is_mirrored)
     _check_unique(fits, name)
@@ -195,7 +194,6 @@ def _likely_poses(
     points_px: Float[np.ndarray, "points 2"],
     lens: Camera,
     noise_px: float,
-    extent_m: Float[np.ndarray, "3"],
 ) -> list[_Fit]:
     """Local minima of the robust cost, the most likely pose first."""
     # A pixel at which the lens shows nothing starts no pose, and counts as an outlier.
@@ -204,9 +202,8 @@ def _likely_poses(
     sampled = solve_pnp_ransac(points_m, rays, gate)
     everything = np.ones(len(rays), bool)
     near = everything if sampled is None else sampled[1]
-    solvers: list[Solver] = ["sqpnp"]
-    if extent_m[2] < _NEARLY_FLAT * extent_m[0]:
-        solvers.append("ippe")
+    # Points that are nearly in a plane may fit a second pose, which IPPE finds; four points may fit four.
+    solvers: list[Solver] = ["sqpnp", "ippe"]
     if len(rays) == MIN_POINTS:
         solvers.append("ap3p")
     fits = [
