@@ -37,7 +37,7 @@ class ReferenceOptions:
 
     Attributes:
         drone: drone of the reference that carries the camera; None: the name in TRACKS, or the only drone.
-        orientations: orientations of the reference by a clock of their own, as of an IMU, as TUM or CSV.
+        orientations: orientations of the reference by a clock of their own, as of an IMU, as TUM.
     """
 
     drone: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
@@ -55,7 +55,8 @@ _NAMES = {"with_lever_arm": "lever-arm", "with_turn": "turn", "max_offset_s": "m
     "--offset",
     metavar="SECONDS|auto",
     callback=lambda _, __, given: _read_offset(given),
-    help="Time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s.  [default: 0]",
+    help="Time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s.  [default: 0; "
+    "auto for paths with orientations]",
 )
 @options_of(ReferenceOptions, "given", heading="Paths with orientations")
 @options_of(PathSettings, "settings", names=_NAMES, heading="Paths with orientations")
