@@ -66,7 +66,6 @@ ORDER = [
     "inside_out.line_time",
     "inside_out.mapping",
     "inside_out.localising",
-    "inside_out.comparison",
     "inside_out.fusing",
     "inside_out",
     "pipeline",

@@ -61,7 +61,7 @@ from .schema import (
     write_toml,
 )
 from .similarity import similarity
-from .standard_errors import block_jackknife, standard_error, widening
+from .standard_errors import block_jackknife, standard_error, time_blocks, widening
 from .text_tables import POSITION, finite_or_none, format_numbers, text_table
 from .times import LEAST_STEP_S, first_repeat
 
@@ -151,6 +151,7 @@ __all__ = [
     "standard_error",
     "terminal_bar",
     "text_table",
+    "time_blocks",
     "toml_key",
     "toml_text",
     "toml_value",
