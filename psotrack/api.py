@@ -225,6 +225,7 @@ def doctor(
         made = compute(recording, SilhouetteSettings(), cache=stored, jobs=jobs, report=report)
         sightings = from_silhouettes(made, report)
     else:
+        recording = recording.usable(videos=False)
         files = detection_files_of(recording, source)
         recording.check_detections(files)
         boxes = {name: read_detections(path) for name, path in files.items()}
