@@ -20,9 +20,9 @@ from jaxtyping import UInt8
 from psotrack import calibration, inside_out
 from psotrack.calibration import doctor as examination
 from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.foreground.silhouettes import ForegroundSettings, Living, SilhouetteSettings, compute
 from psotrack.geometry.rig_files import write_rig
-from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.pipeline import (
     Parts,
     TrackedRecording,

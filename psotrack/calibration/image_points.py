@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import MarkerDetector
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import Table, read_table
 
@@ -110,17 +110,14 @@ def find_markers_in(
     dictionary: str = "4x4_1000",
 ) -> ImagePoints:
     """Find the corners of markers of known positions in grey images of a static camera; see `find_markers`."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
+    detector = MarkerDetector(dictionary, ids=corners_m)
     found: dict[int, list[Float[np.ndarray, "4 2"]]] = {}
     frames = 0
     for grey in images:
         frames += 1
-        quads, ids, _ = detector.detectMarkers(grey)
-        for quad, marker in zip(quads, [] if ids is None else map(int, ids.ravel()), strict=True):
-            if marker in corners_m:
-                found.setdefault(marker, []).append(quad.reshape(4, 2).astype(np.float64))
+        markers = detector.detect(grey).of_single_ids()
+        for quad, marker in zip(markers.corners_px, markers.ids.tolist(), strict=True):
+            found.setdefault(marker, []).append(quad)
     kept = sorted(marker for marker, quads in found.items() if len(quads) >= _SEEN * frames)
     return ImagePoints(
         tuple(f"{marker}.{corner + 1}" for marker in kept for corner in range(4)),

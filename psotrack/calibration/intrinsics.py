@@ -107,7 +107,7 @@ def lens_of_board(
         SettingsError: the dictionary does not exist.
     """
     found = find_views(board, (images,), instants_of_numbers((images,)), report)
-    board = found.recognised.board
+    board = found.board
     views = found.views.select(found.views.seen[0])
     if len(views.number) < _MIN_VIEWS:
         raise InputError(

@@ -60,9 +60,7 @@ def calibrate_by_board(
         every = {camera.name: len(camera.frames) for camera in cameras}
         searched = zip(found.views.names, found.searched.tolist(), strict=True)
         said += say_searched({name: (count, every[name]) for name, count in searched})
-        calibrated = calibrate_rig(
-            found.recognised.board, found.views, lenses, floor=settings.floor, report=report
-        )
+        calibrated = calibrate_rig(found.board, found.views, lenses, floor=settings.floor, report=report)
     if given is not None:
         with errors_name(given.path):
             change, left_m = fit_world(calibrated.rig, given, with_scale=False)

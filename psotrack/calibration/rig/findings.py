@@ -147,10 +147,8 @@ def say_searched(searched: Mapping[str, tuple[int, int]]) -> list[str]:
 
 def say_print(found: FoundBoards) -> list[str]:
     """Sentences on how the board was printed and seen."""
-    recognised, sentences = found.recognised, []
-    if recognised.inverted:
-        sentences.append("the board is printed white on black")
-    if recognised.board.legacy:
+    sentences = []
+    if found.board.legacy:
         sentences.append(
             "the board has the pattern of OpenCV before version 4.6, with a marker in its first corner"
         )
