@@ -599,7 +599,7 @@ def test_the_stated_standard_deviation_agrees_with_the_errors_of_corners(noise_p
         built = build_map(
             with_insets(sightings(noise_px=noise_px, num_views=30, seed=seed), seed), {7: ROOM[7]}
         )
-        std_m = built.marker_map.std_of(built.ids)
+        std_m = built.marker_map.std_of(built.ids.tolist())
         assert std_m[built.known] == 0
         inside += (errors_m(built) / np.maximum(std_m, 1e-9)[:, None] < np.sqrt(chi2.ppf(0.9, 3)))[
             ~built.known

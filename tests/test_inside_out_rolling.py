@@ -415,7 +415,7 @@ def test_a_map_from_a_rolling_shutter_is_as_good_as_from_a_global_one(line_time_
     ids, counts = np.unique(sightings.marker, return_counts=True)
     known = {int(marker): corners[int(marker)] for marker in ids[np.argsort(counts)[-3:]]}
     built = build_map(sightings, known)
-    off = built.marker_map.corners_of(built.ids) - np.array(
+    off = built.marker_map.corners_of(built.ids.tolist()) - np.array(
         [corners[marker] for marker in built.ids.tolist()]
     )
     off = off[~built.known]

@@ -214,7 +214,7 @@ class Bundle:
                 off[rows] = problem.corners_px[rows] - pixels.reshape(shape)
                 by_point[rows] = slope.reshape(*shape, 3)
                 by_lens[rows, ..., : of_lens.shape[-1]] = of_lens.reshape(*shape, of_lens.shape[-1])
-        off[in_camera[..., 2] <= NEAR_M] = np.inf
+        off[(in_camera[..., 2] <= NEAR_M) & np.isfinite(off[..., 0])] = np.inf
         if problem.inward is not None:
             off -= np.ravel(state.lenses)[problem.lens, None, None] * problem.inward
             by_lens[..., 0] = problem.inward
@@ -227,9 +227,24 @@ class Bundle:
         by_target = [-by_world @ cross_matrices(arm), by_world]
         if problem.cameras_are_blocks:
             by_target.append(by_world @ arm[..., None])
-            return off, *(np.concatenate(part, axis=-1) for part in ([by_lens, *by_target], by_camera))
-        by_block = np.concatenate(by_target, axis=-1) * problem.free_target[problem.target, None, None, :6]
-        return off, np.concatenate([by_lens, *by_camera], axis=-1), by_block
+            by_shared, by_block = [by_lens, *by_target], by_camera
+        else:
+            by_shared, by_block = [by_lens, *by_camera], by_target
+        return (
+            off,
+            np.concatenate(by_shared, axis=-1),
+            np.concatenate(by_block, axis=-1) * self._is_free_block,
+        )
+
+    @property
+    def _is_free_block(self) -> Float[np.ndarray, "sightings 1 1 *m"]:
+        """Whether the unknowns of a sighting's block are adjusted."""
+        free = (
+            self.problem.free_camera[:, None]
+            if self.problem.cameras_are_blocks
+            else self.problem.free_target[:, :6]
+        )
+        return free[self.problem.block, None, None].astype(np.float64)
 
     @cached_property
     def distance_px(self) -> Float[np.ndarray, "sightings corners"]:
@@ -370,7 +385,7 @@ def summed(
     """An array of a shape with the sums of all values that have the same index."""
     flat = np.broadcast_to(np.ravel_multi_index(np.broadcast_arrays(*index), shape), values.shape)
     sums: np.ndarray = np.bincount(flat.ravel(), values.ravel(), minlength=int(np.prod(shape)))
-    return sums.reshape(shape)
+    return sums.reshape(shape).astype(np.float64)
 
 
 def _moved(

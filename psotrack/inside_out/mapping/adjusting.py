@@ -46,6 +46,8 @@ _SHAKEN_RAD = 0.05
 #: Fewest pairs of consecutive frames that tell whether a shutter rolls, and the ratio of the estimated readout to its
 #: standard deviation from which on it does.
 _FEWEST_PAIRS, _SURE = 5, 4.0
+#: Number of pairs that follow one another whose errors are alike.
+_ALIKE = 5
 #: Standard deviation of a motion that is none, radians and metres.
 _STILL = 1e-7
 #: Number of residuals of a marker in one view.
@@ -115,7 +117,8 @@ def adjust(
     bundle, sigma_px = _without_outliers(bundle, unknowns)
     rolling = _with_motion(sightings, bundle)
     if rolling is not None:
-        bundle, sigma_px = _without_outliers(rolling, unknowns + 6 * sightings.num_views)
+        moved, moved_px = _without_outliers(rolling, unknowns + 6 * sightings.num_views)
+        bundle, sigma_px = (moved, moved_px) if moved_px < sigma_px else (bundle, sigma_px)
     inset_px = np.ravel(bundle.state.lenses)
     return AdjustedMap(
         _markers(markers, bundle.state),
@@ -201,8 +204,8 @@ def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
 
     A view's rows show the motion m during half a frame with the information L. The next view shows the motion x in a
     whole frame. The readout, in frames, is 2 r of the least squares solution of m = r x, weighted by L, over all pairs
-    of consecutive views; its variance is that of the sums over pairs (Liang & Zeger, Longitudinal data analysis using
-    generalized linear models, Biometrika 73(1), 1986).
+    of consecutive views; its variance is that of the sums over neighbouring pairs, whose errors are alike (Liang &
+    Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73(1), 1986).
     """
     first = np.flatnonzero(_is_followed(sightings))
     if len(first) < _FEWEST_PAIRS:
@@ -240,7 +243,9 @@ def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
         if pairs.sum() < _FEWEST_PAIRS:
             continue
         ratio = right[pairs].sum() / weight[pairs].sum()
-        spread = np.linalg.norm(right[pairs] - ratio * weight[pairs]) / weight[pairs].sum()
+        rest = right[pairs] - ratio * weight[pairs]
+        sums = np.add.reduceat(rest, np.arange(0, len(rest), _ALIKE))
+        spread = np.linalg.norm(sums) / weight[pairs].sum()
         if abs(ratio) > _SURE * spread:
             size = np.sqrt((shown[pairs].reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
             std[sightings.lens == video] = np.maximum(abs(ratio) * np.repeat(size, 3), _STILL)

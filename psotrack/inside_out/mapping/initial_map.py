@@ -7,7 +7,7 @@ many frames.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,7 +138,7 @@ class MarkerPlacer:
                 )
                 placed |= {marker: one for marker, one in better.items() if marker not in known}
 
-    def _next_marker(self, views: ViewPoses, done: Collection[int]) -> int | None:
+    def _next_marker(self, views: ViewPoses, done: set[int]) -> int | None:
         """The marker that most views show beside placed markers; None if there is none."""
         sure = np.minimum(views.count, 3)[self.sightings.view]
         weight = np.bincount(self.sightings.marker, sure)
