@@ -13,6 +13,7 @@ from .image_points import (
 from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
 from .lens_models import LensModel, known_lenses, parse_lens_model
 from .placed_cameras import PlacedCameras, place_cameras
+from .pnp import ray_distances, refine_pnp, solve_pnp, solve_pnp_ransac
 from .residuals import GATE, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
 from .rig.by_board import RigCalibration, calibrate_by_board
@@ -105,15 +106,19 @@ __all__ = [
     "open_recorded",
     "parse_lens_model",
     "place_cameras",
+    "ray_distances",
     "read_image_points",
     "read_point_views",
     "read_world",
+    "refine_pnp",
     "reproject",
     "save_board",
     "save_coverage",
     "say_not_compared",
     "say_print",
     "say_searched",
+    "solve_pnp",
+    "solve_pnp_ransac",
     "spread_px",
     "stick_length",
     "summed",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -12,6 +11,7 @@ from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
 from psotrack.calibration.bundle import Bundle, BundleProblem, BundleState, solve_robustly
 from psotrack.calibration.lens_models import PINHOLE, LensModel
+from psotrack.calibration.pnp import ray_distances, solve_pnp
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
 _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)
@@ -32,26 +32,11 @@ def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Floa
     """
     found: list[tuple[float, np.ndarray]] = []
     for order in board.labellings:
-        seen = np.isfinite(rays[:, 0])
-        if seen.sum() < board.least_corners:
+        if np.isfinite(rays[:, 0]).sum() < board.least_corners:
             break
-        points_m, ends = board.corners_m[order][seen], np.ascontiguousarray(rays[seen])
-        try:
-            count, turns, shifts, errors = cv2.solvePnPGeneric(
-                points_m, ends, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-            )
-        except cv2.error:
-            # OpenCV fails for corners on one line.
-            continue
-        if not count:
-            # OpenCV finds no pose where a lens that is far off spreads the corners of a view too far.
-            continue
-        for turn, shift, error in zip(turns, shifts, np.asarray(errors).ravel(), strict=True):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-            # The seen corners are in front of the camera; before a wide lens the board's origin may be beside it.
-            if np.isfinite(T).all() and (points_m @ T[2, :3] + T[2, 3] > 0).all():
-                found.append((float(error), T))
+        points_m = board.corners_m[order]
+        for T in solve_pnp(points_m, rays, "ippe"):
+            found.append((float(np.nanmean(ray_distances(points_m, rays, T))), T))
     found.sort(key=lambda one: one[0])
     return np.array([T for _, T in found]).reshape(-1, 4, 4)
 

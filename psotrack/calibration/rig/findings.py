@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.calibration.pnp import ray_distances, refine_pnp
 from psotrack.calibration.rig.adjustment import CalibratedRig
 from psotrack.calibration.rig.lens_choice import say_not_compared
 from psotrack.calibration.rig.views import FoundBoards
@@ -199,12 +199,8 @@ def _misplaced(
     T_cam_world: Float[np.ndarray, "4 4"],
 ) -> float:
     """Median distance x / z, y / z of points from where a camera sees them, if it stands where they fit best."""
-    seen = np.isfinite(rays[..., 0])
-    points_m, ends = points_m[seen], np.ascontiguousarray(rays[seen])
-    turn, shift = cv2.Rodrigues(T_cam_world[:3, :3])[0], T_cam_world[:3, 3].reshape(3, 1).copy()
-    _, turn, shift = cv2.solvePnP(points_m, ends, np.eye(3), None, turn, shift, True, cv2.SOLVEPNP_ITERATIVE)
-    found, _ = cv2.projectPoints(points_m, turn, shift, np.eye(3), None)
-    return float(np.median(np.linalg.norm(np.asarray(found).reshape(-1, 2) - ends, axis=-1)))
+    points_m, rays = points_m.reshape(-1, 3), rays.reshape(-1, 2)
+    return float(np.nanmedian(ray_distances(points_m, rays, refine_pnp(points_m, rays, T_cam_world))))
 
 
 def advise(calibrated: CalibratedRig) -> list[str]:

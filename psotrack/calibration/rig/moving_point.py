@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.calibration.pnp import solve_pnp_ransac
 from psotrack.calibration.residuals import spread_px
 from psotrack.calibration.rig.point_adjustment import AdjustedRig, adjust
 from psotrack.calibration.rig.world import Similarity
@@ -263,27 +264,15 @@ def _next_camera(
     }
     index = max(seen, key=lambda one: int(seen[one].sum()))
     rays = undistort(lenses.cameras[index], views.points_px[seen[index], index])
-    usable = np.isfinite(rays[:, 0])
-    if usable.sum() >= _LEAST_SHARED:
-        focal_px = float(lenses.cameras.K[index, 0, 0])
-        found, turn, shift, inliers = cv2.solvePnPRansac(
-            points_m[seen[index]][usable],
-            np.ascontiguousarray(rays[usable]),
-            np.eye(3),
-            None,
-            iterationsCount=2000,
-            reprojectionError=_WIDE_PX / focal_px,
-            confidence=0.9999,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-        if found and inliers is not None and len(inliers) >= _LEAST_SHARED:
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-            return index, T
+    focal_px = float(lenses.cameras.K[index, 0, 0])
+    found = solve_pnp_ransac(points_m[seen[index]], rays, _WIDE_PX / focal_px, tries=2000)
+    if found is not None and found[1].sum() >= _LEAST_SHARED:
+        return index, found[0]
+    usable = int(np.isfinite(rays[:, 0]).sum())
     raise InputError(
         f"camera {views.names[index]}",
         expected=f"at least {_LEAST_SHARED} instants at which it sees the point with two other cameras",
-        found=f"{int(usable.sum())} that no pose of it fits" if usable.sum() else "none",
+        found=f"{usable} that no pose of it fits" if usable else "none",
         remedy="move the point where this camera and two others see it",
     )
 

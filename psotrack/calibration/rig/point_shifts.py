@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.calibration.pnp import solve_pnp_ransac
 from psotrack.calibration.rig.moving_point import PointViews
 from psotrack.geometry import Rig, project, triangulate_linearly, undistort
 
@@ -115,18 +115,5 @@ def _fitting_share(
     points_m: Float[np.ndarray, "points 3"], rays: Float[np.ndarray, "points 2"], gate: float
 ) -> float:
     """Share of points that a camera sees along these rays, x / z and y / z, from the pose that fits most of them."""
-    try:
-        is_found, _, _, inliers = cv2.solvePnPRansac(
-            points_m,
-            np.ascontiguousarray(rays),
-            np.eye(3),
-            None,
-            iterationsCount=300,
-            reprojectionError=gate,
-            confidence=0.999,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-    except cv2.error:
-        # OpenCV refuses points that nearly coincide.
-        return 0.0
-    return len(inliers) / len(points_m) if is_found and inliers is not None else 0.0
+    found = solve_pnp_ransac(points_m, rays, gate)
+    return 0.0 if found is None else float(found[1].mean())

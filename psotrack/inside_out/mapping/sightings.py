@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.calibration import solve_pnp
 from psotrack.errors import InputError
 from psotrack.geometry import Camera, undistort
 from psotrack.inside_out.detection import MarkerDetector
@@ -191,20 +192,10 @@ def _unit(vectors: Float[np.ndarray, "*vectors 2"]) -> Float[np.ndarray, "*vecto
 def square_poses(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 2 4 4"]:
     """The two poses of a square with sides of 1 that look almost the same, marker to camera, the better one first.
 
-    Infinitesimal plane-based pose estimation (IPPE; Collins & Bartoli 2014). NaN without a pose.
+    NaN where there is no pose, or no second one.
     """
     T = np.full((len(sightings.view), 2, 4, 4), np.nan)
     for row, rays in enumerate(sightings.rays):
-        if not np.isfinite(rays).all():
-            continue
-        try:
-            _, turns, shifts, _ = cv2.solvePnPGeneric(
-                SQUARE, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-            )
-        except cv2.error:
-            # Degenerate corners, such as corners on one line.
-            continue
-        for which, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
-            T[row, which] = np.eye(4)
-            T[row, which, :3] = np.column_stack([cv2.Rodrigues(turn)[0], shift])
+        poses = solve_pnp(SQUARE, rays, "ippe")
+        T[row, : len(poses)] = poses
     return T
