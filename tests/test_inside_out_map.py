@@ -22,8 +22,7 @@ from psotrack.inside_out import (
     read_marker_map,
     read_measured_corners,
 )
-from psotrack.inside_out.mapping.scene import outward
-from psotrack.inside_out.mapping.sightings import SQUARE, FrameMarkers, collect_sightings
+from psotrack.inside_out.mapping.sightings import SQUARE, FrameMarkers, collect_sightings, outward
 from psotrack.inside_out.mapping.square_fitting import fit_square
 from psotrack.recordings.datasets import read_marker_corners, write_marker_corners
 from psotrack.recordings.mocap import Markers, write_c3d
@@ -200,6 +199,26 @@ def test_other_columns_are_ignored(tmp_path):
     assert len(read_marker_map(path)) == len(ROOM)
 
 
+def test_a_table_may_state_a_standard_deviation_of_each_marker(tmp_path):
+    path, std_m = tmp_path / "corners.csv", {marker: 0.001 * marker for marker in ROOM}
+    write_marker_corners(path, ROOM, std_m)
+    assert path.read_text().splitlines()[0].endswith(";std_m")
+    found = read_marker_map(path)
+    assert found.std_m == pytest.approx(std_m)
+    assert found.std_of([7, 99, 3]).tolist() == pytest.approx([0.007, 0.0, 0.003])
+    write_marker_corners(path, ROOM)
+    assert read_marker_map(path).std_of([7, 3]).tolist() == [0, 0]
+    path.write_text(
+        path.read_text().replace("z4[m]", "z4[m];std_m").replace("\n", ";2\n").replace("std_m;2", "std[mm]")
+    )
+    assert read_marker_map(path).std_m[7] == pytest.approx(0.002)
+    path.write_text(path.read_text().replace(";2\n", ";-2\n"))
+    with pytest.raises(
+        InputError, match=r"line 2, column std\[mm\]: expected a standard deviation of 0 or more"
+    ):
+        read_marker_map(path)
+
+
 def test_a_map_has_sides_centres_and_normals():
     found = MarkerMap(ROOM)
     np.testing.assert_array_equal(found.ids, np.arange(1, 17))
@@ -360,17 +379,18 @@ def test_markers_on_the_outside_of_a_box_face_outwards(tmp_path):
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-9, 9)] * 3), st.floats(0.05, 1.0))
 def test_the_square_fitted_to_a_square_is_the_same_square(turn, centre, side_m):
     axes = Rotation.from_rotvec(turn).as_matrix()
-    found_axes, found_centre, found_side = fit_square(np.array(centre) + side_m * SQUARE @ axes.T)
+    found = fit_square(np.array(centre) + side_m * SQUARE @ axes.T)
     # Double precision, for numbers up to 10.
-    np.testing.assert_allclose(found_axes, axes, atol=1e-11 / side_m)
-    np.testing.assert_allclose(found_centre, centre, atol=1e-11)
-    assert found_side == pytest.approx(side_m, rel=1e-9)
+    np.testing.assert_allclose(found.T_world_marker[:3, :3], axes, atol=1e-11 / side_m)
+    np.testing.assert_allclose(found.T_world_marker[:3, 3], centre, atol=1e-11)
+    assert found.side_m == pytest.approx(side_m, rel=1e-9)
 
 
 def test_the_fitted_square_is_nearer_than_other_squares():
     rng = np.random.default_rng(1)
     points = ROOM[5] + 0.005 * rng.standard_normal((4, 3))
-    axes, centre, side = fit_square(points)
+    square = fit_square(points)
+    axes, centre, side = square.T_world_marker[:3, :3], square.T_world_marker[:3, 3], square.side_m
 
     def cost(turn, shift, factor):
         turned = axes @ Rotation.from_rotvec(turn).as_matrix()
@@ -487,7 +507,8 @@ def test_a_single_known_side_makes_the_axes_of_the_marker_those_of_the_world():
     """The map moves with the known marker: the same images give the same map in another world."""
     given_world = build_map(sightings(noise_px=0.2), {7: ROOM[7]})
     own_world = build_map(sightings(noise_px=0.2), {7: corners_in_own_frame(SIDE_M)})
-    axes, centre, _ = fit_square(ROOM[7])
+    known = fit_square(ROOM[7]).T_world_marker
+    axes, centre = known[:3, :3], known[:3, 3]
     moved = own_world.marker_map.all_corners_m @ axes.T + centre
     # Both searches end when the relative decrease of the cost is less than 1e-9.
     np.testing.assert_allclose(moved, given_world.marker_map.all_corners_m, atol=1e-5)
@@ -570,6 +591,23 @@ def test_unusable_known_markers():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("noise_px", [0.1, 0.3])
+def test_the_stated_standard_deviation_agrees_with_the_errors_of_corners(noise_px):
+    """The truth lies within the 90 % sphere about a corner at least as often; insets make it wider than white noise."""
+    inside = []
+    for seed in range(6):
+        built = build_map(
+            with_insets(sightings(noise_px=noise_px, num_views=30, seed=seed), seed), {7: ROOM[7]}
+        )
+        std_m = built.marker_map.std_of(built.ids.tolist())
+        assert std_m[built.known] == 0
+        inside += (errors_m(built) / np.maximum(std_m, 1e-9)[:, None] < np.sqrt(chi2.ppf(0.9, 3)))[
+            ~built.known
+        ].tolist()
+    assert np.mean(inside) > 0.85
+
+
+@pytest.mark.slow
 def test_the_covariance_agrees_with_the_errors():
     """Noise is independent in every frame: normalised squared errors of the centres average 3 over repeated draws."""
     normalised = []
@@ -618,7 +656,7 @@ def test_correct_maps_have_no_findings():
         measured = {marker: corners + 0.001 * rng.standard_normal((4, 3)) for marker, corners in ROOM.items()}
         checkup = check_map(sightings(noise_px=0.3, seed=seed), MarkerMap(measured))
         assert checkup.findings == ()
-        assert all(one.sightings > 5 for one in checkup.markers.values())
+        assert all(count > 5 for count in checkup.sightings.values())
 
 
 TURN = Rotation.from_rotvec(np.deg2rad(12) * np.array([0.0, 0.0, 1.0])).as_matrix()

@@ -39,8 +39,7 @@ from psotrack.inside_out import (
     open_source,
     smooth,
 )
-from psotrack.inside_out.mapping.scene import outward
-from psotrack.inside_out.mapping.sightings import MarkerSightings
+from psotrack.inside_out.mapping.sightings import MarkerSightings, outward
 from psotrack.recordings import VideoWriter, probe
 from psotrack.simulation import build, change_scenario, scenario, write_recorded_flight
 from psotrack.simulation.imaging.onboard import OnboardRenderer, lens, onboard_poses
@@ -182,7 +181,7 @@ def poses_of(clip: Clip, shutter: RollingShutter | None) -> list[dict[str, Any]]
     ]
 
 
-def map_of(clip: Clip, shutter: RollingShutter | None) -> dict[str, Any]:
+def map_of(clip: Clip) -> dict[str, Any]:
     """Errors of a map from the video of one hand's motion, given its most seen marker.
 
     Its covariance allows for a camera that encodes light by another power than assumed, which finds the sides of all
@@ -192,12 +191,12 @@ def map_of(clip: Clip, shutter: RollingShutter | None) -> dict[str, Any]:
     sightings = find_sightings([(probe(clip.video), clip.camera)])
     ids, counts = np.unique(sightings.marker, return_counts=True)
     known = int(ids[counts.argmax()])
-    built = build_map(sightings, {known: clip.marker_map.corners_m[known]}, shutter=shutter)
+    built = build_map(sightings, {known: clip.marker_map.corners_m[known]})
     off_m, inside_as_drawn = _off_map(built, clip)
     inside = []
     for number in range(INSET_DRAWS):
         moved = _with_insets(sightings, np.random.default_rng(number))
-        again = build_map(moved, {known: clip.marker_map.corners_m[known]}, shutter=shutter)
+        again = build_map(moved, {known: clip.marker_map.corners_m[known]})
         inside += _off_map(again, clip)[1].tolist()
     off_mm = 1e3 * np.linalg.norm(off_m, axis=-1)
     return {
@@ -269,7 +268,8 @@ def rows_of(folder: Path, frames: int, seed: int) -> list[dict[str, Any]]:
         clip = draw(folder, seed, frames, readout_s)
         about = {"case": case, "seed": seed}
         found += [about | row for row in poses_of(clip, shutter)]
-        found.append(about | map_of(clip, shutter))
+        if shutter is None:
+            found.append(about | map_of(clip))
     return found
 
 
@@ -287,7 +287,7 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for seed in range(arguments.seeds):
         rows += rows_of(arguments.folder, arguments.frames, seed)
-        for row in rows[-12:]:
+        for row in rows[-10:]:
             print(
                 "  ".join(
                     f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"

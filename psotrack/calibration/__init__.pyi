@@ -2,6 +2,7 @@ from .board_corners import BoardFinder
 from .board_page import save_board
 from .board_recognition import describe_board, detect_board
 from .boards import Board
+from .bundle import Bundle, BundleProblem, BundleState, summed
 from .derivatives import reproject
 from .extrinsics import Located, locate_camera
 from .image_points import (
@@ -52,6 +53,9 @@ __all__ = [
     "BoardFinder",
     "BoardSettings",
     "BoardViews",
+    "Bundle",
+    "BundleProblem",
+    "BundleState",
     "CalibratedRig",
     "CameraFigures",
     "CameraImages",
@@ -115,6 +119,7 @@ __all__ = [
     "solve_pnp_ransac",
     "spread_px",
     "stick_length",
+    "summed",
     "views_of_detections",
     "world_of_camera",
     "worst_views",

@@ -8,7 +8,7 @@ from .fusing.fused_table import write_fused
 from .lens_files import choose_lens, lens_from_matrix
 from .localising import LineTime, LocalisedVideo, LocaliseSettings, localise_video
 from .mapping import BuiltMap, build_map, corners_in_own_frame
-from .mapping.check import MapCheck, check_map
+from .mapping.checking import MapCheck, check_map
 from .mapping.sightings import find_sightings
 from .mapping.square_fitting import FittedSquares, fit_squares, read_measured_corners
 from .marker_map import MarkerCentres, MarkerMap, read_marker_map, read_marker_table

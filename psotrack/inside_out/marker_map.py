@@ -1,13 +1,13 @@
 """`MarkerMap`: corners of markers in a room; and its table, which is checked when it is read.
 
 A marker is a flat square. A table is refused where it clearly contradicts this. Other errors of a map are found from a
-video: see `localising.map_evidence` and `mapping.check`.
+video: see `localising.map_evidence` and `mapping.checking`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -39,9 +39,12 @@ class MarkerMap:
     Attributes:
         corners_m: (4, 3) by marker id, world, metres: in the order of OpenCV's ArUco, clockwise from the marker's own
             top left as seen from its front.
+        std_m: standard deviation of the position of a marker's corners along each axis of the world, metres, by marker
+            id; it is the same error in every frame. Markers that are not listed are known exactly.
     """
 
     corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
+    std_m: Mapping[int, float] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -67,6 +70,10 @@ class MarkerMap:
     def corners_of(self, ids: Iterable[int]) -> Float[np.ndarray, "chosen 4 3"]:
         """(chosen, 4, 3), corners of these markers, which must all be in the map."""
         return np.array([self.corners_m[int(marker)] for marker in ids], np.float64).reshape(-1, 4, 3)
+
+    def std_of(self, ids: Iterable[int]) -> Float[np.ndarray, " chosen"]:
+        """(chosen,), standard deviations of these markers along each axis, metres; 0 where none is listed."""
+        return np.array([self.std_m.get(int(marker), 0.0) for marker in ids])
 
     @cached_property
     def all_corners_m(self) -> Float[np.ndarray, "markers 4 3"]:
@@ -139,7 +146,10 @@ def read_marker_map(path: Path | str) -> MarkerMap:
     rows = read_marker_rows(path)
     for marker, row in rows.items():
         _check_square(marker, row)
-    marker_map = MarkerMap({marker: row.corners_m for marker, row in rows.items()})
+    marker_map = MarkerMap(
+        {marker: row.corners_m for marker, row in rows.items()},
+        {marker: row.std_m for marker, row in rows.items() if row.std_m},
+    )
     _check_apart(rows, marker_map)
     _check_facing(path, marker_map)
     return marker_map

@@ -4,5 +4,5 @@ In: images or videos of all cameras (`images`). Out: a `CalibratedRig` with cova
 the board, `board_poses` finds a first lens of each camera, `chain` joins the cameras through the views that they share,
 `adjustment` and `slips` adjust lenses, cameras and boards together with the equations of `bundle`, `covariance` says
 how certain the rig is, and `findings` says what to do. Without a board, `moving_point` places the cameras, and
-`point_adjustment` adjusts cameras and points together.
+`point_adjustment` adjusts cameras and points together; both by `calibration.bundle`.
 """

@@ -14,18 +14,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration.boards import Board
+from psotrack.calibration.bundle import (
+    LEAST_NOISE_PX,
+    Bundle,
+    BundleProblem,
+    BundleState,
+    median_by_camera,
+    solve_robustly,
+)
 from psotrack.calibration.derivatives import centre_by_pose
 from psotrack.calibration.lens_models import PINHOLE, LensModel, camera_matrix
 from psotrack.calibration.residuals import GATE
 from psotrack.calibration.rig.board_poses import find_lens
-from psotrack.calibration.rig.bundle import (
-    LEAST_NOISE_PX,
-    BoardBundle,
-    BoardProblem,
-    BoardState,
-    CameraCorners,
-    solve_robustly,
-)
 from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
 from psotrack.calibration.rig.covariance import covariance_over_instants
 from psotrack.calibration.rig.lens_choice import LEAST_VIEWS, MOST_FITS, choose_lens_model
@@ -121,7 +121,7 @@ def calibrate_rig(
     views = _relabelled(board, views, chain)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed, advance)
-    return replace(_result(board, views, chain, bundle), not_compared=_not_compared(views, lenses))
+    return replace(_result(board, views, chain, models, bundle), not_compared=_not_compared(views, lenses))
 
 
 def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
@@ -228,7 +228,7 @@ def _adjust(
     lenses: LensChoice,
     fixed: int | None,
     advance: Advance,
-) -> BoardBundle:
+) -> Bundle:
     """Adjust everything, with the world fixed to the first camera or to the board at an instant."""
     models, vectors, lens_of = start
     known = lenses.known or {}
@@ -242,24 +242,25 @@ def _adjust(
         T_cam_world = T_cam_world @ T_world_board[fixed] @ _UPWARDS
         T_world_board = np.linalg.inv(T_world_board[fixed] @ _UPWARDS) @ T_world_board
         free_board[fixed] = False
-    seen = tuple(map(CameraCorners.of, views.corners_px))
     # Turns about the board's middle and shifts of the middle are nearly independent.
     middle = np.eye(4)
     middle[:3, 3] = board.corners_m.mean(axis=0)
-    problem = BoardProblem(
+    camera, instant = np.nonzero(np.isfinite(views.corners_px[..., 0]).any(axis=-1))
+    problem = BundleProblem(
         models=models,
-        lens_of=lens_of,
-        image_size_wh=sizes,
+        priors=tuple(model.prior(tuple(size)) for model, size in zip(models, sizes.tolist(), strict=True)),
         corners_m=board.corners_m - middle[:3, 3],
-        seen=seen,
-        noise_px=np.ones(len(seen)),
+        lens=lens_of[camera],
+        camera=camera,
+        target=instant,
+        corners_px=views.corners_px[camera, instant],
+        noise_px=np.ones(len(camera)),
         free_lens=tuple(np.zeros(model.size, bool) for model in models),
         free_camera=free_camera,
-        free_board=free_board,
+        free_target=np.tile(free_board, (7, 1)).T,
     )
-    state = BoardState(vectors, T_cam_world, T_world_board @ middle)
-    everything = tuple(np.ones(len(one.corner), bool) for one in seen)
-    bundle = BoardBundle(problem, state, everything, robust=True)
+    state = BundleState(vectors, T_cam_world, T_world_board @ middle, np.ones(len(T_world_board)))
+    bundle = Bundle(problem, state, np.isfinite(problem.corners_px).all(axis=-1), is_robust=True)
     if problem.size:
         bundle = solve_robustly(bundle)
     advance(1)
@@ -269,33 +270,34 @@ def _adjust(
     )
     bundle = replace(bundle, problem=replace(problem, free_lens=free_lens))
     bundle = _adjust_with_slips(bundle, board, advance)
-    for name, of_camera in zip(views.names, bundle.used, strict=True):
-        if not of_camera.any():
+    for index, name in enumerate(views.names):
+        if not bundle.used[camera == index].any():
             raise InputError(f"camera {name}", expected="views that fit the other cameras", found="none")
-    placed = replace(bundle.state, T_world_board=bundle.state.T_world_board @ np.linalg.inv(middle))
-    return replace(bundle, state=placed, problem=replace(bundle.problem, corners_m=board.corners_m))
+    boards = bundle.state.T_world_target @ np.linalg.inv(middle)
+    problem = replace(bundle.problem, corners_m=board.corners_m)
+    return replace(bundle, state=replace(bundle.state, T_world_target=boards), problem=problem)
 
 
-def _adjust_with_slips(bundle: BoardBundle, board: Board, advance: Advance) -> BoardBundle:
+def _adjust_with_slips(bundle: Bundle, board: Board, advance: Advance) -> Bundle:
     """Adjust with squared residuals; outliers, noise and slips are estimated anew after each adjustment."""
     extent_m = float(np.linalg.norm(np.ptp(board.corners_m, axis=0)))
-    seen = bundle.problem.seen
-    slips = Slips.start(extent_m, len(seen), len(bundle.state.T_world_board))
-    bundle = replace(bundle, robust=False, slip_std=slips.each())
+    seen = np.isfinite(bundle.problem.corners_px).all(axis=-1)
+    slips = Slips.start(extent_m, len(seen))
+    bundle = replace(bundle, is_robust=False, slip_std=slips.each())
     for _ in range(_MOST_ROUNDS):
-        before = bundle
-        distances = bundle.own_distance_px
-        noise_px = np.array(list(map(_noise_px, distances)))
-        used = tuple(
-            _inliers(one, distance <= GATE * noise, board.least_corners)
-            for one, distance, noise in zip(seen, distances, noise_px, strict=True)
-        )
-        widths = slips.std
+        before, widths = bundle, slips.std
+        distance_px = bundle.own_distance_px
+        # The median of distances of which each part has a normal distribution (Rayleigh).
+        noise_px = np.maximum(LEAST_NOISE_PX, median_by_camera(bundle, distance_px) / np.sqrt(2 * log(2)))
+        near = seen & (distance_px <= GATE * noise_px[:, None])
+        # Without the views of which too few corners are near.
+        count = near.sum(axis=1)
+        near &= ((count >= board.least_corners) & (2 * count > seen.sum(axis=1)))[:, None]
         problem = replace(bundle.problem, noise_px=noise_px)
-        bundle = replace(bundle, problem=problem, used=used, slip_std=slips.each()).solved()
+        bundle = replace(bundle, problem=problem, used=near, slip_std=slips.each()).solved()
         slips = slips.estimated(bundle)
         advance(1)
-        same = all((new == old).all() for new, old in zip(used, before.used, strict=True))
+        same = (bundle.used == before.used).all()
         if same and np.abs(np.log(slips.std / widths)).max() < _SETTLED:
             break
     return bundle
@@ -305,53 +307,39 @@ def _adjust_with_slips(bundle: BoardBundle, board: Board, advance: Advance) -> B
 _UPWARDS = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _noise_px(distance_px: Float[np.ndarray, " seen"]) -> float:
-    """Standard deviation along each axis from the median of distances, which may contain outliers."""
-    if not len(distance_px):
-        return 1.0
-    return max(LEAST_NOISE_PX, float(np.median(distance_px)) / np.sqrt(2 * log(2)))
-
-
-def _inliers(seen: CameraCorners, near: Bool[np.ndarray, " seen"], least: int) -> Bool[np.ndarray, " seen"]:
-    """Corners near their projections, without the views of which too few are."""
-    count = np.bincount(seen.instant, minlength=1)
-    left = np.bincount(seen.instant, weights=near, minlength=1)
-    is_good = (left >= least) & (2 * left > count)
-    return near & is_good[seen.instant]
-
-
-def _result(board: Board, views: BoardViews, chain: Chain, bundle: BoardBundle) -> CalibratedRig:
+def _result(
+    board: Board, views: BoardViews, chain: Chain, models: tuple[LensModel, ...], bundle: Bundle
+) -> CalibratedRig:
     covariance = covariance_over_instants(bundle)
     problem, state = bundle.problem, bundle.state
     cameras: dict[str, Camera] = {}
     lens_std, by_camera, centres = [], [], []
-    residual_px = np.full(views.corners_px.shape[:3], np.nan)
-    own_px, own_distances = residual_px.copy(), bundle.own_distance_px
+    residual_px, own_px = np.full((2, *views.corners_px.shape[:3]), np.nan)
     used = np.zeros(views.corners_px.shape[:3], bool)
+    at = problem.camera, problem.target
+    residual_px[at], own_px[at], used[at] = bundle.distance_px, bundle.own_distance_px, bundle.used
+    lens_of = np.zeros(len(views.names), np.int64)
+    lens_of[problem.camera] = problem.lens
     padded = np.pad(covariance, ((0, 1), (0, 1)))
     for index, (name, T) in enumerate(zip(views.names, state.T_cam_world, strict=True)):
-        lens = int(problem.lens_of[index])
+        lens = int(lens_of[index])
         # Unknowns that were not adjusted have the index -1, the padding.
         lens_std.append(np.sqrt(np.diag(padded)[problem.lens_columns[lens]]))
-        columns = problem.camera_columns[index]
+        columns = problem.pose_columns[index]
         block = padded[np.ix_(columns, columns)]
         by_pose = centre_by_pose(T[:3, :3], T[:3, 3])
         by_camera.append(block)
         centres.append(by_pose @ block @ by_pose.T)
-        seen = problem.seen[index]
-        residual_px[index, seen.instant, seen.corner] = bundle.distance_px[index]
-        own_px[index, seen.instant, seen.corner] = own_distances[index]
-        used[index, seen.instant, seen.corner] = bundle.used[index]
-        cameras[name] = camera_of(problem.models[lens], state.lenses[lens], T, views.image_size_wh[index])
+        cameras[name] = camera_of(models[lens], state.lenses[lens], T, views.image_size_wh[index])
     return CalibratedRig(
         board,
         make_rig(cameras),
         views,
-        state.T_world_board,
+        state.T_world_target,
         residual_px,
         own_px,
         used,
-        tuple(problem.models[lens] for lens in problem.lens_of.tolist()),
+        tuple(models[lens] for lens in lens_of.tolist()),
         tuple(lens_std),
         np.stack(by_camera),
         np.stack(centres),

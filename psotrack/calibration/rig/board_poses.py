@@ -9,15 +9,9 @@ from jaxtyping import Bool, Float
 
 from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
+from psotrack.calibration.bundle import Bundle, BundleProblem, BundleState, solve_robustly
 from psotrack.calibration.lens_models import PINHOLE, LensModel
 from psotrack.calibration.pnp import ray_distances, solve_pnp
-from psotrack.calibration.rig.bundle import (
-    BoardBundle,
-    BoardProblem,
-    BoardState,
-    CameraCorners,
-    solve_robustly,
-)
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
 _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)
@@ -79,7 +73,7 @@ def find_lens(
     for start_px in starts_px if focal_px is None else [focal_px]:
         bundle = _adjust_lens(board, model, chosen, model.start(start_px, image_size_wh), image_size_wh)
         if bundle is not None:
-            cost = sum(float(np.minimum(distance, 20.0).sum()) for distance in bundle.distance_px)
+            cost = float(np.nansum(np.minimum(bundle.distance_px, 20.0)))
             found.append((cost, bundle.state.lenses[0]))
     return min(found, key=lambda one: one[0])[1] if found else None
 
@@ -103,8 +97,7 @@ def fit_boards(
     none = (np.zeros(model.size, bool),)
     bundle = solve_robustly(replace(bundle, problem=replace(bundle.problem, free_lens=none)))
     distance_px = np.full(views_px.shape[:2], np.nan)
-    seen = bundle.problem.seen[0]
-    distance_px[np.flatnonzero(fits)[seen.instant], seen.corner] = bundle.distance_px[0]
+    distance_px[fits] = bundle.distance_px
     return distance_px
 
 
@@ -114,7 +107,7 @@ def _adjust_lens(
     views_px: Float[np.ndarray, "instants corners 2"],
     lens: Float[np.ndarray, " unknowns"],
     image_size_wh: tuple[int, int],
-) -> BoardBundle | None:
+) -> Bundle | None:
     """Adjust a lens and the board's poses: first the focal lengths and the first coefficient, then all."""
     prepared = _problem(board, model, lens, views_px, image_size_wh)
     if prepared is None:
@@ -139,26 +132,27 @@ def _problem(
     lens: Float[np.ndarray, " unknowns"],
     views_px: Float[np.ndarray, "instants corners 2"],
     image_size_wh: tuple[int, int],
-) -> tuple[BoardBundle, Bool[np.ndarray, " instants"]] | None:
+) -> tuple[Bundle, Bool[np.ndarray, " instants"]] | None:
     """Adjustment of one lens, and the views that it can show; None if it can show none."""
     rays = model.normalise(lens, views_px.reshape(-1, 2)).reshape(views_px.shape)
     poses = [find_board_poses(board, of_view) for of_view in rays]
     fits = np.array([len(candidates) > 0 for candidates in poses])
     if not fits.any():
         return None
-    seen = CameraCorners.of(views_px[fits])
-    problem = BoardProblem(
+    count = int(fits.sum())
+    problem = BundleProblem(
         models=(model,),
-        lens_of=np.zeros(1, np.int64),
-        image_size_wh=np.array([image_size_wh]),
+        priors=(model.prior(image_size_wh),),
         corners_m=board.corners_m,
-        seen=(seen,),
-        noise_px=np.ones(1),
+        lens=np.zeros(count, np.int64),
+        camera=np.zeros(count, np.int64),
+        target=np.arange(count),
+        corners_px=views_px[fits],
+        noise_px=np.ones(count),
         free_lens=(np.ones(model.size, bool),),
         free_camera=np.zeros(1, bool),
-        free_board=np.ones(int(fits.sum()), bool),
+        free_target=np.ones((count, 7), bool),
     )
-    state = BoardState(
-        (lens,), np.eye(4)[None], np.array([candidates[0] for candidates in poses if len(candidates)])
-    )
-    return BoardBundle(problem, state, (np.ones(len(seen.corner), bool),), robust=True), fits
+    boards = np.array([candidates[0] for candidates in poses if len(candidates)])
+    state = BundleState((lens,), np.eye(4)[None], boards, np.ones(count))
+    return Bundle(problem, state, np.isfinite(problem.corners_px).all(axis=-1), is_robust=True), fits

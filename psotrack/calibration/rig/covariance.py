@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration.rig.bundle import BoardBundle
+from psotrack.calibration.bundle import Bundle, summed
 from psotrack.errors import InputError
 
 #: Largest condition number of the information, in units of its diagonal.
@@ -21,7 +21,7 @@ _MAX_CONDITION = 1e13
 _LEAST_LEFT = 0.02
 
 
-def covariance_over_instants(bundle: BoardBundle) -> Float[np.ndarray, "unknowns unknowns"]:
+def covariance_over_instants(bundle: Bundle) -> Float[np.ndarray, "unknowns unknowns"]:
     """Covariance of the shared unknowns of an adjustment, by the jackknife over the instants.
 
     Raises:
@@ -52,19 +52,22 @@ def covariance_over_instants(bundle: BoardBundle) -> Float[np.ndarray, "unknowns
 
 
 def _by_instant(
-    bundle: BoardBundle, gain: Float[np.ndarray, "instants 6 unknowns"]
+    bundle: Bundle, gain: Float[np.ndarray, "instants 6 unknowns"]
 ) -> tuple[Float[np.ndarray, "used unknowns unknowns"], Float[np.ndarray, "used unknowns"]]:
     """Information of each used instant about the shared unknowns, and its pull on them."""
-    size, instants = bundle.problem.size, len(bundle.state.T_world_board)
-    information, pull = np.zeros((instants, size, size)), np.zeros((instants, size))
-    board, coupling = np.zeros((instants, 6, 6)), np.zeros((instants, 6, size))
-    for view in bundle.views:
-        information[np.ix_(view.instant, view.unknowns, view.unknowns)] += view.shared
-        coupling[np.ix_(view.instant, np.arange(6), view.unknowns)] += view.coupling
-        board[view.instant] += view.board
-        pull[np.ix_(view.instant, view.unknowns)] += view.shared_right
-        pull[view.instant] -= np.matvec(gain[view.instant].swapaxes(-1, -2), view.board_right)
+    parts, size, count = bundle.sightings, bundle.problem.size, len(gain)
+    column, instant, own = parts.columns, bundle.problem.block[:, None, None], np.arange(6)
+    information = summed(
+        parts.shared, (instant, column[:, :, None], column[:, None]), (count, size + 1, size + 1)
+    )[:, :-1, :-1]
+    coupling = summed(parts.coupling, (instant, own[:, None], column[:, None]), (count, 6, size + 1))[
+        ..., :-1
+    ]
+    block = summed(parts.block, (instant, own[:, None], own), (count, 6, 6))
+    block_right = summed(parts.block_right, (instant[..., 0], own), (count, 6))
+    pull = summed(parts.shared_right, (instant[..., 0], column), (count, size + 1))[:, :-1]
+    pull -= np.matvec(gain.swapaxes(-1, -2), block_right)
     crossed = gain.swapaxes(-1, -2) @ coupling
-    information += gain.swapaxes(-1, -2) @ board @ gain - crossed - crossed.swapaxes(-1, -2)
+    information += gain.swapaxes(-1, -2) @ block @ gain - crossed - crossed.swapaxes(-1, -2)
     is_used = np.trace(information, axis1=1, axis2=2) > 0
     return information[is_used], pull[is_used]

@@ -1,7 +1,7 @@
 """Adjustment of cameras with known lenses and the points that they see.
 
-A point is a board with a single corner (`rig.bundle`), whose turn nothing shows. The first camera stays where it is;
-the unit of length is open, and damped steps hardly change it.
+A point is a target with a single corner (`calibration.bundle`), whose turn nothing shows. The first camera stays where
+it is; the unit of length is open, and damped steps hardly change it.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.calibration.bundle import Bundle, BundleProblem, BundleState
 from psotrack.calibration.lens_models import known_lenses
 from psotrack.calibration.residuals import GATE, spread_px
-from psotrack.calibration.rig.bundle import BoardBundle, BoardProblem, BoardState, CameraCorners
 from psotrack.errors import InputError
 from psotrack.geometry import NEAR_M, Camera, Rig, to_camera, triangulate_linearly
 
@@ -62,7 +62,11 @@ def adjust(rig: Rig, points_px: Float[np.ndarray, "points cameras 2"], noise_px:
     _check_seen(rig, placed)
     seen_px = np.where(placed[..., None], points_px, np.nan)
     bundle = _start(rig, start_m, seen_px, noise_px).solved()
-    used, unknowns = placed, 6 * len(rig) - 7 + 3 * int(placed.any(axis=1).sum())
+    seen, unknowns = (
+        (bundle.problem.target, bundle.problem.camera),
+        6 * len(rig) - 7 + 3 * int(placed.any(axis=1).sum()),
+    )
+    used = placed
     # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
         distance_px = _distances(bundle, placed.shape)
@@ -70,14 +74,13 @@ def adjust(rig: Rig, points_px: Float[np.ndarray, "points cameras 2"], noise_px:
         # A point that only one camera sees has no position.
         inliers &= (inliers.sum(axis=1) >= 2)[:, None]
         before, used = used, inliers
-        of_cameras = tuple(used[seen.instant, index] for index, seen in enumerate(bundle.problem.seen))
-        bundle = replace(bundle, used=of_cameras, robust=False).solved()
+        bundle = replace(bundle, used=used[seen][:, None], is_robust=False).solved()
         if (used == before).all():
             break
     _check_seen(rig, used)
     _check_connected(bundle)
     cameras = replace(rig.cameras, T_cam_world=bundle.state.T_cam_world)
-    points_m = np.where(used.any(axis=1)[:, None], bundle.state.T_world_board[:, :3, 3], np.nan)
+    points_m = np.where(used.any(axis=1)[:, None], bundle.state.T_world_target[:, :3, 3], np.nan)
     return AdjustedRig(Rig(rig.names, cameras), points_m, _distances(bundle, placed.shape), used)
 
 
@@ -86,33 +89,33 @@ def _start(
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points cameras 2"],
     noise_px: float,
-) -> BoardBundle:
+) -> Bundle:
     """The adjustment's first state, with a robust loss."""
     models, lenses = zip(*known_lenses(rig).values(), strict=True)
-    index = np.arange(len(rig))
-    problem = BoardProblem(
+    point, camera = np.nonzero(np.isfinite(points_px[..., 0]))
+    problem = BundleProblem(
         models=models,
-        lens_of=index,
-        image_size_wh=np.asarray(rig.cameras.image_size_wh).astype(np.int64),
+        priors=tuple((lens, np.zeros((len(lens), len(lens)))) for lens in lenses),
         corners_m=np.zeros((1, 3)),
-        seen=tuple(CameraCorners.of(points_px[:, camera, None]) for camera in index),
-        noise_px=np.full(len(rig), noise_px),
+        lens=camera,
+        camera=camera,
+        target=point,
+        corners_px=points_px[point, camera, None],
+        noise_px=np.full(len(point), noise_px),
         free_lens=tuple(np.zeros(model.size, bool) for model in models),
-        free_camera=index > 0,
-        free_board=np.ones(len(points_m), bool),
+        free_camera=np.arange(len(rig)) > 0,
+        free_target=np.ones((len(points_m), 7), bool),
     )
-    boards = np.tile(np.eye(4), (len(points_m), 1, 1))
-    boards[:, :3, 3] = points_m
-    everything = tuple(np.ones(len(seen.corner), bool) for seen in problem.seen)
-    state = BoardState(lenses, np.asarray(rig.cameras.T_cam_world), boards)
-    return BoardBundle(problem, state, everything, robust=True)
+    points = np.tile(np.eye(4), (len(points_m), 1, 1))
+    points[:, :3, 3] = points_m
+    state = BundleState(lenses, np.asarray(rig.cameras.T_cam_world), points, np.ones(len(points)))
+    return Bundle(problem, state, np.ones((len(point), 1), bool), is_robust=True)
 
 
-def _distances(bundle: BoardBundle, shape: tuple[int, ...]) -> Float[np.ndarray, "points cameras"]:
+def _distances(bundle: Bundle, shape: tuple[int, ...]) -> Float[np.ndarray, "points cameras"]:
     """Distances in the image, NaN where a camera does not see a point."""
     distance_px = np.full(shape, np.nan)
-    for index, (seen, of_camera) in enumerate(zip(bundle.problem.seen, bundle.distance_px, strict=True)):
-        distance_px[seen.instant, index] = of_camera
+    distance_px[bundle.problem.target, bundle.problem.camera] = bundle.distance_px[:, 0]
     return distance_px
 
 
@@ -127,7 +130,7 @@ def _check_seen(rig: Rig, seen: Bool[np.ndarray, "points cameras"]) -> None:
             )
 
 
-def _check_connected(bundle: BoardBundle) -> None:
+def _check_connected(bundle: Bundle) -> None:
     """Check that points determine the cameras but for the unit of length, which has no information."""
     information = bundle.equations().reduced().information
     scale = np.sqrt(np.diag(information))

@@ -9,12 +9,12 @@ synchronous the width shrinks to nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from psotrack.calibration.rig.bundle import BoardBundle
+from psotrack.calibration.bundle import Bundle
 
 #: Degrees of freedom of Student's distribution: small, because a board moves now fast and now hardly.
 _FREEDOM = 3.0
@@ -32,49 +32,37 @@ class Slips:
 
     Attributes:
         std: (2,), standard deviation of the turn, rad, and of the shift, m.
-        scale: for each camera, (instants,), variance of a view's slip against that of others.
+        scale: (sightings,), variance of a sighting's slip against that of others.
         board_m: size of the board.
     """
 
     std: Float[np.ndarray, "2"]
-    scale: tuple[np.ndarray, ...]
+    scale: Float[np.ndarray, " sightings"]
     board_m: float
 
     @staticmethod
-    def start(board_m: float, cameras: int, instants: int) -> Slips:
-        """Wide slips of all views."""
-        scale = tuple(np.ones(instants) for _ in range(cameras))
-        return Slips(_START * np.array([1.0, board_m]), scale, board_m)
+    def start(board_m: float, sightings: int) -> Slips:
+        """Wide slips of all sightings."""
+        return Slips(_START * np.array([1.0, board_m]), np.ones(sightings), board_m)
 
-    def each(self) -> tuple[np.ndarray, ...]:
-        """For each camera, (instants, 2), standard deviations of a view's slip, for `BoardBundle`."""
-        return tuple(np.sqrt(of_camera)[:, None] * self.std for of_camera in self.scale)
+    def each(self) -> Float[np.ndarray, "sightings 2"]:
+        """(sightings, 2), standard deviations of a sighting's slip, for `Bundle`."""
+        return np.sqrt(self.scale)[:, None] * self.std
 
-    def estimated(self, bundle: BoardBundle) -> Slips:
+    def estimated(self, bundle: Bundle) -> Slips:
         """The widths again, from the slips of an adjustment with these widths."""
-        views = count_views(bundle)
-        shown, expected = np.zeros(2), np.zeros(2)
-        scales = []
-        for camera, view in enumerate(bundle.views):
-            scale, shared = self.scale[camera][view.instant], views[view.instant]
-            squares = view.slip**2
-            variance = np.diagonal(view.slip_covariance, axis1=1, axis2=2)
-            widths = np.repeat(self.std**2, 3)
-            # The board's pose follows the slips of its views: of two views, each shows half of their difference.
-            kept = np.where(shared > 1, 1 - 1 / np.maximum(shared, 1), 0.0) / scale
-            shown += (kept > 0) @ (squares / scale[:, None]).reshape(-1, 2, 3).sum(axis=-1)
-            expected += kept @ (widths * scale[:, None] - variance).clip(0).reshape(-1, 2, 3).sum(axis=-1)
-            surprise = ((squares + variance) / widths).sum(axis=-1)
-            scales.append(self.scale[camera].copy())
-            scales[-1][view.instant] = (_FREEDOM + surprise) / (_FREEDOM + _UNKNOWNS)
+        instant, parts = bundle.problem.target, bundle.sightings
+        cameras = np.bincount(instant[bundle.used.any(axis=1)], minlength=instant.max() + 1)[instant]
+        squares = parts.slip**2
+        variance = np.diagonal(parts.slip_covariance, axis1=1, axis2=2)
+        widths = np.repeat(self.std**2, 3)
+        # The board's pose follows the slips of its views: of two views, each shows half of their difference.
+        kept = np.where(cameras > 1, 1 - 1 / np.maximum(cameras, 1), 0.0) / self.scale
+        scaled = self.scale[:, None]
+        shown = (kept > 0) @ (squares / scaled).reshape(-1, 2, 3).sum(axis=-1)
+        expected = kept @ (widths * scaled - variance).clip(0).reshape(-1, 2, 3).sum(axis=-1)
+        surprise = ((squares + variance) / widths).sum(axis=-1)
         factor = np.clip(shown / np.maximum(expected, 1e-300), _LARGEST_STEP**-2, _LARGEST_STEP**2)
         least = _LEAST * np.array([1.0, self.board_m])
-        return replace(self, std=np.maximum(self.std * np.sqrt(factor), least), scale=tuple(scales))
-
-
-def count_views(bundle: BoardBundle) -> Int[np.ndarray, " instants"]:
-    """(instants,), number of cameras whose corners count at each instant."""
-    counts = np.zeros(len(bundle.state.T_world_board), np.int64)
-    for seen, used in zip(bundle.problem.seen, bundle.used, strict=True):
-        counts[np.unique(seen.instant[used])] += 1
-    return counts
+        scale = (_FREEDOM + surprise) / (_FREEDOM + _UNKNOWNS)
+        return Slips(np.maximum(self.std * np.sqrt(factor), least), scale, self.board_m)

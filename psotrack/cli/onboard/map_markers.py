@@ -11,7 +11,6 @@ import click
 from msgspec import Meta
 
 from psotrack.cli.onboard.shown import show_built, show_check, show_measured
-from psotrack.cli.onboard.shutter import ShutterOptions
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, known_corners, leading, videos_of
 from psotrack.cli.options import frames_option, out_option, running
 from psotrack.cli.output import Output, check_suffix
@@ -72,7 +71,6 @@ class VideoOptions:
 @options_of(WorldOptions, "world", heading="World")
 @options_of(VideoOptions, "given")
 @options_of(OnboardLensOptions, "lenses", names=LENS_NAMES, heading="Lenses", rare=("names", "scale"))
-@options_of(ShutterOptions, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
 @frames_option
 @running()
 def map_markers(
@@ -93,8 +91,8 @@ def map_markers(
 
     --check MAP reports the markers of MAP that videos see elsewhere. The exit code is then 1 if a marker was reported.
 
-    Most cameras expose the rows of a frame one after the other (rolling shutter). The time from row to row is estimated
-    from each video, unless --line-time or --readout gives it for all.
+    The column std_m of the table is the standard deviation of the position of a marker's corners along each axis, in
+    metres. Shutters may roll: the motion of the camera during a frame is estimated.
 
     \b
     Examples:
@@ -132,7 +130,7 @@ def map_markers(
 
         viewer = None if world.seen_from_m is None else np.array(world.seen_from_m)
         measured = fit_squares(read_measured_corners(sources[0]), side_m=world.side_m, seen_from_m=viewer)
-        write_marker_corners(out, measured.marker_map.corners_m)
+        write_marker_corners(out, measured.marker_map.corners_m, measured.marker_map.std_m)
         show_measured(output, measured, out)
         return
     # Errors of small files are found before the videos are read, which takes long.
@@ -141,21 +139,13 @@ def map_markers(
     given: VideoOptions = filmed["given"]
     videos = videos_of(sources, given.drone, filmed["lenses"], given.fps)
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
-    shutter = None
-    for video, _ in videos.values():
-        shutter = filmed["shutter"].of(video.image_size_wh[1], video.fps)
-    sightings = find_sightings(
-        list(videos.values()), given.dictionary, consecutive=True, report=output.report
-    )
-    rows = {name: video.image_size_wh[1] for name, (video, _) in videos.items()}
+    sightings = find_sightings(list(videos.values()), given.dictionary, report=output.report)
     if marker_map is not None:
-        checkup = check_map(sightings, marker_map, shutter)
-        show_check(output, checkup, rows, shutter, Path(str(checked)))
+        checkup = check_map(sightings, marker_map)
+        show_check(output, checkup, Path(str(checked)))
         if checkup.findings:
             sys.exit(FOUND)
     elif out is not None:
-        built = build_map(
-            sightings, known, side_m=world.side_m, estimate_sides=world.estimate_sides, shutter=shutter
-        )
-        write_marker_corners(out, built.marker_map.corners_m)
-        show_built(output, built, rows, shutter, out)
+        built = build_map(sightings, known, side_m=world.side_m, estimate_sides=world.estimate_sides)
+        write_marker_corners(out, built.marker_map.corners_m, built.marker_map.std_m)
+        show_built(output, built, list(videos), out)

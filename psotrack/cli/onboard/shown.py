@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from psotrack.cli.onboard.shutter import shutter_content, shutter_sentence
 from psotrack.cli.output import Output
 from psotrack.support import POSITION, finite_or_none, format_numbers
 
 if TYPE_CHECKING:
-    from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap, RollingShutter
+    from psotrack.inside_out import BuiltMap, FittedSquares, MapCheck, MarkerMap
 
 
 def show_measured(output: Output, squares: FittedSquares, out: Path) -> None:
@@ -40,15 +39,12 @@ def show_measured(output: Output, squares: FittedSquares, out: Path) -> None:
     output.say(f"{out}: {len(rows)} markers, corners within {1e3 * worst:.1f} mm of squares")
 
 
-def show_built(
-    output: Output, built: BuiltMap, rows_px: dict[str, int], given: RollingShutter | None, out: Path
-) -> None:
+def show_built(output: Output, built: BuiltMap, videos: list[str], out: Path) -> None:
     """Show a map from videos, with the standard deviation of each marker's position.
 
     Args:
         built: the map.
-        rows_px: height of the images by video.
-        given: the shutter that the options give.
+        videos: names of the videos.
         out: table of the map.
     """
     rows = {}
@@ -67,8 +63,7 @@ def show_built(
         "map": str(out),
         "frames": built.num_views,
         "noise_px": built.noise_px,
-        "inset_px": dict(zip(rows_px, built.inset_px.tolist(), strict=True)),
-        "shutter": _shutters(built, rows_px, given),
+        "inset_px": dict(zip(videos, built.inset_px.tolist(), strict=True)),
         "unplaced": list(built.unplaced),
         "markers": rows,
     }
@@ -91,42 +86,28 @@ def show_built(
     if built.unplaced:
         names = ", ".join(map(str, built.unplaced))
         output.say(f"not placed, because too rarely seen beside other markers: {names}")
-    for name, shown in zip(rows_px, built.line_times, strict=True):
-        if of_shutter := shutter_sentence(given, shown):
-            output.say(f"{name}: {of_shutter}")
     output.say(f"{out}: {len(rows)} markers from {built.num_views} frames")
 
 
-def show_check(
-    output: Output, checkup: MapCheck, rows_px: dict[str, int], given: RollingShutter | None, path: Path
-) -> None:
-    """Show the markers of a map that videos see elsewhere.
-
-    Args:
-        checkup: result of the check.
-        rows_px: height of the images by video.
-        given: the shutter that the options give.
-        path: table of the map.
-    """
-    rows = {
-        marker: {
-            "frames": one.sightings,
-            "residual_px": finite_or_none(one.residual_px),
-            "moved_m": [finite_or_none(value) for value in one.moved_m],
-            "std_m": [finite_or_none(value) for value in one.std_m],
-            "turned_deg": finite_or_none(one.turned_deg),
-            "turn_std_deg": finite_or_none(one.turn_std_deg),
-            "grown": finite_or_none(one.side_ratio),
+def show_check(output: Output, checkup: MapCheck, path: Path) -> None:
+    """Show the markers of a map, whose table is at a path, that videos see elsewhere."""
+    rows: dict[int, dict[str, Any]] = {}
+    for marker, frames in sorted(checkup.sightings.items()):
+        difference = checkup.differences.get(marker)
+        rows[marker] = {
+            "frames": frames,
+            "residual_px": checkup.residual_px.get(marker),
+            **({} if difference is None else vars(difference)),
         }
-        for marker, one in sorted(checkup.markers.items())
-    }
+        for name in ("moved_m", "std_m"):
+            if name in rows[marker]:
+                rows[marker][name] = rows[marker][name].tolist()
     content = {
         "map": str(path),
         "findings": [{**vars(one), "markers": list(one.markers)} for one in checkup.findings],
         "frames": checkup.num_views,
         "noise_px": checkup.noise_px,
         "not_in_map": list(checkup.not_in_map),
-        "shutter": _shutters(checkup, rows_px, given),
         "markers": rows,
     }
     output.json(content)
@@ -141,23 +122,10 @@ def show_check(
             for marker, row in rows.items()
         ],
     )
-    for name, shown in zip(rows_px, checkup.line_times, strict=True):
-        if of_shutter := shutter_sentence(given, shown, "the check uses the given one"):
-            output.say(f"{name}: {of_shutter}")
     for finding in checkup.findings:
         output.say(str(finding), always=True)
     if not checkup.findings:
         output.say(f"{path}: nothing disagrees")
-
-
-def _shutters(
-    found: BuiltMap | MapCheck, rows_px: dict[str, int], given: RollingShutter | None
-) -> dict[str, Any]:
-    """The shutter of each video: given, used, and shown by the video."""
-    return {
-        name: shutter_content(given, used, shown, rows)
-        for (name, rows), used, shown in zip(rows_px.items(), found.shutters, found.line_times, strict=True)
-    }
 
 
 def _place(marker_map: MarkerMap, marker: int) -> dict[str, Any]:

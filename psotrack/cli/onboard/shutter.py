@@ -99,17 +99,12 @@ def shutter_content(
     }
 
 
-def shutter_sentence(
-    given: RollingShutter | None,
-    shown: LineTime | None,
-    contradicted: str = "the covariances include the difference",
-) -> str:
+def shutter_sentence(given: RollingShutter | None, shown: LineTime | None) -> str:
     """What the video shows of the shutter, in words; empty where it confirms a global shutter or a given line time.
 
     Args:
         given: the shutter that the options give.
         shown: what the video shows.
-        contradicted: what follows where the video contradicts the given line time.
     """
     if shown is None:
         return ""
@@ -122,7 +117,7 @@ def shutter_sentence(
             return ""
         return (
             f"warning: the video shows a shutter of {found}, not the given {1e6 * given.line_time_s:.2f} us;"
-            f" {contradicted}"
+            " the covariances include the difference"
         )
     if shown.rolls:
         return f"rolling shutter of {found}, estimated from {shown.frames} frames; poses are those of the middle row"

@@ -5,9 +5,8 @@ uncertainty (`BuiltMap`), squares fitted to measured corners (`FittedSquares`), 
 Other rooms use these records with `build_map`, `fit_squares`, `check_map`, `read_measured_corners`, `find_sightings`
 and `corners_in_own_frame`.
 
-Imports go in this order: `sightings` (markers in frames), `square_fitting`, `rolling` (rolling shutters), `scene`
-(views and markers with their derivatives), `bundle` (bundle adjustment), `initial_map`, `building`, `findings` (faults
-in words), `check`.
+Imports go in this order: `sightings` (markers in frames), `square_fitting`, `adjusting` (bundle adjustment),
+`initial_map`, `building`, `checking`.
 """
 
 from psotrack.inside_out.mapping.building import BuiltMap, build_map, corners_in_own_frame

@@ -7,33 +7,18 @@ axes are the world's: the origin at its centre, x to its right, y up, z out of t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, check_positive
-from psotrack.inside_out.mapping.bundle import AdjustedMap, adjust
-from psotrack.inside_out.mapping.initial_map import (
-    MarkerPlacer,
-    PlacedMarker,
-    make_scene,
-    place_markers,
-    placed_markers,
-)
-from psotrack.inside_out.mapping.rolling import (
-    LineTimes,
-    Shutters,
-    line_times,
-    rolling_shutters,
-    with_shutters,
-)
-from psotrack.inside_out.mapping.scene import MappedScene
+from psotrack.geometry import cross_matrices
+from psotrack.inside_out.mapping.adjusting import AdjustedMap, adjust
+from psotrack.inside_out.mapping.initial_map import MarkerPlacer
 from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
-from psotrack.inside_out.mapping.square_fitting import fit_square
+from psotrack.inside_out.mapping.square_fitting import PlacedMarker, fit_square
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.inside_out.pose import RollingShutter
 
 #: Number of views for the initial map; the other views are used for markers that none of these shows.
 _FIRST_VIEWS = 100
@@ -48,7 +33,7 @@ class BuiltMap:
     """A map with its uncertainty.
 
     Attributes:
-        marker_map: the markers that could be placed.
+        marker_map: the markers that could be placed, with their standard deviations.
         ids: (markers,), increasing.
         covariance: (markers, 7, 7), of the centre along the world's axes (m), of a small turn about them (rad), and of
             the logarithm of the side; 0 for known quantities.
@@ -60,8 +45,6 @@ class BuiltMap:
         noise_px: standard deviation of a corner along x and along y, pixels.
         inset_px: (videos,), distance by which the sides of squares are found too far inside, pixels.
         num_views: number of frames that were used.
-        shutters: (videos,), rolling shutters with which the map was made; None is a global shutter.
-        line_times: (videos,), what the videos show of their shutters; None where it was not estimated.
     """
 
     marker_map: MarkerMap
@@ -75,8 +58,6 @@ class BuiltMap:
     noise_px: float
     inset_px: Float[np.ndarray, " videos"]
     num_views: int
-    shutters: Shutters = ()
-    line_times: LineTimes = ()
 
     @property
     def std_m(self) -> Float[np.ndarray, "markers 3"]:
@@ -105,7 +86,6 @@ def build_map(
     *,
     side_m: float | None = None,
     estimate_sides: bool = False,
-    shutter: RollingShutter | None = None,
 ) -> BuiltMap:
     """Build the map that explains sightings, given the positions of some markers.
 
@@ -115,68 +95,39 @@ def build_map(
             them.
         side_m: side of all other markers, metres; None takes the known markers' side.
         estimate_sides: estimate the side of each other marker.
-        shutter: rolling shutter of all cameras; None is estimated for each video. Where a video contradicts it, the
-            covariance includes the difference from the map with the video's shutter.
 
     Raises:
         InputError: no known marker is seen beside another one.
         SettingsError: the side is not above 0.
     """
-    given = (shutter,) * len(sightings.lenses)
-    first = _build(with_shutters(sightings, given), known, side_m, estimate_sides)
-    shown = line_times(sightings, first.marker_map)
-    if shutter is None:
-        if not any(one is not None and one.rolls for one in shown):
-            return replace(first, shutters=given, line_times=shown)
-        found = _build(with_shutters(sightings, rolling_shutters(shown)), known, side_m, estimate_sides)
-        # A map bent by the shutter may have biased the line times. The map itself depends little on the line times,
-        # because the motion in each view is free.
-        shown = line_times(sightings, found.marker_map)
-        return replace(found, shutters=rolling_shutters(shown), line_times=shown)
-    first = replace(first, shutters=given, line_times=shown)
-    if not any(one is not None and one.contradicts(shutter.line_time_s) for one in shown):
-        return first
-    other = _build(with_shutters(sightings, rolling_shutters(shown)), known, side_m, estimate_sides)
-    return _with_difference(first, other)
-
-
-def _with_difference(built: BuiltMap, other: BuiltMap) -> BuiltMap:
-    """A map whose covariances include its difference from another map of the same markers."""
-    covariance = built.covariance.copy()
-    for row, marker in enumerate(built.ids.tolist()):
-        if marker not in other.marker_map:
-            continue
-        (R, centre_m, side_m), (other_R, other_m, other_side_m) = (
-            fit_square(one.marker_map.corners_m[marker]) for one in (built, other)
-        )
-        turn = Rotation.from_matrix(other_R @ R.T).as_rotvec()
-        off = np.concatenate([other_m - centre_m, turn, [np.log(other_side_m / side_m)]])
-        covariance[row] += np.outer(off, off)
-    return replace(built, covariance=covariance)
-
-
-def _build(
-    sightings: MarkerSightings,
-    known: Mapping[int, Float[np.ndarray, "4 3"]],
-    side_m: float | None,
-    estimate_sides: bool,
-) -> BuiltMap:
-    """Build the map with the shutters of the sightings."""
-    placed = {marker: PlacedMarker(*fit_square(corners)) for marker, corners in known.items()}
+    placed = {marker: fit_square(corners_m) for marker, corners_m in known.items()}
     side_m = float(np.median([one.side_m for one in placed.values()])) if side_m is None else side_m
     check_positive("side_m", side_m)
     _check_known(sightings, list(known))
-    first = sightings.select(_spread_views(sightings))
-    placed = place_markers(first, placed, side_m, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
-    if set(sightings.ids) - set(placed):
-        placed = place_markers(sightings, placed, side_m, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
+    for part in (sightings.select(_spread_views(sightings)), sightings):
+        if set(sightings.ids) - set(placed):
+            placed = MarkerPlacer(part, side_m, estimate_sides).place_all(placed, _NOISE_PX)
     # Known markers that no frame shows are left out.
     placed = {marker: one for marker, one in placed.items() if marker in set(sightings.ids)}
-    connected, scene = _connect(sightings, placed, side_m)
-    adjusted, connected = _adjust(
-        connected, scene, [marker for marker in known if marker in placed], side_m, estimate_sides
-    )
-    return _make_result(sightings, connected, adjusted, list(known))
+    fixed = [marker for marker in known if marker in placed]
+    tried: set[int] = set()
+    T_before = None
+    used = sightings
+    while True:
+        used, T = _connected(used, placed, T_before)
+        placed = {marker: placed[marker] for marker in used.ids}
+        adjusted = adjust(used, placed, T, fixed, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
+        explained = {marker: adjusted.used[used.marker == marker].mean() for marker in used.ids}
+        bad = [marker for marker, share in explained.items() if share < _EXPLAINED and marker not in fixed]
+        if not bad:
+            return _result(sightings, used, adjusted, fixed)
+        # A marker that most of its sightings contradict is placed again, or left out.
+        placed = {marker: one for marker, one in adjusted.markers.items() if marker not in bad}
+        placer, T_before = MarkerPlacer(used, side_m), adjusted.T_cam_world
+        views = placer.locate_views(placed, T_before)
+        again = {marker: placer.place(marker, views) for marker in bad if marker not in tried}
+        placed |= {marker: one for marker, one in again.items() if one is not None}
+        tried |= set(bad)
 
 
 def _check_known(sightings: MarkerSightings, known: list[int]) -> None:
@@ -200,76 +151,48 @@ def _spread_views(sightings: MarkerSightings) -> Bool[np.ndarray, " sightings"]:
     return np.isin(sightings.view, views)
 
 
-def _connect(
-    sightings: MarkerSightings, placed: Mapping[int, PlacedMarker], side_m: float
-) -> tuple[MarkerSightings, MappedScene]:
-    """Sightings of placed markers in views that show at least two markers; and the scene of these markers and views."""
+def _connected(
+    sightings: MarkerSightings,
+    placed: Mapping[int, PlacedMarker],
+    before: Float[np.ndarray, "views 4 4"] | None = None,
+) -> tuple[MarkerSightings, Float[np.ndarray, "connected 4 4"]]:
+    """Sightings of placed markers in views that show at least two of them; and the poses of these views."""
     kept = np.isin(sightings.marker, list(placed))
     counts = np.bincount(sightings.view[kept], minlength=sightings.num_views)
-    connected = sightings.select(kept & (counts[sightings.view] >= 2))
-    views = MarkerPlacer(connected, side_m).locate_views(placed)
-    if np.isfinite(views.t_m[:, 0, 0]).all():
-        return connected, make_scene(placed, views, np.zeros(len(connected.lenses)))
-    found = np.isfinite(views.t_m[:, 0, 0])
-    return _connect(connected.select(found[connected.view]), placed, side_m)
+    T = MarkerPlacer(sightings, 1.0).locate_views(placed, before).T[:, 0]
+    kept &= ((counts >= 2) & np.isfinite(T[:, 0, 0]))[sightings.view]
+    return sightings.select(kept), T[np.unique(sightings.view[kept])]
 
 
-def _adjust(
-    sightings: MarkerSightings, scene: MappedScene, fixed: list[int], side_m: float, estimate_sides: bool
-) -> tuple[AdjustedMap, MarkerSightings]:
-    """The adjusted scene. A marker that most of its sightings contradict is placed again, or left out."""
-    tried: set[int] = set()
-    while True:
-        present = np.isin(scene.ids, sightings.ids)
-        scene = MappedScene(
-            scene.R_cam_world,
-            scene.t_m,
-            scene.ids[present],
-            scene.R_world_marker[present],
-            scene.centre_m[present],
-            scene.side_m[present],
-            scene.inset_px,
-        )
-        adjusted = adjust(sightings, scene, fixed, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
-        scene = adjusted.scene
-        bad = [
-            marker
-            for marker in scene.ids.tolist()
-            if marker not in fixed and adjusted.used[sightings.marker == marker].mean() < _EXPLAINED
-        ]
-        if not bad:
-            return adjusted, sightings
-        placed = placed_markers(scene)
-        sound = {marker: one for marker, one in placed.items() if marker not in bad}
-        placer = MarkerPlacer(sightings, side_m)
-        views = placer.locate_views(sound, scene)
-        for marker in bad:
-            found = None if marker in tried else placer.place(marker, views)
-            if found is not None:
-                sound[marker] = found[0]
-        tried |= set(bad)
-        sightings, scene = _connect(sightings, sound, side_m)
-
-
-def _make_result(
+def _result(
     sightings: MarkerSightings, used: MarkerSightings, adjusted: AdjustedMap, known: list[int]
 ) -> BuiltMap:
-    scene = adjusted.scene
-    ids = scene.ids.tolist()
-    of_marker = [used.marker == marker for marker in ids]
-    good = [rows & adjusted.used for rows in of_marker]
+    ids = np.array(sorted(adjusted.markers))
+    of_marker = used.marker == ids[:, None]
+    good = of_marker & adjusted.used
+    squares = (adjusted.residual_px**2).mean(axis=1)
+    std_m = dict(zip(ids.tolist(), _std_m(adjusted).tolist(), strict=True))
     return BuiltMap(
-        MarkerMap(dict(zip(ids, scene.corners_m, strict=True))),
-        scene.ids,
+        MarkerMap({marker: one.corners_m for marker, one in adjusted.markers.items()}, std_m),
+        ids,
         adjusted.covariance,
-        np.array(
-            [np.sqrt(np.mean(adjusted.residual_px[rows] ** 2)) if rows.any() else np.nan for rows in good]
-        ),
-        np.array([rows.sum() for rows in of_marker]),
-        np.array([(rows & ~adjusted.used).sum() for rows in of_marker]),
-        np.isin(scene.ids, known),
-        tuple(marker for marker in sightings.ids if marker not in ids),
+        np.array([np.sqrt(squares[rows].mean()) if rows.any() else np.nan for rows in good]),
+        of_marker.sum(axis=1),
+        (of_marker & ~adjusted.used).sum(axis=1),
+        np.isin(ids, known),
+        tuple(marker for marker in sightings.ids if marker not in adjusted.markers),
         adjusted.noise_px,
-        scene.inset_px,
+        adjusted.inset_px,
         used.num_views,
     )
+
+
+def _std_m(adjusted: AdjustedMap) -> Float[np.ndarray, " markers"]:
+    """(markers,), standard deviations of a corner's position along an axis: root mean squares over corners and axes."""
+    squares = [adjusted.markers[marker] for marker in sorted(adjusted.markers)]
+    arms_m = np.array([one.corners_m - one.T_world_marker[:3, 3] for one in squares])
+    # A corner moves with the centre, with a turn w by w x arm, and with the logarithm of the side by its arm.
+    by_turn = -cross_matrices(arms_m)
+    slopes = np.concatenate([np.broadcast_to(np.eye(3), by_turn.shape), by_turn, arms_m[..., None]], axis=-1)
+    variance = np.einsum("mcif,mfg,mcig->m", slopes, adjusted.covariance, slopes) / 12
+    return np.sqrt(variance)

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.calibration import solve_pnp
 from psotrack.errors import InputError
-from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
+from psotrack.foreground.markers import MarkerDetector
 from psotrack.geometry import Camera, undistort
-from psotrack.inside_out.pose import RollingShutter, row_times_s
-from psotrack.recordings import VideoInfo, read_frames
+from psotrack.recordings import VideoInfo, read_frames_at
 from psotrack.support import Report, no_progress
 
 #: Corners of a marker with sides of 1 in its own axes, x to its right, y up, z out of the print, in OpenCV's order.
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-#: Number of runs of consecutive frames, their length, and the number of a video's first frames in which they lie.
-_RUNS, _RUN_FRAMES, _SEARCHED_FRAMES = 8, 9, 1500
+
+
+#: Largest number of frames of a video that are searched.
+MOST_FRAMES = 300
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,6 @@ class MarkerSightings:
         marker: (sightings,), ids. No view has a marker twice.
         corners_px: (sightings, 4, 2), pixels.
         name: name of the videos, for messages.
-        shutters: rolling shutters of the videos' cameras; None is a global shutter, and so is an empty tuple for all.
-        consecutive: frames of each video that follow one another, number, time (seconds) and markers, to estimate its
-            line time; empty where the views follow one another, and for all videos where it is not to be estimated.
     """
 
     lenses: tuple[Camera, ...]
@@ -65,23 +63,15 @@ class MarkerSightings:
     marker: Int[np.ndarray, " sightings"]
     corners_px: Float[np.ndarray, "sightings 4 2"]
     name: str = "video"
-    shutters: tuple[RollingShutter | None, ...] = ()
-    consecutive: tuple[tuple[tuple[int, float, DetectedMarkers], ...], ...] = ()
-
-    @property
-    def rolls(self) -> bool:
-        """Whether any camera has a rolling shutter."""
-        return any(shutter is not None and shutter.line_time_s for shutter in self.shutters)
 
     @cached_property
-    def row_times_s(self) -> Float[np.ndarray, "sightings 4"]:
-        """(sightings, 4), when the row of each corner was exposed, after the middle row of its image, seconds."""
-        time_s = np.zeros(self.corners_px.shape[:2])
-        for index, (lens, shutter) in enumerate(zip(self.lenses, self.shutters, strict=False)):
-            if shutter is not None:
-                rows = self.lens[self.view] == index
-                time_s[rows] = row_times_s(self.corners_px[rows], lens, shutter.line_time_s)
-        return time_s
+    def rays(self) -> Float[np.ndarray, "sightings 4 2"]:
+        """(sightings, 4, 2), directions x / z, y / z in which the corners are seen."""
+        rays = np.empty_like(self.corners_px)
+        for index, lens in enumerate(self.lenses):
+            rows = self.lens[self.view] == index
+            rays[rows] = undistort(lens, self.corners_px[rows])
+        return rays
 
     @property
     def num_views(self) -> int:
@@ -104,8 +94,6 @@ class MarkerSightings:
             self.marker[kept],
             self.corners_px[kept],
             self.name,
-            self.shutters,
-            self.consecutive,
         )
 
 
@@ -113,8 +101,7 @@ def find_sightings(
     videos: Sequence[tuple[VideoInfo, Camera]],
     dictionary: str = "4x4_1000",
     *,
-    most_frames: int = 300,
-    consecutive: bool = False,
+    most_frames: int = MOST_FRAMES,
     report: Report = no_progress,
 ) -> MarkerSightings:
     """Find the markers in videos of one room.
@@ -122,10 +109,7 @@ def find_sightings(
     Args:
         videos: videos with the lens of each, for images of its size.
         dictionary: name of the markers' dictionary, such as 4x4_50.
-        most_frames: largest number of frames of a video that are searched, evenly spread: neighbouring frames show the
-            same.
-        consecutive: also search frames that follow one another, where others were left out, to see whether the shutter
-            rolls.
+        most_frames: largest number of frames of a video that are searched.
         report: progress is reported to it.
 
     Raises:
@@ -142,35 +126,24 @@ def find_sightings(
             )
     detectors = [MarkerDetector(dictionary, lens=lens) for _, lens in videos]
     seen = []
-    steps = [max(1, -(-video.num_frames // most_frames)) for video, _ in videos]
-    total = sum(-(-video.num_frames // step) for (video, _), step in zip(videos, steps, strict=True))
-    with report("markers", total) as advance:
-        for source, ((video, _), step) in enumerate(zip(videos, steps, strict=True)):
-            for index, frame in enumerate(read_frames(video, step)):
+    numbers = [_searched(video.num_frames, most_frames) for video, _ in videos]
+    with report("markers", sum(map(len, numbers))) as advance:
+        for source, (video, _) in enumerate(videos):
+            for number, frame in read_frames_at(video, numbers[source]):
                 gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
                 found = detectors[source].detect(gray)
-                seen.append(FrameMarkers(source, index * step / video.fps, found.ids, found.corners_px))
+                seen.append(FrameMarkers(source, number / video.fps, found.ids, found.corners_px))
                 advance(1)
     name = ", ".join(str(video.path) for video, _ in videos)
-    sightings = collect_sightings(seen, [lens for _, lens in videos], name)
-    if not consecutive:
-        return sightings
-    followed = [
-        () if step == 1 else tuple(_consecutive(video, detector))
-        for (video, _), step, detector in zip(videos, steps, detectors, strict=True)
-    ]
-    return replace(sightings, consecutive=tuple(followed))
+    return collect_sightings(seen, [lens for _, lens in videos], name)
 
 
-def _consecutive(video: VideoInfo, detector: MarkerDetector) -> Iterator[tuple[int, float, DetectedMarkers]]:
-    """Markers in runs of frames, spread over the beginning of a video."""
-    first_frames = min(video.num_frames, _SEARCHED_FRAMES)
-    starts = np.linspace(0, max(first_frames - _RUN_FRAMES, 0), _RUNS).astype(int)
-    chosen = set((starts[:, None] + np.arange(_RUN_FRAMES)).ravel().tolist())
-    for number, frame in enumerate(islice(read_frames(video), first_frames)):
-        if number in chosen:
-            gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
-            yield number, number / video.fps, detector.detect(gray).of_single_ids()
+def _searched(num_frames: int, most: int) -> list[int]:
+    """Numbers of frames that are evenly spread, and of the next one of each fourth of them, which shows the motion."""
+    if num_frames <= most:
+        return list(range(num_frames))
+    spread = np.linspace(0, num_frames - 2, most * 4 // 5).astype(int)
+    return np.union1d(spread, spread[::4] + 1).tolist()
 
 
 def collect_sightings(
@@ -185,15 +158,12 @@ def collect_sightings(
     rows: list[tuple[int, int, Float[np.ndarray, "4 2"]]] = []
     for frame in seen:
         ids, counts = np.unique(frame.ids, return_counts=True)
-        single = set(ids[counts == 1].tolist())
-        found = [
-            (len(views), marker, corners.astype(np.float64))
-            for marker, corners in zip(frame.ids.tolist(), frame.corners_px, strict=True)
-            if marker in single
+        single = np.flatnonzero(np.isin(frame.ids, ids[counts == 1]))
+        rows += [
+            (len(views), int(frame.ids[row]), frame.corners_px[row].astype(np.float64)) for row in single
         ]
-        if found:
+        if len(single):
             views.append((frame.source, frame.time_s))
-            rows += found
     if not rows:
         raise InputError(
             name,
@@ -201,44 +171,31 @@ def collect_sightings(
             found="none in any frame",
             remedy="check that --dictionary names the printed markers",
         )
-    return MarkerSightings(
-        tuple(lenses),
-        np.array([source for source, _ in views]),
-        np.array([time_s for _, time_s in views]),
-        np.array([view for view, _, _ in rows]),
-        np.array([marker for _, marker, _ in rows]),
-        np.array([corners for _, _, corners in rows]),
-        name,
-    )
+    view, marker, corners_px = map(np.array, zip(*rows, strict=True))
+    source, time_s = map(np.array, zip(*views, strict=True))
+    return MarkerSightings(tuple(lenses), source, time_s, view, marker, corners_px, name)
 
 
-def square_poses(
-    sightings: MarkerSightings, side_m: float
-) -> tuple[Float[np.ndarray, "sightings 2 3 3"], Float[np.ndarray, "sightings 2 3"]]:
-    """The two poses of a square that look almost the same, marker to camera, the better one first; NaN without a pose.
+def outward(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2"]:
+    """Shift of each corner in the image, along the bisector, when each side of the square moves outwards by 1 px."""
+    ahead = _unit(np.roll(sightings.corners_px, -1, axis=1) - sightings.corners_px)
+    behind = np.roll(-ahead, 1, axis=1)
+    # Two sides with an angle a between them give 1 / sin(a / 2). Markers seen too obliquely are not recognised.
+    sine = np.maximum(np.linalg.norm(ahead - behind, axis=-1, keepdims=True) / 2, 0.1)
+    return -_unit(ahead + behind) / sine
 
-    Infinitesimal plane-based pose estimation (IPPE; Collins & Bartoli 2014).
 
-    Args:
-        sightings: markers in views.
-        side_m: side of all markers, metres.
+def _unit(vectors: Float[np.ndarray, "*vectors 2"]) -> Float[np.ndarray, "*vectors 2"]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def square_poses(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 2 4 4"]:
+    """The two poses of a square with sides of 1 that look almost the same, marker to camera, the better one first.
+
+    NaN where there is no pose, or no second one.
     """
-    R = np.full((len(sightings.view), 2, 3, 3), np.nan)
-    t_m = np.full((len(sightings.view), 2, 3), np.nan)
-    lens_of = sightings.lens[sightings.view]
-    for index, lens in enumerate(sightings.lenses):
-        of_lens = np.flatnonzero(lens_of == index)
-        normalised = undistort(lens, sightings.corners_px[of_lens])
-        for row, corners in zip(of_lens.tolist(), normalised, strict=True):
-            if not np.isfinite(corners).all():
-                continue
-            try:
-                _, turns, shifts, _ = cv2.solvePnPGeneric(
-                    side_m * SQUARE, corners, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-                )
-            except cv2.error:
-                # Degenerate corners, such as corners on one line.
-                continue
-            for which, (turn, shift) in enumerate(zip(turns, shifts, strict=True)):
-                R[row, which], t_m[row, which] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return R, t_m
+    T = np.full((len(sightings.view), 2, 4, 4), np.nan)
+    for row, rays in enumerate(sightings.rays):
+        poses = solve_pnp(SQUARE, rays, "ippe")
+        T[row, : len(poses)] = poses
+    return T

@@ -18,6 +18,7 @@ from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.inside_out.marker_map import SQUARE_TOLERANCE, MarkerMap, normals, sides_m
 from psotrack.recordings.datasets import MarkerRow, read_marker_rows, split_label
 from psotrack.recordings.mocap import read_c3d
+from psotrack.support.similarity import similarity
 
 #: Distance of a viewer from a marker's plane, in sides, below which the viewer is on neither side of the marker.
 _ON_A_SIDE = 0.5
@@ -31,7 +32,7 @@ class FittedSquares:
     """Squares that are fitted to measured corners.
 
     Attributes:
-        marker_map: map with the corners of the squares.
+        marker_map: map with the corners of the squares; their standard deviation is from the residuals of all markers.
         residual_m: (4,) by marker id, distances of the measured corners from the corners of the square, metres.
         reordered: ids of markers whose corners were not in OpenCV's order.
     """
@@ -41,22 +42,30 @@ class FittedSquares:
     reordered: tuple[int, ...]
 
 
-def fit_square(
-    points_m: Float[np.ndarray, "4 3"], side_m: float | None = None
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], float]:
-    """Fit a square to four points: its axes in the world (columns), its centre and its side.
+@dataclass(frozen=True)
+class PlacedMarker:
+    """A square.
 
-    Least squares by the singular value decomposition (Umeyama 1991).
-
-    Args:
-        points_m: (4, 3), in OpenCV's order, metres.
-        side_m: side of the square, metres; None fits the side.
+    Attributes:
+        T_world_marker: (4, 4), from the square's own axes (see `sightings.SQUARE`) to the world, metres.
+        side_m: side, metres.
     """
-    centre = points_m.mean(axis=0)
-    U, strength, Vt = np.linalg.svd((points_m - centre).T @ SQUARE)
-    # The model is flat: the sign of the third axis is free, and is chosen to make the rotation a proper one.
-    turn = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
-    return U @ turn @ Vt, centre, float(strength[:2].sum() / np.sum(SQUARE**2)) if side_m is None else side_m
+
+    T_world_marker: Float[np.ndarray, "4 4"]
+    side_m: float
+
+    @property
+    def corners_m(self) -> Float[np.ndarray, "4 3"]:
+        """(4, 3), corners, world, metres."""
+        return self.T_world_marker[:3, 3] + self.side_m * SQUARE @ self.T_world_marker[:3, :3].T
+
+
+def fit_square(points_m: Float[np.ndarray, "4 3"], side_m: float | None = None) -> PlacedMarker:
+    """Fit a square to four points in OpenCV's order, metres; `side_m` is its side, None fits the side."""
+    scale, R, centre_m = similarity(SQUARE, points_m, with_scale=side_m is None)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, centre_m
+    return PlacedMarker(T, scale if side_m is None else side_m)
 
 
 def fit_squares(
@@ -83,15 +92,19 @@ def fit_squares(
         points = _sort_corners(where, row.corners_m, viewer)
         if points is not row.corners_m:
             reordered.append(marker)
-        axes, centre, side = fit_square(points, side_m)
-        corners[marker] = centre + side * SQUARE @ axes.T
+        square = fit_square(points, side_m)
+        corners[marker], side = square.corners_m, square.side_m
         residual_m[marker] = np.linalg.norm(points - corners[marker], axis=1)
         worst = int(residual_m[marker].argmax())
         if not residual_m[marker][worst] <= SQUARE_TOLERANCE * side:
             found = f"a corner that is {1e3 * residual_m[marker][worst]:.0f} mm off"
             expected = f"four points that are a square of {1e3 * side:.0f} mm to {SQUARE_TOLERANCE:.0%}"
             raise InputError(where, expected=expected, found=found, remedy="measure its corners again")
-    return FittedSquares(MarkerMap(corners), residual_m, tuple(reordered))
+    # A square has 12 coordinates, of which its unknowns take up 6 and its side.
+    unknowns = 6 if side_m is not None else 7
+    variance = np.sum(np.square(list(residual_m.values()))) / (len(rows) * (12 - unknowns))
+    std_m = dict.fromkeys(corners, float(np.sqrt(variance * unknowns / 12)))
+    return FittedSquares(MarkerMap(corners, std_m), residual_m, tuple(reordered))
 
 
 def read_measured_corners(path: Path | str) -> dict[int, MarkerRow]:

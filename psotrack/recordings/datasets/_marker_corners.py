@@ -13,7 +13,9 @@ The reader accepts all layouts that are unambiguous:
   or `7.1`;
 - tables without a header, with 13 or 5 numbers per row.
 
-Other columns are ignored. A table of centres alone has the columns `id`, `x`, `y` and `z`.
+A table with one row per marker may have a column `std_m`: the standard deviation of the positions of the marker's
+corners along each axis of the world, metres. Other columns are ignored. A table of centres alone has the columns `id`,
+`x`, `y` and `z`.
 """
 
 from __future__ import annotations
@@ -55,10 +57,12 @@ class MarkerRow:
     Attributes:
         where: file and line, for messages.
         corners_m: (4, 3), positions in the world, metres.
+        std_m: standard deviation of the positions along each axis, metres; 0 where the table has none.
     """
 
     where: str
     corners_m: Float[np.ndarray, "4 3"]
+    std_m: float = 0.0
 
 
 def read_marker_corners(path: Path | str) -> dict[int, Float[np.ndarray, "4 3"]]:
@@ -84,7 +88,14 @@ def read_marker_rows(path: Path | str) -> dict[int, MarkerRow]:
         return _rows_per_corner(table)
     corners_m = lengths_of(table, _CORNERS, _METRES)
     rows = _rows_by_marker(table)
-    return {marker: MarkerRow(row.where, corners_m(row).reshape(4, 3)) for marker, row in rows.items()}
+    std_m = lengths_of(table, ["std"], _METRES) if table.find("std") else None
+    found = {}
+    for marker, row in rows.items():
+        value_m = 0.0 if std_m is None else float(std_m(row)[0])
+        if value_m < 0:
+            raise row.error(table.column("std"), "a standard deviation of 0 or more", f"{value_m:g}")
+        found[marker] = MarkerRow(row.where, corners_m(row).reshape(4, 3), value_m)
+    return found
 
 
 def read_marker_centres(path: Path | str) -> dict[int, Float[np.ndarray, "3"]] | None:
@@ -112,14 +123,22 @@ def split_label(label: str) -> tuple[int, int] | None:
     return (int(match[1]), int(match[2])) if match else None
 
 
-def write_marker_corners(path: Path | str, corners_m: Mapping[int, Float[np.ndarray, "4 3"]]) -> None:
-    """Write corners (4, 3) in the world, metres, by marker id.
+def write_marker_corners(
+    path: Path | str,
+    corners_m: Mapping[int, Float[np.ndarray, "4 3"]],
+    std_m: Mapping[int, float] | None = None,
+) -> None:
+    """Write corners (4, 3) in the world and, if given, their standard deviations along each axis, metres, by marker id.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    header = ["id", *(f"{name}[m]" for name in _CORNERS)]
-    write_rows(path, [header, *([marker, *corners_m[marker].ravel()] for marker in sorted(corners_m))])
+    rows = [["id", *(f"{name}[m]" for name in _CORNERS)]]
+    rows += [[marker, *corners_m[marker].ravel()] for marker in sorted(corners_m)]
+    if std_m is not None:
+        ends = ["std_m", *(std_m[marker] for marker in sorted(corners_m))]
+        rows = [[*row, end] for row, end in zip(rows, ends, strict=True)]
+    write_rows(path, rows)
 
 
 def _rows_by_marker(table: Table) -> dict[int, TextRow]:

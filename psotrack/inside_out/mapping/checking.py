@@ -1,0 +1,267 @@
+"""A check of a map against videos of its room: which markers are wrong, by how much, and what to do.
+
+Markers are sound if the videos show them where the map has them, in views that are located by all markers with a robust
+loss. The map is then built anew from the sound markers (`building`), and the differences are listed. The check fails
+where fewer than half of the markers agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.calibration import spread_px
+from psotrack.errors import InputError
+from psotrack.inside_out.mapping.adjusting import adjust, improved
+from psotrack.inside_out.mapping.building import BuiltMap, build_map
+from psotrack.inside_out.mapping.initial_map import MarkerPlacer
+from psotrack.inside_out.mapping.sightings import MarkerSightings
+from psotrack.inside_out.mapping.square_fitting import PlacedMarker, fit_square
+from psotrack.inside_out.marker_map import MarkerMap
+
+#: Median residual of a suspect marker, as a multiple of the usual median residual.
+_SUSPECT = 4.0
+#: Smallest number of frames from which a suspect marker is placed.
+_LEAST_FRAMES = 3
+#: Standard deviations of a corner in successive adjustments, from a rough start to the end, pixels.
+_NOISES_PX = (8.0, 2.0, 0.5)
+#: Number of standard deviations from which on a difference is significant.
+_SIGNIFICANT = 5.0
+#: Differences below these are expected of a map that was measured by hand or by motion capture, with errors of some
+#: millimetres: of positions (metres), orientations (degrees) and sides (fraction of the side).
+_SHIFT_M, _TURN_DEG, _SIDE_CHANGE = 0.01, 3.0, 0.03
+#: Largest deviation, degrees, from a turn by 90, 180 or 270 degrees at which the order of the corners is the fault.
+_QUARTER_DEG = 15.0
+#: Largest distance of two centres that are the same place, in sides.
+_SAME_PLACE = 0.35
+
+
+@dataclass(frozen=True)
+class MapFinding:
+    """A fault of a map.
+
+    Attributes:
+        kind: kind of the fault in a word or two, for programs.
+        markers: ids of the wrong markers; empty where the whole map is wrong.
+        message: what is wrong, and by how much.
+        remedy: what to do.
+    """
+
+    kind: str
+    markers: tuple[int, ...]
+    message: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.remedy}"
+
+
+@dataclass(frozen=True)
+class MarkerDifference:
+    """How a marker in the videos differs from the map.
+
+    Attributes:
+        moved_m: (3,), from the centre in the map to the centre in the videos, world.
+        std_m: (3,), standard deviation of `moved_m`.
+        turned_deg: angle between the axes in the map and in the videos, degrees.
+        turn_std_deg: standard deviation of `turned_deg`.
+        grown: side in the videos divided by the side in the map.
+    """
+
+    moved_m: Float[np.ndarray, "3"]
+    std_m: Float[np.ndarray, "3"]
+    turned_deg: float
+    turn_std_deg: float
+    grown: float
+
+
+@dataclass(frozen=True)
+class MapCheck:
+    """Result of a check of a map.
+
+    Attributes:
+        findings: faults of the map; empty where nothing is wrong.
+        sightings: number of frames that show a marker beside others of the map, by id.
+        residual_px: median distance in the image between a marker's corners and those in the map, pixels, by id.
+        differences: of suspect markers that could be placed anew, by id.
+        noise_px: standard deviation of a corner along x and along y, pixels.
+        num_views: number of frames that show at least two markers of the map.
+        not_in_map: ids that are seen but not in the map.
+    """
+
+    findings: tuple[MapFinding, ...]
+    sightings: Mapping[int, int]
+    residual_px: Mapping[int, float]
+    differences: Mapping[int, MarkerDifference]
+    noise_px: float
+    num_views: int
+    not_in_map: tuple[int, ...]
+
+
+def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
+    """Check a map against sightings.
+
+    Raises:
+        InputError: no frame shows two markers of the map.
+    """
+    given = {int(marker): fit_square(corners) for marker, corners in marker_map.corners_m.items()}
+    not_in_map = tuple(marker for marker in sightings.ids if marker not in given)
+    kept = np.isin(sightings.marker, list(given))
+    kept &= (np.bincount(sightings.view[kept], minlength=sightings.num_views) >= 2)[sightings.view]
+    if not kept.any():
+        raise InputError(
+            sightings.name,
+            expected="frames that show two markers of the map",
+            found="none",
+            remedy="check that the map and the video are of the same room",
+        )
+    sightings = sightings.select(kept)
+    distance_px = _distances_by_map(sightings, given)
+    noise_px = spread_px(distance_px.ravel(), 0)
+    residual_px = {
+        marker: float(np.median(distance_px[sightings.marker == marker])) for marker in sightings.ids
+    }
+    # The median of a Rayleigh distribution is 1.18 standard deviations.
+    suspects = [marker for marker, value in residual_px.items() if value > _SUSPECT * 1.18 * noise_px]
+    differences: dict[int, MarkerDifference] = {}
+    findings: list[MapFinding] = []
+    sound = len(residual_px) - len(suspects)
+    if 2 * sound <= len(residual_px) or noise_px > _NOISES_PX[0]:
+        message = f"the map as a whole does not fit the video: {sound} of {len(residual_px)} markers agree"
+        remedy = "check that lens, dictionary and map are those of this room, and that no axis is mirrored"
+        findings.append(MapFinding("map", (), f"{message} with one another", remedy))
+    elif suspects:
+        known = {marker: marker_map.corners_m[marker] for marker in residual_px if marker not in suspects}
+        built = build_map(sightings, known, estimate_sides=True)
+        placed = {
+            marker: fit_square(built.marker_map.corners_m[marker])
+            for marker, count in zip(built.ids.tolist(), built.sightings, strict=True)
+            if marker in suspects and count >= _LEAST_FRAMES
+        }
+        differences = {marker: _difference(built, marker, given[marker]) for marker in placed}
+        findings = _find_faults(given, placed, differences, {one: residual_px[one] for one in suspects})
+    counts = {marker: int((sightings.marker == marker).sum()) for marker in given}
+    found = (tuple(findings), counts, residual_px, differences)
+    return MapCheck(*found, noise_px, sightings.num_views, not_in_map)
+
+
+def _distances_by_map(
+    sightings: MarkerSightings, given: Mapping[int, PlacedMarker]
+) -> Float[np.ndarray, "sightings 4"]:
+    """Distances in the image in views that agree with most markers, with all markers where the map has them."""
+    placer, T = MarkerPlacer(sightings, 1.0), None
+    markers = {marker: given[marker] for marker in sightings.ids}
+    for noise_px in _NOISES_PX:
+        # Near the end, a view in a wrong pose may find a better one.
+        T = placer.locate_views(markers, T).T[:, 0]
+        _, T = improved(sightings, markers, T, sightings.ids, noise_px=noise_px)
+    T = placer.locate_views(markers, T).T[:, 0]
+    return adjust(sightings, markers, T, sightings.ids, noise_px=_NOISES_PX[-1]).residual_px
+
+
+def _difference(built: BuiltMap, marker: int, given: PlacedMarker) -> MarkerDifference:
+    found = fit_square(built.marker_map.corners_m[marker])
+    row = built.ids.tolist().index(marker)
+    moved = found.T_world_marker @ np.linalg.inv(given.T_world_marker)
+    return MarkerDifference(
+        found.T_world_marker[:3, 3] - given.T_world_marker[:3, 3],
+        built.std_m[row],
+        float(np.rad2deg(Rotation.from_matrix(moved[:3, :3]).magnitude())),
+        float(np.rad2deg(np.linalg.norm(built.turn_std_rad[row]))),
+        found.side_m / given.side_m,
+    )
+
+
+def _find_faults(
+    given: Mapping[int, PlacedMarker],
+    placed: Mapping[int, PlacedMarker],
+    differences: Mapping[int, MarkerDifference],
+    suspects: Mapping[int, float],
+) -> list[MapFinding]:
+    """Faults of suspect markers, which have these residuals in pixels; two exchanged markers are one fault."""
+    findings, done = [], set()
+    for marker, off_px in suspects.items():
+        if marker in done:
+            continue
+        if marker not in placed:
+            message = f"marker {marker}: it is {off_px:.1f} px off where the map has it"
+            remedy = "too few frames show it beside others to tell where it is: film it with them, or measure it again"
+            findings.append(MapFinding("disagrees", (marker,), message, remedy))
+            continue
+        found, shift_m = placed[marker], float(np.linalg.norm(differences[marker].moved_m))
+        there = (other for other, one in given.items() if other != marker and _are_together(found, one))
+        other = next(there, None)
+        if other is not None and other in placed and _are_together(placed[other], given[marker]):
+            done.add(other)
+            message = f"markers {marker} and {other}: each is where the map has the other one"
+            remedy = "exchange their ids in the map, or on the wall"
+            findings.append(MapFinding("exchanged", (marker, other), message, remedy))
+        elif (turned := _counted_wrongly(marker, given[marker], found)) is not None:
+            findings.append(turned)
+        elif other is not None:
+            message = (
+                f"marker {marker}: it is where the map has marker {other}, {shift_m:.2f} m from its own place"
+            )
+            remedy = "correct its id, in the map or on the wall"
+            findings.append(MapFinding("exchanged", (marker, other), message, remedy))
+        elif (moved := _moved(marker, given[marker], found, differences[marker])) is not None:
+            findings.append(moved)
+    return findings
+
+
+def _are_together(one: PlacedMarker, other: PlacedMarker) -> bool:
+    """Whether two squares are at one place and face the same way."""
+    T, T_other = one.T_world_marker, other.T_world_marker
+    is_near = np.linalg.norm(T[:3, 3] - T_other[:3, 3]) < _SAME_PLACE * other.side_m
+    return bool(is_near and T[:3, 2] @ T_other[:3, 2] > 0)
+
+
+def _counted_wrongly(marker: int, given: PlacedMarker, found: PlacedMarker) -> MapFinding | None:
+    """The fault of a marker at its place whose corners are counted from another one, or backwards."""
+    T = np.linalg.inv(given.T_world_marker) @ found.T_world_marker
+    if np.linalg.norm(T[:3, 3]) >= _SAME_PLACE * given.side_m:
+        return None
+    if T[2, 2] < -np.sqrt(0.5):
+        message = f"marker {marker}: the map counts its corners backwards, so that it faces the wall"
+        remedy = "count them clockwise as seen from the room, from the marker's own top left"
+        return MapFinding("backwards", (marker,), message, remedy)
+    clockwise_deg = float(np.rad2deg(np.arctan2(T[0, 1], T[0, 0])))
+    quarter = round(clockwise_deg / 90) % 4
+    rest_deg = abs((clockwise_deg - 90 * quarter + 180) % 360 - 180)
+    if not quarter or rest_deg > _QUARTER_DEG or T[2, 2] < np.cos(np.deg2rad(_QUARTER_DEG)):
+        return None
+    message = f"marker {marker}: the map counts its corners from another one, {90 * quarter} degrees around"
+    remedy = (
+        f"what the map calls corner {quarter + 1} is corner 1, the marker's own top left; or hang it upright"
+    )
+    return MapFinding("corner order", (marker,), message, remedy)
+
+
+def _moved(marker: int, given: PlacedMarker, found: PlacedMarker, by: MarkerDifference) -> MapFinding | None:
+    """The fault of a marker that is elsewhere, turned or of another size; None if the differences are usual."""
+    shift_m, std_m = float(np.linalg.norm(by.moved_m)), float(np.linalg.norm(by.std_m))
+    faults = {}
+    if shift_m > max(_SHIFT_M, _SIGNIFICANT * std_m):
+        place = ", ".join(f"{value:.3f}" for value in found.T_world_marker[:3, 3])
+        faults["moved"] = (
+            f"{_metres(shift_m)} from where the map has it, at ({place}) m, give or take {_metres(std_m)}"
+        )
+    if by.turned_deg > max(_TURN_DEG, _SIGNIFICANT * by.turn_std_deg):
+        faults["turned"] = f"turned by {by.turned_deg:.1f} degrees, give or take {by.turn_std_deg:.1f}"
+    if abs(by.grown - 1) > _SIDE_CHANGE:
+        faults["side"] = f"{1e3 * found.side_m:.0f} mm wide, not {1e3 * given.side_m:.0f} mm"
+    if not faults:
+        return None
+    remedy = "measure it again; `psotrack onboard map --known` with sound markers builds a map from the video"
+    message = f"marker {marker}: it is {' and '.join(faults.values())}"
+    return MapFinding(next(iter(faults)), (marker,), message, remedy)
+
+
+def _metres(length_m: float) -> str:
+    if length_m >= 0.1:
+        return f"{length_m:.2f} m"
+    return f"{1e3 * length_m:.{0 if length_m >= 0.01 else 1}f} mm"
