@@ -183,9 +183,8 @@ def test_points_of_known_place(tmp_path, lenses):
     assert content["cameras"]["c1"]["used"] == 14
     np.testing.assert_allclose(read_rig(out).cameras.centre_world, CENTRES, atol=0.02)
     other = ("--out", tmp_path / "other.toml")
-    assert "--lenses: expected a calibration with the lens of each camera, found none" in refused(
-        "--pairs", pairs, *other
-    )
+    no_lens = refused("--pairs", pairs, *other)
+    assert "--lenses: expected a calibration with the lens of each camera, or --fov H,V" in no_lens
     assert "--pairs: expected no video" in refused("a.mp4", "--pairs", pairs, "--lenses", lenses, *other)
     assert "--world: expected none" in refused("--pairs", pairs, "--world", pairs, "--lenses", lenses, *other)
     write_rig(tmp_path / "two.toml", RIG.select(["c0", "c1"]))
