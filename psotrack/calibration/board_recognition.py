@@ -229,8 +229,11 @@ def _family_of_board(images: _Images) -> tuple[str, list[_Markers]]:
     Markers that stand still, such as those on the walls of a laboratory, are not those of a board that is moved: they
     count only if no others are found, in the images or in mirrored ones.
     """
-    searched = [_seen_markers(images), _seen_markers(_mirrored(images))]
-    for only_moved, seen in product((True, False), searched):
+    searched: dict[bool, dict[str, list[_Markers]]] = {}
+    for only_moved, mirrored in product((True, False), (False, True)):
+        if mirrored not in searched:
+            searched[mirrored] = _seen_markers(_mirrored(images) if mirrored else images)
+        seen = searched[mirrored]
         chosen = {family: _moved(found) if only_moved else found for family, found in seen.items()}
         family, of_images = max(chosen.items(), key=lambda one: max(map(len, one[1]), default=0))
         if max(map(len, of_images), default=0) >= _LEAST_MARKERS:
@@ -248,7 +251,8 @@ def _seen_markers(images: _Images) -> dict[str, list[_Markers]]:
     seen: dict[str, list[_Markers]] = {name: [{} for _ in images] for name in _FAMILIES}
     for number, grey in enumerate(images):
         quads, ids, _, which = detector.detectMarkersMultiDict(grey)
-        for quad, marker, family in zip(quads, np.ravel(ids), np.ravel(which), strict=True):
+        found = zip(quads, np.ravel(ids), np.ravel(which), strict=True) if quads else ()
+        for quad, marker, family in found:
             seen[list(_FAMILIES)[int(family)]][number][int(marker)] = quad.reshape(4, 2).astype(float)
     return seen
 
