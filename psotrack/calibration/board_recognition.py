@@ -94,16 +94,16 @@ def detect_board(square_m: float, images: _Images) -> Board:
             )
             model = np.asarray(board.opencv().getObjPoints(), np.float64)[..., :2]
             fits.append((float(np.median([_misfit(model, one) for one in clearest])), board))
-    misfit, board = min(fits, key=lambda one: one[0], default=(np.inf, None))
-    if board is None or misfit > _FITS:
+    misfit, fitting = min(fits, key=lambda one: one[0], default=(np.inf, None))
+    if fitting is None or misfit > _FITS:
         raise InputError(
             "board",
             expected="a ChArUco board or a chessboard",
             found=f"markers {lowest} to {highest} of the dictionary {_smallest(family, highest)} in another order",
             remedy="say with --board, --squares, --marker, --dictionary and --first-marker what the board is",
         )
-    part = measure_markers(board, images) or 0.75
-    return replace(board, marker_m=round(part, 2) * square_m)
+    part = measure_markers(fitting, images) or 0.75
+    return replace(fitting, marker_m=round(part, 2) * square_m)
 
 
 def describe_board(board: Board) -> str:
