@@ -268,7 +268,9 @@ def test_four_webcams():
     cameras = open_images([folder / f"cam_{n}.mp4" for n in range(4)])
     found = find_views(Board((4, 5), 0.054, 0.0405, "4x4_1000"), cameras, instants_of_numbers(cameras))
     assert (found.mirrored > 0).tolist() == [False, True, False, False]
-    assert say_print(found) == [f"cam_1 sees the board mirrored, in {found.mirrored[1]} of {found.views.seen[1].sum()} views"]
+    assert say_print(found) == [
+        f"cam_1 sees the board mirrored, in {found.mirrored[1]} of {found.views.seen[1].sum()} views"
+    ]
     calibrated = calibrate_rig(found.board, found.views)
     np.testing.assert_allclose(calibrated.rig.cameras.K[:, 0, 0], [894.5, 704.0, 637.2, 640.4], rtol=0.03)
     assert np.nanmedian(calibrated.residual_px) < 0.6

@@ -94,16 +94,16 @@ def detect_board(square_m: float, images: _Images) -> Board:
             )
             model = np.asarray(board.opencv().getObjPoints(), np.float64)[..., :2]
             fits.append((float(np.median([_misfit(model, one) for one in clearest])), board))
-    misfit, board = min(fits, key=lambda one: one[0], default=(np.inf, None))
-    if board is None or misfit > _FITS:
+    misfit, fitting = min(fits, key=lambda one: one[0], default=(np.inf, None))
+    if fitting is None or misfit > _FITS:
         raise InputError(
             "board",
             expected="a ChArUco board or a chessboard",
             found=f"markers {lowest} to {highest} of the dictionary {_smallest(family, highest)} in another order",
             remedy="say with --board, --squares, --marker, --dictionary and --first-marker what the board is",
         )
-    part = measure_markers(board, images) or 0.75
-    return replace(board, marker_m=round(part, 2) * square_m)
+    part = measure_markers(fitting, images) or 0.75
+    return replace(fitting, marker_m=round(part, 2) * square_m)
 
 
 def describe_board(board: Board) -> str:
@@ -229,8 +229,11 @@ def _family_of_board(images: _Images) -> tuple[str, list[_Markers]]:
     Markers that stand still, such as those on the walls of a laboratory, are not those of a board that is moved: they
     count only if no others are found, in the images or in mirrored ones.
     """
-    searched = [_seen_markers(images), _seen_markers(_mirrored(images))]
-    for only_moved, seen in product((True, False), searched):
+    searched: dict[bool, dict[str, list[_Markers]]] = {}
+    for only_moved, mirrored in product((True, False), (False, True)):
+        if mirrored not in searched:
+            searched[mirrored] = _seen_markers(_mirrored(images) if mirrored else images)
+        seen = searched[mirrored]
         chosen = {family: _moved(found) if only_moved else found for family, found in seen.items()}
         family, of_images = max(chosen.items(), key=lambda one: max(map(len, one[1]), default=0))
         if max(map(len, of_images), default=0) >= _LEAST_MARKERS:
@@ -248,7 +251,8 @@ def _seen_markers(images: _Images) -> dict[str, list[_Markers]]:
     seen: dict[str, list[_Markers]] = {name: [{} for _ in images] for name in _FAMILIES}
     for number, grey in enumerate(images):
         quads, ids, _, which = detector.detectMarkersMultiDict(grey)
-        for quad, marker, family in zip(quads, np.ravel(ids), np.ravel(which), strict=True):
+        found = zip(quads, np.ravel(ids), np.ravel(which), strict=True) if quads else ()
+        for quad, marker, family in found:
             seen[list(_FAMILIES)[int(family)]][number][int(marker)] = quad.reshape(4, 2).astype(float)
     return seen
 

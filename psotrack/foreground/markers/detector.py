@@ -20,7 +20,8 @@ from psotrack.foreground.markers.corners import refine_corners, undistort_pixels
 from psotrack.foreground.markers.patterns import MarkerPatterns, marker_dictionary
 from psotrack.geometry import Camera
 
-_Image = UInt8[np.ndarray, "height width"]
+#: An image, also one of another size than the image that is searched.
+_Image = UInt8[np.ndarray, "_ _"]
 
 #: Shortest side of a marker, in pixels of the full image: one pixel for each of 6 cells, border cells included.
 _SHORTEST_PX = 6.0

@@ -86,7 +86,7 @@ class FittedCorners:
     Attributes:
         corners_px: (markers, 4, 2), the intersection of each side with the side before it, pixels.
         std_px: (markers,), standard deviation of a corner along x and along y, from how well the edges fit, pixels.
-        scatter_px: (markers, 4), median distance of the points of each edge from a straight line, pixels.
+        scatter_px: (markers, 4), median distance of the points of each edge from its chord, pixels.
     """
 
     corners_px: _Corners
@@ -119,31 +119,28 @@ def fit_corners(near_px: _Corners, points_px: _Points, weight: _Weights, spread_
     off = (apart * outward[:, :, None]).sum(axis=-1)
     wide = np.maximum(spread_px, _LEAST_APART_PX)
     correlated = np.maximum(0.5 * points_px.shape[2] * wide / half, 1.0)
-    line, line_variance, scatter_px = _fit_powers(place, off, weight, correlated, 2)
-    curve, curve_variance, _ = _fit_powers(place, off, weight, correlated, 3)
+    line, line_variance = _fit_powers(place, off, weight, correlated, 2)
+    curve, curve_variance = _fit_powers(place, off, weight, correlated, 3)
     bend = np.abs(curve[..., 2])
     bent = (bend > _BENT * np.sqrt(curve_variance[..., 2, 2])) & (
         bend > _LEAST_BEND * wide + _BLURRED_BEND * wide**2 / half
     )
     powers = np.where(bent[..., None], curve, line)
     variance = np.where(bent[..., None, None], curve_variance, line_variance)
-    ends = []
+    ends, chord = [], np.zeros_like(off)
     for end in (np.zeros_like(length), length):
-        at = ((end - middle) / half[..., None])[..., 0]
-        basis, slopes = (
-            at[..., None] ** np.arange(3),
-            at[..., None] ** [0, 0, 1] * [0, 1, 2] / half[..., None],
-        )
-        moved, slope = (
-            (basis * powers).sum(axis=-1, keepdims=True),
-            (slopes * powers).sum(axis=-1, keepdims=True),
-        )
+        at = (end - middle) / half[..., None]
+        basis, slopes = at ** np.arange(3), at ** [0, 0, 1] * [0, 1, 2] / half[..., None]
+        moved = (basis * powers).sum(axis=-1, keepdims=True)
+        slope = (slopes * powers).sum(axis=-1, keepdims=True)
+        chord += moved * (1 - np.abs(along - end) / length)
         left = np.where(bent, _BEND_LEFT[1], _BEND_LEFT[0]) * (basis * (curve - line)).sum(axis=-1) ** 2
         of_fit = (basis[..., None, :] @ variance @ basis[..., None])[..., 0, 0]
         ends.append((near_px + end * ahead + moved * outward, ahead + slope * outward, of_fit + left))
     (on, towards, here), (on_before, towards_before, there) = ends[0], (each[:, BEFORE] for each in ends[1])
     sine = _cross(towards_before, towards)
     reached = _cross(on - on_before, towards) / np.where(np.abs(sine) < 1e-9, 1e-9, sine)
+    scatter_px = median_of_rows(np.abs(off - chord))
     corner_variance = (here + there) / (2 * np.maximum(sine**2, 1e-4))
     return FittedCorners(
         on_before + reached[..., None] * towards_before, np.sqrt(corner_variance.mean(axis=1)), scatter_px
@@ -152,12 +149,11 @@ def fit_corners(near_px: _Corners, points_px: _Points, weight: _Weights, spread_
 
 def _fit_powers(
     place: _Weights, off: _Weights, weight: _Weights, correlated: _Sides, terms: int
-) -> tuple[Float[np.ndarray, "markers 4 3"], Float[np.ndarray, "markers 4 3 3"], _Sides]:
+) -> tuple[Float[np.ndarray, "markers 4 3"], Float[np.ndarray, "markers 4 3 3"]]:
     """Lines (2 terms) or parabolas (3 terms) through points, by least squares with lower weights for outliers.
 
     Returns:
-        coefficients of powers of the place, their covariance, if `correlated` points have the information of one, and
-        the median distance of the points.
+        coefficients of powers of the place, and their covariance, if `correlated` points have the information of one.
     """
     basis = place[..., None] ** np.arange(3) * (np.arange(3) < terms)
     unused = np.diag(np.arange(3) >= terms) + 1e-6 * np.eye(3)
@@ -174,7 +170,7 @@ def _fit_powers(
     freedom = np.maximum((weight > 0).sum(axis=-1) / correlated - terms, 1.0)
     scatter = (used * distance**2).sum(axis=-1) / np.maximum(used.sum(axis=-1), 1e-9)
     scatter = np.maximum(scatter, _LEAST_SCATTER_PX**2) * (1 + terms / freedom) * correlated
-    return powers, scatter[..., None, None] * (inverse - unused * inverse), typical
+    return powers, scatter[..., None, None] * (inverse - unused * inverse)
 
 
 def median_of_rows(values: Float[np.ndarray, "*rows values"]) -> Float[np.ndarray, "*rows"]:
