@@ -62,6 +62,10 @@ class TestStandardError:
         assert np.isnan(standard_error(values[:1])).all()
         assert np.isnan(standard_error(np.full((5, 2), np.nan))).all()
 
+    def test_it_is_not_below_the_standard_error_of_independent_frames(self):
+        flipping = np.tile([[1.0], [-1.0]], (50, 1))
+        assert standard_error(flipping)[0] == pytest.approx(1 / np.sqrt(99))
+
 
 class TestLeverArm:
     def test_in_the_body_frame_it_is_exact_without_noise(self):

@@ -89,6 +89,8 @@ def time_blocks(
 def standard_error(values: Float[np.ndarray, "frames parts"]) -> Float[np.ndarray, "parts"]:
     """Standard error of the mean of each column over frames, of which neighbouring ones are correlated.
 
+    It is never less than that of independent frames.
+
     Args:
         values: (frames, parts), in the order of time; rows with a NaN are left out.
 
@@ -103,4 +105,5 @@ def standard_error(values: Float[np.ndarray, "frames parts"]) -> Float[np.ndarra
     total = np.zeros((len(size), values.shape[1]))
     np.add.at(total, block, known)
     left_out = (known.sum(axis=0) - total) / (len(known) - size)
-    return np.sqrt(np.diag(block_jackknife(known.mean(axis=0), left_out, size[:, 0])))
+    variance = np.diag(block_jackknife(known.mean(axis=0), left_out, size[:, 0]))
+    return np.sqrt(np.maximum(variance, known.var(axis=0, ddof=1) / len(known)))

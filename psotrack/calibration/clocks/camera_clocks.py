@@ -57,6 +57,7 @@ class CameraOffsets:
             `time_offset_s` says it. The mean of the offsets is 0.
         std_frames: (cameras,), standard deviations of the offsets, frames; near `max_offset_frames` for a camera whose
             detections do not show its offset.
+        white_std_frames: (cameras,), the same if the errors of all detections were independent.
         rms_before_px: weighted root mean square distance of the detections from the projections if all offsets are 0,
             pixels; NaN if no point is seen by two cameras.
         rms_after_px: the same distance with the estimated offsets, pixels.
@@ -64,6 +65,7 @@ class CameraOffsets:
 
     offset_frames: Float[np.ndarray, "cameras"]
     std_frames: Float[np.ndarray, "cameras"]
+    white_std_frames: Float[np.ndarray, "cameras"]
     rms_before_px: float
     rms_after_px: float
 
@@ -110,8 +112,8 @@ def camera_offsets(
         before = _linearise(problem, np.zeros(len(rig)), weights)
         weights = before.weights
     after = gauss_newton(_linearise(problem, np.zeros(len(rig)), weights), max_steps=_MAX_STEPS)
-    std_frames = _standard_deviations(after, max_offset_frames)
-    return CameraOffsets(after.offset_frames, std_frames, before.rms_px, after.rms_px)
+    stds_frames = _standard_deviations(after, max_offset_frames)
+    return CameraOffsets(after.offset_frames, *stds_frames, before.rms_px, after.rms_px)
 
 
 @dataclass(frozen=True)
@@ -269,8 +271,11 @@ def _fit_velocities(
     return np.where(known[..., None], pull / squares[..., None], 0.0), np.where(known, 1 / squares, np.inf)
 
 
-def _standard_deviations(system: _System, max_offset_frames: float) -> Float[np.ndarray, "cameras"]:
-    """Standard deviations of the offsets, by a block jackknife: the step that is left without each block."""
+def _standard_deviations(
+    system: _System, max_offset_frames: float
+) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]]:
+    """Standard deviations of the offsets by a block jackknife, the step that is left without each block; and the same
+    for independent errors."""
     w, prior = system.weights, np.eye(len(system.offset_frames)) / max_offset_frames**2
     # The Geman-McClure cost has less curvature than least squares with the fixed weights w: its second derivatives are
     # w (4 √w - 3) along the residual and w across it.
@@ -294,4 +299,4 @@ def _standard_deviations(system: _System, max_offset_frames: float) -> Float[np.
     inverse = np.linalg.inv(total)
     inverse -= inverse.mean(axis=0)
     inverse -= inverse.mean(axis=1, keepdims=True)
-    return np.sqrt(variance + np.einsum("kb,bc,kc->k", inverse, prior, inverse))
+    return np.sqrt(variance + np.einsum("kb,bc,kc->k", inverse, prior, inverse)), np.sqrt(np.diag(inverse))

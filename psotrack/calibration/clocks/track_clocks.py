@@ -139,27 +139,39 @@ def estimate_clocks(
     parts = np.array_split(np.arange(len(points_px)), num_stretches)
     estimates = [_offsets_of_stretch(rig, points_px[part], timeline.rate_hz) for part in parts]
     time_s = np.array([timeline.time_s[part].mean() for part in parts])
-    offset_s, std_s = (np.array(values) / timeline.rate_hz for values in zip(*estimates, strict=True))
+    offset_s, std_s, white_s = (
+        np.array(values) / timeline.rate_hz for values in zip(*estimates, strict=True)
+    )
+    # One stretch of one camera shows badly how far its errors are correlated: all tell it together.
+    seen = np.isfinite(white_s)
+    squares = (std_s[seen] / white_s[seen]) ** 2
+    std_s = white_s * np.sqrt(max(float(squares.mean()), 1.0) if seen.any() else 1.0)
     return fit_clocks(time_s, offset_s, std_s, known_s=_KNOWN / timeline.rate_hz)
 
 
 def _offsets_of_stretch(
     rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], rate_hz: float
-) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]]:
-    """Offsets and standard deviations, intervals between instants; 0 and infinite for cameras that show nothing.
+) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]]:
+    """Offsets, their standard deviations, and these for independent errors, intervals between instants.
+
+    They are 0 and infinite for cameras that show nothing.
 
     Offsets are relative to the mean of all cameras, so a camera that shows nothing must not be one of them.
     """
-    offset, std = np.zeros(len(rig)), np.full(len(rig), np.inf)
+    offset, (std, white) = np.zeros(len(rig)), np.full((2, len(rig)), np.inf)
     left = np.flatnonzero(np.isfinite(points_px).all(axis=-1).sum(axis=(0, 1)) >= _LEAST_PLACES)
     while len(left) >= 2:
         part = rig.select([rig.names[camera] for camera in left])
         found = camera_offsets(part, points_px[:, :, left], rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
         if found.std_frames.max() < MAX_OFFSET_FRAMES / 10:
-            offset[left], std[left] = found.offset_frames, found.std_frames
+            offset[left], std[left], white[left] = (
+                found.offset_frames,
+                found.std_frames,
+                found.white_std_frames,
+            )
             break
         left = np.delete(left, found.std_frames.argmax())
-    return offset, std
+    return offset, std, white
 
 
 def fit_clocks(
