@@ -122,7 +122,7 @@ def test_a_small_lag_does_not_hide_a_turned_camera():
     turned = _boxes.turned(rig, 3, 0.4, np.random.default_rng(0))
     (finding,) = examine(turned, sightings, fps=25.0).findings
     assert (finding.kind, finding.cameras) == ("turned", ("c3",))
-    assert "place it anew with `psotrack calibrate extrinsics --pairs`" in finding.remedy
+    assert "place it anew with `psotrack calibrate rig --pairs`" in finding.remedy
 
 
 def small_problem():

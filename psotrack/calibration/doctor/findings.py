@@ -24,7 +24,7 @@ _ALMOST = 0.9
 _SAME_SCALE = 0.03
 #: What to do about a camera's place, and about its lens.
 _PLACE_ANEW = (
-    "place it anew with `psotrack calibrate extrinsics --pairs`, or all cameras with `psotrack calibrate rig`"
+    "place it anew with `psotrack calibrate rig --pairs`, or all cameras with `psotrack calibrate rig`"
 )
 _LENS_ANEW = "calibrate its lens anew with `psotrack calibrate intrinsics`"
 

@@ -120,7 +120,7 @@ def fuse_drone(
         point: tracked point of the result.
     """
     camera = resample_path(path, time_s, clock_s)
-    arm_m, arm_error_m = estimate_arm(camera, middle_m, frame)
+    arm_m, arm_error_m = estimate_arm(camera, middle_m)
     near = Arm(
         arm_m, max(_ARM_ERRORS * arm_error_m, _LEAST_ARM_STD_M) if np.isfinite(arm_error_m) else _ARM_STD_M
     )

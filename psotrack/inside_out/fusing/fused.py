@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.clocks import Offset, find_offset
 from psotrack.errors import InputError
+from psotrack.evaluation import Offset, find_offset
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, unfused_path
 from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, align_tracks, select_track
@@ -241,7 +241,7 @@ def _pair(
     pairing = pair_tracks(frame, expected_m, reach_m, middle_m)
     for index, camera in enumerate(cameras):
         own_m = select_track(middle_m, pairing.track[:, index])
-        arm_m, _ = estimate_arm(camera, own_m, frame)
+        arm_m, _ = estimate_arm(camera, own_m)
         expected_m[:, index] += camera.rotation @ arm_m
         off_m = np.linalg.norm(own_m - expected_m[:, index], axis=1)
         if np.isfinite(off_m).any():

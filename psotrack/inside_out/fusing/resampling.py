@@ -107,7 +107,7 @@ def is_informative(covariance_m2: Float[np.ndarray, "*rows 3 3"]) -> Bool[np.nda
 
 
 def estimate_arm(
-    camera: ResampledPath, middle_m: Float[np.ndarray, "frames 3"], frame: Int[np.ndarray, "frames"]
+    camera: ResampledPath, middle_m: Float[np.ndarray, "frames 3"]
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """The arm (3,) from the camera's centre to the middle, in the camera's axes, and its standard error, metres.
 
@@ -117,7 +117,6 @@ def estimate_arm(
     Args:
         camera: resampled path.
         middle_m: (frames, 3), middle of the silhouette; NaN where unknown.
-        frame: (frames,), numbers of the frames.
     """
     arms_m = np.einsum("fji,fj->fi", camera.rotation, middle_m - camera.position_m)
     arms_m[~camera.has_orientation] = np.nan
@@ -126,7 +125,7 @@ def estimate_arm(
         return np.zeros(3), np.inf
     off_m = np.linalg.norm(arms_m - np.median(arms_m[there], axis=0), axis=1)
     near = there & (off_m <= _FAR * np.median(off_m[there]) + _SAME_S)
-    error_m = standard_error(np.where(near[:, None], arms_m, np.nan), frame)
+    error_m = standard_error(np.where(near[:, None], arms_m, np.nan))
     return arms_m[near].mean(axis=0), float(np.max(np.nan_to_num(error_m, nan=np.inf)))
 
 
