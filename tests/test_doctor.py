@@ -418,7 +418,7 @@ def test_cameras_without_a_place_are_named(tmp_path):
         lines += [
             f"[cameras.{name}]",
             f'detections = "{name}.csv"',
-            "image_size = [1920, 1080]",
+            "size = [1920, 1080]",
             "fps = 25.0",
         ]
     (tmp_path / "recording.toml").write_text("\n".join(lines) + "\n")
