@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import locate_camera
 from psotrack.errors import InputError
-from psotrack.geometry import NEAR_M, Camera, project_visible
+from psotrack.geometry import NEAR_M, Camera, project_visible, undistort
 
 #: Smallest number of points of the other cameras with which a camera is checked.
 MIN_POINTS_OF_CAMERA = 30
@@ -72,9 +72,7 @@ def explain_camera(camera: Camera, views: CameraViews) -> list[CameraFault]:
     lag = max(_LAGS.tolist(), key=lambda lag: _explained(camera, views, lag))
     lens = max((_scaled(camera, scale) for scale in _SCALES), key=lambda each: _explained(each, views))
     moved = _placed_anew(camera, views)
-    T = moved.T_cam_world.copy()
-    T[:3, 3] = -T[:3, :3] @ camera.centre_world
-    turned = replace(camera, T_cam_world=T)
+    turned = _turned(camera, moved, views)
     return [
         CameraFault("sound", _explained(camera, views), camera),
         CameraFault("clock", _explained(camera, views, lag), camera, lag),
@@ -112,6 +110,23 @@ def _placed_anew(camera: Camera, views: CameraViews) -> Camera:
         (_located(start, views) for start in (camera, _shifted(camera, views))),
         key=lambda each: _explained(each, views),
     )
+
+
+def _turned(camera: Camera, moved: Camera, views: CameraViews) -> Camera:
+    """The camera turned until its rays agree with the points that the moved camera explains."""
+    fit, best = _fits(moved, views)
+    paired = np.flatnonzero(fit > 0)
+    rays = undistort(camera, views.box_px[paired, best[paired]])
+    kept = np.isfinite(rays).all(axis=-1)
+    if kept.sum() < MIN_POINTS_OF_CAMERA:
+        return camera
+    rays, centre_m = np.column_stack([rays, np.ones(len(rays))])[kept], camera.centre_world
+    ahead_m = views.point_m[paired][kept] - centre_m
+    rays, ahead = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (rays, ahead_m))
+    R = Rotation.align_vectors(rays, ahead, weights=fit[paired][kept])[0].as_matrix()
+    T = camera.T_cam_world.copy()
+    T[:3, :3], T[:3, 3] = R, -R @ centre_m
+    return replace(camera, T_cam_world=T)
 
 
 def _shifted(camera: Camera, views: CameraViews) -> Camera:

@@ -134,7 +134,11 @@ def weigh(corrected: Corrected, points: CommonPoints) -> WeightedPoints:
         distance = np.where(there, np.linalg.norm(left_px - bias_px, axis=-1) / sigma_px, np.nan)
         # The fit has three unknowns per point, and follows the noise.
         freedom = 1 - 1.5 / np.maximum((weight > 0).sum(axis=1, keepdims=True), 2)
-        std = np.maximum(np.nan_to_num(medians(distance)) / _RAYLEIGH_MEDIAN, 0.1) / np.sqrt(freedom)
+        scale = np.nan_to_num(medians(distance)) / _RAYLEIGH_MEDIAN
+        if len(scale) == 2:
+            # Two cameras show only the noise of both together.
+            scale = np.full(2, np.sqrt(np.mean(scale**2)))
+        std = np.maximum(scale, 0.1) / np.sqrt(freedom)
         robust = cauchy_weight((np.nan_to_num(distance) / std / _OUTLIER_STD) ** 2) ** 2
         used = there & (robust > 0.02)
         used &= used.sum(axis=1, keepdims=True) >= min(3, used.shape[1])
@@ -152,7 +156,8 @@ def information(
 def misfit_px(corrected: Corrected, data: WeightedPoints) -> Float[np.ndarray, "points cameras"]:
     """Distances of sightings from where the other cameras put the body, pixels; NaN for no sighting and outliers.
 
-    Where fewer than two other cameras see the body, the camera itself takes part.
+    Where fewer than two other cameras see the body, it is twice the distance from where all cameras put it: two cameras
+    have equal parts of their disagreement.
     """
     slopes = linearise(corrected, data.points, data.position_m)
     J, residual_px = slopes.by_point, np.nan_to_num(slopes.residual_px)
@@ -161,7 +166,8 @@ def misfit_px(corrected: Corrected, data: WeightedPoints) -> Float[np.ndarray, "
     normal = each.sum(axis=1, keepdims=True) - np.where(others[..., None], each, 0.0) + _TINY
     right = right.sum(axis=1, keepdims=True) - np.where(others, right, 0.0)
     left_px = residual_px - np.matvec(J, np.linalg.solve(normal, right[..., None])[..., 0])
-    return np.where(data.used, np.linalg.norm(left_px, axis=-1), np.nan)
+    distance_px = np.linalg.norm(left_px, axis=-1) * np.where(others[..., 0], 1, 2)
+    return np.where(data.used, distance_px, np.nan)
 
 
 def medians(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns"]:

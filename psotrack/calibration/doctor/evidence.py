@@ -116,7 +116,7 @@ class Evidence:
         columns = list(hypothesis.columns)
         before = np.zeros_like(self.prior_std) if done is None else done
         left, right = self.equations[:, columns][:, :, columns], self.equations[:, columns, -1]
-        found = []
+        found: list[tuple[float, np.ndarray, np.ndarray]] = []
         for factor in _PRIOR_FACTORS:
             std = factor * self.prior_std[columns]
             inner = np.eye(len(columns)) + std[:, None] * left * std
@@ -210,4 +210,4 @@ def _integrated(
     inner = np.eye(count) + std[:, None] * products[..., :count, :count] * std
     outer = std[:, None] * products[..., :count, count:]
     rest = products[..., count:, count:] - outer.swapaxes(-1, -2) @ np.linalg.solve(inner, outer)
-    return rest, np.linalg.slogdet(inner)[1]
+    return rest, np.asarray(np.linalg.slogdet(inner)[1])

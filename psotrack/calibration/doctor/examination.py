@@ -107,41 +107,33 @@ def examine(
             message = f"{who}: {better.words} {numbers}"
             findings.append(Finding(better.kind, better.cameras, message, better.remedy))
             rig, explained, points = better.rig, again, seen.common_points(better.rig)
-    data = weigh(Corrected(rig, np.zeros(len(rig))), points)
-    diagnosis = Diagnosis(
+    as_read = Corrected(rig, np.zeros(len(rig)))
+    data, lags, fit = weigh(as_read, points), np.full((2, len(rig)), np.nan), None
+    unknown = _why_unknown(rig, seen, explained, points, data)
+    if unknown is not None:
+        findings.append(unknown)
+    else:
+        lags = find_lags(rig, data)
+        findings += _find_faults(rig, seen, data, lags)
+        if not findings and explained.sum() < MIN_SHARE * total:
+            findings.append(_nothing_agrees(rig, seen, explained))
+        if reference is not None:
+            inside = points.frame < reference.num_frames
+            fit = fit_reference(points.frame[inside], points.start_m[inside], reference, fps)
+            findings += describe_reference(fit, fps)
+    misfit = misfit_px(as_read, data)
+    return Diagnosis(
         cameras=rig.names,
         fps=fps,
-        findings=(),
+        findings=tuple(findings),
         num_frames=len(frames),
         num_sightings=seen.count,
         num_explained=explained,
-        residual_px=np.full(len(rig), np.nan),
-        residual_std=np.full(len(rig), np.nan),
-        late_frames=np.full(len(rig), np.nan),
-        late_std_frames=np.full(len(rig), np.nan),
-        epipolar_px=_median_epipolar_distances(rig, points),
-        reference=None,
-    )
-    unknown = _why_unknown(rig, seen, explained, points, data)
-    if unknown is not None:
-        return replace(diagnosis, findings=(*findings, unknown))
-    lags = find_lags(rig, data)
-    findings += _find_faults(rig, seen, data, lags)
-    if not findings and explained.sum() < MIN_SHARE * total:
-        findings.append(_nothing_agrees(rig, seen, explained))
-    fit = None
-    if reference is not None:
-        inside = points.frame < reference.num_frames
-        fit = fit_reference(points.frame[inside], points.start_m[inside], reference, fps)
-        findings += describe_reference(fit, fps)
-    misfit = misfit_px(Corrected(rig, np.zeros(len(rig))), data)
-    return replace(
-        diagnosis,
-        findings=tuple(findings),
         residual_px=medians(misfit),
         residual_std=medians(misfit / (NOISE_PX + NOISE_SHARE * points.side_px)),
         late_frames=lags[0],
         late_std_frames=lags[1],
+        epipolar_px=_median_epipolar_distances(rig, points),
         reference=fit,
     )
 
@@ -172,14 +164,20 @@ def _find_faults(
             if fault is None or (findings and not fault.certain):
                 break
             finding = describe_fault(rest, fault, seen.fps)
+            if least_viewpoints(rig) < 3:
+                message = f"the cameras disagree, for example as if {finding.message}"
+                remedy = "two viewpoints do not show which camera is wrong: check both, or use more cameras"
+                finding = Finding("unclear", rig.names, message, remedy)
             if finding.kind == "clock":
                 column = list(fault.best.hypothesis.columns)
                 number = names.index(finding.cameras[0])
                 lags[:, number] = fault.best.step[column].item(), fault.best.std[column].item()
         findings.append(finding)
         index = [number for number, name in enumerate(rest.names) if name not in finding.cameras]
+        if finding.kind == "unclear" or len(index) in (0, len(rest)):
+            break
         seen, rest = seen.by(index), rest.select([rest.names[number] for number in index])
-        if not finding.cameras or finding.kind == "unclear" or least_viewpoints(rest) < 3:
+        if least_viewpoints(rest) < 3:
             break
         data = weigh(Corrected(rest, np.zeros(len(rest))), seen.common_points(rest))
     return findings

@@ -27,9 +27,10 @@ from psotrack.calibration.doctor.corrections import (
 from psotrack.calibration.doctor.evidence import Hypothesis, Judged, gather, list_hypotheses
 from psotrack.geometry import Rig
 
-#: Logarithm of a ratio of likelihoods that is very strong evidence (R. Kass & A. Raftery, Bayes factors, 1995, section
-#: 3.2): of a fault over a sound rig, over a fault of another camera, and over another kind of fault.
-VERY_STRONG = 5.0
+#: Logarithms of ratios of likelihoods that are very strong and strong evidence (R. Kass & A. Raftery, Bayes factors,
+#: 1995, section 3.2): a fault needs the first over a sound rig and over other kinds of fault, the second over faults of
+#: other cameras.
+VERY_STRONG, STRONG = 5.0, 3.0
 #: Smallest median shift of a camera's boxes by a fault that is named, pixels in an image of 1920 columns: a
 #: calibration's own error.
 LEAST_PX = 1.5
@@ -88,13 +89,20 @@ def find_fault(rig: Rig, data: WeightedPoints) -> FoundFault | None:
         if not likely:
             return None
         shifts_px = [_shift_px(corrected, data, one) for one in likely]
-        small = [one for one, shift_px in zip(likely, shifts_px, strict=True) if shift_px < least_px]
+        enough = max(VERY_STRONG, likely[0].log_odds - STRONG)
+        small = [
+            one
+            for one, shift_px in zip(likely, shifts_px, strict=True)
+            if shift_px < least_px and one.log_odds > enough
+        ]
         if not small:
             fault = _decided(likely, shifts_px)
             same = [one for one in likely if one.hypothesis.camera == fault.best.hypothesis.camera]
             # The kind may be uncertain where the camera is certain: any likely kind of its fault may be visible.
             visible_px = max(_explained_px(corrected, data, one) for one in same)
-            return fault if visible_px > _VISIBLE * fault.shift_px else None
+            # A fault of all lenses mostly moves the points.
+            visible = fault.best.hypothesis.camera < 0 or visible_px > _VISIBLE * fault.shift_px
+            return fault if visible else None
         # A small error that explains the sightings as well as the best fault does is corrected first.
         corrected = corrected.by(small[0].step)
         # Sightings that looked like outliers may be right at the corrected rig.
@@ -129,15 +137,20 @@ def _decided(likely: list[Judged], shifts_px: list[float]) -> FoundFault:
     best = next((one for one in single if one.hypothesis.camera == camera), likely[0])
     # Two faults at once of one camera are too rare to make a single fault of another camera uncertain, and one fault
     # per camera is enough to say which cameras may be wrong.
-    others = {one.hypothesis.camera: one for one in reversed(single) if one.hypothesis.camera != camera}
-    as_well = others.values() if others else (one for one in single if one is not best)
+    others = {
+        one.hypothesis.camera: one
+        for one in reversed(single)
+        if one.hypothesis.camera != camera and one.log_odds > likely[0].log_odds - STRONG
+    }
+    same = [one for one in single if one.hypothesis.camera == camera and one is not best]
+    as_well = others.values() if others else same
     return FoundFault(
         best, tuple(as_well), not others, shifts_px[[one is best for one in likely].index(True)]
     )
 
 
 def _likely(corrected: Corrected, data: WeightedPoints) -> list[Judged]:
-    """The hypotheses for which there is very strong evidence, and no very strong evidence of better ones."""
+    """The hypotheses against which there is no very strong evidence, best first; none if the rig may be sound."""
     evidence = gather(corrected, data)
     as_sound = evidence.as_sound
     cameras = np.flatnonzero(data.used.sum(axis=0) >= _MIN_SIGHTINGS).tolist()
@@ -152,7 +165,7 @@ def _likely(corrected: Corrected, data: WeightedPoints) -> list[Judged]:
     ]
     refined.sort(key=lambda one: -one.log_odds)
     best = refined[0].log_odds
-    return [one for one in refined if one.log_odds > max(VERY_STRONG, best - VERY_STRONG)]
+    return [one for one in refined if best > VERY_STRONG and one.log_odds > best - VERY_STRONG]
 
 
 def _refined(corrected: Corrected, data: WeightedPoints, judged: Judged, as_sound: float) -> Judged:

@@ -77,12 +77,12 @@ def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
         several = "; or ".join(f"{_who(rig, one)}: {_of_judged(rig, one, fps)[0]}" for one in every)
         message = f"the cameras disagree, and these faults explain it about equally well: {several}"
         return Finding("unclear", names, message, "none is certain: check these cameras, or use more cameras")
-    numbers = f"which moves its boxes by {fault.shift_px:.0f} px"
+    numbers = f", which moves its boxes by {fault.shift_px:.0f} px" if names else ""
     if also:
         numbers += f"; nearly as likely, {' or '.join(said for said, _ in also)}"
     kind, *others = (_named(one.hypothesis.kind) for one in every)
     other_kinds = tuple(other for other in dict.fromkeys(others) if other != kind)
-    return Finding(kind, names, f"{_who(rig, fault.best)}: {words}, {numbers}", remedy, other_kinds)
+    return Finding(kind, names, f"{_who(rig, fault.best)}: {words}{numbers}", remedy, other_kinds)
 
 
 def _named(kind: str) -> str:
