@@ -61,5 +61,5 @@ def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path,
     settings = {name: value for record in known.values() for name, value in vars(record).items()}
     if plot is not None:
         plot = plot if plot.name else out.with_suffix(".png")
-    common = {"out": out, "plot": plot, "force": output.force, "progress": output.report}
-    output.result(api.calibrate_rig(sources, **common, **settings))
+    written: dict[str, Any] = {"plot": plot, "force": output.force, "progress": output.report}
+    output.result(api.calibrate_rig(sources, out=out, **written, **settings))

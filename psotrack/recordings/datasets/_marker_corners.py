@@ -133,10 +133,10 @@ def write_marker_corners(
     Raises:
         OutputError: the file cannot be written.
     """
-    rows = [["id", *(f"{name}[m]" for name in _CORNERS)]]
+    rows: list[list[object]] = [["id", *(f"{name}[m]" for name in _CORNERS)]]
     rows += [[marker, *corners_m[marker].ravel()] for marker in sorted(corners_m)]
     if std_m is not None:
-        ends = ["std_m", *(std_m[marker] for marker in sorted(corners_m))]
+        ends: list[object] = ["std_m", *(std_m[marker] for marker in sorted(corners_m))]
         rows = [[*row, end] for row, end in zip(rows, ends, strict=True)]
     write_rows(path, rows)
 
