@@ -6,7 +6,7 @@ tracks of static cameras. Other rooms use the names that this room exports, and 
 
 From a frame to a path: `frames` (reading), `detection` (markers in an image), `pose` (of one frame), `filtering` (over
 time), `localising` (the complete localisation). `mapping` builds and checks maps, `comparison` compares paths with
-references, `fusing` joins paths and tracks. Imports go in this order: frame_motion, camera_path, lens_files,
+references, `fusing` joins paths and tracks. Imports go in this order: camera_path, lens_files,
 marker_map, frames, detection, pose, filtering, line_time (of a rolling shutter), mapping, localising, comparison,
 fusing.
 """

@@ -1,8 +1,7 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .comparison.plots import save_flight
 from .detection.marker_table import markers_of_images, markers_of_video, write_marker_table
-from .filtering.pose_filter import PoseFilterParams
-from .filtering.smoothing import smooth
+from .filtering import PoseFilterParams, smooth
 from .frames import FrameSource, open_source
 from .fusing import FusedTracks, fuse
 from .fusing.fused_table import write_fused

@@ -1,13 +1,13 @@
 """`MarkerMap`: corners of markers in a room; and its table, which is checked when it is read.
 
 A marker is a flat square. A table is refused where it clearly contradicts this. Other errors of a map are found from a
-video: see `localising.map_evidence` and `mapping.check`.
+video: see `localising.recording` and `mapping.check`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -39,9 +39,11 @@ class MarkerMap:
     Attributes:
         corners_m: (4, 3) by marker id, world, metres: in the order of OpenCV's ArUco, clockwise from the marker's own
             top left as seen from its front.
+        std_m: standard deviation of a marker's position along each axis by marker id, metres; nothing where unknown.
     """
 
     corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
+    std_m: Mapping[int, float] = field(default_factory=dict)
 
     __repr__ = short_repr
 
@@ -67,6 +69,10 @@ class MarkerMap:
     def corners_of(self, ids: Iterable[int]) -> Float[np.ndarray, "chosen 4 3"]:
         """(chosen, 4, 3), corners of these markers, which must all be in the map."""
         return np.array([self.corners_m[int(marker)] for marker in ids], np.float64).reshape(-1, 4, 3)
+
+    def std_of(self, ids: Iterable[int]) -> Float[np.ndarray, "chosen"]:
+        """(chosen,), standard deviations of the positions of these markers along each axis, metres; 0 where unknown."""
+        return np.array([self.std_m.get(int(marker), 0.0) for marker in ids])
 
     @cached_property
     def all_corners_m(self) -> Float[np.ndarray, "markers 4 3"]:
