@@ -1,24 +1,14 @@
-"""How the errors of one marker's corners are correlated: estimated from a video, and what it does to covariances.
-
-Corners are projected exactly, from poses at random in front of a wall of markers, with errors of three kinds.
-"""
+"""How large the errors of corners are, learned from a recording, and whether covariances fit them."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack.errors import SettingsError
 from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import look_at, make_camera, project
-from psotrack.inside_out import MarkerMap, PoseSettings
-from psotrack.inside_out.localising.corner_noise import (
-    LEAST_SCALE,
-    MOST_SCALE,
-    CornerNoise,
-    estimate_corner_noise,
-)
-from psotrack.inside_out.pose import RollingShutter, estimate_pose
+from psotrack.inside_out import LocaliseSettings, MarkerMap, RollingShutter
+from psotrack.inside_out.localising import localise_frames
 
 LENS = make_camera(
     R=np.eye(3),
@@ -98,140 +88,36 @@ def filmed(errors, num_frames=60, markers=10, seed=0):
     return frames, poses
 
 
-def nees(frames, poses, settings, size=6):
+def nees(frames, poses, size=6):
     """Mean squared error of poses (size 6) or positions (size 3) by their covariances, divided by its expectation.
 
-    Also the share in the 90 % ellipsoid.
+    Also the fraction in the 90 % ellipsoid.
     """
-    squares = []
-    for (_, _, markers), (position_m, R) in zip(frames, poses, strict=True):
-        corners_m = MarkerMap(wall()).corners_of(markers.ids.tolist())
-        pose = estimate_pose(markers.corners_px, corners_m, LENS, settings)
-        assert pose is not None
-        turn = Rotation.from_matrix(pose.R_world_cam.T @ R).as_rotvec()
-        off = np.append(position_m - pose.position_m, turn)[:size]
-        squares.append(off @ np.linalg.solve(pose.covariance[:size, :size], off))
-    return np.mean(squares) / size, np.mean(np.array(squares) < chi2.ppf(0.9, size))
+    settings = LocaliseSettings(filter=None, shutter=RollingShutter(0.0))
+    path = localise_frames(frames, MarkerMap(wall()), LENS, settings).path
+    position_m, R = (np.array(part) for part in zip(*poses, strict=True))
+    turns = Rotation.from_quat(path.orientation_wxyz, scalar_first=True).inv() * Rotation.from_matrix(R)
+    off = np.concatenate([position_m - path.position_m, turns.as_rotvec()], axis=1)[:, :size]
+    squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(path.covariance[:, :size, :size]), off)
+    return np.mean(squares) / size, np.mean(squares < chi2.ppf(0.9, size))
 
 
-@pytest.mark.parametrize(
-    ("errors", "least", "most"),
-    # Measured 0.76, 0.48 and 1.1. The errors of the markers' places, which are stated as 0.1 mm and estimated in each
-    # frame, account for a part of what independent errors leave, and for most of what markers that move leave.
-    [(independent, 0.65, 1.1), (by_edges, LEAST_SCALE, 0.6), (together, 1.0, MOST_SCALE)],
-)
-def test_the_scale_is_that_of_the_errors(errors, least, most):
-    frames, _ = filmed(errors)
-    noise = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings())
-    assert least <= noise.centre_scale <= most
+@pytest.mark.parametrize("errors", [by_edges, independent, together, as_drawn])
+def test_positions_and_poses_have_covariances_that_fit_their_errors(errors):
+    """By edges, independent, of whole markers, and as in drawn videos: two variances fit all of them."""
+    frames, poses = filmed(errors, 100)
+    for size in (3, 6):
+        found, inside = nees(frames, poses, size)
+        # Measured 0.7 to 1.1, and 0.85 to 0.95; with 100 frames, 0.1 and 0.03 are one standard deviation.
+        assert 0.5 < found < 1.3
+        assert 0.8 <= inside <= 0.99
 
 
 @pytest.mark.parametrize("std_px", [0.05, 0.5])
 def test_the_noise_of_corners_is_learned_from_the_recording(std_px):
-    """With few markers in a frame, the stated noise counts as much as the frame's residuals."""
+    """Corners in frames of four markers, whose residuals alone say little."""
     frames, poses = filmed(lambda rng, corners_px: std_px * rng.normal(size=corners_px.shape), 100)
-    noise = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings())
-    assert noise.usual_px == pytest.approx(std_px, rel=0.1)
     few = [(number, time_s, markers.select(np.arange(10) < 4)) for number, time_s, markers in frames]
-    stated, learned = (
-        nees(few, poses, settings)[0] for settings in (PoseSettings(), noise.settings(PoseSettings()))
-    )
-    # Measured 0.20 and 0.56, and 1.08 and 1.22: the stated errors of places count as much as corners of 0.05 px, and
-    # the scale of 0.5 px is found as 0.87 instead of 1 (see above).
-    assert stated < learned < 1.3
-
-
-def test_given_errors_of_corners_stay():
-    frames, _ = filmed(independent)
-    given = PoseSettings(usual_px=0.3, centre_scale=0.7, usual_place_m=2e-4)
-    assert estimate_corner_noise(frames, MarkerMap(wall()), LENS, given).settings(given) == given
-
-
-def test_corners_by_edges_have_covariances_that_fit_their_errors():
-    """Without the estimate, the covariances are four times as large as the squared errors."""
-    frames, poses = filmed(by_edges, 100)
-    noise = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings())
-    plain, inside = nees(frames, poses, PoseSettings())
-    assert plain < 0.3
-    # Measured 0.20 and 0.63: the stated errors of places and the stated noise of corners have a weight of their own.
-    found, inside = nees(frames, poses, noise.settings(PoseSettings()))
-    assert 0.5 < found < 1.1
-    assert inside >= 0.85
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_positions_and_poses_of_drawn_videos_have_covariances_that_fit_their_errors(seed):
-    """Found: positions far too wide, by errors of places of 0.1 mm that were not there, and orientations too narrow.
-
-    The normalised squares were 0.5 to 0.57 for positions and 1.25 to 1.4 for poses, with 1 and 0.75 of them inside.
-    """
-    frames, poses = filmed(as_drawn, 100, seed=seed)
-    settings = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings()).settings(PoseSettings())
-    # Measured 0.79 and 0.88, 0.93 and 0.9 for positions; 0.84 and 0.85, 0.95 and 0.92 for poses.
-    for size in (3, 6):
-        found, inside = nees(frames, poses, settings, size)
-        assert 0.65 < found < 1.2
-        assert 0.85 <= inside <= 0.97
-
-
-def test_a_shift_of_all_corners_is_in_the_covariance():
-    """No residual shows it, so that it is stated; the pose follows the corners, by a turn for the most part."""
-    frames, _ = filmed(as_drawn, 1)
-    markers = frames[0][2]
-    corners_m = MarkerMap(wall()).corners_of(markers.ids.tolist())
-    plain, shifted = (
-        estimate_pose(markers.corners_px, corners_m, LENS, PoseSettings(shift_px=shift_px))
-        for shift_px in (0.0, 0.5)
-    )
-    assert plain is not None
-    assert shifted is not None
-
-    def middle_px(step):
-        R = plain.R_world_cam @ Rotation.from_rotvec(step[3:]).as_matrix()
-        return project(LENS, (corners_m - plain.position_m - step[:3]).reshape(-1, 3) @ R)[0].mean(axis=0)
-
-    units = 1e-6 * np.eye(6)
-    by_pose = np.stack([(middle_px(unit) - middle_px(-unit)) / 2e-6 for unit in units], axis=1)
-    grown = by_pose @ (shifted.covariance - plain.covariance) @ by_pose.T
-    np.testing.assert_allclose(grown, 0.5**2 * np.eye(2), atol=0.02)
-    with pytest.raises(SettingsError, match="shift_px"):
-        PoseSettings(shift_px=-0.1)
-
-
-@pytest.mark.parametrize(
-    ("errors", "least_mm", "most_mm"),
-    # Independent errors leave means as large as stated places let expect, and markers that move still larger ones.
-    [(as_drawn, 0.03, 0.05), (independent, 0.1, 0.1), (together, 0.1, 0.1)],
-)
-def test_places_that_the_residuals_do_not_show_count_less(errors, least_mm, most_mm):
-    frames, _ = filmed(errors)
-    noise = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings())
-    assert least_mm <= 1e3 * noise.usual_place_m <= most_mm
-
-
-@pytest.mark.parametrize("errors", [independent, together])
-def test_other_errors_do_not_make_covariances_too_small(errors):
-    frames, poses = filmed(errors, 100)
-    noise = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings())
-    found, inside = nees(frames, poses, noise.settings(PoseSettings()))
-    # Measured 1.03 and 1.08, 0.85 and 0.88; with 100 frames, 0.1 and 0.03 are one standard deviation.
-    assert found < 1.25
+    found, inside = nees(few, poses)
+    assert 0.5 < found < 1.5
     assert inside > 0.8
-
-
-def test_a_rolling_shutter_whose_line_time_is_known_has_the_same_scale():
-    frames, _ = filmed(by_edges)
-    rolling = estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings(), RollingShutter(1e-6))
-    assert LEAST_SCALE <= rolling.centre_scale < 0.6
-
-
-def test_frames_with_few_markers_say_nothing():
-    frames, _ = filmed(by_edges, markers=3)
-    stated = CornerNoise(PoseSettings().noise_px, 1.0, PoseSettings().place_m)
-    assert estimate_corner_noise(frames, MarkerMap(wall()), LENS, PoseSettings(min_markers=2)) == stated
-    assert estimate_corner_noise([], MarkerMap(wall()), LENS, PoseSettings()) == stated
-
-
-def test_a_scale_is_positive():
-    with pytest.raises(SettingsError, match="centre_scale"):
-        PoseSettings(centre_scale=0.0)

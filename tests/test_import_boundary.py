@@ -56,7 +56,6 @@ ORDER = [
     "calibration.clocks",
     "calibration",
     "calibration.doctor",
-    "inside_out.frame_motion",
     "inside_out.camera_path",
     "inside_out.lens_files",
     "inside_out.marker_map",

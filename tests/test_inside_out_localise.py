@@ -32,7 +32,6 @@ from psotrack.inside_out import (
 )
 from psotrack.inside_out.frames import read_ahead
 from psotrack.inside_out.lens_files import read_lens, scale_lens
-from psotrack.inside_out.localising import localise_frames
 from psotrack.recordings import VideoWriter, natural_key
 from psotrack.recordings.datasets import write_marker_corners
 from psotrack.trajectories import Status
@@ -454,11 +453,12 @@ class Capture:
 def test_ctrl_c_ends_a_live_stream_and_keeps_its_frames(room, tmp_path, monkeypatch):
     kept, heard, opened = threading.Event(), threading.Event(), []
 
-    def followed(*arguments):
-        for one in localise_frames(*arguments):
+    def counted(detected, done):
+        for number, one in enumerate(detected):
+            if number:
+                # When the next frame is requested, this one has been kept.
+                kept.set()
             yield one
-            # When the next frame is requested, this one has been kept.
-            kept.set()
 
     def interrupt(*_):
         if not heard.is_set():
@@ -477,7 +477,7 @@ def test_ctrl_c_ends_a_live_stream_and_keeps_its_frames(room, tmp_path, monkeypa
 
     capture = Capture(room.images[:FEW_MARKERS_FRAME], press)
     monkeypatch.setattr(cv2, "VideoCapture", lambda device: opened.append(device) or capture)
-    monkeypatch.setattr("psotrack.inside_out.localising.video.localise_frames", followed)
+    monkeypatch.setattr("psotrack.inside_out.localising.video._counted", counted)
     out, before = tmp_path / "track.csv", signal.signal(signal.SIGINT, interrupt)
     try:
         options = ("--live", "--fps", 25, "--markers", room.markers, "--camera", room.lens, "--no-filter")

@@ -7,26 +7,21 @@ import pytest
 from helpers import LENSES
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import approx_fprime, least_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import PoseSettings
-from psotrack.inside_out.pose import ExpectedPose, estimate_pose
-from psotrack.inside_out.pose.equations import (
-    INSET_STD_PX,
-    Noise,
-    equations,
-    seen_markers,
-    summed,
-)
+from psotrack.inside_out.pose import CornerNoise, ExpectedPose, estimate_pose
 from psotrack.inside_out.pose.fit import FALSE_ALARM
 
 K = np.array([[920.0, 0, 959.5], [0, 921.0, 539.5], [0, 0, 1]])
 SETTINGS = PoseSettings()
 ANY_NUMBER = PoseSettings(min_markers=1)
+#: Standard deviation of the inset of all corners that the fit allows for, px.
+INSET_STD_PX = 0.5
 SIDE_M = 0.3
 
 
@@ -128,107 +123,89 @@ def test_markers_where_the_lens_shows_nothing_are_not_used():
     found = estimate_pose(corners_px, corners_m, without_pose(view), ANY_NUMBER)
     np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-6)
     assert found.used.tolist() == [number != 2 for number in range(7)]
-    assert found.common.shape == (6, 22)
-    assert not found.common[:, 6:9].any()
 
 
-def test_derivatives_equal_finite_differences():
-    view, corners_m = camera_looking_at(coefficients=8), two_walls(3)
-    corners = seen_markers(
-        image_corners(view, corners_m), corners_m, without_pose(view), 0.3, 1e-4, focal_error=0.005
-    )
-    R_world_cam = view.T_cam_world[:3, :3].T
-
-    def off_px(x):
-        turned = R_world_cam @ Rotation.from_rotvec(x[3:6]).as_matrix()
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (view.centre_world + x[:3])
-        longer = longer_lens(replace(view, T_cam_world=T), 0.005 * x[7])
-        return (project(longer, corners_m)[0] + x[6] * corners.inward).ravel()
-
-    rows, depth_m = equations(corners, view.centre_world, R_world_cam, np.zeros(2))
-    slopes = approx_fprime(np.zeros(8), off_px, 1e-7).reshape(3, 4, 2, 8)
-    # A finite step of 1e-7 has an error of 1e-5 px from curvature and of 1e-6 px from rounding.
-    np.testing.assert_allclose(rows[..., :8], slopes, rtol=1e-4, atol=0.01)
-    np.testing.assert_allclose(depth_m, project(view, corners_m)[1], rtol=1e-12)
+def inward(corners_px):
+    """Unit vectors from each corner into its marker."""
+    to_next = np.roll(corners_px, -1, axis=1) - corners_px
+    to_next /= np.linalg.norm(to_next, axis=-1, keepdims=True)
+    into = to_next - np.roll(to_next, 1, axis=1)
+    return into / np.linalg.norm(into, axis=-1, keepdims=True)
 
 
-def test_elimination_equals_scipys_least_squares_over_all_unknowns():
-    """Unknowns: pose, inset, focal length, markers' offsets. Errors common to all frames move the pose as in SciPy."""
+def own_whitener(std_px):
+    """(8, 8), inverse root of the covariance of a marker's corners, whose mean has 0.48 of independent errors' std."""
+    mean = np.kron(np.full((4, 4), 0.25), np.eye(2))
+    return (np.eye(8) + (1 / 0.48 - 1) * mean) / std_px
+
+
+def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
+    """Unknowns: pose, inset, focal length, markers' offsets; the noise of each marker is another."""
     rng = np.random.default_rng(0)
     view, corners_m = camera_looking_at(coefficients=4), two_walls(6)
-    noise, count, focal_error = Noise(0.4**2, 0.003**2, 10.0, 10.0), 6, 0.005
+    count, focal_error, std_px = 6, 0.005, np.array([0.1, 0.2, 0.3, 0.2, 0.1, 0.4])
     placed_m = corners_m + 0.003 * rng.normal(size=(count, 1, 3))
-    corners_px = image_corners(longer_lens(view, 0.003), placed_m, rng, 0.4)
-    # A share of 0.6 of the stated deviation of a marker is an error of the map.
-    corners = seen_markers(corners_px, corners_m, without_pose(view), 0.4, 0.0024, 0.0018, focal_error)
-    position_m, R, nuisance = view.centre_world, view.T_cam_world[:3, :3].T, np.zeros(2)
-    for _ in range(6):
-        sums = summed(equations(corners, position_m, R, nuisance)[0], np.ones((count, 4), bool))
-        solution = sums.solved(noise, corners.prior_information, nuisance)
-        position_m, nuisance = position_m + solution.step[:3], nuisance + solution.step[6:]
-        R = R @ Rotation.from_rotvec(solution.step[3:6]).as_matrix()
+    pixels = image_corners(longer_lens(view, 0.003), placed_m)
+    corners_px = pixels + 0.5 * std_px[:, None, None] * rng.normal(size=pixels.shape)
+    map_std_m = np.full(count, 0.0018)
+    stated = PoseSettings(focal_error=focal_error, noise=CornerNoise(1.0, 0.0024))
+    found = estimate_pose(
+        corners_px, corners_m, without_pose(view), stated, std_px=std_px, map_std_m=map_std_m
+    )
+    assert found.used.all()
 
     def best_for(corners_px, start):
         def residuals(x):
-            turned = R @ Rotation.from_rotvec(x[3:6]).as_matrix()
+            turned = found.R_world_cam @ Rotation.from_rotvec(x[3:6]).as_matrix()
             T = np.eye(4)
-            T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (position_m + x[:3])
+            T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (found.position_m + x[:3])
             there = longer_lens(replace(view, T_cam_world=T), focal_error * x[7])
-            pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * corners.inward
-            prior = [x[8:] / 0.003, [x[6] / INSET_STD_PX, x[7]]]
-            return np.concatenate([((corners_px - pixels) / 0.4).ravel(), *prior])
+            pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * inward(corners_px)
+            off = (corners_px - pixels).reshape(count, 8)
+            white = np.concatenate([own_whitener(std) @ one for std, one in zip(std_px, off, strict=True)])
+            return np.concatenate([white, x[8:] / 0.003, [x[6] / INSET_STD_PX, x[7]]])
 
         return least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
 
-    start = np.zeros(8 + 3 * count)
-    start[6:8] = nuisance
-    result = best_for(corners_px, start)
-    deviation = np.sqrt(np.diag(solution.covariance))
-    # Derivatives are mapped_m at the markers' positions in the map, 3 mm from their fitted positions at 5 m.
-    np.testing.assert_allclose((result.x[:8] - start[:8]) / deviation, 0, atol=0.01)
-    expected = np.linalg.inv(result.jac.T @ result.jac)[:8, :8]
+    result = best_for(corners_px, np.zeros(8 + 3 * count))
+    deviation = np.sqrt(np.diag(found.covariance))
+    # Derivatives are those at the markers' positions in the map, 3 mm from their fitted positions at 5 m.
+    np.testing.assert_allclose(result.x[:6] / deviation, 0, atol=0.03)
+    expected = np.linalg.inv(result.jac.T @ result.jac)[:6, :6]
+    # A shift of all corners by 0.015 px, which no residual shows, adds a little to the turn.
     np.testing.assert_allclose(
-        solution.covariance / np.outer(deviation, deviation),
+        found.covariance / np.outer(deviation, deviation),
         expected / np.outer(deviation, deviation),
-        atol=0.01,
+        atol=0.05,
     )
-
-    common = sums.common(solution, noise, corners.map_share)
-    there, off_m = longer_lens(view, 0.003), np.zeros((count, 1, 3))
-    off_m[4, 0, 2] = 0.003 * 0.6
-    for column, changed_view, moved_m in (
-        (3 * 4 + 2, there, placed_m + off_m),
-        (-1, longer_lens(view, 0.003 + focal_error), placed_m),
-    ):
-        by_px = project(changed_view, moved_m)[0] - project(there, placed_m)[0]
-        moved = best_for(corners_px + by_px, result.x).x[:6] - result.x[:6]
-        # The problem is nearly linear, and the covariance is good to a hundredth.
-        np.testing.assert_allclose(common[:6, column] / deviation[:6], moved / deviation[:6], atol=0.02)
-
-
-def test_the_pose_equals_scipys_for_an_exact_map():
-    rng = np.random.default_rng(1)
-    view, corners_m = camera_looking_at(coefficients=5), two_walls(8)
-    corners_px = image_corners(view, corners_m, rng, 0.3)
-    lens = without_pose(view)
-    found = estimate_pose(corners_px, corners_m, lens, PoseSettings(noise_px=0.3, place_m=1e-7))
-    inward = seen_markers(corners_px, corners_m, lens, 0.3, 1e-7).inward
-
-    def residuals(x):
-        R = Rotation.from_rotvec(x[3:6]).as_matrix()
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, -R @ x[:3]
-        off_px = corners_px - project(replace(view, T_cam_world=T), corners_m)[0] - x[6] * inward
-        return np.append(off_px.ravel() / 0.3, x[6] / INSET_STD_PX)
-
-    start = np.concatenate(
-        [view.centre_world, Rotation.from_matrix(view.T_cam_world[:3, :3]).as_rotvec(), [0.0]]
+    # The constant part is the effect of the markers' places in the map and of the focal length.
+    by_errors = []
+    for column in range(3 * count + 1):
+        off_m = np.zeros(3 * count + 1)
+        off_m[column] = 1.0
+        there = longer_lens(view, focal_error * off_m[-1])
+        moved = project(there, corners_m + 0.0018 * off_m[:-1].reshape(count, 1, 3))[0]
+        by_px = moved - project(view, corners_m)[0]
+        by_errors.append(best_for(corners_px + by_px, result.x).x[:6] - result.x[:6])
+    constant = np.transpose(by_errors) @ np.array(by_errors)
+    np.testing.assert_allclose(
+        found.constant / np.outer(deviation, deviation), constant / np.outer(deviation, deviation), atol=0.05
     )
-    result = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14)
-    deviation_m = np.sqrt(np.diag(found.covariance)[:3])
-    # The noise is estimated, so the prior of the inset has a slightly different weight than in SciPy's problem.
-    np.testing.assert_allclose((found.position_m - result.x[:3]) / deviation_m, 0, atol=0.02)
+    assert np.linalg.eigvalsh(found.covariance - found.constant)[0] > 0
+
+
+def test_markers_with_smaller_deviations_count_more():
+    """Found: `std_px`, which detection writes, had no effect on the pose."""
+    rng = np.random.default_rng(15)
+    off_m = {"stated": [], "equal": []}
+    for view in (view for _, view in random_estimates(np.random.default_rng(16), 8, 0.1, 0.0, SETTINGS, 60)):
+        corners_m, std_px = two_walls(8), np.array([0.05] * 4 + [1.0] * 4)
+        pixels = image_corners(view, corners_m)
+        corners_px = pixels + std_px[:, None, None] * rng.normal(size=pixels.shape)
+        for name, stated in (("stated", std_px), ("equal", np.full(8, 0.7))):
+            found = estimate_pose(corners_px, corners_m, without_pose(view), SETTINGS, std_px=stated)
+            off_m[name].append(np.linalg.norm(found.position_m - view.centre_world))
+    assert np.median(off_m["stated"]) < 0.5 * np.median(off_m["equal"])
 
 
 def random_estimates(rng, count, noise_px, place_m, stated, number):
@@ -250,12 +227,9 @@ def random_estimates(rng, count, noise_px, place_m, stated, number):
 @pytest.mark.parametrize(
     ("noise_px", "place_m", "stated", "least"),
     [
-        pytest.param(0.2, 0.0, SETTINGS, 0.85, id="as stated"),
-        pytest.param(1.0, 0.0, SETTINGS, 0.85, id="more noise than stated"),
-        pytest.param(0.1, 0.0, SETTINGS, 0.85, id="less noise than stated"),
-        pytest.param(0.3, 0.003, PoseSettings(place_m=0.003), 0.85, id="marker offsets as stated"),
-        # The variance of the offsets of 8 markers is not well known, because the pose takes up 6 unknowns.
-        pytest.param(0.3, 0.003, SETTINGS, 0.7, id="marker offsets thirty times as stated"),
+        # The means of corners with independent errors vary more than those of edges, as places that are off by 0.3 mm.
+        pytest.param(0.2, 0.0, PoseSettings(noise=CornerNoise(1.0, 6e-4)), 0.85, id="corners"),
+        pytest.param(0.2, 0.003, PoseSettings(noise=CornerNoise(1.0, 0.003)), 0.85, id="places"),
     ],
 )
 @pytest.mark.slow
@@ -291,8 +265,7 @@ def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error
             miss_m = view.centre_world - found.position_m
             within.append(miss_m @ np.linalg.solve(found.covariance[:3, :3], miss_m) < limit)
             off.append(np.linalg.norm(miss_m))
-            of_common = found.common @ found.common.T
-            assert np.linalg.eigvalsh(found.covariance - of_common)[0] > 0
+            assert np.linalg.eigvalsh(found.covariance - found.constant)[0] > 0
     # A limit of three standard deviations of a share of 100.
     assert np.mean(inside) > 0.9 - 3 * np.sqrt(0.09 / 100)
     assert np.mean(inside_without) < np.mean(inside) - 0.05
@@ -300,32 +273,10 @@ def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error
     assert np.median(off_m) < (0.8 if focal_error else 1.05) * np.median(off_without_m)
 
 
-def test_chance_is_the_expected_number_of_sets_of_markers_that_agree():
-    rng = np.random.default_rng(14)
-    view, corners_m = camera_looking_at(), two_walls(4)
-    corners_px = image_corners(view, corners_m, rng, 0.05)
-    found = {
-        count: estimate_pose(corners_px[:count], corners_m[:count], without_pose(view), ANY_NUMBER).chance
-        for count in (1, 2, 4)
-    }
-    # The area within 15 times the stated 0.2 px of a marker's position, as a share of an image of 1920 x 1080.
-    near = np.pi * 3.0**2 / (1920 * 1080)
-    assert found[1] == 1.0
-    assert found[2] == pytest.approx(2 * near)
-    assert found[4] == pytest.approx(4 * near**3)
-    # Any two of the four other markers could agree with the first marker.
-    wrong_px = np.concatenate([corners_px[:3], corners_px[2:] + rng.uniform(200, 400, (2, 1, 2))])
-    mapped_m = np.concatenate([corners_m[:3], two_walls(6)[4:]])
-    some = estimate_pose(wrong_px, mapped_m, without_pose(view), ANY_NUMBER)
-    np.testing.assert_array_equal(some.used, [True] * 3 + [False] * 2)
-    assert some.chance == pytest.approx(5 * 6 * near**2)
-
-
 def test_inset_of_all_corners_does_not_move_the_camera():
     view, corners_m = camera_looking_at(), two_walls(8)
     corners_px = image_corners(view, corners_m)
-    inward = seen_markers(corners_px, corners_m, without_pose(view), 0.3, 1e-4).inward
-    found = estimate_pose(corners_px + 0.5 * inward, corners_m, without_pose(view), SETTINGS)
+    found = estimate_pose(corners_px + 0.5 * inward(corners_px), corners_m, without_pose(view), SETTINGS)
     assert squared_deviations(found, view) < 0.01
     assert found.reprojection_px == pytest.approx(0.5, rel=0.01)
 
@@ -420,7 +371,7 @@ def test_the_ambiguity_of_a_single_marker_is_the_probability_of_the_other_pose()
     stated, wrong = [], []
     for _ in range(120):
         view, corners_m, corners_px = far_marker(rng)
-        found = estimate_pose(corners_px, corners_m, without_pose(view), ANY_NUMBER)
+        found = estimate_pose(corners_px, corners_m, without_pose(view), ANY_NUMBER, std_px=np.array([0.3]))
         stated.append(found.ambiguity)
         # In the mirrored pose, the marker is turned to the other side.
         wrong.append(np.rad2deg(np.linalg.norm(pose_error(found, view)[3:])) > 20)
@@ -534,10 +485,10 @@ def test_invalid_corners_and_settings_are_refused():
         estimate_pose(np.where(corners_px > 1e9, 0, np.nan), corners_m, without_pose(view), SETTINGS)
     with pytest.raises(SettingsError, match="min_markers: expected at least 1, found 0"):
         PoseSettings(min_markers=0)
-    with pytest.raises(SettingsError, match="noise_px"):
-        PoseSettings(noise_px=0.0)
+    with pytest.raises(SettingsError, match="scale"):
+        CornerNoise(scale=0.0)
     with pytest.raises(SettingsError, match="place_m"):
-        PoseSettings(place_m=np.inf)
+        CornerNoise(place_m=np.inf)
     with pytest.raises(SettingsError, match=r"focal_error: expected a number from 0 to below 1, found -0.1"):
         PoseSettings(focal_error=-0.1)
     with pytest.raises(SettingsError, match="map_error_m: expected a number from 0 to below 1, found nan"):

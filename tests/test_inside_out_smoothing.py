@@ -9,19 +9,18 @@ from test_inside_out_filter import (
     FPS,
     errors,
     flight,
+    fraction_within,
     move_poses,
     pose_covariance,
     raw_path,
     remove_poses,
-    share_within,
+    some_frames,
 )
 
 from psotrack.errors import InputError
 from psotrack.inside_out import Flag, PoseFilterParams, smooth
+from psotrack.inside_out.filtering import choose_agility, filter_path, poses_of
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.path_rows import join_rows, split_path
-from psotrack.inside_out.filtering.pose_filter import filter_path
-from psotrack.inside_out.filtering.smoothing import MotionModel, estimate_motion_model
 from psotrack.trajectories import Status
 
 
@@ -30,108 +29,83 @@ def median_mm(error) -> float:
 
 
 def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_frames() -> None:
-    """The reference solves one linear problem for the positions, velocities, accelerations and errors of all frames.
-
-    A constant error shifts the measurement of each frame by another amount. Its effect on the solution is the solution
-    for these shifts.
-    """
-    frames, dt_s = 12, 1 / FPS
-    level = pose_motion.Levels(np.array([4.0]), np.array([0.01]))
+    """The reference solves one linear problem for the positions, velocities, accelerations and errors of all frames."""
+    frames, dt_s, fraction = 12, 1 / FPS, pose_motion.CORRELATED_FRACTION
     noise_m2 = np.diag([1e-5, 2e-5, 4e-5])
     covariance = np.zeros((6, 6))
     covariance[:3, :3], covariance[3:, 3:] = noise_m2, 1e-6 * np.eye(3)
     rng = np.random.default_rng(1)
     measured_m = np.cumsum(rng.normal(scale=0.01, size=(frames, 3)), axis=0) * 0.3
     raw = raw_path(measured_m, Rotation.identity(frames))
-    common = np.zeros((frames, 6, 1))
-    common[:, :3, 0] = 0.01 + np.cumsum(rng.normal(scale=0.001, size=(frames, 3)), axis=0)
-    raw = replace(raw, covariance=covariance + common @ common.swapaxes(1, 2), common=common)
-    gone = slice(5, 8)
-    # Smoother and reference use the same densities and the covariances as stated.
-    model = MotionModel(
-        fits=~np.isin(np.arange(frames), np.r_[gone]),
-        jumps=np.zeros(frames, int),
-        jerk_density_m2_s5=np.full(frames, 4.0),
-        wobble_density_rad2_s3=np.full(frames, 0.01),
-        noise_scale=np.ones(frames),
-        ambiguity=np.zeros(frames),
+    raw, gone = (
+        remove_poses(replace(raw, covariance=np.tile(covariance, (frames, 1, 1))), slice(5, 8)),
+        slice(5, 8),
     )
-    path = smooth(remove_poses(raw, gone), model=model)
+    agility = choose_agility(poses_of(raw), PoseFilterParams())
+    path = smooth(raw)
+    assert (path.flags == 0).all()
 
     part = np.r_[0:9, 15:18]
-    start = pose_motion.initial_motion(
-        measured_m[0], raw.orientation_wxyz[0], covariance, np.zeros((6, 0)), level
-    )
-    _, F = pose_motion.predict(start, dt_s, level)
-    F, Q = F[0][np.ix_(part, part)], pose_motion.process_noise(dt_s, level)[0][np.ix_(part, part)]
-    first = start.covariance[0][np.ix_(part, part)]
-    H = np.hstack([np.eye(3), np.zeros((3, 6)), np.sqrt(pose_motion.LASTING_SHARE * noise_m2)])
-    rows, wanted, shifts = [], [], []
+    start = pose_motion.initial_motion(measured_m[0], np.eye(3), covariance, agility)
+    _, F, Q = pose_motion.predict(start, dt_s, agility)
+    F, Q, first = (matrix[np.ix_(part, part)] for matrix in (F, Q, start.covariance))
+    H = np.hstack([np.eye(3), np.zeros((3, 6)), np.sqrt(fraction * noise_m2)])
+    rows, wanted = [], []
 
-    def equation(coefficients, right, cov, shift_m=None) -> None:
+    def equation(coefficients, right, cov) -> None:
         whiten = np.linalg.inv(np.linalg.cholesky(cov))
         rows.append(whiten @ coefficients)
         wanted.append(whiten @ right)
-        shifts.append(whiten @ (np.zeros(len(right)) if shift_m is None else shift_m))
 
     def at(frame, matrix):
         whole = np.zeros((len(matrix), 12 * frames))
         whole[:, 12 * frame : 12 * frame + 12] = matrix
         return whole
 
-    at_first = np.concatenate([common[0, :3, 0], np.zeros(9)])
-    equation(at(0, np.eye(12)), np.concatenate([measured_m[0], np.zeros(9)]), first, at_first)
+    equation(at(0, np.eye(12)), np.concatenate([measured_m[0], np.zeros(9)]), first)
     for k in range(1, frames):
         equation(at(k, np.eye(12)) - at(k - 1, F), np.zeros(12), Q)
         if not gone.start <= k < gone.stop:
-            white_m2 = (1 - pose_motion.LASTING_SHARE) * noise_m2
-            equation(at(k, H), measured_m[k], white_m2, common[k, :3, 0])
+            equation(at(k, H), measured_m[k], (1 - fraction) * noise_m2)
     A, b = np.vstack(rows), np.concatenate(wanted)
     best = np.linalg.lstsq(A, b, rcond=None)[0].reshape(frames, 12)
     inverse = np.linalg.inv(A.T @ A)
-    off = np.linalg.lstsq(A, np.concatenate(shifts), rcond=None)[0]
-    whole = inverse + np.outer(off, off)
     # The condition number of 1e5 is squared in the normal equations, which leaves six digits of the covariance.
-    # Measured: 1e-8 m for positions, 2e-5 relative for covariances.
     np.testing.assert_allclose(path.position_m, best[:, :3], atol=1e-7)
     np.testing.assert_allclose(path.velocity_m_s, best[:, 3:6], atol=1e-5)
     for k in range(frames):
-        found = path.covariance[k, :3, :3]
-        np.testing.assert_allclose(
-            found, whole[12 * k : 12 * k + 3, 12 * k : 12 * k + 3], rtol=1e-3, atol=1e-10
-        )
+        expected = inverse[12 * k : 12 * k + 3, 12 * k : 12 * k + 3]
+        np.testing.assert_allclose(path.covariance[k, :3, :3], expected, rtol=1e-3, atol=1e-10)
 
 
-@pytest.mark.slow
-def test_without_a_model_the_smoother_uses_the_estimated_model() -> None:
-    raw, _, _ = flight(40, acceleration=1.0, wobble=1.0, seed=31)
-    raw = move_poses(remove_poses(raw, slice(10, 13)), slice(20, 21), [1.0, 0.0, 0.0])
-    params = PoseFilterParams(false_alarm=1e-4)
-    model = estimate_motion_model(raw, params)
-    assert not model.fits[[10, 11, 12, 20]].any()
-    assert model.fits.sum() >= 33
-    for name, value in vars(smooth(raw, params)).items():
-        np.testing.assert_array_equal(getattr(smooth(raw, params, model), name), value)
+def test_agility_distinguishes_calm_from_violent_flights() -> None:
+    calm, violent = (
+        choose_agility(poses_of(flight(100, acceleration=size, shake=size, seed=33)[0]), PoseFilterParams())
+        for size in (0.5, 25.0)
+    )
+    assert violent.acceleration_std_m_s2 > 8 * calm.acceleration_std_m_s2
+    assert violent.rate_change_std_rad_s > 8 * calm.rate_change_std_rad_s
 
 
-@pytest.mark.slow
-def test_the_model_distinguishes_calm_from_violent_flights_and_wide_from_correct_covariances() -> None:
-    calm, _, _ = flight(100, acceleration=0.5, wobble=0.5, seed=33)
-    violent, _, _ = flight(100, acceleration=8.0, wobble=8.0, seed=33)
-    calm_model, violent_model = (estimate_motion_model(raw, PoseFilterParams()) for raw in (calm, violent))
-    # A factor of 16 in acceleration is a factor of 256 in density. The levels of the filter are a factor of 100 apart.
-    assert np.median(violent_model.jerk_density_m2_s5) > 30 * np.median(calm_model.jerk_density_m2_s5)
-    assert np.median(violent_model.wobble_density_rad2_s3) > 10 * np.median(calm_model.wobble_density_rad2_s3)
-    wide = estimate_motion_model(replace(calm, covariance=9 * calm.covariance), PoseFilterParams())
-    assert np.median(wide.noise_scale) < 0.5 * np.median(calm_model.noise_scale)
-    assert 0.5 < np.median(calm_model.noise_scale) < 2.0
+@pytest.mark.parametrize("seed", [0, 1])
+def test_smoothing_a_camera_that_shakes_is_never_worse_than_its_raw_poses(seed) -> None:
+    """Found: nine levels of motion lost such a flight, with errors of metres, and 8.9 mm where raw poses had 6.6 mm."""
+    raw, position_m, truth = flight(100, acceleration=25.0, shake=25.0, seed=seed)
+    path = smooth(raw)
+    assert path.seen.all()
+    for found, own in zip(errors(path, position_m, truth), errors(raw, position_m, truth), strict=True):
+        for fraction in (50, 99):
+            found_off, own_off = (
+                np.percentile(np.linalg.norm(one, axis=1), fraction) for one in (found, own)
+            )
+            assert found_off < 1.01 * own_off
 
 
 @pytest.mark.parametrize(
-    ("acceleration", "wobble"), [(0.5, 0.5), pytest.param(8.0, 8.0, marks=pytest.mark.slow)]
+    ("acceleration", "shake"), [(0.5, 0.5), pytest.param(8.0, 8.0, marks=pytest.mark.slow)]
 )
-def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(acceleration, wobble) -> None:
-    raw, position_m, truth = flight(100, acceleration=acceleration, wobble=wobble, seed=33)
+def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(acceleration, shake) -> None:
+    raw, position_m, truth = flight(100, acceleration=acceleration, shake=shake, seed=33)
     filtered, smoothed = filter_path(raw), smooth(raw)
     # In a violent flight, one of the two filter runs may gate a pose in ten.
     assert (smoothed.status == Status.TRACKED).mean() > 0.88
@@ -140,8 +114,8 @@ def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(ac
     filter_off_m, filter_off_rad = errors(filtered, position_m, truth)
     assert median_mm(off_m) < median_mm(filter_off_m)
     assert median_mm(off_rad) < 1.02 * median_mm(filter_off_rad)
-    assert 0.75 < share_within(off_m, smoothed.covariance[:, :3, :3]) < 1.0
-    assert 0.7 < share_within(off_rad, smoothed.covariance[:, 3:, 3:]) < 1.0
+    assert 0.75 < fraction_within(off_m, smoothed.covariance[:, :3, :3]) < 1.0
+    assert 0.7 < fraction_within(off_rad, smoothed.covariance[:, 3:, 3:]) < 1.0
     speed_m_s = np.gradient(position_m, raw.time_s, axis=0)
     speed_error_m_s = np.linalg.norm(smoothed.velocity_m_s - speed_m_s, axis=1)[2:-2]
     assert np.median(speed_error_m_s) < np.median(
@@ -150,7 +124,7 @@ def test_the_smoother_is_better_than_the_filter_and_its_covariances_are_right(ac
 
 
 def test_gaps_are_bridged_from_both_sides() -> None:
-    raw, position_m, truth = flight(110, acceleration=1.0, wobble=1.0, seed=32)
+    raw, position_m, truth = flight(110, acceleration=1.0, shake=1.0, seed=32)
     gone = np.r_[0:4, 30:50, 70:100]
     raw = remove_poses(raw, gone)
     path, filtered = smooth(raw, PoseFilterParams(longest_gap_s=0.45)), filter_path(raw)
@@ -209,7 +183,7 @@ def test_the_path_is_not_drawn_across_a_permanent_jump() -> None:
 @pytest.mark.parametrize("frames", [0, 1, 2])
 def test_paths_of_few_poses(frames) -> None:
     raw, _, _ = flight(5, seed=36)
-    some = join_rows(split_path(raw)[:frames])
+    some = some_frames(raw, slice(frames))
     assert (smooth(some).status == Status.LOST).all()
     confirmed_at_once = smooth(some, PoseFilterParams(confirm=1))
     assert (confirmed_at_once.status == Status.TRACKED).all()

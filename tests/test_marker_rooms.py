@@ -27,7 +27,6 @@ from psotrack.inside_out import (
     read_marker_table,
 )
 from psotrack.inside_out.localising import frame_poses, localise_frames
-from psotrack.inside_out.localising.map_evidence import are_few, least_markers, without_markers, wrong_markers
 from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.mapping.sightings import SQUARE
 from psotrack.recordings import VideoWriter
@@ -99,15 +98,8 @@ def flight(corners_m=ROOM, num_frames=50, noise_px=0.3, seed=0):
 
 def path_of(frames, corners_m, settings=None):
     """Positions of the filtered path, without the markers that the video says are wrong; and those markers."""
-    settings = (settings or LocaliseSettings()).within(len(frames))
-    marker_map = MarkerMap(corners_m)
-    wrong = wrong_markers(frames, marker_map, CAMERA, settings.pose)
-    if wrong and are_few(wrong, frames):
-        pose = replace(settings.pose, min_markers=least_markers(settings.pose))
-        frames = list(without_markers(frames, wrong, settings.pose))
-        settings = replace(settings, pose=pose)
-    rows = [row for _, row in localise_frames(frames, marker_map, CAMERA, settings)]
-    return rows, wrong
+    found = localise_frames(frames, MarkerMap(corners_m), CAMERA, settings or LocaliseSettings())
+    return found.path, found.wrong_markers
 
 
 def exchanged(first, second):
@@ -120,15 +112,15 @@ def test_markers_may_be_turned_any_way(tmp_path):
     assert len(read_marker_map(tmp_path / "room.csv")) == len(ROOM)
     frames, centres = flight()
     assert {21, 30, 40} <= {int(each) for _, _, found in frames for each in found.ids}
-    rows, wrong = path_of(frames, ROOM)
+    path, wrong = path_of(frames, ROOM)
     assert wrong == ()
     # Measured 11 mm, of corners that are 0.3 px off.
-    assert np.linalg.norm([row.position_m for row in rows] - centres, axis=1).max() < 0.05
+    assert np.linalg.norm(path.position_m - centres, axis=1).max() < 0.05
 
 
 def far_off(first, second, frames, centres):
-    rows, wrong = path_of(frames, exchanged(first, second))
-    off_m = np.linalg.norm([row.position_m for row in rows] - centres, axis=1)
+    path, wrong = path_of(frames, exchanged(first, second))
+    off_m = np.linalg.norm(path.position_m - centres, axis=1)
     return int((off_m > 0.1).sum()), int(np.isnan(off_m).sum()), wrong
 
 
@@ -159,9 +151,8 @@ def test_a_mirrored_marker_and_a_shuffled_map_end_in_lost_frames():
     assert path_of(frames, backwards)[1] == (2,)
     names = list(ROOM)
     shuffled = {name: ROOM[other] for name, other in zip(names, names[7:] + names[:7], strict=True)}
-    rows, wrong = path_of(frames, shuffled)
-    assert len(wrong) > 6
-    assert np.isnan([row.position_m for row in rows]).all()
+    path, _ = path_of(frames, shuffled)
+    assert np.isnan(path.position_m).all()
 
 
 @pytest.mark.parametrize("side_m", [None, SIDE_M])
@@ -176,12 +167,12 @@ def test_a_table_of_centres(side_m, error_m):
     for name, corners in completed.marker_map.corners_m.items():
         # A marker that is hardly seen from the side may be turned by 3 degrees: 12 mm at its corners.
         assert np.linalg.norm(corners - off[name] - ROOM[name], axis=1).max() < 0.03, name
-    settings = LocaliseSettings(pose=PoseSettings(map_error_m=error_m)).within(len(frames))
+    settings = LocaliseSettings(pose=PoseSettings(map_error_m=error_m))
     known = [(n, t, found.select(np.isin(found.ids, completed.marker_map.ids))) for n, t, found in frames]
-    rows = [row for _, row in localise_frames(known, completed.marker_map, CAMERA, settings)]
-    apart_m = np.array([row.position_m for row in rows]) - centres
+    path = localise_frames(known, completed.marker_map, CAMERA, settings).path
+    apart_m = path.position_m - centres
     assert np.linalg.norm(apart_m, axis=1).max() < (0.05 if error_m else 0.03)
-    covariance = np.array([row.covariance[:3, :3] for row in rows])
+    covariance = path.covariance[:, :3, :3]
     squares = np.einsum("fi,fi->f", apart_m, np.linalg.solve(covariance, apart_m[..., None])[..., 0])
     # The normalised squared error averages 3; errors of the map are the same in all frames.
     assert np.mean(squares) < 9
@@ -304,14 +295,14 @@ def test_a_frame_without_a_solution_ends_nothing(stage, monkeypatch):
     frames, centres = flight(num_frames=12)
     working, calls = getattr(frame_poses, stage), []
 
-    def once_singular(*arguments):
+    def once_singular(*arguments, **options):
         calls.append(1)
         if len(calls) == 6:
             raise np.linalg.LinAlgError("Singular matrix")
-        return working(*arguments)
+        return working(*arguments, **options)
 
     monkeypatch.setattr(frame_poses, stage, once_singular)
-    rows, _ = path_of(frames, ROOM)
-    off_m = np.linalg.norm([row.position_m for row in rows] - centres, axis=1)
+    path, _ = path_of(frames, ROOM)
+    off_m = np.linalg.norm(path.position_m - centres, axis=1)
     assert np.isfinite(np.delete(off_m, 5)).all()
     assert np.nanmax(off_m) < 0.1

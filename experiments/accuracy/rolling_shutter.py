@@ -31,13 +31,11 @@ from psotrack.inside_out import (
     CameraPath,
     LocaliseSettings,
     MarkerMap,
-    PoseFilterParams,
     RollingShutter,
     build_map,
     find_sightings,
     localise_video,
     open_source,
-    smooth,
 )
 from psotrack.inside_out.mapping.sightings import MarkerSightings, outward
 from psotrack.recordings import VideoWriter, probe
@@ -168,7 +166,7 @@ def poses_of(clip: Clip, shutter: RollingShutter | None) -> list[dict[str, Any]]
     began = time.perf_counter()
     found = localise_video(open_source(clip.video), clip.marker_map, clip.camera, settings)
     wall_s = time.perf_counter() - began
-    smoothed = smooth(found.raw, PoseFilterParams())
+    smoothed = found.smoothed()
     used = found.shutter
     about = {
         "line_time_us": 1e6 * used.line_time_s,
@@ -252,7 +250,7 @@ def picture(path: Path, folder: Path, frames: int) -> None:
         found = localise_video(
             open_source(clip.video), clip.marker_map, clip.camera, LocaliseSettings(shutter=shutter)
         )
-        smoothed = smooth(found.raw, PoseFilterParams())
+        smoothed = found.smoothed()
         off_mm = 1e3 * np.linalg.norm(smoothed.position_m - clip.position_m, axis=1)
         axes.semilogy(smoothed.time_s, off_mm, label=case, linewidth=1.0)
     axes.set_xlabel("time (s)")

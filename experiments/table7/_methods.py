@@ -1,4 +1,4 @@
-"""Methods from stored markers to poses that Table 7 compares: the paper's, and the three stages of psotrack's."""
+"""Methods from stored markers to poses that Table 7 compares: the paper's, and the three of `localise`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from _recordings import Recording
 from _sightings import Sightings
 
 from psotrack.foreground.markers import DetectedMarkers
-from psotrack.inside_out import CameraPath, LocaliseSettings, PoseSettings, smooth
-from psotrack.inside_out.filtering.path_rows import join_rows
-from psotrack.inside_out.localising import localise_frames, pose_row
+from psotrack.inside_out import CameraPath, LocaliseSettings, PoseSettings
+from psotrack.inside_out.localising import FollowedFrame, localise_frames, own_path
 from psotrack.inside_out.pose import MarkerPose
 
 #: Smallest number of markers of a pose in the paper.
@@ -20,16 +19,16 @@ MIN_MARKERS = 4
 
 
 def paths(recording: Recording, seen: Sightings) -> dict[str, CameraPath]:
-    """Compute the camera's path by each method."""
+    """Compute the camera's path by each method; the last three are what `psotrack onboard localise` writes."""
     markers = [_markers_in_map(recording, seen, frame) for frame in range(recording.video.num_frames)]
     settings = LocaliseSettings(pose=PoseSettings(min_markers=MIN_MARKERS))
-    single = replace(settings, filter=None)
-    raw, filtered = _localise(recording, markers, settings)
+    found = localise_frames(markers, recording.marker_map, recording.lens, settings)
+    single = localise_frames(markers, recording.marker_map, recording.lens, replace(settings, filter=None))
     return {
-        "paper": join_rows([pose_row(*one, _paper_pose(one[2], recording), single) for one in markers]),
-        "single frames": _localise(recording, markers, single)[0],
-        "filter": filtered,
-        "smoother": smooth(raw),
+        "paper": _paper_path(markers, recording),
+        "single frames": single.path,
+        "filter": found.path,
+        "smoother": found.smoothed(),
     }
 
 
@@ -43,12 +42,13 @@ def _markers_in_map(recording: Recording, seen: Sightings, frame: int) -> _Marke
     return frame, frame / recording.video.fps, known
 
 
-def _localise(
-    recording: Recording, markers: list[_Markers], settings: LocaliseSettings
-) -> tuple[CameraPath, CameraPath]:
-    """Path of the poses of single frames, and path of the filter."""
-    rows = list(localise_frames(markers, recording.marker_map, recording.lens, settings))
-    return join_rows([raw for raw, _ in rows]), join_rows([row for _, row in rows])
+def _paper_path(markers: list[_Markers], recording: Recording) -> CameraPath:
+    """The path of the paper's poses."""
+    frames = [
+        FollowedFrame(number, time_s, len(seen), _paper_pose(seen, recording))
+        for number, time_s, seen in markers
+    ]
+    return own_path(frames, PoseSettings(min_markers=MIN_MARKERS))
 
 
 def _paper_pose(markers: DetectedMarkers, recording: Recording) -> MarkerPose | None:
@@ -72,6 +72,4 @@ def _paper_pose(markers: DetectedMarkers, recording: Recording) -> MarkerPose | 
         used=np.ones(len(markers), bool),
         reprojection_px=float(np.sqrt(squared_px.mean())),
         ambiguity=0.0,
-        common=np.zeros((6, 0)),
-        chance=1.0,
     )

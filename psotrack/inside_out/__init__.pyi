@@ -1,6 +1,5 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
-from .filtering.pose_filter import PoseFilterParams
-from .filtering.smoothing import smooth
+from .filtering import PoseFilterParams, smooth
 from .flight_picture import save_flight
 from .frames import FrameSource, open_source
 from .fusing import FusedTracks, fuse

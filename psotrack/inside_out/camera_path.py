@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, errors_name
 from psotrack.geometry import LENGTH_TOLERANCE, rotation_matrices
-from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.support import (
     Table,
     TextRow,
@@ -77,13 +76,6 @@ class CameraPath:
             pose is from the motion, `LOST` where there is no pose.
         flags: (frames,), values of `Flag`.
         velocity_m_s: (frames, 3), world; None without a filter.
-        chance: (frames,), for frames' own poses: upper bound on the probability that the used markers agree by chance
-            although all were misread. The filter uses it; the table does not have it.
-        common: (frames, 6, errors), for frames' own poses: a matrix square root of the part of the covariance due to
-            errors of the map, of the lens and of the line time, which are the same in all frames. The filter uses it;
-            the table does not have it.
-        motion: for frames' own poses by a rolling shutter, what each frame says about pose and motion together; None
-            for a frame without a pose. The filter uses it; the table does not have it.
     """
 
     frame: Int[np.ndarray, "frames"]
@@ -97,9 +89,6 @@ class CameraPath:
     status: Int[np.ndarray, "frames"]
     flags: Int[np.ndarray, "frames"]
     velocity_m_s: Float[np.ndarray, "frames 3"] | None = None
-    chance: Float[np.ndarray, "frames"] | None = None
-    common: Float[np.ndarray, "frames 6 errors"] | None = None
-    motion: tuple[FrameMotion | None, ...] | None = None
 
     __repr__ = short_repr
 

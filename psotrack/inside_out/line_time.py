@@ -1,12 +1,11 @@
 """The line time of a rolling shutter, estimated from the markers in a video.
 
 Rows of one frame show by how far the camera moves from row to row; the poses of neighbouring frames show by how far it
-moves per second. The ratio of the two is the line time. A frame's motion per row is fitted with the frame's pose
-(`pose.row_motion`), and the motion per second is the derivative of a cubic spline through the poses of consecutive
-frames. With the motion per second v, the motion per row u and its covariance V, the estimate is the weighted least
-squares solution of u = v x line time over all frames,
+moves per second. With a line time that is a little wrong, the corners that are moved to the middle row (`pose.rows`)
+keep residuals in proportion to the error. With these residuals r, their inverse covariance V⁻¹ after the fit of the
+pose, and their change d by the line time, one step of a search along the line time is
 
-    line time = Σ vᵀ V⁻¹ u / Σ vᵀ V⁻¹ v,
+    Σ dᵀ V⁻¹ r / Σ dᵀ V⁻¹ d,
 
 and its variance is that of the sums over groups of neighbouring frames, whose errors are alike (Liang & Zeger,
 Longitudinal data analysis using generalized linear models, Biometrika 73(1), 1986). Errors of the map and of the lens
@@ -21,19 +20,19 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
 from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
-from psotrack.inside_out.filtering.manifold import right_jacobian
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import (
-    ExpectedMotion,
     MarkerPose,
+    PosesAt,
     PoseSettings,
     RollingShutter,
+    at_middle_row,
     estimate_pose,
+    shift_of_rows,
+    spline_through,
 )
 
 #: Number and time (seconds) of a frame, and its markers, which are all in the map.
@@ -43,14 +42,11 @@ Detected = tuple[int, float, DetectedMarkers]
 _RUN_FRAMES, _FEWEST_FRAMES, _MOST_RUNS = 11, 5, 5
 #: Smallest number of markers in a frame of a run. The rows of fewer markers hardly show a motion.
 _FEWEST_MARKERS = 3
-#: Largest number of times that motion and line time are estimated by turns, and change of the estimate, in standard
-#: deviations, below which no further turn is needed.
-_TURNS, _SAME = 4, 0.3
-#: Standard deviations of the motion by the spline, velocity (m/s) and turn rate (rad/s), as prior of a frame's rows.
-_SPLINE_STD = np.full(6, 0.05)
+#: Largest number of steps, and length of a step, in standard deviations, below which no further one is needed.
+_STEPS, _SAME = 6, 0.1
 #: Number of neighbouring frames whose errors are alike.
 _GROUP_FRAMES = 5
-#: Residual of a frame's motion, in standard deviations, from which on its weight falls.
+#: Residual of a frame, in standard deviations, from which on its weight falls.
 _ROBUST = 3.0
 #: Ratio of an estimate to its standard deviation from which on the shutter rolls, and from which on a given line time
 #: is contradicted.
@@ -142,45 +138,22 @@ def estimate_line_time(
         return None
     frame_s = float(np.median(np.diff([time_s for _, time_s, _ in runs[0]])))
     rows = int(lens.image_size_wh[1])
-    # A motion per row is stated as the motion per second that it would be with this line time.
-    unit = RollingShutter(frame_s / 2 / rows)
-    ratio = 0.0
-    motions: list[list[ExpectedMotion | None]] = [[None] * len(run) for run in runs]
-    for turn in range(_TURNS):
+    line_time_s = 0.0
+    motions: list[PosesAt | None] = [None] * len(runs)
+    for _ in range(_STEPS):
         followed = [
-            _followed(run, expected, marker_map, lens, settings, unit)
-            for run, expected in zip(runs, motions, strict=True)
+            _followed(run, motion, marker_map, lens, settings, line_time_s)
+            for run, motion in zip(runs, motions, strict=True)
         ]
-        found = [one for one in followed if one is not None]
+        motions = [motion for motion, _ in followed]
+        found = [sums for _, sums in followed if len(sums)]
         if not found:
             return None
-        before, (ratio, std) = ratio, _ratio(found)
-        if turn and abs(ratio - before) < _SAME * std:
+        step_s, std_s = _ratio(found)
+        line_time_s += step_s
+        if abs(step_s) < _SAME * std_s:
             break
-        spread = np.diag(_SPLINE_STD**2)
-        motions = [
-            [None] * len(run) if one is None else [ExpectedMotion(ratio * v, spread) for v in one.all_motions]
-            for run, one in zip(runs, followed, strict=True)
-        ]
-    frames = sum(len(one.motion) for one in found)
-    return LineTime(ratio * unit.line_time_s, std * unit.line_time_s, frames, rows, frame_s)
-
-
-@dataclass(frozen=True)
-class _FollowedRun:
-    """Motions of a camera in a run of frames.
-
-    Attributes:
-        all_motions: (run, 6), motion by the spline at all frames of the run.
-        motion: (frames, 6), motion by the spline at frames with a pose that are not at an end of the run.
-        rows: (frames, 6), motion by the rows of these frames, in the unit of `estimate_line_time`.
-        information: (frames, 6, 6), inverse covariances of `rows`.
-    """
-
-    all_motions: Float[np.ndarray, "run 6"]
-    motion: Float[np.ndarray, "frames 6"]
-    rows: Float[np.ndarray, "frames 6"]
-    information: Float[np.ndarray, "frames 6 6"]
+    return LineTime(line_time_s, std_s, sum(map(len, found)), rows, frame_s)
 
 
 def _runs(detected: Sequence[Detected], settings: PoseSettings) -> list[list[Detected]]:
@@ -210,73 +183,56 @@ def _moved_px2(before: DetectedMarkers, after: DetectedMarkers) -> float:
 
 def _followed(
     run: Sequence[Detected],
-    expected: Sequence[ExpectedMotion | None],
+    motion: PosesAt | None,
     marker_map: MarkerMap,
     lens: Camera,
     settings: PoseSettings,
-    unit: RollingShutter,
-) -> _FollowedRun | None:
-    """Fit poses and motions of a run; None if too few frames have a pose."""
-    poses: list[MarkerPose | None] = [
-        estimate_pose(
-            markers.corners_px,
-            marker_map.corners_of(markers.ids.tolist()),
-            lens,
-            settings,
-            None,
-            unit,
-            motion,
-        )
-        for (_, _, markers), motion in zip(run, expected, strict=True)
-    ]
-    kept = [
-        (time_s, pose)
-        for (_, time_s, _), pose in zip(run, poses, strict=True)
-        if pose is not None and pose.motion is not None
-    ]
-    if len(kept) < _FEWEST_FRAMES:
-        return None
-    time_s = np.array([one for one, _ in kept])
-    motion = _spline_motion(time_s, [pose for _, pose in kept], np.array([one for _, one, _ in run]))
-    inner = [pose.motion for _, pose in kept[1:-1] if pose.motion is not None]
-    information = np.linalg.inv(np.array([one.measured_covariance for one in inner]))
-    at = np.isin([one for _, one, _ in run], time_s[1:-1])
-    return _FollowedRun(motion, motion[at], np.array([one.measured for one in inner]), information)
+    line_time_s: float,
+) -> tuple[PosesAt | None, Float[np.ndarray, "frames 2"]]:
+    """Fit the poses of a run.
 
-
-def _spline_motion(
-    time_s: Float[np.ndarray, "poses"], poses: Sequence[MarkerPose], at_s: Float[np.ndarray, "times"]
-) -> Float[np.ndarray, "times 6"]:
-    """(times, 6), velocity and turn rate of a cubic spline through poses."""
-    position_m = CubicSpline(time_s, [pose.position_m for pose in poses])
-    turns = Rotation.from_matrix([pose.R_world_cam for pose in poses])
-    # Turns from the middle pose; a run is too short for half a revolution.
-    turn = CubicSpline(time_s, (turns[len(poses) // 2].inv() * turns).as_rotvec())
-    rate = (right_jacobian(turn(at_s)) @ turn(at_s, 1)[..., None])[..., 0]
-    return np.concatenate([position_m(at_s, 1), rate], axis=1)
-
-
-def _ratio(runs: Sequence[_FollowedRun]) -> tuple[float, float]:
-    """Ratio of the motions per row to the motions per second, and its standard deviation."""
-    weighted = [np.einsum("fij,fj->fi", run.information, run.motion) for run in runs]
-    information = [(weight * run.motion).sum(axis=1) for weight, run in zip(weighted, runs, strict=True)]
-    right = [(weight * run.rows).sum(axis=1) for weight, run in zip(weighted, runs, strict=True)]
-    share = [np.ones(len(one)) for one in information]
-    ratio = 0.0
-    for _ in range(5):
-        total = sum(float(w @ one) for w, one in zip(share, information, strict=True))
-        ratio = sum(float(w @ one) for w, one in zip(share, right, strict=True)) / max(total, 1e-300)
-        share = [
-            1 / np.maximum(1.0, np.abs(r - ratio * one) / np.sqrt(np.maximum(one, 1e-300)) / _ROBUST)
-            for r, one in zip(right, information, strict=True)
-        ]
-    total = sum(float(w @ one) for w, one in zip(share, information, strict=True))
-    sums = np.array(
-        [
-            float((w * (r - ratio * one))[first : first + _GROUP_FRAMES].sum())
-            for w, r, one in zip(share, right, information, strict=True)
-            for first in range(0, len(one), _GROUP_FRAMES)
-        ]
+    Returns:
+        The motion by these poses, None if too few frames have one; and for each frame that is not at an end of the run,
+        the weighted squares of the changes by the line time, and their products with the residuals.
+    """
+    poses: list[tuple[float, MarkerPose, np.ndarray, np.ndarray]] = []
+    for _, time_s, markers in run:
+        corners_m = marker_map.corners_of(markers.ids.tolist())
+        corners_px = markers.corners_px
+        if motion is not None:
+            corners_px = at_middle_row(corners_px, corners_m, lens, line_time_s, time_s, motion)
+        pose = estimate_pose(corners_px, corners_m, lens, settings, std_px=markers.std_px)
+        if pose is not None and len(pose.used) == len(pose.fits):
+            poses.append((time_s, pose, markers.corners_px, corners_m))
+    if len(poses) < _FEWEST_FRAMES:
+        return None, np.zeros((0, 2))
+    motion = spline_through(
+        [time_s for time_s, *_ in poses], [(pose.position_m, pose.R_world_cam) for _, pose, *_ in poses]
     )
-    spread = np.sqrt((sums**2).sum() * len(sums) / max(len(sums) - 1, 1))
-    return ratio, float(max(spread, np.sqrt(total)) / max(total, 1e-300))
+    unit_s = 1e-3 / float(lens.image_size_wh[1])
+    sums = []
+    for time_s, pose, corners_px, corners_m in poses[1:-1]:
+        around_s = line_time_s - unit_s / 2, line_time_s + unit_s / 2
+        change = shift_of_rows(corners_px, corners_m, lens, around_s, time_s, motion) / unit_s
+        if pose.equations is not None:
+            sums.append(pose.equations.products(change.reshape(-1, 8)))
+    return motion, np.array(sums)
+
+
+def _ratio(runs: Sequence[Float[np.ndarray, "frames 2"]]) -> tuple[float, float]:
+    """Ratio of the sums of products and squares of all frames, and its standard deviation."""
+    frames, ratio = np.concatenate(runs), 0.0
+    for _ in range(5):
+        left = np.abs(frames[:, 1] - ratio * frames[:, 0]) / np.sqrt(np.maximum(frames[:, 0], 1e-300))
+        weight = 1 / np.maximum(1.0, left / _ROBUST)
+        total = max(float(weight @ frames[:, 0]), 1e-300)
+        ratio = float(weight @ frames[:, 1]) / total
+    left = weight * (frames[:, 1] - ratio * frames[:, 0])
+    starts = np.cumsum([0, *(len(run) for run in runs)])
+    groups = [
+        float(left[first : min(first + _GROUP_FRAMES, end)].sum())
+        for start, end in pairwise(starts)
+        for first in range(start, end, _GROUP_FRAMES)
+    ]
+    spread = np.sqrt(np.sum(np.square(groups)) * len(groups) / max(len(groups) - 1, 1))
+    return ratio, float(max(spread, np.sqrt(total)) / total)

@@ -1,7 +1,7 @@
 """`MarkerMap`: corners of markers in a room; and its table, which is checked when it is read.
 
 A marker is a flat square. A table is refused where it clearly contradicts this. Other errors of a map are found from a
-video: see `localising.map_evidence` and `mapping.checking`.
+video: see `localising.recording` and `mapping.checking`.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class PoseOptions:
         min_markers: smallest number of markers for a pose; poses from fewer than 4 markers are flagged.
         filter: filter the poses with a motion model.
         smooth: smooth the path: every pose is estimated from all frames.
-        map_error: standard deviation of each marker's position in the table, in millimetres.
+        map_error: standard deviation of a marker's position, in millimetres, where the table states none.
         focal_error: standard deviation of the focal length, in percent.
     """
 
@@ -140,7 +140,6 @@ def localise(
         PoseSettings,
         read_marker_table,
         save_flight,
-        smooth,
         write_camera_path,
     )
     from psotrack.inside_out import localise_video as localise_camera
@@ -176,12 +175,12 @@ def localise(
         ),
         filter=PoseFilterParams() if poses.filter else None,
         shutter=shutter,
-    ).within(source.num_frames)
+    )
     # What a stream has shown is kept: no one can show the stream again.
     with unhurried_end() if source.stream else contextlib.nullcontext():
         found = localise_camera(source, marker_map, lens, settings, output.report, side_m=given.side_m)
         if poses.smooth:
-            found = replace(found, path=smooth(found.raw, settings.filter))
+            found = replace(found, path=found.smoothed(settings.filter))
         write_camera_path(out, found.path, drone_name, force=output.force)
     if picture is not None:
         save_flight(

@@ -1,75 +1,125 @@
 """Causal filter over the poses of single frames: each frame's estimate uses this frame and earlier ones only.
 
-`init`, `predict` and `update` (of `multiple_models`) filter one continuous motion; a pose that does not fit it is gated
-and not used. `step` follows a camera with these functions. It returns poses once the first ones are confirmed, and none
-after too long a gap. It replaces its state where successive poses agree with one another but not with the state, so
-that no wrong state lasts. The state before a gap is kept and predicted, with growing uncertainty. After the gap, poses
-that this state does not predict need the same number of confirmations as poses that contradict a state, or markers that
-agree beyond chance in a pose that does not contradict the kept state. `filter_path` is a loop over `step`.
+`step` follows a camera. A pose that does not fit the motion is gated and not used. Poses are returned once the first
+ones are confirmed, and none after too long a gap. Poses that agree with one another but not with the motion make a
+rival track, which takes over after enough poses, so that no wrong track lasts. After a gap the track goes on with
+growing uncertainty; poses that it does not predict need the same confirmations as poses that contradict it, or markers
+that agree beyond chance in a pose that does not contradict it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
-from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.filtering.multiple_models import (
-    PoseState,
+from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.geometry import rotation_matrices
+from psotrack.inside_out.camera_path import CameraPath, Flag
+from psotrack.inside_out.filtering.motion import (
+    Agility,
+    Motion,
+    MotionEstimate,
+    correct,
     estimate,
-    init,
+    initial_motion,
+    innovation,
     predict,
-    update,
-    with_equal_weights,
 )
-from psotrack.inside_out.filtering.path_rows import (
-    PoseRow,
-    estimated_row,
-    join_rows,
-    lost_row,
-    measured_pose,
-    split_path,
-)
-from psotrack.inside_out.filtering.records import MeasuredPose, PoseEstimate, PoseFilterParams
+from psotrack.trajectories import Status
 
-__all__ = [
-    "FilterRun",
-    "MeasuredPose",
-    "PoseEstimate",
-    "PoseFilterParams",
-    "PoseState",
-    "advance",
-    "estimate",
-    "expected",
-    "filter_path",
-    "init",
-    "predict",
-    "step",
-    "update",
-]
-
-#: Number of successive poses that distinguish a turn, which no level of agility predicted, from an outlier.
+#: Number of successive poses that distinguish a turn, which only the wildest drone flies, from an outlier.
 _TURN_POSES = 2
-#: Standard deviation along an axis, metres, from which on the camera may be anywhere in a room.
-_ANYWHERE_M = 10.0
+_WILDEST = Agility(50.0, 20.0)
+#: Smallest number of markers that agree beyond chance: two more than the one that has a pose by itself.
+_BEYOND_CHANCE = 3
+#: Standard deviation of the wrong one of two poses from the right one, along each axis (m) and about each axis (rad).
+_OTHER_POSE_STD = 1.0
+#: Degrees of freedom of the Student distribution of an innovation: heavy tails, so that a single wild pose does not
+#: make a hovering camera race.
+_FREEDOM = 4.0
 
 
 @dataclass(frozen=True)
-class Alternative:
-    """Alternative state, from poses that did not fit the state.
+class PoseFilterParams:
+    """Parameters of the pose filter.
 
     Attributes:
-        state: state by these poses alone, or by these poses as a turn that no level of agility predicted.
-        since_s: time of the first of these poses, seconds.
-        needed: number of poses after which the alternative replaces the state.
-        continuous: whether the camera can have moved there from the state, so that the motion has no jump.
+        false_alarm: probability that a good pose is gated.
+        longest_gap_s: time without a fitting pose after which no pose is returned until poses are confirmed again,
+            seconds.
+        confirm: number of poses that must agree before the first pose is returned, unless the markers of one pose agree
+            beyond chance. 1 accepts every first pose.
+        restart_after: number of successive poses that agree with one another and not with the track, after which they
+            replace it. A track that rests on fewer poses needs fewer, unless the markers of one of its poses agree
+            beyond chance.
     """
 
-    state: PoseState
-    since_s: float
-    needed: int
-    continuous: bool
+    false_alarm: float = 1e-3
+    longest_gap_s: float = 0.5
+    confirm: int = 3
+    restart_after: int = 10
+
+    def __post_init__(self) -> None:
+        check_positive("longest_gap_s", self.longest_gap_s)
+        if not 0 < self.false_alarm < 1:
+            raise SettingsError(
+                "false_alarm", expected="a probability above 0 and below 1", found=f"{self.false_alarm:g}"
+            )
+        for name in ("confirm", "restart_after"):
+            if getattr(self, name) < 1:
+                raise SettingsError(name, expected="at least 1", found=f"{getattr(self, name)}")
+
+    def within(self, num_frames: int | None) -> PoseFilterParams:
+        """Parameters for a recording of `num_frames` frames: `confirm` is at most this number. None is a stream."""
+        return self if num_frames is None else replace(self, confirm=max(1, min(self.confirm, num_frames)))
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """The pose of a camera from one frame alone.
+
+    Attributes:
+        time_s: time of the frame, seconds.
+        position_m, R_world_cam, ambiguity: as in `MarkerPose`.
+        covariance: (6, 6), as in `CameraPath`, without the constant part.
+        constant: (6, 6), the part by errors that are the same in all frames: no number of frames averages them out.
+        num_markers: number of markers behind the pose.
+    """
+
+    time_s: float
+    position_m: Float[np.ndarray, "3"]
+    R_world_cam: Float[np.ndarray, "3 3"]
+    covariance: Float[np.ndarray, "6 6"]
+    constant: Float[np.ndarray, "6 6"]
+    ambiguity: float
+    num_markers: int
+
+
+@dataclass(frozen=True)
+class Track:
+    """A camera's motion by the poses that fitted it.
+
+    Attributes:
+        motion: motion after the last of these poses.
+        began_s, seen_s: times of the first and of the last of them, seconds.
+        support: their number.
+        ambiguity: probability that all of them belong to another camera pose that looks the same.
+        sure: whether the markers of one of them agree beyond chance.
+        constant: (6, 6), constant part of the covariance of the last of them.
+    """
+
+    motion: Motion
+    began_s: float
+    seen_s: float
+    support: int
+    ambiguity: float
+    sure: bool
+    constant: Float[np.ndarray, "6 6"]
 
 
 @dataclass(frozen=True)
@@ -77,184 +127,243 @@ class FilterRun:
     """What `step` passes on from frame to frame; `FilterRun()` is the beginning, without any pose.
 
     Attributes:
-        state: current state.
-        alternative: state that is suggested by poses that contradict the current state.
-        previous: state that an alternative replaced; it may still prove right while its last pose is no longer ago
-            than the longest gap.
-        adopted: alternative that became the state in this frame.
-        restored: previous state, as predicted, that became the state again in this frame.
-        before_gap: state before too long a gap, kept until the camera is found again.
-        contradicts: whether the state contradicts the state before the gap.
+        track: the track; None before the first pose.
+        rival: track by poses that contradict the track.
+        needed: number of poses after which the rival replaces the track.
+        restarted_s: time since when the frame's track is another one than in the frame before, seconds; None if it is
+            the same.
+        jumped: whether the camera cannot have moved from one to the other.
+        used: whether this frame's pose fits the track.
+        log_likelihood: logarithm of the density of all poses as predicted, without its constant.
     """
 
-    state: PoseState | None = None
-    alternative: Alternative | None = None
-    previous: PoseState | None = None
-    adopted: Alternative | None = None
-    restored: PoseState | None = None
-    before_gap: PoseState | None = None
-    contradicts: bool = False
+    track: Track | None = None
+    rival: Track | None = None
+    needed: int = 0
+    restarted_s: float | None = None
+    jumped: bool = False
+    used: bool = False
+    log_likelihood: float = 0.0
 
 
-def advance(run: FilterRun, time_s: float, params: PoseFilterParams) -> FilterRun:
-    """Predict a run to the time of the next frame; states without a pose for too long are dropped.
+@dataclass(frozen=True)
+class Estimated:
+    """A frame's estimated pose.
 
-    Raises:
-        InputError: the time is before the time of the run.
+    Attributes:
+        motion: pose and motion, with the constant part of the covariance; None of a frame that is lost.
+        used: whether the frame's own pose was used for it.
+        ambiguity: probability that it belongs to another camera pose that looks the same.
     """
-    if run.state is not None and run.state.time_s == time_s:
-        return run
 
-    def later(state: PoseState | None) -> PoseState | None:
-        if state is None or time_s - state.seen_s > params.longest_gap_s:
-            return None
-        return predict(state, time_s)
-
-    state, previous, alternative = later(run.state), later(run.previous), run.alternative
-    alternative_state = later(alternative.state) if alternative else None
-    alternative = replace(alternative, state=alternative_state) if alternative and alternative_state else None
-    before_gap = run.state if state is None and confirmed(run, params) else run.before_gap
-    if before_gap is not None:
-        before_gap = predict(before_gap, time_s)
-        before_gap = None if _is_anywhere(before_gap) else before_gap
-    if state is None and alternative is not None:
-        return FilterRun(alternative.state, previous=previous, adopted=alternative, before_gap=before_gap)
-    contradicts = before_gap is not None and run.contradicts
-    return FilterRun(state, alternative, previous, before_gap=before_gap, contradicts=contradicts)
+    motion: MotionEstimate | None = None
+    used: bool = False
+    ambiguity: float = np.nan
 
 
-def expected(run: FilterRun, params: PoseFilterParams) -> PoseEstimate | None:
-    """Estimate at the time to which the run was advanced; None where no state is confirmed."""
-    return estimate(run.state) if run.state and confirmed(run, params) else None
+@dataclass(frozen=True)
+class _Updated:
+    """A track with one more pose; whether the pose is in its gate, and the log density of the pose."""
+
+    track: Track
+    fits: bool
+    log_density: float
+
+
+def expected(run: FilterRun, time_s: float, params: PoseFilterParams, agility: Agility) -> Estimated:
+    """Estimate at the time of a frame, without the frame's pose."""
+    track = run.track
+    if track is None or not confirmed(run, params) or time_s - track.seen_s > params.longest_gap_s:
+        return Estimated(None)
+    found = estimate(predict(track.motion, time_s - track.seen_s, agility)[0])
+    return Estimated(
+        replace(found, covariance=found.covariance + track.constant),
+        run.used and time_s == track.seen_s,
+        track.ambiguity,
+    )
 
 
 def confirmed(run: FilterRun, params: PoseFilterParams) -> bool:
-    """Whether the state may be returned: enough poses agree, or the markers of one pose agree beyond chance.
-
-    After a gap, poses that the state before the gap does not predict need as many confirmations as poses that
-    contradict a state. Where poses contradict the state before the gap, markers that agree do not replace
-    confirmations.
-    """
-    state = run.state
-    if state is None:
-        return False
-    needed = params.confirm if run.before_gap is None else max(params.confirm, params.restart_after)
-    return state.support >= needed or (state.p_wrong < params.false_alarm and not run.contradicts)
+    """Whether the track may be returned: enough poses agree, or the markers of one pose agree beyond chance."""
+    return run.track is not None and (run.track.support >= params.confirm or run.track.sure)
 
 
-def step(run: FilterRun, raw: PoseRow, params: PoseFilterParams) -> tuple[FilterRun, PoseRow]:
-    """Follow the camera into the next frame.
-
-    Args:
-        run: result of the frame before, advanced to this frame or not.
-        raw: this frame's own pose; its position is NaN where there is none.
-        params: parameters of the filter.
-
-    Returns:
-        The run for the next frame, and this frame with its estimate: `TRACKED` where the frame's own pose was used,
-        `COASTING` where there was none or it was gated, and `LOST`, with NaN, where no state is confirmed.
+def step(
+    run: FilterRun, time_s: float, pose: FramePose | None, params: PoseFilterParams, agility: Agility
+) -> FilterRun:
+    """Follow the camera into the next frame, whose own pose is `pose`; None if it has none.
 
     Raises:
         InputError: times do not increase, or a pose's covariance is not positive definite.
     """
-    run = advance(run, raw.time_s, params)
-    gated = False
-    if raw.has_pose:
-        adopted = run.adopted
-        run, gated = _use_pose(run, measured_pose(raw), params)
-        run = replace(run, adopted=run.adopted or adopted)
-    estimated = expected(run, params)
-    if estimated is None or run.state is None:
-        return run, lost_row(raw, gated=gated)
-    return run, estimated_row(raw, estimated, run.state.ambiguity, used=raw.has_pose and not gated)
+    run = replace(run, used=False, restarted_s=None, jumped=False)
+    track = run.track
+    if track is not None and not time_s > track.seen_s:
+        raise InputError("time_s", expected=f"a time after {track.seen_s:g} s", found=f"{time_s:g} s")
+    if pose is None:
+        return run
+    if not (np.isfinite(pose.covariance).all() and np.linalg.eigvalsh(pose.covariance)[0] > 0):
+        where = f"covariance at {time_s:g} s"
+        raise InputError(where, expected="a positive definite matrix", found="another")
+    if track is None:
+        first = _first_track(pose, params, agility)
+        return replace(run, track=first, restarted_s=time_s, jumped=True, used=True)
+    updated = _updated(track, pose, params, agility)
+    run = replace(run, log_likelihood=run.log_likelihood + updated.log_density)
+    is_fresh = time_s - track.seen_s <= params.longest_gap_s
+    accepts = updated.fits and (is_fresh or _is_predicted(updated, params))
+    rival = run.rival
+    if rival is not None and time_s - rival.seen_s <= params.longest_gap_s:
+        rivalling = _updated(rival, pose, params, agility)
+        if rivalling.fits and not (accepts and updated.log_density >= rivalling.log_density):
+            # The pose belongs to the rival, even where the track has grown uncertain enough to accept it.
+            return _rivalled(run, rivalling.track, run.needed, run.jumped)
+    if accepts:
+        return replace(run, track=updated.track, rival=None, used=True)
+    if is_fresh:
+        turned = _updated(track, pose, params, _WILDEST)
+        if turned.fits and _is_predicted(turned, params) and confirmed(run, params):
+            turn = replace(turned.track, began_s=time_s)
+            return _rivalled(run, turn, track.support + _TURN_POSES, False)
+    first = _first_track(pose, params, agility)
+    needed = params.restart_after if track.sure else min(params.restart_after, track.support + 1)
+    if not is_fresh:
+        needed = 1 if updated.fits and first.sure else max(params.confirm, params.restart_after)
+    return _rivalled(run, first, needed, True)
 
 
-def filter_path(path: CameraPath, params: PoseFilterParams | None = None) -> CameraPath:
-    """Filter a path: the estimate in each frame uses this frame and earlier ones.
+def _rivalled(run: FilterRun, rival: Track, needed: int, jumped: bool) -> FilterRun:
+    """The run with a rival track, which replaces the track if it has enough poses."""
+    if rival.support < needed:
+        return replace(run, rival=rival, needed=needed)
+    return replace(run, track=rival, rival=None, restarted_s=rival.began_s, jumped=jumped, used=True)
+
+
+def _first_track(pose: FramePose, params: PoseFilterParams, agility: Agility) -> Track:
+    """The track of a single pose."""
+    motion = initial_motion(pose.position_m, pose.R_world_cam, pose.covariance, agility)
+    return Track(motion, pose.time_s, pose.time_s, 1, pose.ambiguity, _is_sure(pose, params), pose.constant)
+
+
+def _is_sure(pose: FramePose, params: PoseFilterParams) -> bool:
+    """Whether the markers of a pose agree beyond chance, and no other pose explains them."""
+    return pose.num_markers >= _BEYOND_CHANCE and pose.ambiguity < params.false_alarm
+
+
+def _updated(track: Track, pose: FramePose, params: PoseFilterParams, agility: Agility) -> _Updated:
+    """A track with one more pose.
+
+    A pose is gated where its squared Mahalanobis distance from the prediction exceeds the value that chi-square with 6
+    degrees of freedom exceeds with probability `false_alarm`. An ambiguous pose is weighted by the probability that it
+    is the right one, given how well it fits.
+    """
+    predicted, _, _ = predict(track.motion, pose.time_s - track.seen_s, agility)
+    found = innovation(predicted, pose.position_m, pose.R_world_cam, pose.covariance)
+    spread = found.covariance + pose.constant
+    nis, log_size = float(found.off @ np.linalg.solve(spread, found.off)), float(np.linalg.slogdet(spread)[1])
+    robust = -((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
+    right = probability_right(found.off, spread, pose.ambiguity)
+    more = Track(
+        correct(predicted, found, right),
+        track.began_s,
+        pose.time_s,
+        track.support + 1,
+        min(track.ambiguity, pose.ambiguity),
+        track.sure or _is_sure(pose, params),
+        pose.constant,
+    )
+    return _Updated(more, bool(nis <= chdtri(6, params.false_alarm)), robust)
+
+
+def probability_right(
+    off: Float[np.ndarray, "6"], spread: Float[np.ndarray, "6 6"], ambiguity: float
+) -> float:
+    """Probability that an ambiguous pose is the right one, given how well it fits the motion.
+
+    Bayes' rule. A wrong pose is distributed about the right one with a metre and a radian along and about each axis.
 
     Args:
-        path: raw poses, each from its frame alone.
-        params: parameters of the filter.
-
-    Raises:
-        InputError: a pose's covariance is not positive definite.
+        off: (6,), difference of the pose from the prediction, metres and radians.
+        spread: (6, 6), covariance of this difference.
+        ambiguity: probability, before the motion is considered, that another pose is the right one.
     """
-    params = params or PoseFilterParams()
-    run, rows = FilterRun(), []
-    for raw in split_path(path):
-        run, row = step(run, raw, params)
-        rows.append(row)
-    return join_rows(rows)
+    if ambiguity == 0:
+        return 1.0
+    wide = spread + _OTHER_POSE_STD**2 * np.eye(6)
+    fits, other = (
+        -(off @ np.linalg.solve(matrix, off) + np.linalg.slogdet(matrix)[1]) / 2 for matrix in (spread, wide)
+    )
+    return float(1 / (1 + ambiguity / (1 - ambiguity) * np.exp(min(other - fits, 700.0))))
 
 
-def _use_pose(run: FilterRun, measurement: MeasuredPose, params: PoseFilterParams) -> tuple[FilterRun, bool]:
-    """The run after a measured pose, and whether the pose was gated."""
-    before_gap, contradicts = run.before_gap, False
-    if before_gap is not None:
-        updated, contradicts = update(before_gap, measurement, params)
-        if not contradicts and _is_predicted(updated, params):
-            return FilterRun(updated, restored=before_gap), False
-    if run.state is None:
-        first = init(measurement)
-        adopted = (
-            None
-            if before_gap is None
-            else Alternative(first, measurement.time_s, 1, continuous=not contradicts)
-        )
-        found, gated = FilterRun(first, adopted=adopted), False
-    else:
-        found, gated = _use_pose_with_state(run, run.state, measurement, params)
-        contradicts = contradicts if found.adopted else run.contradicts
-    found = replace(found, before_gap=before_gap, contradicts=contradicts)
-    return replace(found, before_gap=None, contradicts=False) if confirmed(found, params) else found, gated
-
-
-def _use_pose_with_state(
-    run: FilterRun, state: PoseState, measurement: MeasuredPose, params: PoseFilterParams
-) -> tuple[FilterRun, bool]:
-    """The run after a measured pose, where there is a state, and whether the pose was gated."""
-    predicted = state
-    state, gated = update(predicted, measurement, params)
-    previous, alternative = run.previous, run.alternative
-    if previous is not None:
-        updated, outside = update(previous, measurement, params)
-        if not outside and (gated or updated.log_density > state.log_density):
-            return FilterRun(updated, restored=previous), False
-    outside = True
-    if alternative is not None:
-        alternative_state, outside = update(alternative.state, measurement, params)
-        alternative = replace(alternative, state=alternative_state)
-    if alternative is None or outside:
-        alternative = _first_alternative(state, measurement, params) if gated else None
-        return FilterRun(state, alternative, previous), gated
-    if not gated and alternative.state.log_density <= state.log_density:
-        return FilterRun(state, previous=previous), False
-    # The pose belongs to the alternative, even where the state has grown uncertain enough to accept it.
-    if alternative.state.support >= alternative.needed:
-        return FilterRun(alternative.state, previous=previous or predicted, adopted=alternative), False
-    return FilterRun(predicted, alternative, previous), True
-
-
-def _first_alternative(state: PoseState, measurement: MeasuredPose, params: PoseFilterParams) -> Alternative:
-    """An alternative by one pose that does not fit the state: an unpredicted turn, or a camera that is elsewhere."""
-    sure = state.p_wrong < params.false_alarm
-    if sure or state.support >= params.confirm:
-        turned, outside = update(with_equal_weights(state), measurement, params)
-        if not outside and _is_predicted(turned, params):
-            return Alternative(turned, measurement.time_s, state.support + _TURN_POSES, continuous=True)
-    needed = params.restart_after if sure else min(params.restart_after, state.support + 1)
-    return Alternative(init(measurement), measurement.time_s, needed, continuous=False)
-
-
-def _is_anywhere(state: PoseState) -> bool:
-    """Whether the position is so uncertain that the camera may be anywhere in a room."""
-    return bool(np.linalg.eigvalsh(estimate(state).covariance[:3, :3])[-1] > _ANYWHERE_M**2)
-
-
-def _is_predicted(state: PoseState, params: PoseFilterParams) -> bool:
+def _is_predicted(updated: _Updated, params: PoseFilterParams) -> bool:
     """Whether the last pose is predicted by the motion rather than an outlier.
 
     The density of the pose must exceed the density of an outlier within a metre and a radian by the factor
     1 / `false_alarm`: then outliers are accepted less often than good poses are rejected.
     """
-    return bool(state.log_density > -np.log(params.false_alarm))
+    return bool(updated.log_density > -np.log(params.false_alarm))
+
+
+def poses_of(
+    path: CameraPath, constant: Float[np.ndarray, "frames 6 6"] | None = None
+) -> list[FramePose | None]:
+    """The frames' own poses of a path; None for frames without one.
+
+    Args:
+        path: the path; an unknown ambiguity counts as 0.
+        constant: (frames, 6, 6), the part of the covariances by errors that are the same in all frames; None is 0.
+    """
+    constant = np.zeros((path.num_frames, 6, 6)) if constant is None else constant
+    matrices = rotation_matrices(path.orientation_wxyz)
+    return [
+        FramePose(
+            float(path.time_s[k]),
+            path.position_m[k],
+            matrices[k],
+            path.covariance[k] - constant[k],
+            constant[k],
+            float(np.nan_to_num(path.ambiguity[k])),
+            int(path.num_markers[k]),
+        )
+        if np.isfinite(path.position_m[k]).all()
+        else None
+        for k in range(path.num_frames)
+    ]
+
+
+def path_of(raw: CameraPath, estimates: Sequence[Estimated]) -> CameraPath:
+    """The path with the estimated poses of its frames.
+
+    `TRACKED` where the frame's own pose was used, `COASTING` where there was none or it was gated, and `LOST`, with
+    NaN, where there is no estimate.
+    """
+    count, has_pose = raw.num_frames, np.isfinite(raw.position_m).all(axis=1)
+    motions = [one.motion for one in estimates]
+    there = np.array([motion is not None for motion in motions], bool)
+    used = np.array([one.used for one in estimates], bool)
+    ambiguity = np.where(there, [one.ambiguity for one in estimates], np.nan)
+
+    def of_motions(name: str, shape: tuple[int, ...]) -> Float[np.ndarray, "frames *shape"]:
+        values = np.full((count, *shape), np.nan)
+        for k, motion in enumerate(motions):
+            if motion is not None:
+                values[k] = getattr(motion, name)
+        return values
+
+    orientation_wxyz = np.full((count, 4), np.nan)
+    if there.any():
+        turns = Rotation.from_matrix(of_motions("R_world_cam", (3, 3))[there])
+        orientation_wxyz[there] = turns.as_quat(scalar_first=True)
+    flags = raw.flags | np.where(has_pose & ~used, int(Flag.GATED), 0)
+    surer = there & (ambiguity < raw.ambiguity)
+    return replace(
+        raw,
+        position_m=of_motions("position_m", (3,)),
+        orientation_wxyz=orientation_wxyz,
+        covariance=of_motions("covariance", (6, 6)),
+        ambiguity=ambiguity,
+        status=np.where(there, np.where(used, int(Status.TRACKED), int(Status.COASTING)), int(Status.LOST)),
+        flags=np.where(surer, flags & ~int(Flag.AMBIGUOUS), flags),
+        velocity_m_s=of_motions("velocity_m_s", (3,)) if there.any() else None,
+    )

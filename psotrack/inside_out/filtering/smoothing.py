@@ -1,8 +1,7 @@
-"""Smoothed camera poses: every frame estimated from the poses of all frames.
+"""Paths from the poses of all frames: filtered, each frame by itself and the frames before; or smoothed, by all frames.
 
-The causal filter runs once forwards and once backwards in time. A pose is used if it fits in both directions. Both runs
-estimate how violently the camera moves, and how good the poses are, at any time. With these estimates a
-Rauch-Tung-Striebel smoother on the manifold of poses (`psotrack.geometry.estimation`) gives the path.
+For the smoother, the causal filter runs once forwards and once backwards in time, and a pose is used if it fits in both
+directions. A Rauch-Tung-Striebel smoother on the manifold of poses (`psotrack.geometry.estimation`) gives the path.
 """
 
 from __future__ import annotations
@@ -13,176 +12,147 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from psotrack.geometry.estimation import backward_step
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import motion as pose_motion
-from psotrack.inside_out.filtering.manifold import right_jacobian_inverse
-from psotrack.inside_out.filtering.motion import MOTION, POSE, Levels, Motion
-from psotrack.inside_out.filtering.multiple_models import LEVELS, acceleration_rms, probability_right
-from psotrack.inside_out.filtering.path_rows import (
-    PoseRow,
-    estimated_row,
-    join_rows,
-    lost_row,
-    measured_pose,
-    split_path,
+from psotrack.inside_out.filtering.agility import choose_agility
+from psotrack.inside_out.filtering.motion import Agility, Motion
+from psotrack.inside_out.filtering.pose_filter import (
+    Estimated,
+    FilterRun,
+    FramePose,
+    PoseFilterParams,
+    confirmed,
+    expected,
+    path_of,
+    poses_of,
+    probability_right,
+    step,
 )
-from psotrack.inside_out.filtering.pose_filter import FilterRun, confirmed, step
-from psotrack.inside_out.filtering.records import PoseEstimate, PoseFilterParams
+
+#: (frames, 6, 6), parts of covariances.
+Covariances = Float[np.ndarray, "frames 6 6"]
 
 
 @dataclass(frozen=True)
-class _FilterFindings:
-    """Findings of one run of the filter, apart from poses.
+class _Findings:
+    """Findings of one run of the filter.
 
     Attributes:
         fits: (frames,), True if the frame's pose fits the motion, judged at the end of the run.
-        jumps: (frames,), number of times up to the frame that the filter restarted at another place.
-        log_levels: (frames, 2), logarithms of the densities of the jerk and of the angular acceleration.
-        log_noise_scale: (frames,), logarithm of the factor on the covariances of measured poses.
-        ambiguity: (frames,), ambiguity of the filter's state.
+        track: (frames,), number of the track, which changes where the camera jumps.
+        ambiguity: (frames,), ambiguity of the track.
     """
 
     fits: Bool[np.ndarray, "frames"]
-    jumps: Int[np.ndarray, "frames"]
-    log_levels: Float[np.ndarray, "frames 2"]
-    log_noise_scale: Float[np.ndarray, "frames"]
+    track: Int[np.ndarray, "frames"]
     ambiguity: Float[np.ndarray, "frames"]
 
 
-@dataclass(frozen=True)
-class MotionModel:
-    """All that the smoother needs to know about a path, apart from the poses.
+def filter_path(
+    path: CameraPath, params: PoseFilterParams | None = None, constant: Covariances | None = None
+) -> CameraPath:
+    """Filter a path: the estimate in each frame uses this frame and earlier ones, and the agility of the recording.
 
-    Attributes:
-        fits: (frames,), True if the smoother uses the frame's pose.
-        jumps: (frames,), number of times up to the frame that the camera jumped; the path is not drawn across a jump.
-        jerk_density_m2_s5: (frames,), power spectral density of the jerk along each axis.
-        wobble_density_rad2_s3: (frames,), power spectral density of the angular acceleration about each axis.
-        noise_scale: (frames,), factor on the covariances of the measured poses.
-        ambiguity: (frames,), probability that the path shows another camera pose that looks the same.
+    Args:
+        path: raw poses, each from its frame alone.
+        params: parameters of the filter.
+        constant: part of the covariances by errors that are the same in all frames; None is 0.
+
+    Raises:
+        InputError: a pose's covariance is not positive definite.
     """
-
-    fits: Bool[np.ndarray, "frames"]
-    jumps: Int[np.ndarray, "frames"]
-    jerk_density_m2_s5: Float[np.ndarray, "frames"]
-    wobble_density_rad2_s3: Float[np.ndarray, "frames"]
-    noise_scale: Float[np.ndarray, "frames"]
-    ambiguity: Float[np.ndarray, "frames"]
-
-
-@dataclass(frozen=True)
-class _FilteredFrame:
-    """One frame of the forward pass.
-
-    Attributes:
-        predicted: motion before the frame's pose.
-        F, Q: (1, n, n), transition matrix and process noise from the previous frame.
-        motion: motion after the frame's pose.
-    """
-
-    predicted: Motion
-    F: Float[np.ndarray, "1 n n"]
-    Q: Float[np.ndarray, "1 n n"]
-    motion: Motion
+    params, poses = params or PoseFilterParams(), poses_of(path, constant)
+    agility = choose_agility(poses, params)
+    run, estimates = FilterRun(), []
+    for time_s, pose in zip(path.time_s.tolist(), poses, strict=True):
+        run = step(run, time_s, pose, params, agility)
+        estimates.append(expected(run, time_s, params, agility))
+    return path_of(path, estimates)
 
 
 def smooth(
-    path: CameraPath, params: PoseFilterParams | None = None, model: MotionModel | None = None
+    path: CameraPath, params: PoseFilterParams | None = None, constant: Covariances | None = None
 ) -> CameraPath:
     """Estimate every frame's pose from the poses of all frames.
 
     Gaps are bridged from both sides. A frame is lost if no used pose lies within `longest_gap_s` of it.
 
     Args:
-        path: raw poses, each estimated from its frame alone. Poses from `filter_path` already contain other frames,
-            which would then count twice.
+        path: raw poses, each estimated from its frame alone. Poses of a filter already contain other frames, which
+            would then count twice.
         params: parameters of the filter; None for the defaults.
-        model: what is known about the motion; None for `estimate_motion_model(path, params)`.
+        constant: part of the covariances by errors that are the same in all frames; None is 0.
 
     Raises:
         InputError: a pose's covariance is not positive definite.
     """
-    params = params or PoseFilterParams()
-    rows = split_path(path)
-    if not rows:
-        return path
-    model = model or estimate_motion_model(path, params)
-    smoothed = [lost_row(row, gated=row.has_pose) for row in rows]
-    for span in _spans(path.time_s, model, params.longest_gap_s):
-        poses = _smooth_span(rows, model, span)
-        for k, pose in zip(range(span.start, span.stop), poses, strict=True):
-            smoothed[k] = estimated_row(rows[k], pose, float(model.ambiguity[k]), used=bool(model.fits[k]))
-    return join_rows(smoothed)
-
-
-def first_estimate(path: CameraPath, params: PoseFilterParams) -> tuple[float, PoseEstimate] | None:
-    """Time (seconds) and smoothed estimate of the first used pose of a path; None if no pose is used."""
-    model = estimate_motion_model(path, params)
-    span = next(_spans(path.time_s, model, params.longest_gap_s), None)
-    if span is None:
-        return None
-    return float(path.time_s[span.start]), _smooth_span(split_path(path), model, span)[0]
-
-
-def estimate_motion_model(path: CameraPath, params: PoseFilterParams) -> MotionModel:
-    """Estimate from raw poses how the camera moves and which poses fit: the causal filter in both directions of time.
-
-    Args:
-        path: raw poses, each estimated from its frame alone.
-        params: parameters of the filter.
-
-    Raises:
-        InputError: a pose's covariance is not positive definite.
-    """
-    rows = split_path(path)
-    forward = _run_filter(rows, params)
-    backward = _run_filter([row.backwards() for row in reversed(rows)], params)
-    log_levels = (forward.log_levels + backward.log_levels[::-1]) / 2
-    return MotionModel(
-        fits=forward.fits & backward.fits[::-1],
-        jumps=forward.jumps,
-        jerk_density_m2_s5=np.exp(log_levels[:, 0]),
-        wobble_density_rad2_s3=np.exp(log_levels[:, 1]),
-        noise_scale=np.exp((forward.log_noise_scale + backward.log_noise_scale[::-1]) / 2),
-        ambiguity=np.fmin(forward.ambiguity, backward.ambiguity[::-1]),
+    return path_of(
+        path, smoothed_motions(path.time_s, poses_of(path, constant), params or PoseFilterParams())
     )
 
 
-def _run_filter(rows: Sequence[PoseRow], params: PoseFilterParams) -> _FilterFindings:
-    """Run the causal filter; a frame without a state gets the findings of the last frame that had one."""
-    time_s = np.array([row.time_s for row in rows])
-    has_pose = np.array([row.has_pose for row in rows], bool)
-    fits, jumped = np.zeros(len(rows), bool), np.zeros(len(rows), bool)
-    # A new track begins where the filter starts or jumps; poses of a track that is never confirmed do not count.
-    track, is_confirmed = np.zeros(len(rows), int), [False]
-    run, found = FilterRun(), []
-    latest = _mean_log_levels(_uniform_log_weights()), 0.0, np.nan
-    for k, row in enumerate(rows):
-        run, _ = step(run, row, params)
-        state, rival, recalled = run.state, run.adopted, run.restored
-        if recalled is not None:
-            # The filter went back to an earlier state, so the poses since then were wrong.
-            fits[np.searchsorted(time_s, recalled.seen_s, side="right") : k] = False
-        if state is not None:
+def smoothed_motions(
+    time_s: Float[np.ndarray, "frames"], poses: Sequence[FramePose | None], params: PoseFilterParams
+) -> list[Estimated]:
+    """Smoothed pose and motion of every frame, from the frames' own poses at these times, seconds."""
+    agility = choose_agility(poses, params)
+    forward = _findings(time_s, poses, params, agility)
+    backward = _findings(
+        -time_s[::-1],
+        [pose and replace(pose, time_s=-pose.time_s) for pose in reversed(poses)],
+        params,
+        agility,
+    )
+    fits = forward.fits & backward.fits[::-1]
+    ambiguity = np.fmin(forward.ambiguity, backward.ambiguity[::-1])
+    found = [Estimated(None)] * len(poses)
+    for span in _spans(time_s, fits, forward.track, params.longest_gap_s):
+        constant = np.zeros((6, 6))
+        for k, motion in zip(
+            range(span.start, span.stop), _smooth_span(time_s, poses, fits, span, agility), strict=True
+        ):
+            pose = poses[k]
+            constant = pose.constant if pose is not None and fits[k] else constant
+            motion = replace(motion, covariance=motion.covariance + constant)
+            found[k] = Estimated(motion, bool(fits[k]), float(ambiguity[k]))
+    return found
+
+
+def _findings(
+    time_s: Float[np.ndarray, "frames"],
+    poses: Sequence[FramePose | None],
+    params: PoseFilterParams,
+    agility: Agility,
+) -> _Findings:
+    """Run the causal filter; poses of a track that is never confirmed do not count."""
+    count = len(poses)
+    fits, track, ambiguity = np.zeros(count, bool), np.zeros(count, int), np.full(count, np.nan)
+    has_pose, run, good = np.array([pose is not None for pose in poses], bool), FilterRun(), [False]
+    for k, pose in enumerate(poses):
+        run = step(run, float(time_s[k]), pose, params, agility)
+        fits[k] = run.used
+        if run.restarted_s is not None:
             # The poses of a rival track were gated when they came.
-            since = k if rival is None else int(np.searchsorted(time_s, rival.since_s))
-            jumped[since] |= rival is not None and not rival.continuous
-            if state.support == 1 or jumped[since]:
-                is_confirmed.append(False)
-            track[since : k + 1], is_confirmed[-1] = len(is_confirmed) - 1, confirmed(run, params)
-            fits[since : k + 1] = has_pose[since : k + 1] & (state.seen_s == row.time_s)
-            latest = _mean_log_levels(state.log_weight), float(np.log(state.noise_scale)), state.ambiguity
-        found.append(latest)
-    log_levels, log_noise_scale, ambiguity = (np.array(values) for values in zip(*found, strict=True))
-    fits &= np.array(is_confirmed)[track]
-    return _FilterFindings(fits, np.cumsum(jumped), log_levels, log_noise_scale, ambiguity)
+            since = int(np.searchsorted(time_s, run.restarted_s))
+            fits[since:k] = has_pose[since:k] & ~fits[since:k]
+            if run.jumped:
+                good.append(False)
+                track[since:k] = len(good) - 1
+        track[k], good[-1] = len(good) - 1, confirmed(run, params)
+        if run.track is not None:
+            ambiguity[k] = run.track.ambiguity
+    return _Findings(fits & np.array(good)[track], track, ambiguity)
 
 
-def _spans(time_s: Float[np.ndarray, "frames"], model: MotionModel, longest_gap_s: float) -> Iterator[slice]:
+def _spans(
+    time_s: Float[np.ndarray, "frames"],
+    fits: Bool[np.ndarray, "frames"],
+    track: Int[np.ndarray, "frames"],
+    longest_gap_s: float,
+) -> Iterator[slice]:
     """Yield the spans of frames without a jump or a long gap; a span ends `longest_gap_s` after its last used pose."""
-    seen = np.flatnonzero(model.fits)
-    is_break = (np.diff(time_s[seen]) > 2 * longest_gap_s) | (np.diff(model.jumps[seen]) != 0)
+    seen = np.flatnonzero(fits)
+    is_break = (np.diff(time_s[seen]) > 2 * longest_gap_s) | (np.diff(track[seen]) != 0)
     ends = np.append(np.flatnonzero(is_break), len(seen) - 1) if len(seen) else np.array([], int)
     first = 0
     for end in ends:
@@ -192,102 +162,31 @@ def _spans(time_s: Float[np.ndarray, "frames"], model: MotionModel, longest_gap_
         first = end + 1
 
 
-def _smooth_span(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[PoseEstimate]:
-    """Smoothed poses of a span of frames whose first pose fits."""
-    frames = _filter(rows, model, span)
-    later = frames[-1].motion
-    wobble = model.wobble_density_rad2_s3[span]
-    poses = [_estimate(later, float(wobble[-1]))]
-    for now, ahead, density in zip(frames[-2::-1], frames[:0:-1], wobble[-2::-1], strict=True):
-        later = _smoothed(now.motion, ahead, later)
-        poses.append(_estimate(later, float(density)))
-    return poses[::-1]
-
-
-def _filter(rows: Sequence[PoseRow], model: MotionModel, span: slice) -> list[_FilteredFrame]:
-    """Forward pass of the smoother over a span of frames."""
-    frames: list[_FilteredFrame] = []
-    for k in range(span.start, span.stop):
-        row = rows[k]
-        levels = Levels(model.jerk_density_m2_s5[k : k + 1], model.wobble_density_rad2_s3[k : k + 1])
-        pose = measured_pose(row).scaled(float(model.noise_scale[k]))
-        if not frames:
-            motion = pose_motion.initial_motion(
-                pose.position_m, pose.orientation_wxyz, pose.covariance, pose.common, levels, pose.motion
-            )
-            zeros = np.zeros_like(motion.covariance)
-            frames.append(_FilteredFrame(motion, zeros, zeros, motion))
-            continue
-        dt_s = row.time_s - rows[k - 1].time_s
-        predicted, F = pose_motion.predict(frames[-1].motion, dt_s, levels)
-        motion = predicted
-        if model.fits[k]:
-            innovation = pose_motion.innovation(
-                predicted,
-                pose.position_m,
-                pose.orientation_wxyz,
-                pose.covariance,
-                pose.common,
-                pose.motion,
-            )
-            of_pose = innovation.off[0, :6], innovation.whole_covariance[0, :6, :6]
-            right = probability_right(*of_pose, pose.ambiguity)
-            motion = pose_motion.correct(predicted, innovation, right)
-        frames.append(_FilteredFrame(predicted, F, pose_motion.process_noise(dt_s, levels), motion))
-    return frames
-
-
-def _smoothed(now: Motion, ahead: _FilteredFrame, later: Motion) -> Motion:
-    """Smooth one frame.
-
-    Args:
-        now: filtered motion of the frame.
-        ahead: the next frame of the forward pass.
-        later: smoothed motion of the next frame.
-    """
-    change = pose_motion.difference(ahead.predicted, later)
-    # The covariance of `later` is about its own camera axes; the step needs it about those of the predicted camera.
-    J = np.eye(pose_motion.SIZE)[None]
-    J[:, 9:12, 9:12] = right_jacobian_inverse(change[:, 9:12])
-    # The gain corrects the effects of the constant errors (`common`) like the state.
-    deviation = np.concatenate([change[..., None], J @ later.common - ahead.predicted.common], axis=-1)
-    correction, covariance = map(
-        np.asarray,
-        backward_step(
-            now.covariance,
-            ahead.F,
-            ahead.Q,
-            ahead.predicted.covariance,
-            J @ later.covariance @ J.swapaxes(1, 2),
-            deviation,
-        ),
-    )
-    smoothed = replace(now, covariance=covariance, common=now.common + correction[..., 1:])
-    return pose_motion.retract(smoothed, correction[..., 0])
-
-
-def _estimate(motion: Motion, wobble_density_rad2_s3: float) -> PoseEstimate:
-    """Pose of a motion of one level; the covariance includes the constant errors."""
-    common = motion.common[0]
-    covariance = motion.covariance[0] + common @ common.T
-    return PoseEstimate(
-        motion.position_m[0],
-        motion.orientation_wxyz[0],
-        covariance[np.ix_(POSE, POSE)],
-        motion.velocity_m_s[0],
-        motion.rate_rad_s[0],
-        covariance[np.ix_(MOTION, MOTION)],
-        acceleration_rms(motion, covariance),
-        wobble_density_rad2_s3,
-    )
-
-
-def _mean_log_levels(log_weight: Float[np.ndarray, "levels"]) -> Float[np.ndarray, "2"]:
-    """Weighted means of the log densities of the jerk and of the angular acceleration, over the filter's levels."""
-    densities = np.stack([LEVELS.jerk_density_m2_s5, LEVELS.wobble_density_rad2_s3])
-    return np.log(densities) @ np.exp(log_weight)
-
-
-def _uniform_log_weights() -> Float[np.ndarray, "levels"]:
-    """Logarithms of equal weights of all levels."""
-    return np.full(len(LEVELS.jerk_density_m2_s5), -np.log(len(LEVELS.jerk_density_m2_s5)))
+def _smooth_span(
+    time_s: Float[np.ndarray, "frames"],
+    poses: Sequence[FramePose | None],
+    fits: Bool[np.ndarray, "frames"],
+    span: slice,
+    agility: Agility,
+) -> list[pose_motion.MotionEstimate]:
+    """Smoothed motions of a span of frames whose first pose fits, without constant errors."""
+    first = poses[span.start]
+    if first is None:
+        raise ValueError("expected a pose in the first frame of a span")
+    filtered = [pose_motion.initial_motion(first.position_m, first.R_world_cam, first.covariance, agility)]
+    ahead: list[tuple[Motion, pose_motion.Matrix, pose_motion.Matrix]] = []
+    for k in range(span.start + 1, span.stop):
+        pose = poses[k] if fits[k] else None
+        ahead.append(pose_motion.predict(filtered[-1], float(time_s[k] - time_s[k - 1]), agility))
+        motion = ahead[-1][0]
+        if pose is not None:
+            found = pose_motion.innovation(motion, pose.position_m, pose.R_world_cam, pose.covariance)
+            right = probability_right(found.off, found.covariance + pose.constant, pose.ambiguity)
+            motion = pose_motion.correct(motion, found, right)
+        filtered.append(motion)
+    later = filtered[-1]
+    motions = [later]
+    for now, step_ahead in zip(filtered[-2::-1], ahead[::-1], strict=True):
+        later = pose_motion.smoothed(now, *step_ahead, later)
+        motions.append(later)
+    return [pose_motion.estimate(motion) for motion in motions[::-1]]

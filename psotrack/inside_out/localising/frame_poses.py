@@ -1,10 +1,10 @@
-"""Poses of frames whose markers are detected: each frame's own pose, and the filter's estimate."""
+"""Poses of frames whose markers are detected, one after the other: each frame's own pose, and the filter's estimate."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -12,251 +12,253 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
-from psotrack.inside_out.camera_path import Flag
-from psotrack.inside_out.filtering import PoseFilterParams
-from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
-from psotrack.inside_out.filtering.pose_filter import FilterRun, advance, expected, step
-from psotrack.inside_out.filtering.records import PoseEstimate
-from psotrack.inside_out.filtering.smoothing import first_estimate
-from psotrack.inside_out.localising.records import STAGES, LocaliseSettings
+from psotrack.inside_out.camera_path import CameraPath, Flag
+from psotrack.inside_out.filtering import (
+    Agility,
+    Estimated,
+    FilterRun,
+    FramePose,
+    MotionEstimate,
+    PoseFilterParams,
+    choose_agility,
+    expected,
+    step,
+)
+from psotrack.inside_out.line_time import Detected
+from psotrack.inside_out.localising.records import LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import (
-    ExpectedMotion,
     ExpectedPose,
     MarkerPose,
+    PosesAt,
     PoseSettings,
     RollingShutter,
+    at_middle_row,
     estimate_pose,
+    row_times_s,
+    shift_of_rows,
 )
 from psotrack.trajectories import Status
 
+#: (6, 6), covariance of a pose, as in `CameraPath`.
+Covariance = Float[np.ndarray, "6 6"]
 #: Number of markers that the paper requires. A pose from fewer markers is flagged, even if the settings allow it.
 PAPER_MARKERS = 4
-#: Number of frames that tell the motion in the first one, and smallest such number.
-_FIRST_FRAMES, _FEWEST_FIRST = 10, 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
 _AMBIGUOUS = 0.05
+#: Numbers of poses of a stream after which the camera's agility is chosen anew, each time by the last ones.
+_CHOICES = (8, 16, 32, 64, 128)
+#: Standard deviations of velocity (m/s) and turn rate (rad/s) where nothing is known of the motion.
+_UNKNOWN_RATES = np.repeat([5.0, 3.0], 3)
 
 
 @dataclass(frozen=True)
-class FirstMotion:
-    """Motion of a camera in the first frame of a recording that is located.
+class MotionAround:
+    """Motion of a camera around a frame.
 
     Attributes:
-        time_s: time of the frame, seconds.
-        motion: motion in this frame.
+        poses_at: poses at times, seconds.
+        rate_root: (6, 6), root of the covariance of velocity along the world's axes and turn rate about the camera's.
     """
 
+    poses_at: PosesAt
+    rate_root: Float[np.ndarray, "6 6"]
+
+
+@dataclass(frozen=True)
+class FollowedFrame:
+    """One frame of a camera.
+
+    Attributes:
+        number, time_s: number and time of the frame, seconds.
+        num_markers: number of detected markers.
+        pose: the frame's own pose; None without one.
+        by_motion, by_line_time: (6, 6), parts of the covariance of this pose by the motion during the frame, and by the
+            line time, which is the same in all frames.
+        estimated: the filter's estimate.
+    """
+
+    number: int
     time_s: float
-    motion: ExpectedMotion
+    num_markers: int
+    pose: MarkerPose | None
+    by_motion: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
+    by_line_time: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
+    estimated: Estimated = field(default_factory=Estimated)
+
+    def own(self, *, rows: bool = True) -> FramePose | None:
+        """The own pose for the filter; with or without the covariances by the rows."""
+        pose = self.pose
+        if pose is None:
+            return None
+        return FramePose(
+            self.time_s,
+            pose.position_m,
+            pose.R_world_cam,
+            pose.covariance - pose.constant + rows * self.by_motion,
+            pose.constant + rows * self.by_line_time,
+            pose.ambiguity,
+            int(pose.used.sum()),
+        )
 
 
-def localise_frames(
-    detected: Iterable[tuple[int, float, DetectedMarkers]],
+def follow(
+    detected: Iterable[Detected],
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings,
+    agility: Agility | None,
+    around: Callable[[float], MotionAround | None] | None = None,
     seconds: dict[str, float] | None = None,
-    first: FirstMotion | None = None,
-) -> Iterator[tuple[PoseRow, PoseRow]]:
-    """Each frame's own pose and the filter's estimate, frame by frame; the two are equal without a filter.
+) -> Iterator[FollowedFrame]:
+    """Each frame's own pose and the filter's estimate, frame by frame.
 
     Args:
         detected: number and time (seconds) of each frame, and its markers, which are all in the map.
         marker_map: map of the room.
         lens: intrinsics of the camera.
         settings: settings; the dictionary is not used.
+        agility: how wildly the camera moves; None of a stream, where it is chosen as poses come.
+        around: motion around a frame by its time; None takes it from the filter.
         seconds: times by stage; the times of "locate" and "filter" are added.
-        first: motion in a frame before which nothing is known of the motion; None if it is not known.
     """
-    spent_s = dict.fromkeys(STAGES, 0.0) if seconds is None else seconds
-    run, shutter = FilterRun(), settings.shutter or RollingShutter(0.0)
-    # Where the shutter rolls, a frame's own pose depends on the motion, which the filter follows.
+    spent_s = {"locate": 0.0, "filter": 0.0} if seconds is None else seconds
+    shutter, params = settings.shutter or RollingShutter(0.0), settings.filter or PoseFilterParams()
     rolls = bool(shutter.line_time_s or shutter.std_s)
-    params = settings.filter or (PoseFilterParams() if rolls else None)
-    before_s = np.nan
+    model, run, recent = agility or Agility(), FilterRun(), list[FramePose]()
     for number, time_s, markers in detected:
         began_s = time.perf_counter()
-        if params is not None:
-            run = advance(run, time_s, params)
+        predicted = expected(run, time_s, params, model).motion
         predicted_s = time.perf_counter()
-        predicted = None if params is None else expected(run, params)
-        motion = None if predicted is None else _during_frame(predicted, time_s - before_s)
-        knows = motion is None and first is not None and first.time_s == time_s
-        if first is not None and knows:
-            motion = first.motion
-        before_s = time_s
-        pose = _pose_of_frame(
-            markers, marker_map, lens, settings, predicted, motion, shutter if rolls else None
-        )
-        raw = pose_row(number, time_s, markers, pose, settings)
-        raw = _with_common(raw, markers, pose, marker_map, settings.pose, shutter)
+        motion = around(time_s) if around is not None else None
+        if around is None and predicted is not None:
+            motion = MotionAround(
+                constant_motion(predicted, time_s), np.linalg.cholesky(predicted.rate_covariance)
+            )
+        corners_m = marker_map.corners_of(markers.ids.tolist())
+        moved = markers
+        if rolls and motion is not None:
+            corners_px = at_middle_row(
+                markers.corners_px, corners_m, lens, shutter.line_time_s, time_s, motion.poses_at
+            )
+            moved = DetectedMarkers(markers.ids, corners_px, markers.std_px)
+        pose = _own_pose(moved, corners_m, marker_map, lens, settings, predicted)
+        frame = FollowedFrame(number, time_s, len(markers), pose)
+        if rolls and pose is not None:
+            of_motion, of_line_time = _by_rows(pose, markers, corners_m, lens, shutter, time_s, motion)
+            frame = replace(frame, by_motion=of_motion, by_line_time=of_line_time)
         located_s = time.perf_counter()
-        row = raw
-        if params is not None:
-            try:
-                run, row = step(run, _with_motion(raw, first.motion) if first and knows else raw, params)
-            except np.linalg.LinAlgError:
-                # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
-                run, row = step(advance(FilterRun(), time_s, params), raw, params)
-        if settings.filter is None:
-            row = raw
+        own = frame.own()
+        try:
+            run = step(run, time_s, own, params, model)
+        except np.linalg.LinAlgError:
+            # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
+            run = FilterRun()
+        if agility is None and own is not None and len(recent) < _CHOICES[-1]:
+            recent.append(own)
+            if len(recent) in _CHOICES:
+                model = choose_agility(recent, params)
         spent_s["locate"] += located_s - predicted_s
         spent_s["filter"] += time.perf_counter() - located_s + predicted_s - began_s
-        yield raw, row
+        yield replace(frame, estimated=expected(run, time_s, params, model))
 
 
-def pose_row(
-    number: int,
-    time_s: float,
+def _own_pose(
     markers: DetectedMarkers,
-    pose: MarkerPose | None,
-    settings: LocaliseSettings,
-) -> PoseRow:
-    """A frame of a path with its own pose; without a pose, the number of markers counts the detected markers."""
-    num_markers = len(markers) if pose is None else int(pose.used.sum())
-    flags = Flag(0)
-    if 0 < num_markers < max(PAPER_MARKERS, settings.pose.min_markers):
-        flags |= Flag.FEW_MARKERS
-    if pose is not None and pose.ambiguity > _AMBIGUOUS:
-        flags |= Flag.AMBIGUOUS
-    unknown = np.full(3, np.nan)
-    return PoseRow(
-        frame=number,
-        time_s=time_s,
-        position_m=unknown if pose is None else pose.position_m,
-        orientation_wxyz=np.full(4, np.nan)
-        if pose is None
-        else Rotation.from_matrix(pose.R_world_cam).as_quat(scalar_first=True),
-        covariance=np.full((6, 6), np.nan) if pose is None else pose.covariance,
-        num_markers=num_markers,
-        reprojection_px=np.nan if pose is None else float(pose.reprojection_px),
-        ambiguity=np.nan if pose is None else float(pose.ambiguity),
-        status=int(Status.LOST if pose is None else Status.TRACKED),
-        flags=int(flags),
-        velocity_m_s=unknown,
-        chance=np.nan if pose is None else pose.chance,
-    )
-
-
-def _pose_of_frame(
-    markers: DetectedMarkers,
+    corners_m: Float[np.ndarray, "markers 4 3"],
     marker_map: MarkerMap,
     lens: Camera,
     settings: LocaliseSettings,
-    predicted: PoseEstimate | None,
-    motion: ExpectedMotion | None,
-    shutter: RollingShutter | None,
+    predicted: MotionEstimate | None,
 ) -> MarkerPose | None:
     """The pose by one frame's markers; the filter's prediction decides between poses that fit about equally well."""
     prior = None
     if predicted is not None and settings.filter is not None:
         prior = ExpectedPose(predicted.position_m, predicted.R_world_cam, predicted.covariance)
-    corners_m = marker_map.corners_of(markers.ids.tolist())
+    map_std_m = marker_map.std_of(markers.ids.tolist())
     try:
-        return estimate_pose(markers.corners_px, corners_m, lens, settings.pose, prior, shutter, motion)
+        return estimate_pose(
+            markers.corners_px,
+            corners_m,
+            lens,
+            settings.pose,
+            prior,
+            std_px=markers.std_px,
+            map_std_m=map_std_m,
+        )
     except np.linalg.LinAlgError:
         # Corners of a wrong map may determine no pose at all; the frame is lost, the others are not.
         return None
 
 
-def find_first_motion(
-    detected: Sequence[tuple[int, float, DetectedMarkers]],
-    marker_map: MarkerMap,
-    lens: Camera,
-    settings: LocaliseSettings,
-) -> FirstMotion | None:
-    """Find the motion in the first located frame of a recording from this frame and the next ones.
+def own_path(frames: Sequence[FollowedFrame], settings: PoseSettings) -> CameraPath:
+    """The path of the frames' own poses; without a pose, the number of markers counts the detected markers."""
+    own = [frame.own() for frame in frames]
+    there = [k for k, pose in enumerate(own) if pose is not None]
+    poses = [pose for pose in own if pose is not None]
+    num_markers = np.array([frame.num_markers for frame in frames], int)
+    num_markers[there] = [pose.num_markers for pose in poses]
 
-    One frame of a rolling shutter hardly tells a turn from a movement to the side, and no frame before the first one
-    tells either.
+    def filled(values: Sequence[object], *shape: int) -> np.ndarray:
+        """Values of the frames that have a pose; NaN in the others."""
+        whole = np.full((len(frames), *shape), np.nan)
+        whole[there] = np.reshape(values, (len(there), *shape))
+        return whole
 
-    Args:
-        detected: number and time (seconds) of each frame, and its markers, which are all in the map.
-        marker_map: map of the room.
-        lens: intrinsics of the camera.
-        settings: settings, with the shutter.
-
-    Returns:
-        The motion; None for a global shutter, and where the first frames show no motion.
-    """
-    if settings.shutter is None or not settings.shutter.line_time_s:
-        return None
-    start = next((k for k, one in enumerate(detected) if len(one[2]) >= settings.pose.min_markers), None)
-    if start is None:
-        return None
-    frames = detected[start : start + _FIRST_FRAMES]
-    params = (settings.filter or PoseFilterParams()).within(len(frames))
-    raw = join_rows([raw for raw, _ in localise_frames(frames, marker_map, lens, settings)])
-    if not raw.seen.any():
-        return None
-    found = first_estimate(raw, params)
-    if found is None or len(frames) < _FEWEST_FIRST:
-        return None
-    return FirstMotion(found[0], _during_frame(found[1], frames[1][1] - frames[0][1]))
-
-
-def _during_frame(estimate: PoseEstimate, frame_s: float) -> ExpectedMotion:
-    """Motion during a frame; `frame_s` are the seconds since the frame before."""
-    # White angular acceleration, averaged over the time between two frames.
-    angular_rad_s2 = np.sqrt(estimate.wobble_density_rad2_s3 / frame_s)
-    return ExpectedMotion(
-        np.concatenate([estimate.velocity_m_s, estimate.rate_rad_s]),
-        estimate.motion_covariance,
-        np.repeat([estimate.acceleration_m_s2, angular_rad_s2], 3),
+    ambiguity = filled([pose.ambiguity for pose in poses])
+    few = (num_markers > 0) & (num_markers < max(PAPER_MARKERS, settings.min_markers))
+    flags = np.where(few, int(Flag.FEW_MARKERS), 0)
+    status = np.full(len(frames), int(Status.LOST))
+    status[there] = int(Status.TRACKED)
+    turns = [Rotation.from_matrix(pose.R_world_cam).as_quat(scalar_first=True) for pose in poses]
+    return CameraPath(
+        frame=np.array([frame.number for frame in frames], int),
+        time_s=np.array([frame.time_s for frame in frames], float),
+        position_m=filled([pose.position_m for pose in poses], 3),
+        orientation_wxyz=filled(turns, 4),
+        covariance=filled([pose.covariance + pose.constant for pose in poses], 6, 6),
+        num_markers=num_markers,
+        reprojection_px=filled([frame.pose.reprojection_px for frame in frames if frame.pose is not None]),
+        ambiguity=ambiguity,
+        status=status,
+        flags=flags | np.where(ambiguity > _AMBIGUOUS, int(Flag.AMBIGUOUS), 0),
     )
 
 
-def _with_motion(raw: PoseRow, expected: ExpectedMotion) -> PoseRow:
-    """The row for the filter, as if the frame's rows showed the expected motion too."""
-    seen = raw.motion
-    if seen is None:
-        return raw
-    gain = np.linalg.solve(seen.measured_covariance + expected.covariance, seen.measured_covariance).T
-    kept = np.eye(6) - gain
-    common = np.concatenate([seen.common[:6], kept @ seen.common[6:]])
-    covariance = kept @ seen.measured_covariance @ kept.T + gain @ expected.covariance @ gain.T
-    motion = replace(
-        seen,
-        measured=seen.measured + gain @ (expected.motion - seen.measured),
-        measured_covariance=covariance,
-        common=common,
-    )
-    return replace(raw, motion=motion)
+def constant_motion(predicted: MotionEstimate, time_s: float) -> PosesAt:
+    """Poses with the velocity and the turn rate of an estimate at a time, seconds."""
+
+    def poses_at(times: Float[np.ndarray, "times"]) -> tuple[np.ndarray, np.ndarray]:
+        late_s = (times - time_s)[:, None]
+        turns = Rotation.from_rotvec(late_s * predicted.rate_rad_s).as_matrix()
+        return predicted.position_m + late_s * predicted.velocity_m_s, predicted.R_world_cam @ turns
+
+    return poses_at
 
 
-def _with_common(
-    raw: PoseRow,
+def _by_rows(
+    pose: MarkerPose,
     markers: DetectedMarkers,
-    pose: MarkerPose | None,
-    marker_map: MarkerMap,
-    settings: PoseSettings,
+    corners_m: Float[np.ndarray, "markers 4 3"],
+    lens: Camera,
     shutter: RollingShutter,
-) -> PoseRow:
-    """A frame with the change of its pose by each error that is the same in all frames.
+    time_s: float,
+    motion: MotionAround | None,
+) -> tuple[Covariance, Covariance]:
+    """Covariances of a pose by an uncertain motion during the frame, and by an uncertain line time."""
+    equations, corners_px = pose.equations, markers.corners_px
+    if equations is None or len(equations.fits) < len(corners_px):
+        return np.zeros((6, 6)), np.zeros((6, 6))
+    gain = equations.gain()
+    root = np.diag(_UNKNOWN_RATES) if motion is None else motion.rate_root
 
-    The errors are those of the markers in the map and of the focal length, if any is stated, and of the line time, if
-    it is uncertain.
-    """
-    of_map = 3 * len(marker_map) + 1 if settings.map_error_m or settings.focal_error else 0
-    of_shutter = int(shutter.std_s > 0)
-    columns = np.zeros(0, int)
-    if of_map:
-        first = 3 * np.searchsorted(marker_map.ids, markers.ids)
-        columns = np.append((first[:, None] + np.arange(3)).ravel(), of_map - 1)
+    def by_rates(line_time_s: float) -> Float[np.ndarray, "6 6"]:
+        late_s = np.repeat(row_times_s(corners_px, lens, line_time_s).ravel(), 2)[:, None]
+        return gain @ (late_s * equations.slopes[..., :6].reshape(-1, 6)) @ root
 
-    def placed(effects: Float[np.ndarray, "unknowns errors"]) -> Float[np.ndarray, "unknowns others"]:
-        common = np.zeros((len(effects), of_map + of_shutter))
-        if of_map:
-            common[:, columns] = effects[:, : len(columns)]
-        if of_shutter:
-            common[:, -1] = effects[:, -1]
-        return common
-
-    if pose is None:
-        return replace(raw, common=np.zeros((6, of_map + of_shutter)))
-    effects = pose.common
-    if pose.by_line_time is not None:
-        effects = np.concatenate([effects, pose.by_line_time[:, None]], axis=1)
-    motion = pose.motion and replace(pose.motion, common=placed(pose.motion.common))
-    return replace(raw, common=placed(effects), motion=motion)
+    of_motion, of_line_time = by_rates(shutter.line_time_s), by_rates(shutter.std_s)
+    if motion is not None and shutter.std_s:
+        line_times_s = shutter.line_time_s, shutter.line_time_s + shutter.std_s
+        shift_px = shift_of_rows(corners_px, corners_m, lens, line_times_s, time_s, motion.poses_at)
+        of_line_time = np.column_stack([of_line_time, gain @ shift_px.ravel()])
+    return of_motion @ of_motion.T, of_line_time @ of_line_time.T

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
 
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.filtering import PoseFilterParams
+from psotrack.inside_out.filtering import PoseFilterParams, smooth
 from psotrack.inside_out.line_time import LineTime
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import PoseSettings, RollingShutter
@@ -31,39 +34,50 @@ class LocaliseSettings:
     filter: PoseFilterParams | None = field(default_factory=PoseFilterParams)
     shutter: RollingShutter | None = None
 
-    def within(self, num_frames: int | None) -> LocaliseSettings:
-        """Settings for a recording of `num_frames` frames, as `PoseFilterParams.within`; None is a stream."""
-        return self if self.filter is None else replace(self, filter=self.filter.within(num_frames))
-
 
 @dataclass(frozen=True)
-class LocalisedVideo:
-    """Path of a camera, with the time that it took to compute.
+class LocalisedFrames:
+    """Path of a camera in frames whose markers are detected.
 
     Attributes:
         path: filtered path; equal to `raw` without a filter.
         raw: path of each frame's own pose.
-        marker_map: the map; where only centres were given, with the corners that were found.
-        seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
-        wall_s: seconds from the first frame to the last.
-        interrupted: whether Ctrl-C ended a stream.
-        shutter: the shutter with which the poses were estimated; None is a global shutter.
-        line_time: the line time that the video shows; None if it was not estimated: in a stream, and in a video without
-            five consecutive frames that show enough markers.
+        constant: (frames, 6, 6), part of the covariances of `raw` by errors that are the same in all frames.
+        shutter: the shutter with which the poses were estimated.
+        line_time: the line time that the frames show; None if it was not estimated: in a stream, and without five
+            consecutive frames that show enough markers.
         wrong_markers: ids of the markers that are not where the map has them; they were left out, unless most
             of the seen markers are wrong.
-        unknown_markers: ids of seen markers whose centres were given, but whose corners could not be found.
+        interrupted: whether Ctrl-C ended a stream.
     """
 
     path: CameraPath
     raw: CameraPath
+    constant: Float[np.ndarray, "frames 6 6"]
+    shutter: RollingShutter
+    line_time: LineTime | None = None
+    wrong_markers: tuple[int, ...] = ()
+    interrupted: bool = False
+
+    def smoothed(self, params: PoseFilterParams | None = None) -> CameraPath:
+        """The path with every pose estimated from all frames."""
+        return smooth(self.raw, params, self.constant)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalisedVideo(LocalisedFrames):
+    """Path of a camera in a video, with the time that it took to compute.
+
+    Attributes:
+        marker_map: the map; where only centres were given, with the corners that were found.
+        seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
+        wall_s: seconds from the first frame to the last.
+        unknown_markers: ids of seen markers whose centres were given, but whose corners could not be found.
+    """
+
     marker_map: MarkerMap
     seconds: Mapping[str, float]
     wall_s: float
-    interrupted: bool = False
-    shutter: RollingShutter | None = None
-    line_time: LineTime | None = None
-    wrong_markers: tuple[int, ...] = ()
     unknown_markers: tuple[int, ...] = ()
 
     @property

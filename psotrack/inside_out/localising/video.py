@@ -1,30 +1,21 @@
-"""Localising a camera in a video: decoding, detection of markers, poses and filter, as one loop over frames."""
+"""Localising a camera in a video: decoding and detection of markers, ahead of the poses."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError
-from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
+from psotrack.foreground.markers import MarkerDetector
 from psotrack.geometry import Camera
-from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
-from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
-from psotrack.inside_out.localising.corner_noise import estimate_corner_noise
-from psotrack.inside_out.localising.frame_poses import find_first_motion, localise_frames
-from psotrack.inside_out.localising.map_evidence import (
-    are_few,
-    least_markers,
-    without_markers,
-    wrong_markers,
-)
+from psotrack.inside_out.line_time import Detected
+from psotrack.inside_out.localising.recording import localise_frames
 from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
@@ -48,11 +39,10 @@ def localise_video(
     """Localise a camera in every frame, from markers of known positions.
 
     A thread decodes frames and converts them to grey, and others detect markers in several frames at once. Markers that
-    are not in the map are not detected. In a recording, the markers of all frames are found first, and show whether the
-    shutter rolls (`line_time`) and how large and how correlated the errors of corners are (`corner_noise`). Where two
-    poses fit a frame's markers about equally well, the filter's prediction decides; then the filter uses the pose or
-    gates it. Markers that disagree with the others over a recording are left out, and the poses are estimated once more
-    without them.
+    are not in the map are not detected. In a recording, the markers of all frames are found first, and show the
+    shutter, the errors of the corners and the agility of the camera. Where two poses fit a frame's markers about
+    equally well, the filter's prediction decides; then the filter uses the pose or gates it. Markers that disagree with
+    the others over a recording are left out.
 
     Args:
         source: frames of the camera.
@@ -70,65 +60,25 @@ def localise_video(
             markers of which only the centres are known.
         SettingsError: there is no dictionary of this name, or it has none of the map's markers.
     """
-    settings = (settings or LocaliseSettings()).within(source.num_frames)
-    given = settings
+    settings = settings or LocaliseSettings()
     _check_size(source, lens)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
-    seconds = dict.fromkeys(STAGES, 0.0)
-    raw_rows, rows, interrupted, line_time, first = [], [], False, None, None
-    wrong: tuple[int, ...] = ()
-    unknown: tuple[int, ...] = ()
+    seconds, unknown = dict.fromkeys(STAGES, 0.0), tuple[int, ...]()
     began_s = time.perf_counter()
-    try:
-        with report("localise", source.num_frames or 0) as done:
-            detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds), done)
-            if not source.stream:
-                detected = list(detected)
-            if isinstance(marker_map, MarkerCentres):
-                room, unknown, detected = _completed(source, marker_map, lens, detected, side_m)
-            else:
-                room = marker_map
-            if isinstance(detected, list):
-                line_time, settings = _learned(detected, room, lens, settings, seconds)
-                first = find_first_motion(detected, room, lens, settings)
-            for raw, row in localise_frames(detected, room, lens, settings, seconds, first):
-                raw_rows.append(raw)
-                rows.append(row)
-    except KeyboardInterrupt:
-        # A recording can be localised again, a stream cannot: the frames of a stream are kept.
-        if not source.stream or not rows:
-            raise
-        interrupted = True
-    # Ctrl-C may come between the two appends.
-    raw_rows = raw_rows[: len(rows)]
-    if isinstance(detected, list) and any(map(_disagrees, raw_rows, (markers for _, _, markers in detected))):
-        wrong = wrong_markers(detected, room, lens, settings.pose)
-        if wrong and are_few(wrong, detected):
-            right = list(without_markers(detected, wrong, settings.pose))
-            pose = replace(given.pose, min_markers=least_markers(given.pose))
-            again = replace(given, pose=pose)
-            line_time, settings = _learned(right, room, lens, again, seconds)
-            first = find_first_motion(right, room, lens, settings)
-            both = list(localise_frames(right, room, lens, settings, seconds, first))
-            raw_rows, rows = [raw for raw, _ in both], [row for _, row in both]
-    wall_s = time.perf_counter() - began_s
+    with report("localise", source.num_frames or 0) as done:
+        detected: Iterable[Detected] = _counted(_detect_markers(source, detector, seconds), done)
+        if not source.stream:
+            detected = list(detected)
+        if isinstance(marker_map, MarkerCentres):
+            marker_map, unknown, detected = _completed(source, marker_map, lens, detected, side_m)
+        found = localise_frames(detected, marker_map, lens, settings, seconds)
     return LocalisedVideo(
-        join_rows(rows),
-        join_rows(raw_rows),
-        room,
-        seconds,
-        wall_s,
-        interrupted,
-        settings.shutter,
-        line_time,
-        wrong,
-        unknown,
+        **vars(found),
+        marker_map=marker_map,
+        seconds=seconds,
+        wall_s=time.perf_counter() - began_s,
+        unknown_markers=unknown,
     )
-
-
-def _disagrees(raw: PoseRow, markers: DetectedMarkers) -> bool:
-    """Whether a frame's markers do not all agree with one pose."""
-    return len(markers) >= 2 and (not np.isfinite(raw.position_m[0]) or raw.num_markers < len(markers))
 
 
 def _completed(
@@ -151,25 +101,6 @@ def _completed(
     known = completed.marker_map.ids
     frames = [(number, time_s, each.select(np.isin(each.ids, known))) for number, time_s, each in detected]
     return completed.marker_map, completed.left_out, frames
-
-
-def _learned(
-    detected: list[Detected],
-    marker_map: MarkerMap,
-    lens: Camera,
-    settings: LocaliseSettings,
-    seconds: dict[str, float],
-) -> tuple[LineTime | None, LocaliseSettings]:
-    """The line time that frames show, and settings with the shutter and the errors of corners to use."""
-    began_s = time.perf_counter()
-    line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
-    if line_time is not None:
-        settings = replace(settings, shutter=line_time.shutter(settings.shutter))
-    if None in (settings.pose.centre_scale, settings.pose.usual_px, settings.pose.usual_place_m):
-        noise = estimate_corner_noise(detected, marker_map, lens, settings.pose, settings.shutter)
-        settings = replace(settings, pose=noise.settings(settings.pose))
-    seconds["locate"] += time.perf_counter() - began_s
-    return line_time, settings
 
 
 def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:

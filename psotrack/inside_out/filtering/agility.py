@@ -1,0 +1,63 @@
+"""How wildly a camera moves, chosen for a recording by the likelihood of its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+
+from psotrack.inside_out.filtering.motion import Agility
+from psotrack.inside_out.filtering.pose_filter import FilterRun, FramePose, PoseFilterParams, step
+
+#: Factor between neighbouring values, and largest number of steps from the defaults: accelerations from 0.05 to
+#: 500 m/s², changes of the turn rate from 0.03 to 300 rad/s.
+_FACTOR, _MOST_STEPS = np.sqrt(10.0), 4
+#: Number of successive poses that are looked at together, and largest number of such windows.
+_WINDOW, _MOST_WINDOWS = 60, 4
+#: What a step from the defaults costs of the log likelihood, so that a few poses do not decide.
+_STEP_COST = 0.5
+
+
+def choose_agility(poses: Sequence[FramePose | None], params: PoseFilterParams) -> Agility:
+    """The most likely agility of a camera, by a search along both numbers in turn.
+
+    Args:
+        poses: the frames' own poses; None for a frame without one.
+        params: parameters of the filter.
+    """
+    seen = [pose for pose in poses if pose is not None]
+    last = max(len(seen) - _WINDOW, 0)
+    starts = np.unique(np.linspace(0, last, min(_MOST_WINDOWS, 1 + -(-last // _WINDOW))).astype(int))
+    windows = [seen[start : start + _WINDOW] for start in starts]
+
+    @cache
+    def likelihood(along: int, about: int) -> float:
+        steps = abs(along), abs(about)
+        if max(steps) > _MOST_STEPS:
+            return -np.inf
+        found = (_log_likelihood(window, params, _agility(along, about)) for window in windows)
+        return sum(found) - _STEP_COST * sum(steps)
+
+    best = (0, 0)
+    while True:
+        around = [(best[0] + along, best[1] + about) for along, about in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+        better = max(around, key=lambda steps: likelihood(*steps))
+        if likelihood(*better) <= likelihood(*best):
+            return _agility(*best)
+        best = better
+
+
+def _agility(along: int, about: int) -> Agility:
+    default = Agility()
+    return Agility(
+        float(default.acceleration_std_m_s2 * _FACTOR**along),
+        float(default.rate_change_std_rad_s * _FACTOR**about),
+    )
+
+
+def _log_likelihood(poses: Sequence[FramePose], params: PoseFilterParams, agility: Agility) -> float:
+    run = FilterRun()
+    for pose in poses:
+        run = step(run, pose.time_s, pose, params, agility)
+    return run.log_likelihood

@@ -1,0 +1,299 @@
+"""Frames of one camera, from a video file, a folder of images or a live stream; read and worked on ahead of their use.
+
+In: a path, an address or a device. Out: a `FrameSource`, which describes the frames and reads them one by one as
+`Frame` (number, time, image). `read_ahead` and `map_ahead` read frames, and work on them, in separate threads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYetError
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.recordings import (
+    IMAGE_SUFFIXES,
+    VideoInfo,
+    is_picture_folder,
+    open_pictures,
+    probe,
+    read_frames,
+    silence_opencv,
+)
+from psotrack.support import whole_number
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+#: Largest number of items that wait to be used.
+_AHEAD = 4
+#: Longest uninterrupted wait for an item, seconds. Python handles Ctrl-C in the main thread only; if another thread
+#: received the signal, or on Windows, the signal does not end the wait.
+_WAIT_S = 0.1
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a camera.
+
+    Attributes:
+        number: number of the frame, from 0; in a live stream, numbers of frames that were left out are missing.
+        time_s: time since the first frame, seconds.
+        bgr: (height, width, 3), the image.
+    """
+
+    number: int
+    time_s: float
+    bgr: UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """Frames of one camera, with the facts that are known before the frames are read.
+
+    Attributes:
+        name: name in messages: a path, a device or an address.
+        image_size_wh: width and height in pixels.
+        num_frames: number of frames; None for a stream.
+        frames: function that returns the frames, from the first one; a stream can be read only once.
+        stream: whether the frames come from a stream.
+        newest: whether frames of a stream that come faster than they are used are left out.
+        fps: frames per second; None if unknown.
+    """
+
+    name: str
+    image_size_wh: tuple[int, int]
+    num_frames: int | None
+    frames: Callable[[], Iterator[Frame]]
+    stream: bool = False
+    newest: bool = False
+    fps: float | None = None
+
+    def first(self, num_frames: int | None) -> FrameSource:
+        """Limit the source to its first `num_frames` frames; None keeps all frames.
+
+        Raises:
+            SettingsError: the source has fewer frames.
+        """
+        if num_frames is None:
+            return self
+        most = math.inf if self.num_frames is None else self.num_frames
+        if not 0 < num_frames <= most:
+            expected = "1 or more" if self.num_frames is None else f"1 to {most}, the frames of {self.name}"
+            raise SettingsError("frames", expected=expected, found=f"{num_frames}")
+        # The frame after the last one is not read: it may be broken.
+        return replace(self, num_frames=num_frames, frames=lambda: islice(self.frames(), num_frames))
+
+
+def open_source(source: Path | str, *, fps: float | None = None, live: bool = False) -> FrameSource:
+    """Open the frames of a video file, a folder of images, or a stream.
+
+    Args:
+        source: path of a video or a folder; or address of a stream, such as rtsp://camera/1; or, with `live`, number
+            of a device.
+        fps: frames per second; required for a folder of images, and for a video whose header has a wrong rate.
+        live: always use the newest frame of a stream, and leave out the frames before.
+
+    Raises:
+        InputError: the source cannot be read or has no frames, or its images differ in size.
+        SettingsError: `fps` is missing or not above 0.
+    """
+    if fps is not None:
+        check_positive("--fps", fps)
+    if live or "://" in str(source):
+        return _stream(str(source), fps, live)
+    path = Path(source)
+    if path.is_dir():
+        if fps is None and is_picture_folder(path):
+            raise SettingsError(
+                "--fps",
+                expected=f"the rate at which the images in {path} were taken, because images do not state it",
+                found="no --fps",
+                remedy="add it in frames per second, such as --fps 25",
+            )
+        video = open_pictures(path, fps)
+        return _recorded(video, video.fps)
+    if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
+        remedy = "name the images' folder, and pass --fps"
+        raise InputError(path, expected="a video, or a folder of images", found="one image", remedy=remedy)
+    video = probe(path)
+    return _recorded(video, fps or video.fps)
+
+
+def _recorded(video: VideoInfo, fps: float) -> FrameSource:
+    """The frames of a file or a folder, at `fps` frames per second."""
+
+    def frames() -> Iterator[Frame]:
+        return (Frame(number, number / fps, bgr) for number, bgr in enumerate(read_frames(video)))
+
+    return FrameSource(str(video.path), video.image_size_wh, video.num_frames, frames, fps=fps)
+
+
+def _stream(address: str, fps: float | None, live: bool) -> FrameSource:
+    """The frames of a network address or of a camera connected to this computer; `live` uses the newest one."""
+    number = whole_number(address)
+    with silence_opencv():
+        capture = cv2.VideoCapture(address if number is None else number)
+    there, first = capture.read() if capture.isOpened() else (False, None)
+    if not there or first is None:
+        capture.release()
+        found = "none that can be opened" if first is None and not there else "one without frames"
+        raise InputError(address, expected="a camera or a stream", found=found)
+
+    def frames() -> Iterator[Frame]:
+        bgr, number = first, 0
+        clock = _Clock(lambda: capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, fps)
+        try:
+            while True:
+                yield Frame(number, clock.time_s(number), np.asarray(bgr, np.uint8))
+                there, bgr = capture.read()
+                number += 1
+                if not there:
+                    break
+                if bgr.shape != first.shape:
+                    size = f"{first.shape[1]} x {first.shape[0]} pixels"
+                    found = f"{bgr.shape[1]} x {bgr.shape[0]} in frame {number}"
+                    raise InputError(address, expected=size, found=found)
+        finally:
+            capture.release()
+
+    return FrameSource(
+        address, (first.shape[1], first.shape[0]), None, frames, stream=True, newest=live, fps=fps
+    )
+
+
+class _Clock:
+    """Times of a stream's frames: from a given rate, else from the stream's timestamps, else from the times of arrival.
+
+    Args:
+        stamp_s: returns the timestamp of the frame that was read last, seconds.
+        fps: frames per second; None if unknown.
+    """
+
+    def __init__(self, stamp_s: Callable[[], float], fps: float | None) -> None:
+        self._stamp_s, self._fps = stamp_s, fps
+        self._began_s, self._last_stamp_s = time.monotonic(), stamp_s()
+        self._time_s, self._stamped = 0.0, True
+
+    def time_s(self, number: int) -> float:
+        """Time of the frame that was read last, seconds; always later than the time of the frame before."""
+        if self._fps is not None:
+            return number / self._fps
+        if number == 0:
+            return 0.0
+        stamp_s = self._stamp_s()
+        # Some cameras give no timestamps, and the timestamps of some streams restart at 0.
+        self._stamped &= stamp_s > self._last_stamp_s
+        if self._stamped:
+            self._time_s += stamp_s - self._last_stamp_s
+            self._last_stamp_s = stamp_s
+        else:
+            self._time_s = max(time.monotonic() - self._began_s, self._time_s + 1e-3)
+        return self._time_s
+
+
+def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Item]:
+    """Iterate over items that a thread produces, a few items ahead of the item in use.
+
+    Errors of the thread are raised here. Ctrl-C ends the iteration within about a second, even if the thread hangs.
+
+    Args:
+        items: iterator that the thread runs.
+        newest: leave out older items if items are produced faster than they are used; else the thread waits.
+    """
+    done = object()
+    waiting: queue.Queue[object] = queue.Queue(maxsize=1 if newest else _AHEAD)
+    stop = threading.Event()
+
+    def put(item: object, *, force: bool = False) -> None:
+        while not stop.is_set():
+            with contextlib.suppress(queue.Full):
+                waiting.put(item, timeout=0.0 if newest and not force else 0.1)
+                return
+            if newest and not force:
+                with contextlib.suppress(queue.Empty):
+                    waiting.get_nowait()
+
+    def work() -> None:
+        try:
+            for item in items:
+                if stop.is_set():
+                    break
+                put(item)
+            put(done, force=True)
+        except BaseException as error:
+            # Any error is raised where the items are used.
+            put(error, force=True)
+        finally:
+            close = getattr(items, "close", None)
+            if close is not None:
+                close()
+
+    thread = threading.Thread(target=work, daemon=True, name="psotrack-frames")
+    thread.start()
+    try:
+        while (item := _get(waiting)) is not done:
+            if isinstance(item, BaseException):
+                raise item
+            yield item  # type: ignore[misc]
+    finally:
+        stop.set()
+        # A camera that does not respond must not block the program.
+        thread.join(timeout=1.0)
+
+
+def _get(waiting: queue.Queue[object]) -> object:
+    """Get the next item; Ctrl-C can interrupt the wait."""
+    while True:
+        with contextlib.suppress(queue.Empty):
+            return waiting.get(timeout=_WAIT_S)
+
+
+def map_ahead(
+    function: Callable[[_Item], _Result], items: Iterator[_Item], workers: int
+) -> Iterator[_Result]:
+    """Results of a function for items, in their order, computed by threads a few items ahead of the result in use.
+
+    Errors of the function and of the items are raised here, in their order. Ctrl-C ends the iteration.
+
+    Args:
+        function: called in several threads at once.
+        items: its arguments.
+        workers: number of threads; 0 computes each result when it is asked for, so that no item waits.
+    """
+    if workers < 1:
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="psotrack-map")
+    waiting: deque[Future[_Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            # One item more than threads, so that no thread is idle while a result is in use.
+            if len(waiting) > workers:
+                yield _result(waiting.popleft())
+        while waiting:
+            yield _result(waiting.popleft())
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _result(future: Future[_Result]) -> _Result:
+    """Wait for a result; Ctrl-C can interrupt the wait."""
+    while True:
+        with contextlib.suppress(NotYetError):
+            return future.result(timeout=_WAIT_S)

@@ -1,0 +1,177 @@
+"""Localising a camera in all frames: what a recording shows is learned first, then its poses are estimated.
+
+A recording shows whether the shutter rolls (`line_time`), how large the errors of corners are (`pose.noise`), how
+wildly the camera moves (`filtering.agility`), and which markers are not where the map has them: in one frame, markers
+that disagree say nothing about which of them is wrong, but over a recording a wrong marker disagrees with all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from psotrack.geometry import Camera
+from psotrack.inside_out.filtering import Agility, PoseFilterParams, filter_path, path_of, smoothed_motions
+from psotrack.inside_out.line_time import Detected, estimate_line_time
+from psotrack.inside_out.localising.frame_poses import (
+    FollowedFrame,
+    MotionAround,
+    constant_motion,
+    follow,
+    own_path,
+)
+from psotrack.inside_out.localising.records import LocalisedFrames, LocaliseSettings
+from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.pose import CornerNoise, RollingShutter, estimate_noise, spline_through
+
+#: Largest number of frames from which the errors of corners are learned, and number of estimates.
+_NOISE_FRAMES, _NOISE_TURNS = 60, 2
+#: Number of times that the motion of a rolling shutter and its poses are estimated by turns.
+_ROLLING_TURNS = 3
+#: A marker is wrong if it disagrees in more than this fraction of the poses of its frames, of at least so many.
+_WRONG, _LEAST_FRAMES = 0.5, 3
+#: Number of right markers that a pose needs where wrong ones are left out.
+_ENOUGH = 2
+
+
+def localise_frames(
+    detected: Iterable[Detected],
+    marker_map: MarkerMap,
+    lens: Camera,
+    settings: LocaliseSettings,
+    seconds: dict[str, float] | None = None,
+) -> LocalisedFrames:
+    """Localise a camera in frames whose markers are detected.
+
+    Args:
+        detected: number and time (seconds) of each frame, and its markers, which are all in the map. A list or another
+            sequence is a recording; an iterator is a stream, which is localised as its frames come.
+        marker_map: map of the room.
+        lens: intrinsics of the camera.
+        settings: settings; the dictionary is not used.
+        seconds: times by stage; the times of "locate" and "filter" are added.
+    """
+    if not isinstance(detected, Sequence):
+        shown, interrupted = list[FollowedFrame](), False
+        try:
+            shown.extend(follow(detected, marker_map, lens, settings, None, None, seconds))
+        except KeyboardInterrupt:
+            # A recording can be localised again, a stream cannot: the frames of a stream are kept.
+            if not shown:
+                raise
+            interrupted = True
+        return replace(_localised(shown, settings), interrupted=interrupted)
+    if settings.filter is not None:
+        settings = replace(settings, filter=settings.filter.within(len(detected)))
+    localised, found = _recording(detected, marker_map, lens, settings, seconds)
+    wrong: tuple[int, ...] = ()
+    given = detected
+    while more := _wrong_markers(detected, found):
+        wrong = tuple(sorted((*wrong, *more)))
+        if 2 * len(wrong) > len({int(marker) for _, _, markers in given for marker in markers.ids}):
+            # Most markers are wrong: nothing says which ones are, or the lens is wrong.
+            break
+        fewest = settings.pose.min_markers
+        detected = [
+            (number, time_s, markers.select(~np.isin(markers.ids, wrong) & (len(markers) >= fewest)))
+            for number, time_s, markers in given
+        ]
+        least = replace(settings, pose=replace(settings.pose, min_markers=min(fewest, _ENOUGH)))
+        localised, found = _recording(detected, marker_map, lens, least, seconds)
+    return replace(localised, wrong_markers=wrong)
+
+
+def _recording(
+    detected: Sequence[Detected],
+    marker_map: MarkerMap,
+    lens: Camera,
+    settings: LocaliseSettings,
+    seconds: dict[str, float] | None,
+) -> tuple[LocalisedFrames, list[FollowedFrame]]:
+    """Localise a recording with all its markers."""
+    line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
+    if line_time is not None:
+        settings = replace(settings, shutter=line_time.shutter(settings.shutter))
+    shutter = settings.shutter or RollingShutter(0.0)
+    params, agility, around = settings.filter or PoseFilterParams(), Agility(), None
+    for turn in range(_ROLLING_TURNS if shutter.line_time_s or shutter.std_s else 0):
+        # Poses by a shutter that is taken as global are wrong, but their errors change as little as the motion.
+        known = settings if turn else replace(settings, shutter=RollingShutter(0.0))
+        found = list(follow(detected, marker_map, lens, known, agility, around, seconds))
+        around = _motions_around(found, params)
+    if settings.pose.noise is None:
+        noise = CornerNoise()
+        several = [one for one in detected if len(one[2]) >= max(2, settings.pose.min_markers)]
+        chosen = np.unique(np.linspace(0, len(several) - 1, min(_NOISE_FRAMES, len(several))).astype(int))
+        some = [several[index] for index in chosen]
+        for _ in range(_NOISE_TURNS):
+            known = replace(settings, pose=replace(settings.pose, noise=noise))
+            shown = follow(some, marker_map, lens, replace(known, filter=None), agility, around, seconds)
+            poses = [frame.pose for frame in shown if frame.pose is not None]
+            noise = estimate_noise([pose.equations for pose in poses if pose.equations is not None], noise)
+        settings = replace(settings, pose=replace(settings.pose, noise=noise))
+    found = list(follow(detected, marker_map, lens, settings, agility, around, seconds))
+    return replace(_localised(found, settings, anew=True), line_time=line_time), found
+
+
+def _localised(
+    found: Sequence[FollowedFrame], settings: LocaliseSettings, *, anew: bool = False
+) -> LocalisedFrames:
+    """The paths of frames; filtered anew with the agility of all frames, or as they were estimated."""
+    raw, own = own_path(found, settings.pose), [frame.own() for frame in found]
+    constant = np.array([np.zeros((6, 6)) if pose is None else pose.constant for pose in own])
+    constant = constant.reshape(-1, 6, 6)
+    path = raw
+    if settings.filter is not None:
+        estimated = path_of(raw, [frame.estimated for frame in found])
+        path = filter_path(raw, settings.filter, constant) if anew else estimated
+    return LocalisedFrames(path, raw, constant, settings.shutter or RollingShutter(0.0))
+
+
+def _motions_around(
+    found: Sequence[FollowedFrame], params: PoseFilterParams
+) -> Callable[[float], MotionAround | None]:
+    """The motion around each frame, by splines through the smoothed poses."""
+    times = np.array([frame.time_s for frame in found])
+    smoothed = smoothed_motions(times, [frame.own(rows=False) for frame in found], params)
+    known = {time_s: one.motion for time_s, one in zip(times.tolist(), smoothed, strict=True) if one.motion}
+    if not known:
+        return lambda time_s: None
+    # At the ends, a spline's slope would rest on the last pose, and errors of the two would amplify each other.
+    frame_s = float(np.diff(times).min(initial=1.0))
+    first, last = min(known), max(known)
+    ends = [(first, first - frame_s), (last, last + frame_s)]
+    beyond = {
+        outside: constant_motion(known[inside], inside)(np.array([outside])) for inside, outside in ends
+    }
+    poses = {time_s: (motion.position_m, motion.R_world_cam) for time_s, motion in known.items()}
+    poses |= {time_s: (position_m[0], R[0]) for time_s, (position_m, R) in beyond.items()}
+    poses_at = spline_through(sorted(poses), [poses[time_s] for time_s in sorted(poses)])
+    # A velocity is the difference of the poses before and after, divided by the time between the two.
+    scale = np.sqrt(2) / (2 * frame_s)
+    roots = {time_s: scale * np.linalg.cholesky(motion.covariance) for time_s, motion in known.items()}
+
+    def around(time_s: float) -> MotionAround | None:
+        nearest = min(roots, key=lambda other: abs(other - time_s))
+        if abs(nearest - time_s) > params.longest_gap_s:
+            return None
+        # A frame that was lost has a motion all the same, by its neighbours.
+        return MotionAround(poses_at, roots[nearest])
+
+    return around
+
+
+def _wrong_markers(detected: Sequence[Detected], found: Sequence[FollowedFrame]) -> tuple[int, ...]:
+    """Ids of the markers that disagree with most of the poses by two markers and more of their frames."""
+    shown: dict[int, list[bool]] = {}
+    for (_, _, markers), frame in zip(detected, found, strict=True):
+        if frame.pose is not None and frame.pose.used.sum() >= 2:
+            for marker, used in zip(markers.ids.tolist(), frame.pose.used, strict=True):
+                shown.setdefault(marker, []).append(bool(used))
+    return tuple(
+        marker
+        for marker, used in sorted(shown.items())
+        if len(used) >= _LEAST_FRAMES and np.mean(used) < 1 - _WRONG
+    )
