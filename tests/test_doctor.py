@@ -412,7 +412,7 @@ def test_two_cameras_are_checked():
 
 def test_cameras_without_a_place_are_named(tmp_path):
     """Detections, sizes and rates are known, but no camera has a place."""
-    lines = []
+    lines = ["version = 1"]
     for name in ("left", "right"):
         write_detections(tmp_path / f"{name}.csv", SEEN["c0"])
         lines += [

@@ -60,7 +60,7 @@ class CommonPoints:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ExaminedFrames:
     """What is examined.
 
     Attributes:
@@ -80,7 +80,7 @@ class Seen:
         """(cameras,), numbers of sightings."""
         return np.isfinite(self.sightings.noise_px[self.frames]).sum(axis=(0, 2))
 
-    def by(self, index: list[int]) -> Seen:
+    def by(self, index: list[int]) -> ExaminedFrames:
         """What some of the cameras see."""
         exposures = self.sightings.exposures
         chosen = None if exposures is None else exposures.of_cameras(np.array(index))

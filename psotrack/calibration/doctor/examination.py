@@ -14,8 +14,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, CameraViews, explain_camera
-from psotrack.calibration.doctor.common_points import CommonPoints, Seen, least_viewpoints
+from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, PointViews, explain_camera
+from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames, least_viewpoints
 from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, medians, misfit_px, weigh
 from psotrack.calibration.doctor.diagnosis import Diagnosis
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
@@ -86,7 +86,7 @@ def examine(
         bounds_m: (2, 3), corners of the region where bodies can be, metres; None: all places that the cameras may see.
     """
     frames = sampled_frames(sightings.num_frames, fps)
-    seen = Seen(sightings, frames, wide_bounds(rig) if bounds_m is None else bounds_m, fps)
+    seen = ExaminedFrames(sightings, frames, wide_bounds(rig) if bounds_m is None else bounds_m, fps)
     findings, rig = _check_numbers(rig, seen)
     if bounds_m is None:
         seen = replace(seen, bounds_m=wide_bounds(rig))
@@ -147,7 +147,7 @@ def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chose
 
 
 def _find_faults(
-    rig: Rig, seen: Seen, data: WeightedPoints, lags: Float[np.ndarray, "2 cameras"]
+    rig: Rig, seen: ExaminedFrames, data: WeightedPoints, lags: Float[np.ndarray, "2 cameras"]
 ) -> list[Finding]:
     """Find faults of cameras, the largest first, each without the cameras that were found wrong before.
 
@@ -183,7 +183,7 @@ def _find_faults(
     return findings
 
 
-def _gross_fault(rig: Rig, seen: Seen, points: CommonPoints) -> Finding | None:
+def _gross_fault(rig: Rig, seen: ExaminedFrames, points: CommonPoints) -> Finding | None:
     """The largest fault of a camera whose sightings take no part in the loose matching."""
     wrong = []
     for index in np.flatnonzero(points.share < SUSPECT_SHARE * np.median(points.share)).tolist():
@@ -192,7 +192,7 @@ def _gross_fault(rig: Rig, seen: Seen, points: CommonPoints) -> Finding | None:
         if least_viewpoints(rest) < 3:
             continue
         known, boxes = seen.by(others).common_points(rest), seen.sightings
-        views = CameraViews(
+        views = PointViews(
             known.start_m,
             known.velocity_m,
             boxes.centre_px[known.frame, index],
@@ -212,7 +212,7 @@ def _gross_fault(rig: Rig, seen: Seen, points: CommonPoints) -> Finding | None:
     return describe_camera_fault(rig, index, explained, seen.fps)
 
 
-def _check_numbers(rig: Rig, seen: Seen) -> tuple[list[Finding], Rig]:
+def _check_numbers(rig: Rig, seen: ExaminedFrames) -> tuple[list[Finding], Rig]:
     """Find implausible lengths and principal points, and correct both: findings, and the corrected rig."""
     findings = []
     cameras = rig.cameras
@@ -235,7 +235,7 @@ def _check_numbers(rig: Rig, seen: Seen) -> tuple[list[Finding], Rig]:
     return findings + of_lenses, Rig(rig.names, replace(cameras, K=K))
 
 
-def _body_size_m(rig: Rig, seen: Seen) -> float | None:
+def _body_size_m(rig: Rig, seen: ExaminedFrames) -> float | None:
     """Median size of the bodies by the rig, metres; None if too few agree."""
     few = replace(seen, frames=seen.frames[: FEWEST_RUNS * RUN_FRAMES], bounds_m=wide_bounds(rig))
     points = few.common_points(rig)
@@ -270,7 +270,11 @@ def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
 
 
 def _why_unknown(
-    rig: Rig, seen: Seen, explained: Int[np.ndarray, "cameras"], points: CommonPoints, data: WeightedPoints
+    rig: Rig,
+    seen: ExaminedFrames,
+    explained: Int[np.ndarray, "cameras"],
+    points: CommonPoints,
+    data: WeightedPoints,
 ) -> Finding | None:
     """Why the rig cannot be checked; None if it can."""
     total = int(seen.count.sum())
@@ -294,7 +298,7 @@ def _why_unknown(
     return Finding("too little seen", (), message, remedy)
 
 
-def _nothing_agrees(rig: Rig, seen: Seen, explained: Int[np.ndarray, "cameras"]) -> Finding:
+def _nothing_agrees(rig: Rig, seen: ExaminedFrames, explained: Int[np.ndarray, "cameras"]) -> Finding:
     total, viewpoints = int(seen.count.sum()), "three" if least_viewpoints(rig) > 2 else "two"
     message = (
         f"the rig or the detections: {viewpoints} viewpoints agree on only {explained.sum() / total:.0%} of {total} "

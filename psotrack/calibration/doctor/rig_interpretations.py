@@ -9,7 +9,7 @@ from itertools import combinations, product
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration.doctor.common_points import Seen
+from psotrack.calibration.doctor.common_points import ExaminedFrames
 from psotrack.geometry import Camera, Rig
 
 #: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
@@ -38,7 +38,7 @@ class RigInterpretation:
     rig: Rig
 
 
-def find_best_interpretation(rig: Rig, seen: Seen) -> RigInterpretation:
+def find_best_interpretation(rig: Rig, seen: ExaminedFrames) -> RigInterpretation:
     """Find the other interpretation of a rig that explains most sightings."""
 
     def explained(interpretation: RigInterpretation, step: int = 1) -> int:
