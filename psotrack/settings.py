@@ -176,6 +176,8 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
         learn_sizes: whether sizes are learned while tracking; `size_m` switches this off.
         body_offset_m: vector from the body's origin to the middle of the silhouette (with "projection-lines" of the
             box), along the world's axes, metres. No image shows where the origin is.
+        origin_uncertainty_m: standard deviation of `body_offset_m` along each axis, metres; None: the covariance is
+            that of the middle, not of the origin.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -186,6 +188,7 @@ class DroneSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     size_m: Annotated[tuple[Positive, Positive, Positive], _metavar("X,Y,Z")] | None = None
     learn_sizes: bool = True
     body_offset_m: Annotated[tuple[float, float, float], _metavar("X,Y,Z")] = (0.0, 0.0, 0.0)
+    origin_uncertainty_m: NotNegative | None = None
 
 
 class StatusSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -16,18 +16,18 @@ from psotrack.evaluation import evaluate
 from psotrack.geometry import project, reconstruct
 from psotrack.settings import ErrorSettings, MotionSettings, TrackSettings
 from psotrack.tracking.camera_errors import (
+    Autocorrelation,
     CameraErrors,
-    Fading,
     FittedPlaces,
     MeasurementErrors,
+    autocorrelation_of,
     camera_variances,
-    fading_of,
     filtered_variances,
     fit_constant_errors,
-    lasting_covariances,
     learn_camera_errors,
     noise_covariance,
     noise_ratios,
+    systematic_covariances,
     views_of_places,
     views_of_sightings,
 )
@@ -36,7 +36,8 @@ from psotrack.tracking.motion import Measurements, MotionParams, filter_measurem
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 
 FPS = 25.0
-USUAL = Fading(0.3, 0.7, 0.0, 0.4)
+USUAL = (0.7, 0.4)
+NOTHING_KNOWN = Autocorrelation(1.0, np.zeros(1), np.ones(1))
 #: The chi-square distribution with 3 degrees of freedom is below this with probability 0.9.
 INSIDE_90 = chi2.ppf(0.9, 3)
 
@@ -84,9 +85,9 @@ def fitted_views(rig, stated, position_m, velocity_m_s, error_px):
 
 
 def only_noise(noise_px, fading):
-    """Errors of cameras that have no lasting errors."""
+    """Errors of cameras that have no systematic errors; `fading` is the noise's fraction that fades, and its time."""
     unknowns = 4 * len(noise_px)
-    return CameraErrors(noise_px, fading, np.zeros(noise_px.shape), 0.0, 0.0, np.zeros((unknowns, unknowns)))
+    return CameraErrors(noise_px, *fading, np.zeros(noise_px.shape), 0.0, 0.0, np.zeros((unknowns, unknowns)))
 
 
 def inside_rate(error_m, covariance_m2):
@@ -175,7 +176,7 @@ class TestViews:
             views = views_of_places(rig.cameras, place_px, np.ones(place_px.shape), position_m, velocity_m_s)
             errors = learn_camera_errors(views, FPS, USUAL)
             noise_covariance(views, errors)
-            lasting_covariances(views, errors)
+            systematic_covariances(views, errors)
             _, peak = tracemalloc.get_traced_memory()
             tracemalloc.stop()
             return peak
@@ -192,57 +193,51 @@ class TestLearning:
         error_px = noise_px * rng.normal(size=(800, 1, 4, 2))
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
         places = FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], np.ones((800, 4), bool))
-        found = np.sqrt(camera_variances(places, np.zeros((800, 4, 2))))
+        found = np.sqrt(camera_variances(places))
         # Positions follow the precise cameras, so only some of the 800 residuals show these cameras' noise, whose
         # standard error is a tenth.
         np.testing.assert_allclose(found, noise_px, rtol=0.2)
         # The plain spread of the residuals is too small.
         assert np.square(views.residual_px).mean() < 0.8 * np.square(noise_px).mean()
-        known = np.broadcast_to(noise_px**2, (800, 4, 2))
-        assert camera_variances(places, known).max() < 0.1 * np.square(noise_px).max()
+        # Few independent residuals tell cameras apart less.
+        few = np.sqrt(camera_variances(places, inflation=400.0))
+        assert few.max() / few.min() < found.max() / found.min() / 2
 
     def test_a_camera_that_shows_nothing_has_no_variance(self):
         rig, rng = ring_rig(3), np.random.default_rng(2)
         position_m, velocity_m_s = flights(rng, 50, 1)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(50, 1, 3, 2)))
         shown = np.tile([True, True, False], (50, 1))
-        variance = camera_variances(
-            FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], shown), np.zeros((50, 3, 2))
-        )
+        variance = camera_variances(FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], shown))
         assert np.isfinite(variance[:2]).all()
         assert np.isnan(variance[2]).all()
 
-    @pytest.mark.parametrize(("share", "frames"), [(0.7, 10), (0.7, 25), (0.0, 10)])
-    def test_fading_is_found(self, share, frames):
+    @pytest.mark.parametrize(("fraction", "frames"), [(0.7, 10), (0.7, 25), (0.0, 10)])
+    def test_correlated_errors_are_found(self, fraction, frames):
         rng = np.random.default_rng(3)
-        values = correlated(rng, (600, 3, 4, 2), share, frames)
-        found = fading_of(values, np.ones((600, 3, 4), bool), 1 / FPS, USUAL)
-        assert found.white_share == pytest.approx(1 - share, abs=0.08)
-        if share:
-            assert found.fading_share + found.lasting_share == pytest.approx(share, abs=0.08)
-            assert found.time_s == pytest.approx(frames / FPS, rel=0.3)
+        values = correlated(rng, (600, 3, 4, 2), fraction, frames)
+        found = autocorrelation_of(values, np.ones((600, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
+        assert found.white == pytest.approx(1 - fraction, abs=0.08)
+        rho = toeplitz(np.where(np.arange(600) == 0, 1.0, fraction * np.exp(-np.arange(600) / frames)))
+        assert found.inflation(1 / FPS) == pytest.approx(rho.mean() * 600, rel=0.35)
 
-    def test_errors_that_never_change_last(self):
+    def test_errors_that_never_change_are_bias(self):
         rng = np.random.default_rng(4)
         values = 0.6 * rng.normal(size=(1, 3, 4, 2)) + 0.8 * rng.normal(size=(300, 3, 4, 2))
-        found = fading_of(values, np.ones((300, 3, 4), bool), 1 / FPS, USUAL)
+        found = autocorrelation_of(values, np.ones((300, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
         true = np.square(values.mean(axis=0)).mean() / np.square(values).mean()
-        assert found.lasting_share == pytest.approx(true, abs=0.06)
+        assert found.bias == pytest.approx(true, abs=0.06)
 
-    def test_too_few_frames_fade_as_usual(self):
-        assert fading_of(np.ones((4, 1, 2, 2)), np.ones((4, 1, 2), bool), 1 / FPS, USUAL) == USUAL
+    def test_too_few_frames_are_correlated_as_usual(self):
+        ones = np.ones((4, 1, 2, 2))
+        assert autocorrelation_of(ones, ones[..., 0] > 0, 1 / FPS, NOTHING_KNOWN) is NOTHING_KNOWN
 
-    @pytest.mark.parametrize("num_frames", [1, 2, 7, 40])
-    def test_variance_of_means_is_that_of_the_covariance_matrix(self, num_frames):
-        fading = Fading(0.25, 0.6, 0.15, 0.3)
-        lag = np.arange(num_frames)
-        rho = 0.25 * (lag == 0) + 0.6 * np.exp(-lag / FPS / 0.3) + 0.15
-        expected = toeplitz(rho).mean()
-        assert fading.variance_of_mean(np.array([num_frames]), 1 / FPS)[0] == pytest.approx(expected)
+    def test_inflation_is_that_of_a_long_sum(self):
+        correlation = Autocorrelation(0.4, np.array([0.6]), np.array([0.3]))
         long = (
             toeplitz(0.4 * (np.arange(4000) == 0) + 0.6 * np.exp(-np.arange(4000) / FPS / 0.3)).sum() / 4000
         )
-        assert Fading(0.4, 0.6, 0.0, 0.3).inflation(1 / FPS) == pytest.approx(long, rel=0.01)
+        assert correlation.inflation(1 / FPS) == pytest.approx(long, rel=0.01)
 
     @pytest.mark.parametrize("angle_deg", [0.1, 0.5])
     def test_turned_cameras_are_found(self, angle_deg):
@@ -301,7 +296,7 @@ class TestLearning:
         assert np.linalg.eigvalsh(constant.covariance).min() > -1e-9 * largest
 
     @pytest.mark.parametrize("frames", [200, 2100])
-    def test_a_sound_rig_has_no_lasting_errors(self, frames):
+    def test_a_sound_rig_has_no_systematic_errors(self, frames):
         rng = np.random.default_rng(6)
         rig = ring_rig(5, image_size_wh=(1920, 1080))
         position_m, velocity_m_s = flights(rng, frames, 2)
@@ -310,7 +305,7 @@ class TestLearning:
             fitted_views(rig, rig, position_m, velocity_m_s, error_px)[0], FPS, USUAL
         )
         np.testing.assert_allclose(errors.noise_px, 1.0, rtol=0.2)
-        assert errors.lasting_px.max() < 0.5
+        assert errors.bias_px.max() < 0.5
         assert np.degrees(errors.turn_rad) < 0.03
         assert errors.clock_s < 0.004
 
@@ -322,7 +317,7 @@ class TestLearning:
         )
         errors = learn_camera_errors(views, FPS, USUAL)
         assert np.isnan(errors.noise_px).all()
-        assert (errors.lasting_px.max(), errors.turn_rad, errors.clock_s) == (0.0, 0.0, 0.0)
+        assert (errors.bias_px.max(), errors.turn_rad, errors.clock_s) == (0.0, 0.0, 0.0)
 
 
 class TestCovariances:
@@ -339,12 +334,14 @@ class TestCovariances:
         )
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, no_error)
         none = only_noise(np.ones((4, 2)), USUAL)
-        lasting = lasting_covariances(views, none, ErrorSettings(rig_deg=0.2))
+        systematic = systematic_covariances(views, none, ErrorSettings(rig_deg=0.2))
         for frame in range(2):
             found = np.cov(moved_m[:, frame, 0].T)
-            np.testing.assert_allclose(lasting.absolute_m2[frame, 0], found, atol=0.3 * np.abs(found).max())
+            np.testing.assert_allclose(
+                systematic.absolute_m2[frame, 0], found, atol=0.3 * np.abs(found).max()
+            )
         # Two frames that are near to each other err alike: hardly anything remains without the mean.
-        assert np.trace(lasting.relative_m2[0, 0]) < 0.05 * np.trace(lasting.absolute_m2[0, 0])
+        assert np.trace(systematic.relative_m2[0, 0]) < 0.05 * np.trace(systematic.absolute_m2[0, 0])
 
     def test_given_errors_count_where_the_cameras_show_less(self):
         rng = np.random.default_rng(8)
@@ -352,17 +349,17 @@ class TestCovariances:
         position_m, velocity_m_s = flights(rng, 3, 2)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((3, 2, 2, 2)))
         none = only_noise(np.full((2, 2), np.nan), USUAL)
-        some = replace(only_noise(np.ones((2, 2)), USUAL), lasting_px=np.full((2, 2), 3.0))
-        nothing = lasting_covariances(views, none).absolute_m2
+        some = replace(only_noise(np.ones((2, 2)), USUAL), bias_px=np.full((2, 2), 3.0))
+        nothing = systematic_covariances(views, none).absolute_m2
         assert (nothing == 0).all()
-        given = lasting_covariances(views, none, ErrorSettings(pixel_px=2.0)).absolute_m2
+        given = systematic_covariances(views, none, ErrorSettings(pixel_px=2.0)).absolute_m2
         expected = 4.0 * np.einsum("fdcik,fdcjk->fdij", views.gain, views.gain)
         np.testing.assert_allclose(given, expected)
-        learned = lasting_covariances(views, some).absolute_m2
-        both = lasting_covariances(views, some, ErrorSettings(pixel_px=2.0)).absolute_m2
+        learned = systematic_covariances(views, some).absolute_m2
+        both = systematic_covariances(views, some, ErrorSettings(pixel_px=2.0)).absolute_m2
         np.testing.assert_allclose(learned, both)
         assert (
-            np.linalg.eigvalsh(lasting_covariances(views, some, ErrorSettings(rig_deg=1.0)).relative_m2)
+            np.linalg.eigvalsh(systematic_covariances(views, some, ErrorSettings(rig_deg=1.0)).relative_m2)
             > -1e-12
         ).all()
 
@@ -371,15 +368,15 @@ class TestCovariances:
         rng, rig = np.random.default_rng(11), ring_rig(3)
         position_m, velocity_m_s = flights(rng, 2300, 2)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((2300, 2, 3, 2)))
-        turn_rad, clock_s, noise_px, lasting_px = (
+        turn_rad, clock_s, noise_px, bias_px = (
             0.01,
             0.02,
             rng.uniform(1, 2, (3, 2)),
             rng.uniform(1, 2, (3, 2)),
         )
         constant = np.diag(np.tile(np.square([turn_rad, turn_rad, turn_rad, clock_s]), 3))
-        errors = CameraErrors(noise_px, USUAL, lasting_px, turn_rad, clock_s, constant)
-        gain, found = views.gain, lasting_covariances(views, errors)
+        errors = CameraErrors(noise_px, *USUAL, bias_px, turn_rad, clock_s, constant)
+        gain, found = views.gain, systematic_covariances(views, errors)
 
         def spread(moved):
             return (moved @ moved.swapaxes(-1, -2)).sum(axis=2)
@@ -388,14 +385,14 @@ class TestCovariances:
             noise_covariance(views, errors), spread(gain * noise_px[:, None]), rtol=1e-9
         )
         turned = gain @ views.turn_px
-        other = spread(gain * lasting_px[:, None])
+        other = spread(gain * bias_px[:, None])
         other += clock_s**2 * spread(gain @ views.flow_px_s[..., None])
         np.testing.assert_allclose(found.absolute_m2, turn_rad**2 * spread(turned) + other, rtol=1e-9)
         np.testing.assert_allclose(
             found.relative_m2, turn_rad**2 * spread(turned - turned.mean(axis=0)) + other, rtol=1e-9
         )
 
-    def test_a_drone_keeps_its_lasting_covariance_while_it_is_not_seen(self):
+    def test_a_drone_keeps_its_systematic_covariance_while_it_is_not_seen(self):
         rng = np.random.default_rng(9)
         rig = ring_rig(3)
         position_m, velocity_m_s = flights(rng, 6, 1)
@@ -404,7 +401,7 @@ class TestCovariances:
             rig.cameras, np.full((6, 1, 3, 2), np.nan), np.ones((6, 1, 3, 2)), position_m, velocity_m_s
         )
         none = only_noise(np.ones((3, 2)), USUAL)
-        found = lasting_covariances(views, none, ErrorSettings(pixel_px=1.0)).absolute_m2[:, 0]
+        found = systematic_covariances(views, none, ErrorSettings(pixel_px=1.0)).absolute_m2[:, 0]
         np.testing.assert_array_equal(found[[0, 3, 4]], found[[1, 2, 2]])
         assert (np.linalg.eigvalsh(found)[:, 0] > 0).all()
 
@@ -439,8 +436,8 @@ class TestCovariances:
             stated = turned(rig, angle_deg, rng)
             views, moved_m = fitted_views(rig, stated, position_m, velocity_m_s, error_px)
             errors = learn_camera_errors(views, FPS, USUAL)
-            lasting = lasting_covariances(views, errors)
-            rates.append(inside_rate(moved_m, noise_covariance(views, errors) + lasting.absolute_m2))
+            systematic = systematic_covariances(views, errors)
+            rates.append(inside_rate(moved_m, noise_covariance(views, errors) + systematic.absolute_m2))
         assert 0.8 <= np.mean(rates) <= 0.97
 
 
@@ -492,7 +489,7 @@ class TestFilteredVariance:
         measured[50:, 2] *= 4
         noise[50:, 2] *= 16
         measured[90:, 2] = np.nan
-        errors = only_noise(np.ones((4, 2)), Fading(0.3, 0.7, 0.0, 0.4))
+        errors = only_noise(np.ones((4, 2)), USUAL)
         ratio, filtered = noise_ratios(
             measured, noise, errors, MotionSettings(error_share=0.7, error_time_s=0.4), 25.0
         )

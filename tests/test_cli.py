@@ -39,7 +39,7 @@ ERRORS = [
 #: Keys of the record beside the tracks, of every method; the contract promises more, where they have a meaning.
 RECORD = {
     *("rate_hz", "camera_times", "settings", "seed", "versions", "device", "input_keys", "start", "volume"),
-    *("drones", "arrivals", "points", "left_out", "camera_errors", "encounters"),
+    *("drones", "arrivals", "points", "left_out", "ellipsoid", "camera_errors", "encounters"),
     *("seconds", "real_time_factor", "real_time_factor_running"),
 }
 NUM_FRAMES = 12
@@ -300,7 +300,17 @@ def test_projection_lines_from_the_sequence_a_folder_and_blobs(
     record = json.loads(tracks[0].with_suffix(".json").read_text())
     assert [point["middle_of"] for point in record["points"]] == ["box"] * 4
     assert record["settings"]["method"] == "projection-lines"
+    assert record["ellipsoid"] == "the middle of the box"
     assert_record_of_contract(record, 4)
+    # What is stated of the body's origin widens the ellipsoid, which then is that of the origin.
+    wide = tmp_path / "wide.csv"
+    words = ("--method", "projection-lines", "--origin-uncertainty", "0.03")
+    assert run(*track(sequence, wide, *words)).code == 0
+    assert json.loads(wide.with_suffix(".json").read_text())["ellipsoid"] == "the body's origin"
+    before, after = pd.read_csv(tracks[0]), pd.read_csv(wide)
+    np.testing.assert_allclose(after.cov_xx - before.cov_xx, 0.03**2, rtol=1e-3)
+    np.testing.assert_allclose(after.cov_xy, before.cov_xy)
+    np.testing.assert_allclose(after.rel_cov_xx, before.rel_cov_xx)
     assert sorted(record["input_keys"]) == [f"cam{i}" for i in range(1, 9)]
     evaluated = run("evaluate", tracks[0], sequence, "--json", "-")
     errors = json.loads(evaluated.out)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from psotrack.settings import MotionSettings
-from psotrack.tracking.camera_errors import CameraErrors, Fading, LastingCovariances, TrackErrors
+from psotrack.tracking.camera_errors import CameraErrors, SystematicCovariances, TrackErrors
 from psotrack.tracking.fusion import COMMON_CORRELATION, fuse_tracks
 from psotrack.trajectories import Arrival, Status, Tracks
 
@@ -231,37 +231,39 @@ def test_both_methods_may_have_no_tracks():
     assert fuse(empty, empty)[0].status.shape == (FRAMES, 0)
 
 
-def lasting_errors(variance_m2):
-    """The errors of a method whose positions have errors that last, of the given variances, (frames, drones)."""
-    lasting_m2 = np.asarray(variance_m2)[..., None, None] * np.eye(3)
+def systematic_errors(variance_m2):
+    """The errors of a method whose positions have systematic errors, of the given variances, (frames, drones)."""
+    variance_m2 = np.asarray(variance_m2)[..., None, None] * np.eye(3)
     two = np.ones((2, 2))
-    cameras = CameraErrors(two, Fading(1.0, 0.0, 0.0, 0.1), two, 0.002, 0.0, np.eye(8))
-    return TrackErrors(cameras, LastingCovariances(lasting_m2, 0.25 * lasting_m2))
+    cameras = CameraErrors(two, 0.0, 0.1, two, 0.002, 0.0, np.eye(8))
+    return TrackErrors(cameras, SystematicCovariances(variance_m2, 0.25 * variance_m2))
 
 
-def fused_lasting(swarm, lines, swarm_errors, lines_errors):
-    return fuse(swarm, lines, errors=(swarm_errors, lines_errors))[1].errors.lasting
+def fused_systematic(swarm, lines, swarm_errors, lines_errors):
+    return fuse(swarm, lines, errors=(swarm_errors, lines_errors))[1].errors.systematic
 
 
-def test_errors_that_last_are_not_averaged():
+def test_systematic_errors_are_not_averaged():
     """Turned cameras move the positions of both methods alike: noise averages out, this error does not."""
     truth_m = circular_paths(2)
     swarm = simulate_method(truth_m, SWARM_STD_M, seed=0)
     # The lines know the drones in another order.
     lines = simulate_method(truth_m[:, ::-1], LINES_STD_M, seed=1)
     variance_m2 = np.broadcast_to([1e-4, 4e-4], (FRAMES, 2))
-    lasting = fused_lasting(swarm, lines, lasting_errors(variance_m2), lasting_errors(variance_m2[:, ::-1]))
-    np.testing.assert_allclose(np.trace(lasting.absolute_m2, axis1=-2, axis2=-1) / 3, variance_m2)
-    np.testing.assert_allclose(lasting.relative_m2, 0.25 * lasting.absolute_m2)
+    systematic = fused_systematic(
+        swarm, lines, systematic_errors(variance_m2), systematic_errors(variance_m2[:, ::-1])
+    )
+    np.testing.assert_allclose(np.trace(systematic.absolute_m2, axis1=-2, axis2=-1) / 3, variance_m2)
+    np.testing.assert_allclose(systematic.relative_m2, 0.25 * systematic.absolute_m2)
 
 
-def test_errors_that_last_are_those_of_the_method_that_found_the_drone():
+def test_systematic_errors_are_those_of_the_method_that_found_the_drone():
     truth_m = circular_paths(2)
     swarm = simulate_method(truth_m, SWARM_STD_M, seed=0, hidden=[(1, 0, FRAMES), (0, 50, FRAMES)])
     lines = simulate_method(truth_m, LINES_STD_M, seed=1, hidden=[(0, 0, 30), (0, 100, FRAMES)])
-    one, other = (lasting_errors(np.full((FRAMES, 2), value)) for value in (1e-4, 9e-4))
-    lasting = fused_lasting(swarm, lines, one, other)
-    variance_m2 = lasting.absolute_m2[..., 0, 0]
+    one, other = (systematic_errors(np.full((FRAMES, 2), value)) for value in (1e-4, 9e-4))
+    systematic = fused_systematic(swarm, lines, one, other)
+    variance_m2 = systematic.absolute_m2[..., 0, 0]
     np.testing.assert_allclose(variance_m2[:30, 0], 1e-4)
     assert np.all((variance_m2[30:50, 0] > 1e-4) & (variance_m2[30:50, 0] < 9e-4))
     np.testing.assert_allclose(variance_m2[50:100, 0], 9e-4)
@@ -269,5 +271,5 @@ def test_errors_that_last_are_those_of_the_method_that_found_the_drone():
     np.testing.assert_allclose(variance_m2[100:, 0], 9e-4)
     # The swarm never finds its second drone; the lines' drone there is a third one.
     np.testing.assert_allclose(variance_m2[:, 2], 9e-4)
-    without = fused_lasting(swarm, lines, None, other)
+    without = fused_systematic(swarm, lines, None, other)
     np.testing.assert_allclose(without.absolute_m2[50:100, 0, 0, 0], 9e-4)

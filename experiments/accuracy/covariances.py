@@ -196,7 +196,7 @@ def labelled(rig: Rig, case: str, seed: int, num_frames: int) -> dict[str, Any]:
         axis=1
     )
     error_m = position_m - truth_m[:, partner]
-    covariance_m2 = corrected.covariance_m2 + errors.lasting.absolute_m2
+    covariance_m2 = corrected.covariance_m2 + errors.systematic.absolute_m2
     figures = consistency(error_m, error_m, covariance_m2)
     return {
         "sequence": f"{len(rig)} cameras",

@@ -17,7 +17,7 @@ import numpy as np
 from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import compute, exposures_of
 from psotrack.geometry import Rig
-from psotrack.pipeline.results import environment, warn_of_missing_drones
+from psotrack.pipeline.results import centre_of_ellipsoids, environment, warn_of_missing_drones
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.support import Report, no_progress
@@ -84,6 +84,7 @@ def causal_tracker(
         "settings": msgspec.to_builtins(settings),
         "seed": settings.seed,
         "volume": volume.record,
+        "ellipsoid": centre_of_ellipsoids(["silhouette"], settings.drones),
         **environment(),
     }
 

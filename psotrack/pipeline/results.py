@@ -6,7 +6,7 @@ import logging
 import platform
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.pipeline.inputs import Run
-from psotrack.settings import TrackSettings, flatten
+from psotrack.settings import DroneSettings, TrackSettings, flatten
 from psotrack.support import html_block, html_lines, identify
 from psotrack.tracking.births import (
     BirthRules,
@@ -139,6 +139,10 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
             trajectories, identities.order if settings.identity.resolve_swaps else None
         )
     body_m = trajectories.position_m - settings.drones.body_offset_m
+    origin_m = settings.drones.origin_uncertainty_m
+    if origin_m and trajectories.covariance_m2 is not None:
+        wider_m2 = trajectories.covariance_m2 + origin_m**2 * np.eye(3)
+        trajectories = replace(trajectories, covariance_m2=wider_m2)
     timeline = recording.timeline()
     trajectories = replace(trajectories, position_m=body_m, time_s=timeline.time_s)
     seconds = dict.fromkeys(("decode", "foreground", "compile", "finish"), 0.0)
@@ -179,6 +183,7 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         ],
         "arrivals": [asdict(arrival) for arrival in tracks.arrivals],
         "points": result.points,
+        "ellipsoid": centre_of_ellipsoids((point["middle_of"] for point in result.points), settings.drones),
         "camera_errors": {} if errors is None else errors.record(recording.rig.names),
         "encounters": [asdict(encounter) for encounter in identities.encounters],
         "input_keys": dict(result.input_keys),
@@ -187,6 +192,14 @@ def finish(run: Run, result: MethodResult) -> TrackedRecording | InputError:
         **environment(),
     }
     return TrackedRecording(trajectories, tracks.size_m, identities, record)
+
+
+def centre_of_ellipsoids(middle_of: Iterable[str], drones: DroneSettings) -> str:
+    """The point of a drone for which the covariances hold: the body's origin only where its uncertainty is stated."""
+    if drones.origin_uncertainty_m is not None:
+        return "the body's origin"
+    middles = sorted(set(middle_of), reverse=True)
+    return f"the middle of the {' or the '.join(middles)}" if middles else "the point that the method follows"
 
 
 def warn_of_missing_drones(settings: TrackSettings, num_drones: int) -> None:

@@ -25,7 +25,7 @@ from scipy.optimize import linear_sum_assignment
 
 from psotrack.settings import MotionSettings
 from psotrack.support import standard_error
-from psotrack.tracking.camera_errors import LastingCovariances, TrackErrors, noise_ratios
+from psotrack.tracking.camera_errors import SystematicCovariances, TrackErrors, noise_ratios
 from psotrack.tracking.matching import SEPARATION_M
 from psotrack.tracking.motion import GATE_999, Measurements, filter_measurements, motion_params
 from psotrack.trajectories import ARRAYS, Status, Tracks, padded
@@ -229,9 +229,9 @@ def _with_errors(
 ) -> tuple[Tracks, TrackErrors]:
     """Fused tracks whose noise fades, and the errors of both methods as one.
 
-    Errors that last have the same causes in both methods, the turned cameras and the late clocks, and do not average
+    Systematic errors have the same causes in both methods, the turned cameras and the late clocks, and do not average
     out. A weighted mean of two errors has at most the weighted mean of their squares, whatever their correlation: that
-    is the covariance of the fused errors that last.
+    is the covariance of the fused systematic errors.
 
     Args:
         fused: the fused tracks; their measured covariances are those of the noise that was found.
@@ -248,7 +248,7 @@ def _with_errors(
     cameras = replace(
         known[0],
         noise_px=np.full_like(known[0].noise_px, np.nan),
-        lasting_px=mean_square("lasting_px"),
+        bias_px=mean_square("bias_px"),
         turn_rad=float(mean_square("turn_rad")),
         clock_s=float(mean_square("clock_s")),
         constant_covariance=np.mean([each.constant_covariance for each in known], axis=0),
@@ -260,11 +260,11 @@ def _with_errors(
     last = _last_found(found)
     nearest = np.where(last < 0, found.argmax(axis=0), last)
     share = np.nan_to_num(np.take_along_axis(lines_share, nearest, axis=0))[..., None, None]
-    lasting: dict[str, Any] = {"absolute_m2": 0.0, "relative_m2": 0.0}
+    systematic: dict[str, Any] = {"absolute_m2": 0.0, "relative_m2": 0.0}
     for weight, (errors, drones) in zip((1 - share, share), methods, strict=True):
         if errors is not None:
-            for name, of_method_m2 in vars(errors.lasting).items():
+            for name, of_method_m2 in vars(errors.systematic).items():
                 # Drone -1 has the column of zeros.
-                lasting[name] += weight * np.pad(of_method_m2, [(0, 0), (0, 1), (0, 0), (0, 0)])[:, drones]
+                systematic[name] += weight * np.pad(of_method_m2, [(0, 0), (0, 1), (0, 0), (0, 0)])[:, drones]
     corrected = replace(fused, covariance_m2=fused.covariance_m2 * filtered[..., None, None])
-    return corrected, TrackErrors(cameras, LastingCovariances(**lasting))
+    return corrected, TrackErrors(cameras, SystematicCovariances(**systematic))

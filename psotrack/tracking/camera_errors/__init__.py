@@ -1,6 +1,6 @@
 """Errors of the cameras, learned from what they show of tracked drones, and covariances that hold for these errors.
 
-In: tracks, and the place where each camera alone shows each drone. Out: noise and lasting errors of each camera in
+In: tracks, and the place where each camera alone shows each drone. Out: noise and bias of each camera in
 pixels, turns and clocks of the cameras, and covariances of the tracks that contain them. Other rooms may use every name
 in `__init__.pyi`.
 """

@@ -1,10 +1,10 @@
 """Covariances of tracks from the errors of the cameras.
 
 An error of a drone's place in a camera's image moves the estimated position by the gain of the estimate
-(`CameraViews.gain`). Noise is averaged by the motion model; errors that last are not, however many frames are averaged.
-So the covariance of a track is that of the motion model, for the noise that was found, plus the covariance of the
-errors that last (consider parameters: B. D. Tapley, B. E. Schutz, G. H. Born, Statistical Orbit Determination, 2004,
-section 6.4).
+(`CameraViews.gain`). Noise is averaged by the motion model; systematic errors are not, however many frames are
+averaged. So the covariance of a track is that of the motion model, for the noise that was found, plus the covariance of
+the systematic errors: biases, turns and clocks (consider parameters: B. D. Tapley, B. E. Schutz, G. H. Born,
+Statistical Orbit Determination, 2004, section 6.4).
 
 Clocks. Camera c shows a drone with the velocity v as late as d_c after the instant, so its place is J_c v d_c behind,
 and the position errs by
@@ -12,7 +12,7 @@ and the position errs by
     e = -sum_c G_c J_c v d_c,    G_c the gain of camera c, J_c the derivative of its projection.
 
 The clocks are taken to err independently about the time of the recording, with mean 0 and variance s², so that
-cov(e) = s² sum_c (G_c J_c v) (G_c J_c v)ᵀ. A delay d that all cameras share is in this sum with the share that
+cov(e) = s² sum_c (G_c J_c v) (G_c J_c v)ᵀ. A delay d that all cameras share is in this sum with the part that
 independent clocks have by chance, and no residual shows more of it: sum_c G_c J_c is the identity, so the drone is seen
 v d behind its place by all cameras alike. Such a delay is not in the covariance.
 """
@@ -48,8 +48,8 @@ def noise_covariance(views: CameraViews, errors: CameraErrors) -> Float[np.ndarr
 
 
 @dataclass(frozen=True)
-class LastingCovariances:
-    """Covariances of positions by errors that last, m².
+class SystematicCovariances:
+    """Covariances of positions by systematic errors, m².
 
     Attributes:
         absolute_m2: (frames, drones, 3, 3), of the positions in the world.
@@ -60,10 +60,10 @@ class LastingCovariances:
     relative_m2: Float[np.ndarray, "frames drones 3 3"]
 
 
-def lasting_covariances(
+def systematic_covariances(
     views: CameraViews, errors: CameraErrors, given: ErrorSettings = NO_ERRORS
-) -> LastingCovariances:
-    """Covariances of the positions by errors of the cameras that last.
+) -> SystematicCovariances:
+    """Covariances of the positions by systematic errors of the cameras.
 
     Turned cameras are off by nearly the same vector in all frames, so most of this error is a constant offset of each
     drone.
@@ -73,7 +73,7 @@ def lasting_covariances(
         errors: the cameras' errors.
         given: smallest errors that the settings state.
     """
-    lasting_px2 = np.maximum(np.square(errors.lasting_px), given.pixel_px**2)
+    bias_px2 = np.maximum(np.square(errors.bias_px), given.pixel_px**2)
     constant = errors.constant_covariance.copy()
     of_turns = np.arange(len(constant)) % 4 < 3
     given_rad2 = float(np.radians(given.rig_deg)) ** 2 / 3
@@ -81,7 +81,7 @@ def lasting_covariances(
     mean, parts = _mean_turned(views), []
     for part in views.parts():
         gain = part.gain
-        by_place, turned = _moved_by_places(gain, lasting_px2), gain @ part.turn_px
+        by_place, turned = _moved_by_places(gain, bias_px2), gain @ part.turn_px
         late = -np.einsum("fdcik,fdck->fdci", gain, part.flow_px_s)[..., None]
         totals_m2 = []
         for offset in (0.0, mean):
@@ -90,7 +90,7 @@ def lasting_covariances(
             totals_m2.append(by_place + moved @ constant @ moved.swapaxes(-1, -2))
         parts.append((turned.any(axis=(-3, -2, -1)), *totals_m2))
     found, absolute_m2, relative_m2 = map(np.concatenate, zip(*parts, strict=True))
-    return LastingCovariances(_filled(absolute_m2, found, 0.0), _filled(relative_m2, found, 0.0))
+    return SystematicCovariances(_filled(absolute_m2, found, 0.0), _filled(relative_m2, found, 0.0))
 
 
 def _moved_by_places(
@@ -147,23 +147,23 @@ def noise_ratios(
     known = (stated > 0) & np.isfinite(stated) & np.isfinite(found)
     if not known.any():
         return np.ones(known.shape), np.ones(known.shape)
-    dt_s, fading = 1 / fps, errors.fading
+    dt_s = 1 / fps
     window = 1 + 2 * round(_WINDOW_S / dt_s / 2)
     stated, found = (_local_medians(np.where(known, value, np.nan), window) for value in (stated, found))
     # The filter's gain depends on the stated variance; with the gain, the variance is linear in the found variance.
     levels_m2 = np.geomspace(stated[known].min(), stated[known].max(), _NUM_LEVELS)
 
-    def ratio(level_m2: float, share: float) -> float:
+    def ratio(level_m2: float, part: float) -> float:
         assumed = MeasurementErrors(level_m2, motion.error_share, motion.error_time_s)
-        real = MeasurementErrors(share * level_m2, fading.fading_share, fading.time_s)
+        real = MeasurementErrors(part * level_m2, errors.fading_fraction, errors.fading_time_s)
         before, after = filtered_variances(assumed, real, dt_s=dt_s, jerk_density_m2_s5=motion.jerk_density)
         return after / before
 
     level = np.where(known, stated, levels_m2[0])
     measured = np.where(known, found / level, 1.0)
     by_motion, by_both = (
-        np.interp(np.log(level), np.log(levels_m2), [ratio(each, share) for each in levels_m2])
-        for share in (0.0, 1.0)
+        np.interp(np.log(level), np.log(levels_m2), [ratio(each, part) for each in levels_m2])
+        for part in (0.0, 1.0)
     )
     filtered = by_motion + (by_both - by_motion) * measured
     return _filled(measured, known, 1.0), _filled(filtered, known, 1.0)
@@ -189,7 +189,7 @@ def _mean(values: np.ndarray) -> float:
 
 #: Largest number of frames until the filter's covariance has settled.
 _MAX_FRAMES = 2000
-#: The filter has settled when its variance changes by less than this share per frame.
+#: The filter has settled when its variance changes by less than this fraction per frame.
 _SETTLED = 1e-6
 
 
@@ -199,12 +199,12 @@ class MeasurementErrors:
 
     Attributes:
         variance_m2: variance, m².
-        fading_share: share of the variance that fades exponentially; the rest is white.
+        fading_fraction: fraction of the variance that fades exponentially; the rest is white.
         time_s: time constant of the fading errors, seconds.
     """
 
     variance_m2: float
-    fading_share: float
+    fading_fraction: float
     time_s: float
 
 
@@ -230,11 +230,11 @@ def filtered_variances(
     F[3, 3] = np.exp(-dt_s / assumed.time_s)
     motion_noise = np.zeros((4, 4))
     motion_noise[:3, :3] = jerk_density_m2_s5 * white_jerk_noise(float(dt_s))
-    fading_m2 = assumed.fading_share * assumed.variance_m2
+    fading_m2 = assumed.fading_fraction * assumed.variance_m2
     noise = motion_noise + np.diag([0, 0, 0, fading_m2 * (1 - F[3, 3] ** 2)])
     # A measurement is the position plus the fading error plus white noise.
     H = np.array([1.0, 0.0, 0.0, 1.0])
-    white_m2 = (1 - assumed.fading_share) * assumed.variance_m2
+    white_m2 = (1 - assumed.fading_fraction) * assumed.variance_m2
     P, gain = np.diag([assumed.variance_m2, 1.0, 1.0, fading_m2]), np.zeros(4)
     stated_m2 = np.inf
     for _ in range(_MAX_FRAMES):
@@ -260,7 +260,7 @@ def _real_variance(
     decay = np.exp(-dt_s / found.time_s)
     ahead = np.zeros((5, 5))
     ahead[:4, :4], ahead[4, 4] = F, decay
-    fading_m2 = found.fading_share * found.variance_m2
+    fading_m2 = found.fading_fraction * found.variance_m2
     noise = np.zeros((5, 5))
     noise[:4, :4] = motion_noise
     noise[4, 4] = fading_m2 * (1 - decay**2)
@@ -268,7 +268,7 @@ def _real_variance(
     innovation = np.array([1.0, 0.0, 0.0, -1.0, 1.0])
     corrects = np.array([-gain[0], -gain[1], -gain[2], gain[3], 0.0])
     correct = np.eye(5) + np.outer(corrects, innovation)
-    white_m2 = (1 - found.fading_share) * found.variance_m2
+    white_m2 = (1 - found.fading_fraction) * found.variance_m2
     step = correct @ ahead
     driven = correct @ noise @ correct.T + white_m2 * np.outer(corrects, corrects)
     # X = step X stepᵀ + driven, as linear equations.

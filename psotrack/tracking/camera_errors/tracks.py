@@ -12,16 +12,16 @@ from jaxtyping import Int
 
 from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors.covariances import (
-    LastingCovariances,
-    lasting_covariances,
+    SystematicCovariances,
     noise_covariance,
     noise_ratios,
+    systematic_covariances,
 )
-from psotrack.tracking.camera_errors.learning import CameraErrors, Fading, learn_camera_errors
+from psotrack.tracking.camera_errors.learning import CameraErrors, learn_camera_errors
 from psotrack.tracking.camera_errors.views import CameraViews
 from psotrack.trajectories import Status, Tracks, Trajectories
 
-#: Largest share of the noise that fades, for the motion model, which needs some white noise.
+#: Largest fraction of the noise that fades, for the motion model, which needs some white noise.
 _MOST_FADING = 0.95
 
 
@@ -31,22 +31,21 @@ class TrackErrors:
 
     Attributes:
         cameras: errors of the cameras.
-        lasting: covariances of the positions by errors that last, which the tracks' covariances do not contain.
+        systematic: covariances of the positions by systematic errors, which the tracks' covariances do not contain.
     """
 
     cameras: CameraErrors
-    lasting: LastingCovariances
+    systematic: SystematicCovariances
 
     def smoothing(self, motion: MotionSettings) -> MotionSettings:
         """Settings of the motion model with noise that fades as it was found to."""
-        fading = self.cameras.fading
-        share = min(fading.fading_share, _MOST_FADING)
-        return msgspec.structs.replace(motion, error_share=share, error_time_s=fading.time_s)
+        fraction = min(self.cameras.fading_fraction, _MOST_FADING)
+        return msgspec.structs.replace(motion, error_share=fraction, error_time_s=self.cameras.fading_time_s)
 
     def added_to(
         self, trajectories: Trajectories, order: Int[np.ndarray, "frames drones"] | None
     ) -> Trajectories:
-        """Trajectories with the errors that last in their covariances.
+        """Trajectories with the systematic errors in their covariances.
 
         Args:
             trajectories: trajectories from the tracks.
@@ -54,10 +53,10 @@ class TrackErrors:
         """
         assert trajectories.covariance_m2 is not None
         covariances = []
-        for lasting_m2 in (self.lasting.absolute_m2, self.lasting.relative_m2):
+        for systematic_m2 in (self.systematic.absolute_m2, self.systematic.relative_m2):
             if order is not None:
-                lasting_m2 = np.take_along_axis(lasting_m2, order[..., None, None], axis=1)
-            total_m2 = trajectories.covariance_m2 + lasting_m2
+                systematic_m2 = np.take_along_axis(systematic_m2, order[..., None, None], axis=1)
+            total_m2 = trajectories.covariance_m2 + systematic_m2
             covariances.append((total_m2 + total_m2.swapaxes(-1, -2)) / 2)
         return replace(trajectories, covariance_m2=covariances[0], relative_covariance_m2=covariances[1])
 
@@ -68,21 +67,21 @@ class TrackErrors:
             "cameras": {
                 name: {
                     "noise_px": None if np.isnan(noise_px).any() else noise_px.tolist(),
-                    "lasting_px": lasting_px.tolist(),
+                    "lasting_px": bias_px.tolist(),
                 }
-                for name, noise_px, lasting_px in zip(names, errors.noise_px, errors.lasting_px, strict=True)
+                for name, noise_px, bias_px in zip(names, errors.noise_px, errors.bias_px, strict=True)
             },
             "turn_deg": float(np.degrees(errors.turn_rad) * np.sqrt(3)),
             "clock_s": errors.clock_s,
-            "fading_share": errors.fading.fading_share,
-            "fading_time_s": errors.fading.time_s,
+            "fading_share": errors.fading_fraction,
+            "fading_time_s": errors.fading_time_s,
         }
 
 
 def with_camera_errors(
     tracks: Tracks, views: CameraViews, motion: MotionSettings, given: ErrorSettings, fps: float
 ) -> tuple[Tracks, TrackErrors]:
-    """Tracks whose covariances are those of the noise that was found, and the errors that last.
+    """Tracks whose covariances are those of the noise that was found, and the systematic errors.
 
     Args:
         tracks: tracks of the swarm or of the projection lines.
@@ -91,8 +90,7 @@ def with_camera_errors(
         given: what is known of the cameras' errors beforehand.
         fps: frames per second.
     """
-    usual = Fading(1 - motion.error_share, motion.error_share, 0.0, motion.error_time_s)
-    errors = learn_camera_errors(views, fps, usual)
+    errors = learn_camera_errors(views, fps, (motion.error_share, motion.error_time_s))
     measured_m2, filtered_m2 = (
         np.asarray(value, np.float64) for value in (tracks.measured_covariance_m2, tracks.covariance_m2)
     )
@@ -109,4 +107,4 @@ def with_camera_errors(
         measured_covariance_m2=measured_m2 * measured[..., None, None],
         covariance_m2=filtered_m2 * filtered[..., None, None],
     )
-    return corrected, TrackErrors(errors, lasting_covariances(views, errors, given))
+    return corrected, TrackErrors(errors, systematic_covariances(views, errors, given))

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-#: Largest number of steps, which end when the variances change by less than a share of the mean squared residual. A
+#: Largest number of steps, which end when the variances change by less than a fraction of the mean squared residual. A
 #: variance that is zero is halved in each step at the end.
 _NUM_STEPS, _SETTLED = 60, 1e-5
-#: Least variance, as a share of the mean squared residual.
+#: Least variance, as a fraction of the mean squared residual.
 _LEAST = 1e-6
 #: Number of residuals as which the common variance of all cameras counts.
 _COMMON = 3.0
@@ -72,34 +72,33 @@ def weighted_residuals(
 
 
 def camera_variances(
-    places: FittedPlaces,
-    known_px2: Float[np.ndarray, "rows cameras 2"],
-    near_px2: Float[np.ndarray, "cameras 2"] | None = None,
+    places: FittedPlaces, inflation: float = 1.0, near_px2: Float[np.ndarray, "cameras 2"] | None = None
 ) -> Float[np.ndarray, "cameras 2"]:
     """(cameras, 2), variances of each camera's places along columns and rows; NaN without residuals.
 
     Two cameras show errors across their common plane with the drone only, and the sum of both cameras' errors rather
-    than each: what residuals do not tell apart is the mean of all variances.
+    than each: what residuals do not tell apart is the mean of all variances. Errors that stay for seconds are few
+    errors, however many frames show them, and tell few cameras apart.
 
     Args:
         places: residuals and derivatives.
-        known_px2: (rows, cameras, 2), the known part of the variances, which is not in the result, squared pixels.
+        inflation: number of rows that show as much as one row would of white noise.
         near_px2: (cameras, 2), variances from which the steps start; None: the mean squared residual.
     """
-    rows = places.determined
-    places, known_px2 = places.only(rows), known_px2[rows]
+    places = places.only(places.determined)
     seen = np.repeat(np.any(places.shown, axis=0, keepdims=True).T, 2, axis=-1)
     if not len(places.shown):
         return np.full(seen.shape, np.nan)
-    parts = _Parts.of(places)
-    known_px2 = known_px2.reshape(len(known_px2), -1).T
-    mean_px2 = np.square(parts.residual_px).sum() / max(1, 2 * places.shown.sum())
+    shown = places.shown[..., None]
+    mean_px2 = np.square(np.where(shown, places.residual_px, 0.0)).sum() / max(1, 2 * shown.sum())
     least_px2 = _LEAST * mean_px2 + np.finfo(float).tiny
-    variance_px2 = np.full(seen.shape, mean_px2) if near_px2 is None else near_px2
-    variance_px2 = np.maximum(variance_px2, least_px2)
+    variance_px2 = np.maximum(np.full(seen.shape, mean_px2) if near_px2 is None else near_px2, least_px2)
     for _ in range(_NUM_STEPS):
-        weight = parts.shown / (known_px2 + variance_px2.reshape(-1, 1))
-        found, expected = (of.reshape(seen.shape) for of in parts.squares(weight))
+        weight = shown / variance_px2
+        left, weighted, inverse = weighted_residuals(places, weight)
+        # Sums over the rows of (P r)² and of the diagonal of P.
+        leverage = np.einsum("rcik,rkl,rcil->ci", weighted, inverse, weighted, optimize=True)
+        found, expected = np.square(left).sum(axis=0) / inflation, (weight.sum(axis=0) - leverage) / inflation
         # The common variance counts as some more residuals of each camera.
         told = np.where(seen, expected, 0.0)
         common_px2 = (told * variance_px2).sum() / told.sum() if told.sum() > 0 else mean_px2
@@ -110,67 +109,3 @@ def camera_variances(
         if np.abs(variance_px2 - before_px2).max() < _SETTLED * mean_px2:
             break
     return np.where(seen, variance_px2, np.nan)
-
-
-#: Elements of a symmetric 3 x 3 matrix, and how often each is in the matrix.
-_PAIRS, _TIMES = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)), np.array([1, 2, 1, 2, 2, 1])
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """Places with the axis of rows last, along which NumPy computes fast; 0 where a camera does not show the place.
-
-    Attributes:
-        residual_px: (views, rows), residuals, one view for each camera and axis of its image.
-        jacobian: (3, views, rows), derivatives of the residuals' places.
-        products: (6, views, rows), products of two derivatives, for the lower triangle of a matrix.
-        shown: (views, rows), 1 where shown.
-    """
-
-    residual_px: Float[np.ndarray, "views rows"]
-    jacobian: Float[np.ndarray, "3 views rows"]
-    products: Float[np.ndarray, "6 views rows"]
-    shown: Float[np.ndarray, "views rows"]
-
-    @classmethod
-    def of(cls, places: FittedPlaces) -> _Parts:
-        """The parts of some places."""
-        num_rows = len(places.shown)
-        shown = np.repeat(places.shown, 2, axis=-1).T.astype(float)
-        residual_px = np.where(shown > 0, places.residual_px.reshape(num_rows, -1).T, 0.0)
-        jacobian = np.where(shown > 0, places.jacobian.reshape(num_rows, -1, 3).transpose(2, 1, 0), 0.0)
-        products = np.stack([jacobian[first] * jacobian[second] for first, second in _PAIRS])
-        return cls(residual_px, jacobian, products, shown)
-
-    def squares(
-        self, weight: Float[np.ndarray, "views rows"]
-    ) -> tuple[Float[np.ndarray, "views"], Float[np.ndarray, "views"]]:
-        """Sums over the rows of (P r)², and of the diagonal of P (see `weighted_residuals`)."""
-        inverse = _inverse(np.einsum("pvr,vr->pr", self.products, weight))
-        to_place = np.einsum("kvr,vr->kr", self.jacobian, weight * self.residual_px)
-        element = {pair: inverse[number] for number, pair in enumerate(_PAIRS)}
-        rows = ((max(k, other), min(k, other)) for k in range(3) for other in range(3))
-        matrix = np.stack([element[pair] for pair in rows]).reshape(3, 3, -1)
-        moved_m = np.einsum("kmr,mr->kr", matrix, to_place)
-        left = weight * (self.residual_px - np.einsum("kvr,kr->vr", self.jacobian, moved_m))
-        # Diagonal of P: w - w² J (Jᵀ W J)⁻¹ Jᵀ.
-        leverage = np.einsum("pvr,pr->vr", self.products, _TIMES[:, None] * inverse)
-        diagonal = weight - np.square(weight) * leverage
-        return np.square(left).sum(axis=-1), diagonal.sum(axis=-1)
-
-
-def _inverse(matrix: Float[np.ndarray, "6 rows"]) -> Float[np.ndarray, "6 rows"]:
-    """Inverses of positive definite 3 x 3 matrices, given as their lower triangles, by Cholesky factors."""
-    a, b, c, d, e, f = matrix
-    # Factor L, with the inverses of its diagonal; then L⁻¹; then L⁻ᵀ L⁻¹.
-    p = 1 / np.sqrt(a)
-    l10, l20 = b * p, d * p
-    q = 1 / np.sqrt(c - l10 * l10)
-    l21 = (e - l20 * l10) * q
-    s = 1 / np.sqrt(f - l20 * l20 - l21 * l21)
-    m10 = -l10 * p * q
-    m21 = -l21 * q * s
-    m20 = -(l20 * p + l21 * m10) * s
-    return np.stack(
-        [p * p + m10 * m10 + m20 * m20, m10 * q + m20 * m21, q * q + m21 * m21, m20 * s, m21 * s, s * s]
-    )

@@ -149,6 +149,9 @@ class StepwiseTracker:
         number, body_offset_m = self._run.drone, np.array(self._drones.body_offset_m, np.float32)
         slots = sorted(self._run.known, key=lambda slot: int(number[slot]))
         known = {name: np.asarray(getattr(rows, name))[:, slots] for name in _SHOWN}
+        known["covariance_m2"] = known["covariance_m2"] + (
+            self._drones.origin_uncertainty_m or 0.0
+        ) ** 2 * np.eye(3)
         return Trajectories(
             frame=np.array([instant]),
             time_s=np.array([time_s]),
