@@ -20,9 +20,9 @@ from jaxtyping import UInt8
 from psotrack import calibration, inside_out
 from psotrack.calibration import doctor as examination
 from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.foreground.silhouettes import ForegroundSettings, Living, SilhouetteSettings, compute
 from psotrack.geometry.rig_files import write_rig
-from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.pipeline import (
     Parts,
     TrackedRecording,
@@ -59,7 +59,7 @@ from psotrack.tracking.matching import from_detections, from_silhouettes
 from psotrack.trajectories import Trajectories
 
 #: Fields of `RigSettings` that are files.
-_RIG_FILES = ("lenses", "pairs", "markers", "world")
+_RIG_FILES = ("lenses", "pairs", "places", "markers", "world")
 #: Tracks in memory.
 Tracks = TrackedRecording | Trajectories
 
@@ -139,7 +139,7 @@ def calibrate_rig(
     force: bool = False,
     progress: bool | Report = False,
     **more: Any,
-) -> calibration.RigCalibration | calibration.PlacedCameras:
+) -> calibration.RigCalibration:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
         calibrated = pt.calibrate_rig("my_lab/board", square_m=0.04, floor=0)
@@ -173,12 +173,11 @@ def calibrate_rig(
     if plot is not None and not settings.by_board:
         raise SettingsError("rig", expected="--plot with --squares", found="points")
     refuse_files(*(Path(path) for path in (out, plot) if path is not None), force=force)
-    found: calibration.RigCalibration | calibration.PlacedCameras
     if settings.points:
         found = calibration.calibrate_by_moving_point(paths, settings)
     elif settings.by_board:
         found = calibration.calibrate_by_board(paths, settings, report_of(progress))
-        if plot is not None:
+        if plot is not None and found.calibrated is not None:
             calibration.save_coverage(Path(plot), found.calibrated, force=force)
     else:
         corners_m = (
@@ -226,6 +225,7 @@ def doctor(
         made = compute(recording, SilhouetteSettings(), cache=stored, jobs=jobs, report=report)
         sightings = from_silhouettes(made, report)
     else:
+        recording = recording.usable(videos=False)
         files = detection_files_of(recording, source)
         recording.check_detections(files)
         boxes = {name: read_detections(path) for name, path in files.items()}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 
 BLACK, WHITE, GAMMA = 35.0, 215.0, 2.2
 #: Samples per pixel along each side.

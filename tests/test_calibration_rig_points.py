@@ -28,7 +28,7 @@ from psotrack.calibration import (
 from psotrack.calibration.rig.point_adjustment import adjust
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
-from psotrack.recordings import Detections
+from psotrack.recordings import Detections, FrameTimes
 
 RIG = row_of_cameras(4)
 
@@ -185,13 +185,14 @@ def test_a_stick(tmp_path):
 
 def test_one_box_of_a_frame_counts():
     """The box of highest confidence counts; of two that are equal none does."""
-    xyxy = np.array([[0, 0, 10, 10], [20, 20, 31, 31], [5, 5, 8, 8], [7, 7, 9, 9.0]])
-    boxes = Detections(np.array([0, 0, 3, 3]), xyxy, np.array([0.9, 0.95, 0.5, 0.5]))
-    other = Detections(np.array([3]), np.array([[0, 0, 2, 2.0]]), np.array([1.0]))
-    views = views_of_detections({"a": boxes, "b": other})
-    np.testing.assert_array_equal(views.number, [0, 3])
-    np.testing.assert_array_equal(views.points_px[:, 0], [[25, 25], [np.nan, np.nan]])
-    np.testing.assert_array_equal(views.points_px[:, 1], [[np.nan, np.nan], [0.5, 0.5]])
+    xyxy = np.array([[0, 0, 10, 10], [20, 20, 31, 31], [0, 0, 10, 10], [5, 5, 8, 8], [7, 7, 9, 9.0]])
+    boxes = Detections(np.array([0, 0, 1, 3, 3]), xyxy, np.array([0.9, 0.95, 0.5, 0.5, 0.5]))
+    other = Detections(np.array([2, 3]), np.array([[0, 0, 4, 4], [0, 0, 2, 2.0]]), np.ones(2))
+    times = dict.fromkeys("ab", FrameTimes(4, 25.0))
+    views = views_of_detections({"a": boxes, "b": other}, times)
+    np.testing.assert_array_equal(views.number, [0, 1, 2, 3])
+    np.testing.assert_array_equal(views.points_px[:, 0, 0], [25, 4.5, np.nan, np.nan])
+    np.testing.assert_array_equal(views.points_px[:, 1, 1], [np.nan, np.nan, 1.5, 0.5])
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 10))

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.inside_out import CameraPath, Flag, read_camera_path, write_camera_path
-from psotrack.inside_out.camera_path import roll_pitch_yaw_deg
-from psotrack.trajectories import Status, read_trajectories
+from psotrack.trajectories import Status, read_trajectories, roll_pitch_yaw_deg
 
 #: (3, 3), columns are the axes (right, down, ahead) of a camera that looks along the world's x axis.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

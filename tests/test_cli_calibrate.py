@@ -59,16 +59,16 @@ def centres(rig):
     return rig.cameras.centre_world
 
 
-def test_extrinsics_from_marks(tmp_path):
+def test_a_rig_from_marks(tmp_path):
     rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
     write_rig(tmp_path / "lenses.yml", rig)
     pairs = pairs_of(tmp_path / "pairs.csv", rig, wrong=("c1", 4))
     out, report = tmp_path / "rig.toml", tmp_path / "report.json"
     shown = run(
-        "extrinsics",
+        "rig",
         "--pairs",
         pairs,
-        "--intrinsics",
+        "--lenses",
         tmp_path / "lenses.yml",
         "--out",
         out,
@@ -93,7 +93,7 @@ def test_extrinsics_from_marks(tmp_path):
         "residual_px": pytest.approx(80, abs=10),
         "used": False,
     }
-    assert "--force" in refused("extrinsics", "--pairs", pairs, "--intrinsics", out, "--out", out)
+    assert "--force" in refused("rig", "--pairs", pairs, "--lenses", out, "--out", out)
 
 
 def test_positions_in_a_separate_file_and_a_lens_from_a_data_sheet(tmp_path):
@@ -113,12 +113,12 @@ def test_positions_in_a_separate_file_and_a_lens_from_a_data_sheet(tmp_path):
     )
     view_deg = [2 * np.rad2deg(np.arctan(side / 2 / 800)) for side in (1280, 720)]
     lens = ("--fov", f"{view_deg[0]},{view_deg[1]}", "--size", "1280,720")
-    run("extrinsics", "--pairs", pairs, "--points", points, *lens, "--out", tmp_path / "a.toml", "-q")
+    run("rig", "--pairs", pairs, "--places", points, *lens, "--out", tmp_path / "a.toml", "-q")
     np.testing.assert_allclose(centres(read_rig(tmp_path / "a.toml")), centres(rig), atol=1e-6)
     lens = ("--focal-length", "8", "--sensor", "12.8,7.2", "--size", "1280x720")
-    run("extrinsics", "--pairs", pairs, "--points", points, *lens, "--out", tmp_path / "b.yml", "-q")
+    run("rig", "--pairs", pairs, "--places", points, *lens, "--out", tmp_path / "b.yml", "-q")
     np.testing.assert_allclose(centres(read_rig(tmp_path / "b.yml")), centres(rig), atol=1e-6)
-    message = refused("extrinsics", "--pairs", pairs, *lens, "--out", tmp_path / "c.yml")
+    message = refused("rig", "--pairs", pairs, *lens, "--out", tmp_path / "c.yml")
     assert (
         "line 2, column point: expected x_m, y_m, z_m in one of its rows, or in a file of places" in message
     )
@@ -141,8 +141,8 @@ def test_broken_marks_are_refused(tmp_path, change, message):
     write_rig(tmp_path / "rig.toml", rig)
     pairs = pairs_of(tmp_path / "pairs.csv", rig)
     pairs.write_text(pairs.read_text().replace(*change, 1))
-    options = ("--intrinsics", tmp_path / "rig.toml", "--out", tmp_path / "out.toml")
-    assert message in refused("extrinsics", "--pairs", pairs, *options)
+    options = ("--lenses", tmp_path / "rig.toml", "--out", tmp_path / "out.toml")
+    assert message in refused("rig", "--pairs", pairs, *options)
     assert not (tmp_path / "out.toml").exists()
 
 
@@ -152,31 +152,36 @@ def test_a_point_with_two_positions_is_refused(tmp_path):
     )
     lens = ("--fov", "60,40", "--size", "640,480", "--out", tmp_path / "out.toml")
     assert "line 3, column point: expected p at [0.0, 0.0, 1.0], as before" in refused(
-        "extrinsics", "--pairs", pairs, *lens
+        "rig", "--pairs", pairs, *lens
     )
     pairs = write_lines(tmp_path / "pairs.csv", "camera,point,x_px,y_px,x_m,y_m,z_m", "c0,p,1,2,0,0,1")
     assert "camera c0: expected at least 4 points of known position, found 1" in refused(
-        "extrinsics", "--pairs", pairs, *lens
+        "rig", "--pairs", pairs, *lens
     )
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "extrinsics: expected --pairs FILE or --markers SEQ, found neither"),
-        (("--pairs", "a", "--markers", "b"), "found both"),
+        (("--pairs", "a", "--markers", "b"), "found --pairs and --markers"),
         (("--pairs", "a.csv"), "a.csv: expected a file to read"),
-        (("--markers", "nowhere"), "aruco_corners.csv: expected a file to read"),
+        (("a.mp4", "--markers", "nowhere"), "nowhere: expected a file to read"),
+        (("a.mp4", "--square", "0.04", "--fov", "60,40"), "--fov: expected points or markers, not a board"),
     ],
 )
 def test_wrong_combinations_of_options_are_refused(tmp_path, arguments, message):
-    assert message in refused("extrinsics", *arguments, "--out", tmp_path / "out.toml")
+    assert message in refused("rig", *arguments, "--out", tmp_path / "out.toml")
+
+
+def test_the_old_name_of_the_command_says_the_new_one():
+    result = CliRunner().invoke(calibrate, ["extrinsics", "--pairs", "pairs.csv"])
+    assert "extrinsics is `psotrack calibrate rig --pairs` now" in result.output
 
 
 def test_wrong_combinations_of_lens_options_are_refused(tmp_path):
     pairs = pairs_of(tmp_path / "pairs.csv", ring_rig(1))
-    start = ("extrinsics", "--pairs", pairs, "--out", tmp_path / "out.toml")
-    assert "lens: expected --intrinsics FILE, or --fov H,V" in refused(*start)
+    start = ("rig", "--pairs", pairs, "--out", tmp_path / "out.toml")
+    assert "--lenses: expected a calibration with the lens of each camera, or --fov H,V" in refused(*start)
     assert "found another combination" in refused(*start, "--fov", "60,40", "--focal-length", "8")
     assert "found another combination" in refused(*start, "--focal-length", "8")
     assert "--size: expected width and height" in refused(*start, "--fov", "60,40")
@@ -224,22 +229,21 @@ def marker_room(folder):
     return rig
 
 
-def test_extrinsics_from_markers_on_the_walls(tmp_path):
+def test_a_rig_from_markers_on_the_walls(tmp_path):
     folder = tmp_path / "ROOM"
     folder.mkdir()
     rig = marker_room(folder)
-    lens = ("--intrinsics", folder / "cameras_calibration.csv", "--size", "1280,720", "--noise", "0.3")
-    output = run(
-        "extrinsics", "--markers", folder, *lens, "--out", tmp_path / "rig.toml", "--json", "-"
-    ).stdout
+    known = ("--markers", folder / "aruco_corners.csv", "--noise", "0.3")
+    lens = ("--lenses", folder / "cameras_calibration.csv", "--size", "1280,720")
+    output = run("rig", folder, *known, *lens, "--out", tmp_path / "rig.toml", "--json", "-").stdout
     row = json.loads(output)["cameras"]["cam1i"]
     assert row["points"] == 7 * 4
     assert row["worst"][0]["point"].partition(".")[0] in {"3", "4", "5", "6", "20", "21", "22"}
     # A tenth of a pixel at 5 m is 0.5 mm, but corners in compressed video have larger errors. Measured 3 mm.
     assert np.linalg.norm(centres(read_rig(tmp_path / "rig.toml")) - centres(rig)) < 0.01
-    # The same by `calibrate rig`: a video for each camera instead of a sequence.
-    words = ("--markers", folder / "aruco_corners.csv", "--lenses", tmp_path / "rig.toml", "--noise", "0.3")
-    run("rig", folder / "cam1i_s.avi", *words, "--out", tmp_path / "again.toml")
+    # The same by a video for each camera instead of a sequence.
+    lens = ("--lenses", tmp_path / "rig.toml")
+    run("rig", folder / "cam1i_s.avi", *known, *lens, "--out", tmp_path / "again.toml")
     again = read_rig(tmp_path / "again.toml")
     assert again.names == ("cam1i_s",)
     assert np.linalg.norm(centres(again) - centres(rig)) < 0.01

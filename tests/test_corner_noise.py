@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from psotrack.errors import SettingsError
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import MarkerMap, PoseSettings
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.localising.corner_noise import (
     LEAST_SCALE,
     MOST_SCALE,

@@ -17,8 +17,7 @@ from marker_pictures import Sheet, picture, rows_of_sheets
 
 from psotrack.cli.onboard.detect_markers import detect_markers
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.foreground.detection import marker_dictionary
-from psotrack.inside_out.detection import MarkerDetector
+from psotrack.foreground.markers import MarkerDetector, marker_dictionary
 from psotrack.recordings import VideoWriter, read_grey
 
 REAL = Path(os.environ.get("PSOTRACK_REAL_DATA", "real-data"))

@@ -13,9 +13,9 @@ from helpers import ring_rig
 from scipy.spatial.transform import Rotation
 
 import psotrack as pt
-from psotrack.calibration.doctor import Agreement, examine, sampled_frames
+from psotrack.calibration.doctor import examine, sampled_frames
 from psotrack.cli.doctor import doctor
-from psotrack.geometry import Rig, project
+from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_calibration
 from psotrack.recordings import Detections, write_detections
 from psotrack.recordings.datasets import write_poses
@@ -151,7 +151,8 @@ def test_a_correct_rig_has_no_findings(seed):
 def test_a_turned_camera(degrees):
     finding = only_finding(with_displaced_camera(2, turn=(0.0, degrees, 0.0)))
     assert (finding.kind, finding.cameras) == ("turned", ("c2",))
-    assert f"turned by {degrees:.1f} degrees" in finding.message
+    (found,) = re.findall(r"turned by (\S+) degrees", finding.message)
+    assert abs(float(found) - degrees) < 0.15
 
 
 def test_a_moved_camera():
@@ -333,22 +334,6 @@ def test_the_command(tmp_path):
     assert [row["camera"] for row in content["cameras"]] == list(small.names)
 
 
-def test_the_share_of_explained_sightings_is_at_most_one():
-    """A merged box of two drones is used by both drones, but counts as one sighting."""
-    merged = Agreement(
-        frame=np.zeros(2, int),
-        position_m=np.zeros((2, 3)),
-        centre_px=np.zeros((2, 3, 2)),
-        noise_px=np.ones((2, 3)),
-        used=np.ones((2, 3), bool),
-        residual_px=np.zeros((2, 3)),
-        num_sightings=np.array([1, 2, 4]),
-        num_frames=1,
-    )
-    assert merged.share_of_camera.tolist() == [1.0, 1.0, 0.5]
-    assert merged.share == 6 / 7
-
-
 def test_a_correct_rig_with_few_frames_gets_no_finding_about_the_rig():
     """Ten frames of one drone agree with the rig, but are too few to judge it."""
     truth_m = flights(1)[:10]
@@ -356,3 +341,85 @@ def test_a_correct_rig_with_few_frames_gets_no_finding_about_the_rig():
     (finding,) = examine(RIG, seen, fps=FPS).findings
     assert finding.kind == "too little seen"
     assert "the rig" not in finding.message
+
+
+def follow(rig, body_m, rng, *, white_px, correlated_px, correlated_s):
+    """Boxes of one body whose middles have white noise and an error that is correlated for some seconds."""
+    seen, keep = {}, np.exp(-1 / (60.0 * correlated_s))
+    for index, name in enumerate(rig.names):
+        slow = rng.standard_normal((len(body_m), 2))
+        for frame in range(1, len(slow)):
+            slow[frame] = keep * slow[frame - 1] + np.sqrt(1 - keep**2) * slow[frame]
+        error_px = correlated_px * slow + white_px * rng.standard_normal(slow.shape)
+        middle = project(rig.cameras[index], body_m)[0] + 0.5 + error_px
+        xyxy = np.concatenate([middle - 8, middle + 8], axis=-1)
+        seen[name] = Detections(np.arange(len(middle)), xyxy, np.ones(len(middle)))
+    return from_detections(seen, rig, len(body_m))
+
+
+def outdoors(rng, angles, frames=900, fps=60.0):
+    """Cameras on a circle of 60 m, and the path of a body above its middle."""
+    K, cameras = np.array([[1400.0, 0.0, 960.0], [0.0, 1400.0, 540.0], [0.0, 0.0, 1.0]]), {}
+    for index, angle in enumerate(angles):
+        R, t_m = look_at([60 * np.cos(angle), 60 * np.sin(angle), 2.0], (0.0, 0.0, 15.0))
+        cameras[f"cam{index + 1}"] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    phase, rate = rng.uniform(0, 6.28, 3), rng.uniform(0.2, 0.5, 3)
+    angle = np.arange(frames)[:, None] / fps * rate + phase
+    return make_rig(cameras), np.array([6.0, 6.0, 2.4]) * np.sin(angle) + np.array([0.0, 0.0, 15.0])
+
+
+@pytest.mark.parametrize("seed", [0, 10, 12])
+def test_a_rig_that_explains_nothing_is_not_sound(seed):
+    """Every camera is turned by about a degree, 20 px: no three cameras agree, and no single fault explains it."""
+    rng = np.random.default_rng(seed)
+    rig, body_m = outdoors(rng, [0.0, 2.1, 4.2])
+    sightings = follow(rig, body_m, rng, white_px=0.3, correlated_px=0.5, correlated_s=0.3)
+    T = rig.cameras.T_cam_world.copy()
+    for index in range(3):
+        degrees, axis = rng.uniform(0.4, 1.2), rng.normal(size=3)
+        turn = Rotation.from_rotvec(degrees * axis / np.linalg.norm(axis), degrees=True)
+        T[index, :3] = turn.as_matrix() @ T[index, :3]
+    diagnosis = examine(Rig(rig.names, replace(rig.cameras, T_cam_world=T)), sightings, fps=60.0)
+    assert diagnosis.to_dict()["explained"] < 0.05
+    assert diagnosis.findings
+
+
+@pytest.mark.parametrize("seed", [4, 5, 7])
+def test_a_verdict_agrees_with_the_residuals(seed):
+    """Sound rigs of three cameras and one body; correlated errors look a little like a turn of several pixels."""
+    rng = np.random.default_rng(seed)
+    rig, body_m = outdoors(rng, [-0.5, 0.0, 0.5])
+    sightings = follow(rig, body_m, rng, white_px=0.3, correlated_px=2.5, correlated_s=2.0)
+    assert examine(rig, sightings, fps=60.0).findings == ()
+
+
+def test_two_cameras_are_checked():
+    """Two cameras show whether they agree, but not which of them is wrong."""
+    rig = ring_rig(2, image_size_wh=(1920, 1080))
+    seen = simulate_detections(rig, TRUTH_M)
+    diagnosis = examine(rig, from_detections(seen, rig, FRAMES), fps=FPS, reference=make_reference(TRUTH_M))
+    assert diagnosis.findings == ()
+    assert diagnosis.to_dict()["explained"] > 0.85
+    T = rig.cameras.T_cam_world.copy()
+    T[1, :3] = Rotation.from_rotvec([1.0, 0.0, 0.0], degrees=True).as_matrix() @ T[1, :3]
+    wrong = Rig(rig.names, replace(rig.cameras, T_cam_world=T))
+    (finding,) = examine(wrong, from_detections(seen, rig, FRAMES), fps=FPS).findings
+    assert (finding.kind, finding.cameras) == ("unclear", rig.names), finding
+
+
+def test_cameras_without_a_place_are_named(tmp_path):
+    """Detections, sizes and rates are known, but no camera has a place."""
+    lines = []
+    for name in ("left", "right"):
+        write_detections(tmp_path / f"{name}.csv", SEEN["c0"])
+        lines += [
+            f"[cameras.{name}]",
+            f'detections = "{name}.csv"',
+            "image_size = [1920, 1080]",
+            "fps = 25.0",
+        ]
+    (tmp_path / "recording.toml").write_text("\n".join(lines) + "\n")
+    with pytest.raises(
+        pt.InputError, match="cameras whose lens and place are known, found none for left, right"
+    ):
+        pt.doctor(tmp_path)

@@ -2,6 +2,7 @@
 
 import runpy
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,12 @@ from scipy.stats import multivariate_normal
 
 from psotrack.calibration.doctor import evidence, examine
 from psotrack.calibration.doctor.common_points import CommonPoints
-from psotrack.calibration.doctor.fault_search import consistent_share
-from psotrack.calibration.doctor.hypotheses import (
+from psotrack.calibration.doctor.corrections import (
     PER_CAMERA,
     Corrected,
-    Hypothesis,
+    WeightedPoints,
     linearise,
-    list_hypotheses,
+    weigh,
 )
 from psotrack.geometry import Rig, project
 from psotrack.tracking.matching import from_detections
@@ -122,7 +122,7 @@ def test_a_small_lag_does_not_hide_a_turned_camera():
     turned = _boxes.turned(rig, 3, 0.4, np.random.default_rng(0))
     (finding,) = examine(turned, sightings, fps=25.0).findings
     assert (finding.kind, finding.cameras) == ("turned", ("c3",))
-    assert "place it anew with `psotrack calibrate extrinsics --pairs`" in finding.remedy
+    assert "place it anew with `psotrack calibrate rig --pairs`" in finding.remedy
 
 
 def small_problem():
@@ -138,7 +138,6 @@ def small_problem():
     points = CommonPoints(
         np.arange(10),
         piece,
-        np.arange(2),
         point_m,
         velocity_m,
         centre_px,
@@ -148,22 +147,19 @@ def small_problem():
         np.ones(4),
     )
     weight = np.where(np.isfinite(side_px), rng.uniform(0.3, 1.0, side_px.shape), 0.0)
-    return rig, evidence.WeightedPoints(points, point_m, weight)
+    return rig, WeightedPoints(points, point_m, weight)
 
 
 def test_derivatives_are_those_of_finite_differences():
     rig, data = small_problem()
     points = data.points
     at = Corrected(rig, np.array([0.3, 0.0, -1.0, 2.0]))
-    slopes = linearise(at, data.position_m, points.velocity_m, points.centre_px, points.offset_frames)
+    slopes = linearise(at, points, data.position_m)
     for column in range(PER_CAMERA * 4 + 1):
         step = np.zeros(PER_CAMERA * 4 + 1)
         step[column] = 1e-6
         ahead, behind = (
-            linearise(
-                at.by(sign * step), data.position_m, points.velocity_m, points.centre_px, points.offset_frames
-            ).off_px
-            for sign in (1, -1)
+            linearise(at.by(sign * step), points, data.position_m).residual_px for sign in (1, -1)
         )
         np.testing.assert_allclose(
             np.nan_to_num(behind - ahead) / 2e-6,
@@ -177,16 +173,16 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     """The same marginal likelihoods from the covariance of all pixels, with points of a wide prior distribution."""
     rig, data = small_problem()
     points, at = data.points, Corrected(rig, np.zeros(4))
-    std = evidence.prior_of(rig, data)
     hypothesis = next(
-        each for each in list_hypotheses(4, range(4)) if (each.kind, each.camera) == ("turned", 1)
+        each for each in evidence.list_hypotheses(4, range(4)) if (each.kind, each.camera) == ("turned", 1)
     )
-    gathered = evidence.gather(rig, evidence.sum_up(at, data), std)
-    found = gathered.judge(hypothesis, gathered.as_sound).evidence
+    gathered = evidence.gather(at, data)
+    std = gathered.prior_std
+    found = gathered.judge(hypothesis, gathered.as_sound).log_odds
 
-    slopes = linearise(at, data.position_m, points.velocity_m, points.centre_px, points.offset_frames)
+    slopes = linearise(at, points, data.position_m)
     rows = np.argwhere(np.repeat((data.weight > 0)[..., None], 2, axis=-1))
-    e = np.array([slopes.off_px[tuple(row)] for row in rows])
+    e = np.array([slopes.residual_px[tuple(row)] for row in rows])
     same_point = rows[:, None, 0] == rows[None, :, 0]
     by_point = np.array([slopes.by_point[tuple(row)] for row in rows])
     base = np.where(same_point, 4.0 * by_point @ by_point.T, 0.0)
@@ -194,17 +190,17 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     same = (rows[:, None, 1:] == rows[None, :, 1:]).all(axis=-1)
     piece = points.piece[rows[:, 0]]
     side = np.array([points.side_px[p, c] for p, c, _ in rows])
+    floor = np.hypot(side, evidence._SMALL_BOX_PX)
     image = (points.centre_px - rig.cameras.K[:, :2, 2]) / (rig.cameras.image_size_wh / 2)
     over = np.array([[1.0, *image[p, c]] for p, c, _ in rows])
-    mean = np.array(
-        [np.nanmean(points.side_px[points.piece == k, c]) for k, (_, c, _) in zip(piece, rows, strict=True)]
-    )
     theta = np.array([slopes.by_parameter[tuple(row)][list(hypothesis.columns)] for row in rows])
     theta = np.where((rows[:, 1] == 1)[:, None], theta, 0.0)
     logs: dict[str, list[float]] = {"sound": [], "turned": []}
-    for rare, (of_piece, of_camera, of_calibration) in zip(evidence._LOG_SIZES, evidence._SIZES, strict=True):
-        shared = np.where(piece[:, None] == piece, np.outer(side / mean, side / mean), 0.0)
-        covariance = base + np.where(same, shared * ((of_piece * mean) ** 2 + evidence._PIECE_PX**2), 0.0)
+    sizes = product(evidence._PIECE_ERRORS, evidence._CAMERA_ERRORS, evidence._CALIBRATION_PX)
+    for of_piece, of_camera, of_calibration in sizes:
+        rare = evidence._RARE * ((of_camera > 0.1) + (of_calibration > 0.7))
+        shared = np.where(piece[:, None] == piece, np.outer(floor, floor), 0.0)
+        covariance = base + np.where(same, shared * of_piece**2, 0.0)
         smooth = over @ over.T
         covariance += np.where(same, smooth * (of_camera**2 * np.outer(side, side) + of_calibration**2), 0.0)
         logs["sound"].append(rare + multivariate_normal.logpdf(e, cov=covariance))
@@ -219,24 +215,20 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
 def test_sightings_that_agree_by_chance_do_not_go_on_from_frame_to_frame(monkeypatch):
     """A rig is not judged by matches of spots of noise, as the blobs of a noisy background are."""
     rig, data = small_problem()
-    assert consistent_share(rig, data.points) > 0.9
+
+    def consistent(points):
+        return weigh(Corrected(rig, np.zeros(4)), points).used.sum() / points.seen.sum()
+
+    assert consistent(data.points) > 0.9
     jumps_px = np.random.default_rng(1).standard_t(1, data.points.centre_px.shape) * 40
     spots = replace(data.points, centre_px=data.points.centre_px + jumps_px)
     # The scale of the noise is the median's, so that the far tenth of these jumps are outliers.
-    assert consistent_share(rig, spots) < 0.85
+    assert consistent(spots) < 0.85
     case = make_case(4, "late 0.5")
-    monkeypatch.setattr("psotrack.calibration.doctor.examination.consistent_share", lambda rig, points: 0.6)
+    monkeypatch.setattr("psotrack.calibration.doctor.examination.MIN_CONSISTENT", 1.01)
     (finding,) = examine(case.rig, from_detections(case.seen, case.rig, case.frames), fps=_boxes.FPS).findings
     assert finding.kind == "too little seen"
     assert "agree by chance" in finding.message
-
-
-def test_hypotheses_have_their_own_columns():
-    found = list_hypotheses(3, [0, 2])
-    assert all(isinstance(each, Hypothesis) for each in found)
-    by_camera = {each.camera for each in found}
-    assert by_camera == {0, 2, -1}
-    assert {column // PER_CAMERA for each in found for column in each.columns} == {0, 2, 3}
 
 
 def test_far_cameras_that_see_bodies_of_plausible_size_are_no_wrong_unit():

@@ -7,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.errors import SettingsError
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import MarkerDetector, marker_dictionary, refine_corners
+from psotrack.foreground.markers.gamma import estimate_gamma
 from psotrack.geometry import distort, make_camera, undistort
-from psotrack.inside_out.detection import MarkerDetector, refine_corners
-from psotrack.inside_out.detection.gamma import estimate_gamma
 
 SIZE_WH = (640, 480)
 #: Samples per pixel along each side of drawn images: every edge is good to 1/16 of a pixel.

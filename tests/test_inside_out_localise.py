@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import lens_of_sensor, lens_of_view
 from psotrack.cli.onboard.localise import localise as command
 from psotrack.errors import InputError, OutputError, SettingsError
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_calibration, write_rig
 from psotrack.inside_out import (

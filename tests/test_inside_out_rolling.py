@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from psotrack.cli.onboard.localise import localise as localise_command
 from psotrack.cli.onboard.map_markers import map_markers as map_command
 from psotrack.errors import SettingsError
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import (
     LocaliseSettings,
@@ -28,7 +29,6 @@ from psotrack.inside_out import (
     check_map,
     smooth,
 )
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.filtering.path_rows import join_rows, measured_pose, split_path
 from psotrack.inside_out.frame_motion import FrameMotion
 from psotrack.inside_out.line_time import LineTime, estimate_line_time

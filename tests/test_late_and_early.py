@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from test_camera_times import FPS, RIG, alike, make_timeline, positions, sightings_of, tracked
 
-from psotrack.calibration.clocks import ReferenceOffset, camera_offsets, clocks_of_tracks, find_offset
+from psotrack.calibration.clocks import ReferenceOffset, camera_offsets, clocks_of_tracks
 from psotrack.calibration.doctor import examine
+from psotrack.evaluation import find_offset
 from psotrack.geometry import project
 from psotrack.recordings import FrameTimes
 from psotrack.trajectories import Trajectories

@@ -12,7 +12,7 @@ from test_inside_out_map import ROOM, on_wall, recorded_corners, with_bent_corne
 
 from psotrack.cli.onboard.map_markers import FOUND, map_markers
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import MarkerMap

@@ -13,6 +13,7 @@ from test_inside_out_localise import LENS, draw_markers, wall_markers
 
 from psotrack.cli import cli
 from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_rig
 from psotrack.inside_out import (
@@ -24,7 +25,6 @@ from psotrack.inside_out import (
     read_marker_map,
     read_marker_table,
 )
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.localising import frame_poses, localise_frames
 from psotrack.inside_out.localising.map_evidence import are_few, least_markers, without_markers, wrong_markers
 from psotrack.inside_out.mapping.from_centres import complete_map

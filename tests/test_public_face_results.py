@@ -9,8 +9,9 @@ import pytest
 from board_rigs import row_of_cameras
 
 import psotrack as pt
-from psotrack.calibration.clocks import Offset, ReferenceOffset
+from psotrack.calibration.clocks import ReferenceOffset
 from psotrack.errors import InputError, PsotrackError
+from psotrack.evaluation import Offset
 from psotrack.geometry import project
 from psotrack.recordings import VideoWriter
 

@@ -144,9 +144,7 @@ COMMANDS = {
         "videos.psotrack",
     ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
     ("folder",): "archive {inputs}/packed.psotrack --out folder",
-    (
-        "rig.toml",
-    ): "calibrate extrinsics --pairs {inputs}/pairs.csv --intrinsics {inputs}/lenses.yml --out rig.toml "
+    ("rig.toml",): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.toml "
     "--force",
     (
         "rig.yml",

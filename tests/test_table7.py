@@ -13,7 +13,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 from psotrack.geometry import look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import write_calibration
 from psotrack.recordings import VideoWriter

@@ -25,7 +25,7 @@ sys.path.append(str(HERE.parents[1] / "tests"))
 from marker_pictures import Sheet, picture
 
 from psotrack import detect_markers
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 from psotrack.geometry import Camera, look_at, make_camera, project
 from psotrack.inside_out import BuiltMap, build_map, corners_in_own_frame
 from psotrack.inside_out.mapping.sightings import FrameMarkers, MarkerSightings, collect_sightings

@@ -17,7 +17,7 @@ import numpy as np
 
 import psotrack
 from psotrack.calibration import lens_of_view
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 from psotrack.geometry import Camera, look_at, make_camera, project
 from psotrack.inside_out import LocalisedVideo, MarkerMap, localise_video, open_source, read_marker_map
 from psotrack.inside_out.localising import STAGES

@@ -1,8 +1,8 @@
-"""Poses of cameras from labels whose errors last from point to point, beside `solvePnPRansac` and LM of OpenCV.
+"""Poses of cameras from labels whose errors are correlated, beside `solvePnPRansac` and LM of OpenCV.
 
     python experiments/calibration/extrinsics_labels.py [--quick]
 
-A drone of known path is labelled in every frame. A label's error is white noise of 1 px and an error that lasts over
+A drone of known path is labelled in every frame. A label's error is white noise of 1 px and a correlated error over
 neighbouring labels, an AR(1) process, of 0, 1.5 or 3 px; some labels are on something else. Each camera is located by
 `locate_camera`, by OpenCV, and by least squares of exactly the labels that are on the drone ("true labels"), which no
 program knows. The poses are measured on another flight: on its labels, which have errors of the same kind ("left out"),
@@ -34,8 +34,8 @@ HERE = Path(__file__).parent
 K = np.array([[1157.0, 0.0, 959.5], [0.0, 1157.0, 539.5], [0.0, 0.0, 1.0]])
 DIST = np.array([-0.1, 0.03, 0.0005, -0.0005, 0.0])
 SIZE_WH = (1920, 1080)
-#: Correlation of the lasting error of a label with that of the label before.
-LASTING = 0.95
+#: Correlation of a label's correlated error with that of the label before.
+CORRELATION = 0.95
 METHODS = ("psotrack", "RANSAC and LM", "true labels")
 
 
@@ -50,20 +50,20 @@ def main() -> None:
     options = parser.parse_args()
     run = _results.Run("extrinsics_labels")
     rows = []
-    for labels, lasting_px, false in product((12, 60, 300), (0.0, 1.5, 3.0), (0.0, 0.1)):
-        rows.append(summary(labels, lasting_px, false, 5 if options.quick else options.draws))
+    for labels, correlated_px, false in product((12, 60, 300), (0.0, 1.5, 3.0), (0.0, 0.1)):
+        rows.append(summary(labels, correlated_px, false, 5 if options.quick else options.draws))
         print(rows[-1], flush=True)
     table = pd.DataFrame(rows)
     print(table.to_string(index=False))
     run.save(options.out, rows=table)
 
 
-def summary(labels: int, lasting_px: float, false: float, draws: int) -> dict[str, object]:
+def summary(labels: int, correlated_px: float, false: float, draws: int) -> dict[str, object]:
     """Row of the table."""
     # (draws, methods, measures)
-    found = [one_camera(labels, lasting_px, false, seed) for seed in range(draws)]
+    found = [one_camera(labels, correlated_px, false, seed) for seed in range(draws)]
     errors_px = np.array([errors for errors in found if errors is not None])
-    row: dict[str, object] = {"labels": labels, "lasting error (px)": lasting_px, "false labels": false}
+    row: dict[str, object] = {"labels": labels, "correlated error (px)": correlated_px, "false labels": false}
     row["refused"] = draws - len(errors_px)
     for method, name in enumerate(METHODS):
         row[f"{name} (px)"] = round(float(np.median(errors_px[:, method, 1])), 3)
@@ -91,18 +91,20 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def one_camera(labels: int, lasting_px: float, false: float, seed: int) -> list[tuple[float, float]] | None:
+def one_camera(
+    labels: int, correlated_px: float, false: float, seed: int
+) -> list[tuple[float, float]] | None:
     """Errors on another flight, pixels, of each method, on its labels and exact; None if two poses fit equally well."""
     rng = np.random.default_rng(seed)
     around = rng.uniform(0, 2 * np.pi)
     R, t_m = look_at((5 * np.cos(around), 5 * np.sin(around), rng.uniform(1, 3)), (0.0, 0.0, 1.0))
     camera = make_camera(R=R, t_m=t_m, K=K, dist=DIST, image_size_wh=SIZE_WH)
     points_m, others_m = path(rng, labels), path(rng, 300)
-    pixels = project(camera, points_m)[0] + label_errors(rng, labels, lasting_px)
+    pixels = project(camera, points_m)[0] + label_errors(rng, labels, correlated_px)
     wrong = rng.random(labels) < false
     pixels[wrong] += rng.normal(0, 100, (int(wrong.sum()), 2))
     truth = project(camera, others_m)[0]
-    left_out = truth + label_errors(rng, len(truth), lasting_px)
+    left_out = truth + label_errors(rng, len(truth), correlated_px)
     try:
         located = locate_camera(points_m, pixels, K, DIST)
     except InputError as error:
@@ -121,13 +123,13 @@ def one_camera(labels: int, lasting_px: float, false: float, seed: int) -> list[
     return errors
 
 
-def label_errors(rng: np.random.Generator, count: int, lasting_px: float) -> np.ndarray:
-    """Errors of labels one after the other, pixels: white noise, and an error that lasts."""
+def label_errors(rng: np.random.Generator, count: int, correlated_px: float) -> np.ndarray:
+    """Errors of labels one after the other, pixels: white noise, and a correlated error."""
     errors = rng.normal(0, 1.0, (count, 2))
-    lasting = rng.normal(0, 1, 2)
+    correlated = rng.normal(0, 1, 2)
     for index in range(count):
-        errors[index] += lasting_px * lasting
-        lasting = LASTING * lasting + np.sqrt(1 - LASTING**2) * rng.normal(0, 1, 2)
+        errors[index] += correlated_px * correlated
+        correlated = CORRELATION * correlated + np.sqrt(1 - CORRELATION**2) * rng.normal(0, 1, 2)
     return errors
 
 

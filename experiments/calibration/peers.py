@@ -89,7 +89,7 @@ def main() -> None:
         paths, board, published = SETS[name]
         cameras = open_images([options.real / path for path in paths])
         found = find_views(board, cameras, instants_of_numbers(cameras))
-        board, views = found.recognised.board, found.views
+        board, views = found.board, found.views
         if name == "charuco_calibration":
             views = one_frame_later(views, "cam_1")
         for method, make in methods(options.peers, options.real, published).items():

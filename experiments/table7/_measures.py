@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 from _methods import MIN_MARKERS
 from _recordings import Recording
+from _visibility import visible_markers
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from psotrack.evaluation import PathComparison, Statistics
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import PathComparison, Statistics
-from psotrack.inside_out.comparison.visibility import visible_markers
 
 ANGLES = ("roll", "pitch", "yaw")
 

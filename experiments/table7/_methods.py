@@ -9,8 +9,8 @@ import numpy as np
 from _recordings import Recording
 from _sightings import Sightings
 
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.inside_out import CameraPath, LocaliseSettings, PoseSettings, smooth
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.filtering.path_rows import join_rows
 from psotrack.inside_out.localising import localise_frames, pose_row
 from psotrack.inside_out.pose import MarkerPose

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.calibration import lens_of_view
 from psotrack.calibration.clocks import own_reference
 from psotrack.errors import InputError
+from psotrack.evaluation import drone_of
 from psotrack.geometry import Camera, make_camera
 from psotrack.inside_out import MarkerMap, read_marker_map
 from psotrack.recordings import OnboardVideo, VideoInfo
@@ -32,25 +32,6 @@ CLOCKS_S = 5.0
 
 
 @dataclass(frozen=True)
-class Reference:
-    """Recorded motion of the drone's body.
-
-    Attributes:
-        time_s: (samples,), times of the positions by their own clock, seconds.
-        position_m: (samples, 3), positions in the world, metres.
-        orientation_wxyz: (turns, 4), orientations, body to world, or None.
-        orientation_time_s: (turns,), times of the orientations, seconds, if they have another clock.
-        planted_s: offsets of the two clocks ahead of the video's clock, seconds, in simulated recordings.
-    """
-
-    time_s: Float[np.ndarray, "samples"]
-    position_m: Float[np.ndarray, "samples 3"]
-    orientation_wxyz: Float[np.ndarray, "turns 4"] | None
-    orientation_time_s: Float[np.ndarray, "turns"] | None = None
-    planted_s: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
 class Recording:
     """One flight of one drone.
 
@@ -59,7 +40,9 @@ class Recording:
         video: video of the drone's own camera.
         lens: intrinsics of this camera.
         marker_map: markers of the room.
-        reference: input of the paper's procedure.
+        reference: poses of the drone's body by the reference: input of the paper's procedure.
+        turns: its orientations if they have another clock, as those of an IMU; None in real sequences.
+        planted_s: offsets of the two clocks ahead of the video's clock, seconds, in simulated recordings.
         truth: true poses of the camera in simulated sequences; None in real sequences.
     """
 
@@ -68,7 +51,9 @@ class Recording:
     video: VideoInfo
     lens: Camera
     marker_map: MarkerMap
-    reference: Reference
+    reference: Trajectories
+    turns: Trajectories | None
+    planted_s: tuple[float, float] | None
     truth: OnboardVideo | None
 
 
@@ -115,15 +100,19 @@ def recordings(folder: Path) -> Iterator[Recording]:
         raise InputError(folder, expected="a video of a drone's own camera, dronN_cam_s.avi", found="none")
     flights = own_reference(sequence)
     for name, onboard in sequence.onboard.items():
-        body = _flight(flights, name, folder)
+        reference, turns, planted_s = drone_of(flights, name), None, None
         known = np.isfinite(onboard.position_m).all(axis=-1).any()
+        if known:
+            reference, turns, planted_s = _with_other_clocks(reference, f"{sequence.name} {name}")
         yield Recording(
             sequence=sequence.name,
             drone=name,
             video=onboard.video,
             lens=_lens(onboard),
             marker_map=marker_map,
-            reference=_with_other_clocks(body, f"{sequence.name} {name}") if known else body,
+            reference=reference,
+            turns=turns,
+            planted_s=planted_s,
             truth=onboard if known else None,
         )
 
@@ -135,37 +124,32 @@ def _lens(onboard: OnboardVideo) -> Camera:
     return make_camera(R=np.eye(3), t_m=np.zeros(3), K=onboard.K, image_size_wh=size_wh)
 
 
-def _flight(flights: Trajectories, name: str, folder: Path) -> Reference:
-    """Reference of the drone of this name, or of the only drone."""
-    if name not in flights.drones and len(flights.drones) > 1:
-        raise InputError(folder, expected=f"{name} in its reference", found=f"{', '.join(flights.drones)}")
-    drone = flights.drones.index(name) if name in flights.drones else 0
-    seen = flights.seen[:, drone]
-    turns = flights.orientation_wxyz
-    return Reference(
-        flights.time_s,
-        np.where(seen[:, None], flights.position_m[:, drone], np.nan),
-        None if turns is None else np.where(seen[:, None], turns[:, drone], np.nan),
-    )
-
-
-def _with_other_clocks(body: Reference, name: str) -> Reference:
+def _with_other_clocks(
+    body: Trajectories, name: str
+) -> tuple[Trajectories, Trajectories, tuple[float, float]]:
     """Resample a simulated flight as two independent recorders would store it: with other rates and other clocks."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     clock_s, turn_clock_s = rng.uniform(-CLOCKS_S, CLOCKS_S, 2)
     if body.orientation_wxyz is None:
         raise InputError(name, expected="orientations of the drone", found="none")
-    known = np.isfinite(body.position_m).all(axis=-1) & np.isfinite(body.orientation_wxyz).all(axis=-1)
+    known = body.seen[:, 0] & np.isfinite(body.orientation_wxyz[:, 0]).all(axis=-1)
     time_s = body.time_s[known]
     samples_s, turns_s = (
         np.arange(time_s[0] + rng.uniform(0, 1 / rate_hz), time_s[-1], 1 / rate_hz)
         for rate_hz in (POSITIONS_HZ, ORIENTATIONS_HZ)
     )
-    turns = RotationSpline(time_s, Rotation.from_quat(body.orientation_wxyz[known], scalar_first=True))
-    return Reference(
+    turns = RotationSpline(time_s, Rotation.from_quat(body.orientation_wxyz[known, 0], scalar_first=True))
+    positions = Trajectories(
+        np.arange(len(samples_s)),
         samples_s + clock_s,
-        CubicSpline(time_s, body.position_m[known])(samples_s),
-        turns(turns_s).as_quat(scalar_first=True),
-        turns_s + turn_clock_s,
-        (float(clock_s), float(turn_clock_s)),
+        body.drones,
+        CubicSpline(time_s, body.position_m[known, 0])(samples_s)[:, None],
     )
+    orientations = Trajectories(
+        np.arange(len(turns_s)),
+        turns_s + turn_clock_s,
+        body.drones,
+        np.zeros((len(turns_s), 1, 3)),
+        orientation_wxyz=turns(turns_s).as_quat(scalar_first=True)[:, None],
+    )
+    return positions, orientations, (float(clock_s), float(turn_clock_s))

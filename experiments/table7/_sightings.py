@@ -11,8 +11,8 @@ import numpy as np
 from _recordings import Recording
 from jaxtyping import Float, Int
 
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.inside_out import MarkerMap, detection
-from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.recordings import read_frames
 from psotrack.support import atomic_write, progress_bar
 

@@ -25,9 +25,9 @@ from _recordings import Recording, at_hand, recordings, simulated
 from _sightings import Sightings, detected, mislabelled
 
 from psotrack.errors import PsotrackError
+from psotrack.evaluation import PathComparison, compare_paths
+from psotrack.evaluation.path_plots import save_paths
 from psotrack.inside_out import CameraPath
-from psotrack.inside_out.comparison import PathComparison, PathReference, compare_paths
-from psotrack.inside_out.comparison.plots import save_path_errors, save_paths
 from psotrack.support import atomic_write
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -123,33 +123,22 @@ def flight(recording: Recording, out: Path) -> Flight:
                 f"{name}, {wrong:.0%} wrong, {method}: {1e3 * np.nanmean(one.distance_m):.1f} mm", flush=True
             )
         with_wrong = f"{wrong:.0%}".replace("%", "_percent_wrong")
-        save_path_errors(out / f"errors_{name}_{with_wrong}.png", comparisons, force=True)
+        save_paths(out / f"errors_{name}_{with_wrong}.png", comparisons, force=True)
         if wrong == 0:
             described = description(recording, seen, found["paper"], comparisons["smoother"])
-            caption = f"{recording.sequence}, {recording.drone}: by the filter, and by the reference"
-            save_paths(
-                out / f"paths_{name}.png", found["filter"], comparisons["filter"], caption=caption, force=True
-            )
+            title = f"{recording.sequence}, {recording.drone}: by the filter, and by the reference"
+            save_paths(out / f"paths_{name}.png", {"filter": comparisons["filter"]}, title=title, force=True)
     return described, cases
 
 
 def compared(recording: Recording, path: CameraPath) -> PathComparison:
-    """Compare by the paper's procedure, which does not know the offsets of the clocks."""
-    reference = recording.reference
-    return compare_paths(
-        path,
-        PathReference(
-            reference.time_s,
-            reference.position_m,
-            reference.orientation_wxyz,
-            reference.orientation_time_s,
-        ),
-    )
+    """Compare by the paper's procedure, which does not know the offsets of the clocks, as `psotrack evaluate` does."""
+    return compare_paths(path.trajectories(recording.drone), recording.reference, recording.turns)
 
 
 def clocks(recording: Recording, comparison: PathComparison) -> dict[str, float]:
     """Clock offsets that were found, and their errors in frames where the true offsets are known."""
-    turning, planted_s = comparison.turning, recording.reference.planted_s
+    turning, planted_s = comparison.turning, recording.planted_s
     found = {
         "offset_s": comparison.offset_s,
         "orientation_offset_s": np.nan if turning is None else turning.offset_s,

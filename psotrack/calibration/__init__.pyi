@@ -11,10 +11,10 @@ from .image_points import (
 )
 from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
 from .lens_models import LensModel, known_lenses, parse_lens_model
-from .placed_cameras import PlacedCameras, place_cameras
+from .pnp import ray_distances, refine_pnp, solve_pnp, solve_pnp_ransac
 from .residuals import GATE, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
-from .rig.by_board import RigCalibration, calibrate_by_board
+from .rig.by_board import calibrate_by_board
 from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
     CameraFigures,
@@ -40,6 +40,7 @@ from .rig.point_files import (
     views_of_detections,
 )
 from .rig.point_shifts import PointShift, find_point_shifts
+from .rig.result import RigCalibration
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.views import BoardViews, FoundBoards, find_views
 from .rig.world import Similarity, align, world_of_camera
@@ -63,7 +64,6 @@ __all__ = [
     "LensSettings",
     "Located",
     "ModelComparison",
-    "PlacedCameras",
     "PointRig",
     "PointSettings",
     "PointShift",
@@ -100,16 +100,19 @@ __all__ = [
     "open_images",
     "open_recorded",
     "parse_lens_model",
-    "place_cameras",
+    "ray_distances",
     "read_image_points",
     "read_point_views",
     "read_world",
+    "refine_pnp",
     "reproject",
     "save_board",
     "save_coverage",
     "say_not_compared",
     "say_print",
     "say_searched",
+    "solve_pnp",
+    "solve_pnp_ransac",
     "spread_px",
     "stick_length",
     "views_of_detections",

@@ -1,7 +1,7 @@
-"""Corners of a board in an image, by OpenCV's detectors.
+"""Corners of a board in an image.
 
-A board may be printed white on black, and it may be seen mirrored: from behind through thin paper, or because its back
-shows the mirrored pattern.
+A board of markers may be printed white on black, and a board may be seen mirrored: from behind through thin paper, or
+because its back shows the mirrored pattern.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.calibration.boards import Board
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 
 #: Largest standard deviation of corners from one line that is still a line, pixels.
 _LINE_PX = 1.5
@@ -24,25 +24,18 @@ _CHESSBOARD_SIDE_PX = 1000
 
 @dataclass(frozen=True)
 class BoardFinder:
-    """Finds the corners of a board.
-
-    Attributes:
-        board: the board.
-        inverted: whether the board is printed white on black.
-    """
+    """Finds the corners of a board."""
 
     board: Board
-    inverted: bool = False
 
     def find(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
         """Pixels of the board's corners, (corners, 2); NaN where a corner is not found, everywhere if few are."""
-        image = 255 - grey if self.inverted else grey
         if self.board.kind == "chessboard":
-            found = self._find_chessboard(image)
+            found = self._find_chessboard(grey)
         elif self.board.kind == "grid":
-            found = self._find_grid(image)
+            found = self._find_grid(grey)
         else:
-            found = self._find_charuco(image)
+            found = self._find_charuco(grey)
         seen = np.isfinite(found[:, 0])
         if seen.sum() < self.board.least_corners or _on_a_line(found[seen]):
             found[:] = np.nan
@@ -54,34 +47,37 @@ class BoardFinder:
         found[:, 0] = grey.shape[1] - 1 - found[:, 0]
         return found
 
+    def markers(self, grey: UInt8[np.ndarray, "height width"]) -> DetectedMarkers:
+        """The board's markers in an image, each at most once."""
+        return self._detector.detect(grey).of_single_ids()
+
+    @cached_property
+    def _detector(self) -> MarkerDetector:
+        first = self.board.first_marker
+        return MarkerDetector(self.board.dictionary, ids=range(first, first + self.board.num_markers))
+
     @cached_property
     def _charuco(self) -> cv2.aruco.CharucoDetector:
         return cv2.aruco.CharucoDetector(self.board.opencv())
 
-    @cached_property
-    def _markers(self) -> cv2.aruco.ArucoDetector:
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        return cv2.aruco.ArucoDetector(marker_dictionary(self.board.dictionary), parameters)
-
     def _nothing(self) -> Float[np.ndarray, "corners 2"]:
         return np.full((self.board.num_corners, 2), np.nan)
 
-    def _find_charuco(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
-        found = self._nothing()
-        corners, ids, _, _ = self._charuco.detectBoard(image)
-        if ids is not None and len(ids):
-            found[np.asarray(ids).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2)
+    def _find_charuco(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        found, markers = self._nothing(), self.markers(grey)
+        if len(markers):
+            quads = [quad[None].astype(np.float32) for quad in markers.corners_px]
+            corners, ids, _, _ = self._charuco.detectBoard(
+                grey, markerCorners=quads, markerIds=markers.ids[:, None].astype(np.int32)
+            )
+            if ids is not None and len(ids):
+                found[np.asarray(ids).ravel()] = np.asarray(corners, np.float64).reshape(-1, 2)
         return found
 
-    def _find_grid(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
-        found = self._nothing().reshape(-1, 4, 2)
-        quads, ids, _ = self._markers.detectMarkers(image)
-        for quad, marker in zip(quads, [] if ids is None else map(int, np.ravel(ids)), strict=True):
-            place = marker - self.board.first_marker
-            if 0 <= place < len(found):
-                found[place] = np.asarray(quad, np.float64).reshape(4, 2)
-        return found.reshape(-1, 2)
+    def _find_grid(self, grey: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
+        found, markers = self._nothing(), self.markers(grey)
+        found.reshape(-1, 4, 2)[markers.ids - self.board.first_marker] = markers.corners_px
+        return found
 
     def _find_chessboard(self, image: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "corners 2"]:
         columns, rows = self.board.squares_wh

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from psotrack.calibration.rig.settings import BoardSettings
 from psotrack.errors import SettingsError, check_positive
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import marker_dictionary
 
 BoardKind = Literal["charuco", "chessboard", "grid"]
 #: Smallest number of corners of a view that counts, or all that the board has.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -24,19 +23,6 @@ def reproject(
     pixels, by_shift = to_pixels_with_jacobian(lens, turned + t_m)
     # A small turn w moves a point Y by w x Y = -[Y] w.
     return pixels, -by_shift @ cross_matrices(turned), by_shift
-
-
-def pixel_slopes(
-    points_m: Float[np.ndarray, "points 3"],
-    turn: Float[np.ndarray, "3"],
-    t_m: Float[np.ndarray, "3"],
-    lens: Camera,
-) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 6"]]:
-    """Pixels of points, and their derivatives by OpenCV's Rodrigues vector and by the translation."""
-    R, by_turn = cv2.Rodrigues(turn)
-    pixels, by_shift = to_pixels_with_jacobian(lens, points_m @ np.asarray(R).T + t_m)
-    moved = np.einsum("kij,pj->pik", np.asarray(by_turn).reshape(3, 3, 3), points_m)
-    return pixels, np.concatenate([by_shift @ moved, by_shift], axis=-1)
 
 
 def centre_by_pose(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 6"]:

@@ -14,16 +14,16 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import InputError
-from psotrack.foreground.detection import marker_dictionary
+from psotrack.foreground.markers import MarkerDetector
 from psotrack.recordings import VideoInfo, read_frames
-from psotrack.support import Column, Table, TextRow, read_rows
+from psotrack.support import Table, read_table
 
 _SEPARATOR = ","
 _WORLD = ("x_m", "y_m", "z_m")
 #: Number of frames of a video in which markers are searched: the median over them hides the noise.
 _FRAMES = 15
-#: Smallest share of these frames that must show a marker: a rarer marker is a false detection.
+#: Smallest fraction of these frames that must show a marker. A median holds only as long as most values do
+#: (P. J. Huber, Robust Statistics, 1981, section 1.4), and what is seen less often may be a false detection.
 _SEEN = 0.5
 
 
@@ -53,10 +53,10 @@ def read_image_points(path: str | Path, places: str | Path | None = None) -> dic
         InputError: a file cannot be read, a column or a value is missing, a camera has a point twice, or a point has no
             position in the world or two different positions. The message names the line.
     """
-    table = _read_table(path)
+    table = read_table(path, _SEPARATOR, has_gaps=True)
     camera, point = table.column("camera"), table.column("point")
     pixels = [table.column(name) for name in ("x_px", "y_px")]
-    place_of = {} if places is None else _places(_read_table(places), required=True)
+    place_of = {} if places is None else _places(read_table(places, _SEPARATOR), required=True)
     place_of = _places(table, required=False, known=place_of)
     seen: dict[str, dict[str, list[float]]] = {}
     for row in table.rows:
@@ -69,7 +69,7 @@ def read_image_points(path: str | Path, places: str | Path | None = None) -> dic
                 point,
                 f"{', '.join(_WORLD)} in one of its rows, or in a file of places",
                 f"none for {name}",
-                "pass --points",
+                "pass --places",
             )
         of_camera[name] = [row.number(column) for column in pixels]
     return {
@@ -110,41 +110,20 @@ def find_markers_in(
     dictionary: str = "4x4_1000",
 ) -> ImagePoints:
     """Find the corners of markers of known positions in grey images of a static camera; see `find_markers`."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters)
+    detector = MarkerDetector(dictionary, ids=corners_m)
     found: dict[int, list[Float[np.ndarray, "4 2"]]] = {}
     frames = 0
     for grey in images:
         frames += 1
-        quads, ids, _ = detector.detectMarkers(grey)
-        for quad, marker in zip(quads, [] if ids is None else map(int, ids.ravel()), strict=True):
-            if marker in corners_m:
-                found.setdefault(marker, []).append(quad.reshape(4, 2).astype(np.float64))
+        markers = detector.detect(grey).of_single_ids()
+        for quad, marker in zip(markers.corners_px, markers.ids.tolist(), strict=True):
+            found.setdefault(marker, []).append(quad)
     kept = sorted(marker for marker, quads in found.items() if len(quads) >= _SEEN * frames)
     return ImagePoints(
         tuple(f"{marker}.{corner + 1}" for marker in kept for corner in range(4)),
         np.array([corners_m[marker] for marker in kept]).reshape(-1, 3),
         np.array([np.median(found[marker], axis=0) for marker in kept]).reshape(-1, 2),
     )
-
-
-def _read_table(path: str | Path) -> Table:
-    """Read a table whose last cells may be empty; `read_table` would refuse such a row as too short."""
-    path = Path(path)
-    header, *rows = read_rows(path, _SEPARATOR) or [TextRow(path, 1, ("",))]
-    columns = tuple(Column(index, cell.lower(), "", cell) for index, cell in enumerate(header.cells))
-    if not rows:
-        raise InputError(path, expected="rows below the header", found="none")
-    whole = []
-    for row in rows:
-        cells = row.cells + ("",) * (len(row.cells) == len(columns) - 1)
-        if len(cells) != len(columns):
-            raise InputError(
-                row.where, expected=f"{len(columns)} values as in the header", found=f"{len(row.cells)}"
-            )
-        whole.append(TextRow(path, row.line, cells))
-    return Table(path, columns, tuple(whole))
 
 
 def _places(

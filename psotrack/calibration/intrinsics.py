@@ -22,7 +22,7 @@ from psotrack.support import Report, no_progress
 
 #: Smallest number of views: fewer views determine k1, k2, p1, p2 badly.
 _MIN_VIEWS = 8
-#: Largest standard deviation of the focal length, as a share of the focal length.
+#: Largest standard deviation of the focal length, as a fraction of the focal length.
 _MAX_FOCAL_ERROR = 0.02
 #: Smallest angle between the planes of the board in the two views that differ most, degrees: views of parallel boards
 #: do not determine the focal length.
@@ -107,7 +107,7 @@ def lens_of_board(
         SettingsError: the dictionary does not exist.
     """
     found = find_views(board, (images,), instants_of_numbers((images,)), report)
-    board = found.recognised.board
+    board = found.board
     views = found.views.select(found.views.seen[0])
     if len(views.number) < _MIN_VIEWS:
         raise InputError(

@@ -12,14 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import Rig, make_camera, undistort
+from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, Rig, make_camera, undistort
 from psotrack.support import whole_number
 
 #: Number of unknowns of a lens before the distortion: fx, fy, cx, cy.
 PINHOLE = 4
-#: Numbers of distortion coefficients of OpenCV's pinhole model.
-_PINHOLE_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
-_FISHEYE_COEFFICIENTS = 4
 #: Standard deviations of the distortion coefficients before any view: so wide that they matter only where the views
 #: leave a coefficient open. The order is OpenCV's; p1 and p2 are small for every lens, and so is a tilted sensor.
 _COEFFICIENT_STD = np.array([1, 1, 0.05, 0.05, 1, 1, 1, 1, 0.05, 0.05, 0.05, 0.05, 0.05, 0.05], np.float64)
@@ -40,7 +37,7 @@ class LensModel:
     fisheye: bool = False
 
     def __post_init__(self) -> None:
-        known = (_FISHEYE_COEFFICIENTS,) if self.fisheye else _PINHOLE_COEFFICIENTS
+        known = (FISHEYE_COEFFICIENTS,) if self.fisheye else PINHOLE_COEFFICIENTS
         if self.coefficients not in known:
             raise SettingsError(
                 "lens",
@@ -71,14 +68,16 @@ class LensModel:
         points_m = np.ascontiguousarray(points_m)[:, None]
         still = np.zeros(3)
         K = camera_matrix(lens)
+        # The columns of OpenCV's derivatives that are by the shift of the points, and by the lens.
         if self.fisheye:
             pixels, slopes = cv2.fisheye.projectPoints(points_m, still, still, K, lens[PINHOLE:])
-            slopes = np.asarray(slopes, np.float64).reshape(-1, 2, slopes.shape[-1])
-            return np.asarray(pixels).reshape(-1, 2), slopes[..., 11:14], slopes[..., :8]
-        dist = lens[PINHOLE:] if self.coefficients else np.zeros(4)
-        pixels, slopes = cv2.projectPoints(points_m, still, still, K, dist)
+            by_shift, by_lens = slice(11, 14), slice(0, 8)
+        else:
+            dist = lens[PINHOLE:] if self.coefficients else np.zeros(4)
+            pixels, slopes = cv2.projectPoints(points_m, still, still, K, dist)
+            by_shift, by_lens = slice(3, 6), slice(6, 6 + self.size)
         slopes = np.asarray(slopes, np.float64).reshape(-1, 2, slopes.shape[-1])
-        return np.asarray(pixels).reshape(-1, 2), slopes[..., 3:6], slopes[..., 6 : 6 + self.size]
+        return np.asarray(pixels).reshape(-1, 2), slopes[..., by_shift], slopes[..., by_lens]
 
     def normalise(
         self, lens: Float[np.ndarray, " unknowns"], points_px: Float[np.ndarray, "points 2"]
@@ -124,14 +123,11 @@ def parse_lens_model(word: str) -> LensModel | None:
     if word.lower() == "auto":
         return None
     if word.lower() == "fisheye":
-        return LensModel(_FISHEYE_COEFFICIENTS, fisheye=True)
+        return LensModel(FISHEYE_COEFFICIENTS, fisheye=True)
     count = whole_number(word)
-    if count not in _PINHOLE_COEFFICIENTS:
-        raise SettingsError(
-            "lens",
-            expected=f"auto, fisheye, or one of {', '.join(map(str, _PINHOLE_COEFFICIENTS))}",
-            found=word,
-        )
+    if count not in PINHOLE_COEFFICIENTS:
+        known = ", ".join(map(str, PINHOLE_COEFFICIENTS))
+        raise SettingsError("lens", expected=f"auto, fisheye, or one of {known}", found=word)
     return LensModel(count)
 
 
@@ -147,15 +143,11 @@ def known_lenses(rig: Rig) -> dict[str, tuple[LensModel, np.ndarray]]:
         K, dist = np.asarray(camera.K), np.asarray(camera.dist)
         if abs(K[0, 1]) > 0:
             raise SettingsError(f"camera {name}", expected="a lens without skew", found=f"{K[0, 1]:g} px")
-        is_fisheye = bool(getattr(camera, "fisheye", False))
-        size = (
-            next(n for n in _PINHOLE_COEFFICIENTS if n >= len(dist))
-            if not is_fisheye
-            else _FISHEYE_COEFFICIENTS
-        )
-        dist = np.pad(dist[:size], (0, max(0, size - len(dist))))
-        known[name] = (
-            LensModel(size, is_fisheye),
-            np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dist]),
-        )
+        is_fisheye = bool(camera.fisheye)
+        allowed = (FISHEYE_COEFFICIENTS,) if is_fisheye else PINHOLE_COEFFICIENTS
+        size = next((n for n in allowed if n >= len(dist)), allowed[-1])
+        padded = np.zeros(size)
+        padded[: len(dist)] = dist[:size]
+        values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], padded])
+        known[name] = LensModel(size, is_fisheye), values
     return known

@@ -24,7 +24,7 @@ def spread_px(distance_px: Float[np.ndarray, " residuals"], unknowns: int) -> fl
     equations = 2 * len(distance_px)
     if equations <= unknowns:
         return 0.0
-    # The median of a Rayleigh distribution is σ √(2 ln 2); a fit takes the unknowns' share of the squares away.
+    # The median of a Rayleigh distribution is σ √(2 ln 2); a fit takes the unknowns' part of the squares away.
     return float(np.median(distance_px) / np.sqrt(2 * log(2) * (1 - unknowns / equations)))
 
 

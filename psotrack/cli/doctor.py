@@ -85,9 +85,9 @@ def doctor(
     as translations; millimetres that were read as metres; mirrored axes; a reference with another clock, unit or
     origin. A video is late if its frame i shows what the others show in an earlier frame.
 
-    A fault is named only if it explains the detections clearly better than a sound rig, whose boxes may have lasting
-    errors: the middle of a lopsided body's box is not the same point for two cameras. If faults of several cameras
-    explain them equally well, as often with three cameras, all are listed and none is certain.
+    A fault is named only if it explains the detections clearly better than a sound rig, whose boxes may have
+    correlated errors: the middle of a lopsided body's box is not the same point for two cameras. If faults of several
+    cameras explain them equally well, as often with two or three cameras, all are listed and none is certain.
 
     With --tracks, the offset of the reference's clock minimises the mean distance between TRACKS and the reference, to
     a fraction of a frame. Each drone may have a constant lever arm.

@@ -1,9 +1,9 @@
 """Evaluation: compare tracks with a reference.
 
 In: two `Trajectories`, the estimate and the reference. Out: an `Evaluation` with the figures of the contract, errors
-per frame, tables and plots. The input is only trajectories, so all methods are evaluated by the same code. Only
-`sweep`, `cli` and other rooms above this one import it; they may use every name in `__init__.pyi`, and the modules
-`plots` and `tables`.
+per frame, tables and plots. The input is only trajectories, so all methods are evaluated by the same code. A path with
+orientations and clocks of its own is compared by `compare_paths`; `find_offset` finds the offset between two clocks.
+Other rooms may use every name in `__init__.pyi`, and the modules `plots`, `path_plots` and `tables`.
 """
 
 import lazy_loader

@@ -1,6 +1,8 @@
 from .consistency import INSIDE_90
 from .metrics import evaluate
+from .offsets import Offset, find_offset
 from .over_time import errors_over_time
+from .path_comparison import PathComparison, PathSettings, Statistics, compare_paths, drone_of
 from .records import DroneEvaluation, ErrorSummary, Evaluation
 
 __all__ = [
@@ -8,6 +10,13 @@ __all__ = [
     "DroneEvaluation",
     "ErrorSummary",
     "Evaluation",
+    "Offset",
+    "PathComparison",
+    "PathSettings",
+    "Statistics",
+    "compare_paths",
+    "drone_of",
     "errors_over_time",
     "evaluate",
+    "find_offset",
 ]

@@ -170,10 +170,7 @@ def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
     est_m = fixed_partner_values(pair.est_m, partner)
     residual_m = est_m - pair.ref_m
     offsets, centred_m = zip(
-        *(
-            _centre(residual_m[:, drone], pair.orientation_wxyz[:, drone], pair.frame)
-            for drone in range(len(partner))
-        ),
+        *(_centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))),
         strict=True,
     )
     return _Followed(
@@ -191,7 +188,6 @@ def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
 def _centre(
     residual_m: Float[np.ndarray, "frames 3"],
     orientation_wxyz: Float[np.ndarray, "frames 4"],
-    frame: Int[np.ndarray, "frames"],
 ) -> tuple[_Offset, Float[np.ndarray, "frames 3"]]:
     """Mean residual of one drone, in its body's frame where known, and the residuals without it, in the world."""
     centred_m = np.full_like(residual_m, np.nan)
@@ -208,7 +204,7 @@ def _centre(
     x, y, z = offset_m.tolist()
     standard_error_m = None
     if len(turned_m) > 1:
-        dx, dy, dz = standard_error(turned_m, frame[seen]).tolist()
+        dx, dy, dz = standard_error(turned_m).tolist()
         standard_error_m = (dx, dy, dz)
     return _Offset((x, y, z), standard_error_m, "body" if in_body else "world"), centred_m
 

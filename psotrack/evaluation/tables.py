@@ -15,6 +15,7 @@ from psotrack.support import html_block, html_lines, html_table
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from psotrack.evaluation.path_comparison import PathComparison
     from psotrack.evaluation.records import DroneEvaluation, Evaluation
 
 _COLUMNS = ("mean", "median", "std", "p95", "max", "missed", "centred", "offset x y z")
@@ -50,6 +51,36 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
         table.add_row(Text(name), *cells)
     table.add_section()
     table.add_row(*together, style="bold")
+    return table
+
+
+def render_paths(comparison: PathComparison, title: str) -> Table:
+    """Tables 7 and 8 of one path: distances in millimetres, angles in degrees, with the offsets that were found."""
+    found, turning = comparison, comparison.turning
+    known = "" if found.offset_std_s != found.offset_std_s else f" ± {found.offset_std_s:.4f} s"
+    lines = [f"the reference's clock is {found.offset_s:+.4f} s{known} ahead of the path's"]
+    if turning is not None and turning.offset_s != found.offset_s:
+        lines.append(f"the clock of the reference's orientations is {turning.offset_s:+.4f} s ahead")
+    arm = " ".join(f"{1e3 * part:+.1f}" for part in found.lever_arm_m)
+    lines.append(f"lever arm {arm} mm; length of the reference's path {found.path_length_m:.2f} m")
+    table = Table(
+        title=Text(title, style="bold"),
+        caption=Text("\n".join(lines), style="default"),
+        box=box.HORIZONTALS,
+        show_edge=False,
+        min_width=76,
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("")
+    for name in ("mean", "median", "std", "min", "max", "frames"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for key, one in found.statistics.items():
+        *words, unit = key.split("_")
+        factor, decimals, unit = (1e3, 2, "mm") if unit == "m" else (1.0, 3, "deg")
+        values = (one.mean, one.median, one.std, one.minimum, one.maximum)
+        cells = (f"{factor * value:.{decimals}f}" for value in values)
+        table.add_row(f"{' '.join(words)} ({unit})", *cells, str(one.count))
     return table
 
 

@@ -4,11 +4,10 @@ In: an on-board video, a map of the markers and the lens. Out: a `CameraPath` wi
 and status in every frame; also maps of markers, made from videos or measured corners, and the fusion of paths with
 tracks of static cameras. Other rooms use the names that this room exports, and nothing else.
 
-From a frame to a path: `frames` (reading), `detection` (markers in an image), `pose` (of one frame), `filtering` (over
-time), `localising` (the complete localisation). `mapping` builds and checks maps, `comparison` compares paths with
-references, `fusing` joins paths and tracks. Imports go in this order: frame_motion, camera_path, lens_files,
-marker_map, frames, detection, pose, filtering, line_time (of a rolling shutter), mapping, localising, comparison,
-fusing.
+From a frame to a path: `frames` (reading), `pose` (of one frame), `filtering` (over time), `localising` (the complete
+localisation). `mapping` builds and checks maps, `fusing` joins paths and tracks; `psotrack.evaluation` compares paths
+with references. Imports go in this order: frame_motion, camera_path, lens_files, marker_map, flight_picture, frames,
+pose, filtering, line_time (of a rolling shutter), mapping, localising, fusing.
 """
 
 import lazy_loader

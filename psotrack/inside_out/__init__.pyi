@@ -1,8 +1,7 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
-from .comparison.plots import save_flight
-from .detection.marker_table import markers_of_images, markers_of_video, write_marker_table
 from .filtering.pose_filter import PoseFilterParams
 from .filtering.smoothing import smooth
+from .flight_picture import save_flight
 from .frames import FrameSource, open_source
 from .fusing import FusedTracks, fuse
 from .fusing.fused_table import write_fused
@@ -13,6 +12,7 @@ from .mapping.check import MapCheck, check_map
 from .mapping.sightings import find_sightings
 from .mapping.square_fitting import FittedSquares, fit_squares, read_measured_corners
 from .marker_map import MarkerCentres, MarkerMap, read_marker_map, read_marker_table
+from .marker_table import markers_of_images, markers_of_video, write_marker_table
 from .pose import PoseSettings, RollingShutter
 
 __all__ = [

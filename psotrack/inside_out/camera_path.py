@@ -27,7 +27,7 @@ from psotrack.support import (
     short_repr,
     write_rows,
 )
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import Status, Trajectories, roll_pitch_yaw_deg
 
 #: Axes of the covariance: the world's axes, in metres, then small turns about the camera's axes, in radians.
 _AXES = "xyzabc"
@@ -40,9 +40,6 @@ _ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 _COVARIANCE = tuple(_AXES[row] + _AXES[column] for row, column in zip(*_UPPER, strict=True))
 _STATUS = {status.label: status for status in Status}
 _SEPARATOR = ","
-
-#: Columns: the axes of a body (x ahead, y left, z up) in the axes of a camera (x right, y down, z ahead).
-_BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 class Flag(IntFlag):
@@ -138,27 +135,6 @@ class CameraPath:
             status=self.status[:, None],
             covariance_m2=self.covariance[:, None, :3, :3],
         )
-
-
-def roll_pitch_yaw_deg(orientation_wxyz: Float[np.ndarray, "*frames 4"]) -> Float[np.ndarray, "*frames 3"]:
-    """Angles of a camera's orientation, as of a body that faces the camera's viewing direction; NaN stays NaN.
-
-    The body's axes are x ahead (the camera's z), y left, z up. It is turned about the world's z by yaw, then about its
-    own y by pitch, then about its own x by roll: R = Rz(yaw) Ry(pitch) Rx(roll), as in ROS (REP 103). Yaw is counted
-    from the world's x axis, counterclockwise seen from above. Pitch is positive with the nose down, roll with the right
-    side down. Each angle is in (-180, 180], pitch in [-90, 90].
-
-    Args:
-        orientation_wxyz: (*frames, 4), unit quaternions, camera to world.
-
-    Returns:
-        (*frames, 3): roll, pitch, yaw, degrees.
-    """
-    body = rotation_matrices(orientation_wxyz.reshape(-1, 4)) @ _BODY_IN_CAMERA
-    roll = np.arctan2(body[:, 2, 1], body[:, 2, 2])
-    pitch = -np.arcsin(np.clip(body[:, 2, 0], -1.0, 1.0))
-    yaw = np.arctan2(body[:, 1, 0], body[:, 0, 0])
-    return np.degrees(np.stack([roll, pitch, yaw], axis=-1)).reshape(*orientation_wxyz.shape[:-1], 3)
 
 
 def write_camera_path(path: Path | str, camera_path: CameraPath, name: str, *, force: bool = False) -> None:

@@ -24,8 +24,8 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.filtering.manifold import right_jacobian
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import (

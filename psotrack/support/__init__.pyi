@@ -61,7 +61,7 @@ from .schema import (
     write_toml,
 )
 from .similarity import similarity
-from .standard_errors import standard_error
+from .standard_errors import block_jackknife, standard_error, time_blocks, widening
 from .text_tables import POSITION, finite_or_none, format_numbers, text_table
 from .times import LEAST_STEP_S, first_repeat
 
@@ -91,6 +91,7 @@ __all__ = [
     "atomic_write",
     "atomic_write_all",
     "bind",
+    "block_jackknife",
     "check_file_name",
     "check_interface",
     "check_no_nul",
@@ -150,12 +151,14 @@ __all__ = [
     "standard_error",
     "terminal_bar",
     "text_table",
+    "time_blocks",
     "toml_key",
     "toml_text",
     "toml_value",
     "use_device",
     "user_cache",
     "whole_number",
+    "widening",
     "with_traceback",
     "worker_processes",
     "write_rows",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from psotrack.errors import InputError
@@ -154,8 +154,13 @@ def read_rows(path: Path | str, separator: str) -> list[TextRow]:
     return rows
 
 
-def read_table(path: Path | str, separator: str = ";") -> Table:
+def read_table(path: Path | str, separator: str = ";", *, has_gaps: bool = False) -> Table:
     """Read a table from a text file whose first line names the columns.
+
+    Args:
+        path: the file.
+        separator: what stands between cells.
+        has_gaps: whether the last cell of a row may be empty.
 
     Raises:
         InputError: the file cannot be read, has fewer than two columns, one column twice, no rows, or a row
@@ -173,6 +178,9 @@ def read_table(path: Path | str, separator: str = ";") -> Table:
         raise InputError(header.where, expected="each column once", found=f"{', '.join(twice)} again")
     if not rows:
         raise InputError(path, expected="rows below the header", found="none")
+    if has_gaps:
+        short = len(columns) - 1
+        rows = [replace(row, cells=(*row.cells, "")) if len(row.cells) == short else row for row in rows]
     for row in rows:
         if len(row.cells) != len(columns):
             raise InputError(

@@ -171,7 +171,7 @@ def _point_offset(
         median_m[drone] = np.nanmedian(off_m[:, drone], axis=0)
         apart_m = off_m[:, drone] - median_m[drone]
         far_m = FAR * MAD_STD * np.nanmedian(np.abs(apart_m), axis=0)
-        std_m[drone] = MEDIAN_ERROR * standard_error(np.clip(apart_m, -far_m, far_m), np.arange(len(off_m)))
+        std_m[drone] = MEDIAN_ERROR * standard_error(np.clip(apart_m, -far_m, far_m))
     return median_m, std_m
 
 

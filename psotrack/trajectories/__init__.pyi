@@ -1,5 +1,6 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import DroneRows, check_cells, from_rows, read_trajectories, write_ambiguity, write_trajectories
+from .orientations import roll_pitch_yaw_deg, rotations_of
 from .resampling import resample
 from .row_streams import RowStream
 from .status import Status
@@ -25,6 +26,8 @@ __all__ = [
     "padded",
     "read_trajectories",
     "resample",
+    "roll_pitch_yaw_deg",
+    "rotations_of",
     "summary_columns",
     "write_ambiguity",
     "write_trajectories",

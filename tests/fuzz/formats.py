@@ -423,7 +423,7 @@ _TABLES = {
         _marks(),
         calibration.read_image_points,
         calibration.read_world,
-        command="calibrate extrinsics --pairs {file} --fov 92.4,60.8 --size 1280,720 --out {out}/rig.toml",
+        command="calibrate rig --pairs {file} --fov 92.4,60.8 --size 1280,720 --out {out}/rig.toml",
     ),
     "point-views": _table("views.csv", _VIEWS, calibration.read_point_views),
     "world": _table(

@@ -1,22 +1,18 @@
 from .camera_clocks import camera_offsets
-from .reference_clock import ReferenceOffset, reference_for, reference_offset
-from .synchronisation import Offset, find_offset, own_reference, save_curve, shifted
+from .reference_clock import ReferenceOffset, own_reference, reference_for, reference_offset, save_curve
 from .track_clocks import CameraClocks, clocks_of_tracks, estimate_clocks, fit_clocks
 from .track_places import places_of_tracks
 
 __all__ = [
     "CameraClocks",
-    "Offset",
     "ReferenceOffset",
     "camera_offsets",
     "clocks_of_tracks",
     "estimate_clocks",
-    "find_offset",
     "fit_clocks",
     "own_reference",
     "places_of_tracks",
     "reference_for",
     "reference_offset",
     "save_curve",
-    "shifted",
 ]

@@ -7,8 +7,7 @@ the points in space are estimated together by Gauss-Newton steps in which the po
 D. E. McClure, Statistical Methods for Tomographic Image Reconstruction, 1987).
 
 Errors of neighbouring frames are not independent: the middle of a drone's box is off in nearly the same way for as long
-as the drone flies in the same attitude. The standard deviations therefore use the autocovariance of the residuals
-(W. K. Newey and K. D. West, Econometrica 55 (3), 1987), pooled over all drones and both image axes of a camera.
+as the drone flies in the same attitude. The standard deviations are therefore those of a block jackknife.
 """
 
 from __future__ import annotations
@@ -16,9 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from psotrack.calibration.clocks.correlated_errors import autocorrelation, widening
 from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import (
     MAX_CONDITION,
@@ -29,7 +27,8 @@ from psotrack.geometry import (
     to_camera,
     triangulate_linearly,
 )
-from psotrack.geometry.estimation import NormalEquations, cauchy_weight, gauss_newton
+from psotrack.geometry.estimation import cauchy_weight, gauss_newton
+from psotrack.support import block_jackknife, time_blocks, widening
 
 #: Number of rounds without a step until the weights have settled, and largest number of steps.
 _WEIGHT_ROUNDS, _MAX_STEPS = 5, 35
@@ -45,8 +44,8 @@ _REACH_S = 0.25
 _CLEARLY = 3.0
 #: Smallest curvature of the robust cost, as a share of the curvature of weighted least squares.
 _MIN_CURVATURE = 0.3
-#: Largest leverage: a larger share of a detection's error that the triangulated point absorbs is not corrected.
-_MAX_LEVERAGE = 0.9
+#: Smallest number of degrees of freedom of the jackknife: of fewer, standard deviations are infinite.
+_LEAST_FREEDOM = 0.5
 
 
 @dataclass(frozen=True)
@@ -139,25 +138,18 @@ class _System:
     Attributes:
         problem: data of the estimate.
         offset_frames: (cameras,), offsets at which the problem was linearised, frames.
-        normal: (cameras, cameras), left side, squared pixels per squared frame.
-        gradient: (frames, cameras), right side of each frame, squared pixels per frame.
+        normal: (frames, drones, cameras, cameras), left side of each drone, squared pixels per squared frame.
+        gradient: (frames, drones, cameras), right side of each drone, squared pixels per frame.
         weights: (frames, drones, cameras), weights of the detections; 0 where there is no detection.
-        residual_px: (frames, drones, cameras, 2), detections minus projections; 0 where there is no detection.
-        influence: (cameras, frames, drones, cameras, 2), derivatives of the right side by the weighted residuals,
-            pixels per frame.
-        leverage: (frames, drones, cameras), share of a detection's error that the triangulated point absorbs.
         variance_px2: variance of one coordinate of a detection, squared pixels.
         rms_px: weighted root mean square distance of the detections from the projections, pixels.
     """
 
     problem: _Problem
     offset_frames: Float[np.ndarray, "cameras"]
-    normal: Float[np.ndarray, "cameras cameras"]
-    gradient: Float[np.ndarray, "frames cameras"]
+    normal: Float[np.ndarray, "frames drones cameras cameras"]
+    gradient: Float[np.ndarray, "frames drones cameras"]
     weights: Float[np.ndarray, "frames drones cameras"]
-    residual_px: Float[np.ndarray, "frames drones cameras 2"]
-    influence: Float[np.ndarray, "solved frames drones cameras 2"]
-    leverage: Float[np.ndarray, "frames drones cameras"]
     variance_px2: float
     rms_px: float
 
@@ -165,9 +157,9 @@ class _System:
         """Take a step with the prior, keep the offsets within their limit, and keep their mean at 0."""
         limit = self.problem.max_offset_frames
         stiffness = self.variance_px2 / limit**2
-        normal = self.normal + stiffness * np.eye(len(self.offset_frames))
-        right = self.gradient.sum(axis=0) - stiffness * self.offset_frames
-        offset_frames = self.offset_frames + NormalEquations(normal, right).solved().shared
+        normal = self.normal.sum(axis=(0, 1)) + stiffness * np.eye(len(self.offset_frames))
+        right = self.gradient.sum(axis=(0, 1)) - stiffness * self.offset_frames
+        offset_frames = self.offset_frames + np.linalg.solve(normal, right)
         offset_frames = np.clip(offset_frames, -limit, limit)
         return _linearise(self.problem, offset_frames - offset_frames.mean(), self.weights)
 
@@ -206,43 +198,20 @@ def _linearise(
     freedom = 2 * total - 3 * float((weights.max(axis=-1) * known).sum())
     variance_px2 = squares / max(freedom, 1.0) + 1e-12
 
-    trace_m2 = np.trace(np.linalg.inv(point_normal), axis1=-2, axis2=-1)
-    spread_m2 = np.where(known, variance_px2 * trace_m2, np.inf)
+    inverse = np.linalg.inv(point_normal)
+    spread_m2 = np.where(known, variance_px2 * np.trace(inverse, axis1=-2, axis2=-1), np.inf)
     velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, problem.reach)
     moving = known & ((velocity_m**2).sum(axis=-1) > _CLEARLY**2 * noise_m2)
     u = np.einsum("fdcij,fdj->fdci", J, np.where(moving[..., None], velocity_m, 0.0))
     coupling = np.einsum("fdc,fdcik,fdci->fdkc", weights, J, u)
-    point_right = np.einsum("fdc,fdcik,fdci->fdk", weights, J, e)
-    gradient = np.einsum("fdc,fdci,fdci->fc", weights, u, e)
-    num_cameras = len(offset_frames)
-    reduced = NormalEquations(
-        np.diag(np.einsum("fdc,fdci,fdci->c", weights, u, u)),
-        gradient.sum(axis=0),
-        point_normal.reshape(-1, 3, 3),
-        point_right.reshape(-1, 3),
-        coupling.reshape(-1, 3, num_cameras),
-    ).reduced()
-    inverse, gain = reduced.block_covariance.reshape(point_normal.shape), reduced.gain.reshape(coupling.shape)
-    gradient -= np.einsum("fdlc,fdl->fc", gain, point_right)
-    # The derivative of camera b's equation by camera c's weighted residual: u_b if b = c, less J_c M⁻¹ J_bᵀ w u_b.
-    influence = -np.einsum("fdcik,fdkb->bfdci", J, gain)
-    index = np.arange(num_cameras)
-    influence[index, :, :, index] += np.moveaxis(u, 2, 0)
-    influence *= there[..., None]
-    leverage = np.einsum("fdcik,fdkl,fdcil,fdc->fdc", J, inverse, J, weights) / 2
+    gain = inverse @ coupling
+    normal = -np.einsum("fdkb,fdkc->fdbc", coupling, gain)
+    index = np.arange(len(offset_frames))
+    normal[:, :, index, index] += np.einsum("fdc,fdci,fdci->fdc", weights, u, u)
+    gradient = np.einsum("fdc,fdci,fdci->fdc", weights, u, e)
+    gradient -= np.einsum("fdlc,fdl->fdc", gain, np.einsum("fdc,fdcik,fdci->fdk", weights, J, e))
     rms_px = np.sqrt(squares / total) if total else np.nan
-    return _System(
-        problem,
-        offset_frames,
-        reduced.information,
-        gradient,
-        weights,
-        e,
-        influence,
-        leverage,
-        variance_px2,
-        rms_px,
-    )
+    return _System(problem, offset_frames, normal, gradient, weights, variance_px2, rms_px)
 
 
 def _robust_weights(
@@ -301,57 +270,28 @@ def _fit_velocities(
 
 
 def _standard_deviations(system: _System, max_offset_frames: float) -> Float[np.ndarray, "cameras"]:
-    """Standard deviations of the offsets: a sandwich covariance with the residuals' autocovariance (P. J. Huber 1967).
-
-    The residual of a detection is divided by 1 - leverage, which makes it the distance from the point that the other
-    cameras see (the HC3 estimator of J. G. MacKinnon and H. White, J. Econometrics 29, 1985).
-    """
-    num_cameras = len(system.normal)
-    prior = np.eye(num_cameras) / max_offset_frames**2
-    w = system.weights
+    """Standard deviations of the offsets, by a block jackknife: the step that is left without each block."""
+    w, prior = system.weights, np.eye(len(system.offset_frames)) / max_offset_frames**2
     # The Geman-McClure cost has less curvature than least squares with the fixed weights w: its second derivatives are
     # w (4 √w - 3) along the residual and w across it.
     curvature = max(float((w * (2 * np.sqrt(w) - 1)).sum() / max(w.sum(), 1e-12)), _MIN_CURVATURE)
-    inverse = np.linalg.inv(curvature * system.normal / system.variance_px2 + prior)
-    # The mean of the offsets is 0.
+    normal, gradient = curvature * system.normal / system.variance_px2, system.gradient / system.variance_px2
+    block = time_blocks(np.asarray((w > 0).any(axis=-1)))
+    block_normal = np.array([normal[block == one].sum(axis=0) for one in range(block.max(initial=0) + 1)])
+    block_gradient = np.array([gradient[block == one].sum(axis=0) for one in range(len(block_normal))])
+    information = np.diagonal(block_normal, axis1=-2, axis2=-1)
+    weight = information.sum(axis=-1)
+    used = weight > 1e-6 * weight.sum()
+    total = block_normal.sum(axis=0) + prior
+    left_out = np.linalg.solve(total - block_normal[used], -block_gradient[used][..., None])[..., 0]
+    left_out -= left_out.mean(axis=1, keepdims=True)
+    variance = np.zeros(len(prior))
+    if used.sum() > 1:
+        freedom = information.sum(axis=0) ** 2 / np.maximum((information**2).sum(axis=0), 1e-300) - 1
+        spread = np.diag(block_jackknife(np.zeros(len(prior)), left_out, weight[used]))
+        variance = spread * widening(np.maximum(freedom, _LEAST_FREEDOM)) ** 2
+    # Where nothing moves, the prior alone is known. The mean of the offsets is 0.
+    inverse = np.linalg.inv(total)
     inverse -= inverse.mean(axis=0)
     inverse -= inverse.mean(axis=1, keepdims=True)
-    influence = np.einsum("kb,bfdci->kfdci", inverse / system.variance_px2, system.influence)
-    error_px = (w / (1 - np.minimum(system.leverage, _MAX_LEVERAGE)))[..., None] * system.residual_px
-    variance = np.einsum("kb,bc,kc->k", inverse, prior, inverse)
-    for camera in range(num_cameras):
-        variance += _propagate_errors(influence[..., camera, :], error_px[:, :, camera], w[:, :, camera] > 0)
-    return np.sqrt(variance)
-
-
-def _propagate_errors(
-    influence: Float[np.ndarray, "cameras frames drones 2"],
-    error_px: Float[np.ndarray, "frames drones 2"],
-    there: Bool[np.ndarray, "frames drones"],
-) -> Float[np.ndarray, "cameras"]:
-    """Variances of all offsets that the errors of one camera's detections cause.
-
-    The errors are stationary, with the same autocovariance for all drones and for both axes. Different drones have a
-    constant covariance, which is that of an error of the camera's pose or lens.
-    """
-    if not there.any():
-        return np.zeros(len(influence))
-    pairs = np.round(autocorrelation(there.astype(float)).sum(axis=1))
-    covariance = autocorrelation(error_px).sum(axis=(1, 2)) / np.maximum(2 * pairs, 1)
-    # Estimates at long lags are noise: the sum ends where two neighbouring lags are negative together (C. J. Geyer,
-    # Statistical Science 7 (4), 1992). Only lags count at which pairs of frames exist.
-    lags = np.flatnonzero(pairs)
-    padded = np.append(covariance[lags], 0.0)[: len(lags) + len(lags) % 2]
-    positive = np.logical_and.accumulate(padded[0::2] + padded[1::2] > 0)
-    kept = lags[np.repeat(positive, 2)[: len(lags)]]
-    products = autocorrelation(np.moveaxis(influence, 1, 0)).sum(axis=(2, 3))
-    twice = np.where(kept > 0, 2.0, 1.0)
-    # Never less than the variance of independent errors.
-    variance = np.maximum(products[0] * covariance[0], (twice * covariance[kept]) @ products[kept])
-    error_sum, influence_sum, count = error_px.sum(axis=0), influence.sum(axis=1), there.sum(axis=0)
-    pairs_of_drones = count.sum() ** 2 - (count**2).sum()
-    shared = (error_sum.sum(axis=0) ** 2).sum() - (error_sum**2).sum()
-    product = (influence_sum.sum(axis=1) ** 2).sum(axis=-1) - (influence_sum**2).sum(axis=(1, 2))
-    variance += max(shared / max(2 * pairs_of_drones, 1), 0.0) * np.maximum(product, 0.0)
-    share = variance / np.maximum(products[0] * (error_px**2).sum(), 1e-300)
-    return variance * widening(share) ** 2
+    return np.sqrt(variance + np.einsum("kb,bc,kc->k", inverse, prior, inverse))

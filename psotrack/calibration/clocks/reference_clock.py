@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from psotrack.calibration.clocks.synchronisation import Offset, find_offset, own_reference
-from psotrack.calibration.clocks.time_shift import shifted
 from psotrack.errors import InputError
+from psotrack.evaluation import Offset, find_offset
 from psotrack.recordings import Recording
+from psotrack.support import COLOURS, save_figure
 from psotrack.trajectories import UNASSIGNED, Trajectories, resample
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Largest offset that is tried where nobody says one, seconds.
 USUAL_OFFSET_S = 2.0
@@ -123,4 +127,45 @@ def reference_for(
     if offset_s == "auto":
         offset_s = reference_offset(recording, tracks).offset.offset_s
     time_s = recording.timeline().time_s
-    return shifted(own_reference(recording), offset_s, np.arange(len(time_s)), time_s), offset_s
+    return resample(own_reference(recording), np.arange(len(time_s)), time_s, later_s=offset_s), offset_s
+
+
+def own_reference(recording: Recording) -> Trajectories:
+    """The reference of a recording at its own rate, with orientations only if every position has one.
+
+    Raises:
+        InputError: the recording has no reference.
+    """
+    known = recording.reference
+    if known is None:
+        raise InputError(recording.folder, expected="a reference to synchronise with", found="none")
+    reference = known.truth if known.own is None else known.own
+    if reference.orientation_wxyz is not None:
+        turned = np.isfinite(reference.orientation_wxyz).all(axis=-1)
+        if not turned[reference.seen].all():
+            return replace(reference, orientation_wxyz=None)
+    return reference
+
+
+def save_curve(path: str | Path, offset: Offset, *, force: bool = False) -> None:
+    """Save a PNG with the mean distance at each offset, and a mark at the offset that was found.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or the file cannot be written.
+    """
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        axes.plot(offset.curve_s, 1e3 * offset.curve_m, color=COLOURS[0], linewidth=1.2)
+        axes.plot(offset.offset_s, 1e3 * offset.mean_distance_m, "o", color=COLOURS[1], markersize=5)
+        axes.annotate(
+            f"{offset.offset_s:+.4f} s, {1e3 * offset.mean_distance_m:.1f} mm",
+            (offset.offset_s, 1e3 * offset.mean_distance_m),
+            (14, 12),
+            textcoords="offset points",
+        )
+        axes.set_xlabel("offset of the reference (s)")
+        axes.set_ylabel("mean distance (mm)")
+        axes.set_ylim(bottom=0)
+
+    save_figure(Path(path), (8.0, 4.0), draw, force)

@@ -9,6 +9,7 @@ from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import NEAR_M, Camera, project
 from psotrack.recordings import Timeline
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings
+from psotrack.trajectories.resampling import interpolated
 
 #: Largest error of a clock before the estimate, in intervals between instants: sightings are searched this far along a
 #: drone's motion.
@@ -140,15 +141,4 @@ def _interpolate(places_px: Float[np.ndarray, "instants drones 2"], timeline: Ti
     first = np.flatnonzero((frame >= 0) & (np.diff(frame, prepend=-1) != 0))
     frame_s = (timeline.time_s + offset_s)[first]
     gap_s = _MAX_GAP * float(np.median(np.diff(frame_s))) if len(first) > 1 else 0.0
-    for drone in range(places_px.shape[1]):
-        own = np.isfinite(places_px[first, drone]).all(axis=-1)
-        at_s, values_px = frame_s[own], places_px[first[own], drone]
-        places_px[:, drone] = np.nan
-        if len(at_s) < 2:
-            continue
-        after = np.clip(np.searchsorted(at_s, timeline.time_s), 1, len(at_s) - 1)
-        inside = (timeline.time_s >= at_s[0]) & (timeline.time_s <= at_s[-1])
-        inside &= at_s[after] - at_s[after - 1] <= gap_s
-        for axis in range(2):
-            values = np.interp(timeline.time_s, at_s, values_px[:, axis])
-            places_px[inside, drone, axis] = values[inside]
+    places_px[:] = interpolated(frame_s, places_px[first], gap_s)(timeline.time_s)

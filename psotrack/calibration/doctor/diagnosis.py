@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.agreement import Agreement
 from psotrack.calibration.doctor.findings import Finding
 from psotrack.calibration.doctor.reference_fit import ReferenceFit
 from psotrack.support import finite_or_none, html_block, html_table, text_table
@@ -25,7 +24,13 @@ class Diagnosis:
         cameras: names of the cameras.
         fps: frames per second of the videos.
         findings: disagreements; empty for a correct rig.
-        found: agreement of the rig with its sightings, after a wrong unit or interpretation was corrected.
+        num_frames: number of examined frames.
+        num_sightings: (cameras,), numbers of sightings in these frames.
+        num_explained: (cameras,), numbers of sightings that agree with those of other cameras, after a wrong unit or
+            interpretation of the rig was corrected.
+        residual_px: (cameras,), median distance of the camera's sightings from where the other cameras put the bodies,
+            pixels; NaN if too few agree.
+        residual_std: (cameras,), the same in units of the noise that boxes are first assumed to have.
         late_frames: (cameras,), how late each camera's video shows the scene, relative to the median camera, frames:
             frame i of a video that is late by k shows what the others show in frame i - k; NaN if it cannot be found.
         late_std_frames: (cameras,), standard deviations of `late_frames`.
@@ -37,7 +42,11 @@ class Diagnosis:
     cameras: tuple[str, ...]
     fps: float
     findings: tuple[Finding, ...]
-    found: Agreement
+    num_frames: int
+    num_sightings: Int[np.ndarray, "cameras"]
+    num_explained: Int[np.ndarray, "cameras"]
+    residual_px: Float[np.ndarray, "cameras"]
+    residual_std: Float[np.ndarray, "cameras"]
     late_frames: Float[np.ndarray, "cameras"]
     late_std_frames: Float[np.ndarray, "cameras"]
     epipolar_px: Float[np.ndarray, "cameras cameras"]
@@ -54,8 +63,8 @@ class Diagnosis:
                 }
                 for finding in self.findings
             ],
-            "frames": self.found.num_frames,
-            "explained": self.found.share,
+            "frames": self.num_frames,
+            "explained": float(self.num_explained.sum() / max(self.num_sightings.sum(), 1)),
             "cameras": self._measured(),
             "epipolar_px": [[finite_or_none(value) for value in row] for row in self.epipolar_px],
             "reference_m": None if self.reference is None else self.reference.before_m,
@@ -80,22 +89,18 @@ class Diagnosis:
 
     def _measured(self) -> list[dict[str, Any]]:
         """Measurements of each camera."""
-        found, rows = self.found, []
-        for index, name in enumerate(self.cameras):
-            residual_px = found.residual_px[:, index][found.used[:, index]]
-            noise_px = found.noise_px[:, index][found.used[:, index]]
-            rows.append(
-                {
-                    "camera": name,
-                    "detections_per_frame": float(found.num_sightings[index] / max(found.num_frames, 1)),
-                    "explained": float(found.share_of_camera[index]),
-                    "residual_px": float(np.median(residual_px)) if len(residual_px) else None,
-                    "residual_std": float(np.median(residual_px / noise_px)) if len(residual_px) else None,
-                    "late_frames": finite_or_none(self.late_frames[index]),
-                    "late_std_frames": finite_or_none(self.late_std_frames[index]),
-                }
-            )
-        return rows
+        return [
+            {
+                "camera": name,
+                "detections_per_frame": float(self.num_sightings[index] / max(self.num_frames, 1)),
+                "explained": float(self.num_explained[index] / max(self.num_sightings[index], 1)),
+                "residual_px": finite_or_none(self.residual_px[index]),
+                "residual_std": finite_or_none(self.residual_std[index]),
+                "late_frames": finite_or_none(self.late_frames[index]),
+                "late_std_frames": finite_or_none(self.late_std_frames[index]),
+            }
+            for index, name in enumerate(self.cameras)
+        ]
 
     def _rows(self) -> list[tuple[str, ...]]:
         """The same as texts of a table."""

@@ -12,28 +12,29 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.agreement import MIN_VIEWPOINTS, Agreement, measure_agreement
-from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, collect_views, explain_camera
-from psotrack.calibration.doctor.common_points import CommonPoints, find_common_points
+from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, CameraViews, explain_camera
+from psotrack.calibration.doctor.common_points import CommonPoints, Seen, least_viewpoints
+from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, medians, misfit_px, weigh
 from psotrack.calibration.doctor.diagnosis import Diagnosis
-from psotrack.calibration.doctor.fault_search import consistent_share, find_faults
+from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.findings import (
     Finding,
     describe_camera_fault,
     describe_fault,
     describe_reference,
 )
-from psotrack.calibration.doctor.hypotheses import parameters_of
-from psotrack.calibration.doctor.late_videos import measure_lags
 from psotrack.calibration.doctor.reference_fit import fit_reference
-from psotrack.calibration.doctor.rig_interpretations import (
-    find_better_interpretation,
-    required_share,
-)
+from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
 from psotrack.geometry import Rig
-from psotrack.tracking.matching import Sightings, epipolar_distance, wide_bounds
+from psotrack.tracking.matching import (
+    NOISE_PX,
+    NOISE_SHARE,
+    Sightings,
+    epipolar_distance,
+    wide_bounds,
+)
 from psotrack.trajectories import Trajectories
 
 #: Smallest and largest number of runs of consecutive frames that are examined, number of frames per run, and seconds
@@ -43,21 +44,22 @@ FEWEST_RUNS, MOST_RUNS, RUN_FRAMES, APART_S = 4, 14, 12, 1.2
 INTERPRETATION_FRAMES = 8
 #: Smallest and largest plausible median distance of two cameras in a room, metres.
 PLAUSIBLE_M = (0.05, 200.0)
-#: Largest plausible distance of a principal point from the image's middle, as a share of the image's side: real lenses
-#: are off by a few per cent.
-OFF_MIDDLE = 0.15
-#: Share of sightings that a correct rig explains. False detections, and drones that only two cameras see, are the rest.
+#: Largest plausible difference of a principal point from the image's middle, as a fraction of it: real lenses have a
+#: few per cent.
+FROM_MIDDLE = 0.3
+#: Fraction of sightings that a correct rig explains. False detections, and drones that only two cameras see, are the
+#: rest.
 SOUND_SHARE = 0.85
-#: Smallest share of explained sightings with which single cameras can be checked.
+#: Smallest fraction of explained sightings with which single cameras can be checked.
 MIN_SHARE = 0.3
-#: A camera may be grossly wrong if the loose matching uses less of its sightings than this share of the median
-#: camera's. It is wrong if a correction explains more of what the others see by this share, or if it explains less of
-#: this than the last number without a correction that helps.
-OFF_SHARE, GROSS_GAIN, NOTHING_EXPLAINED = 0.5, 0.3, 0.1
+#: A camera may be grossly wrong if the loose matching uses less of its sightings than this fraction of the median
+#: camera's. It is wrong if a correction explains more of what the others see by this fraction, or if it explains less
+#: of this than the last number without a correction that helps.
+SUSPECT_SHARE, GROSS_GAIN, NOTHING_EXPLAINED = 0.5, 0.3, 0.1
 #: Smallest number of points with which a rig can be checked.
 MIN_POINTS = 12
-#: Smallest share of matched sightings that go on from frame to frame: of boxes of bodies nine in ten do, of matches by
-#: chance about half.
+#: Smallest fraction of matched sightings that go on from frame to frame: of boxes of bodies nine in ten do, of matches
+#: by chance about half.
 MIN_CONSISTENT = 0.75
 #: Smallest and largest plausible size of a body, metres.
 PLAUSIBLE_BODY_M = (0.01, 10.0)
@@ -74,7 +76,7 @@ def examine(
     """Find faults of a rig from sightings of moving bodies.
 
     Faults that move the projections by less than the boxes' own errors are not found. With three cameras, a fault can
-    often not be assigned to one of them.
+    often not be assigned to one of them, with two it never can.
 
     Args:
         rig: the rig as it was read.
@@ -84,79 +86,64 @@ def examine(
         bounds_m: (2, 3), corners of the region where bodies can be, metres; None: all places that the cameras may see.
     """
     frames = sampled_frames(sightings.num_frames, fps)
-    findings, rig = _check_numbers(rig, sightings, frames)
-    bounds_m = wide_bounds(rig) if bounds_m is None else bounds_m
-    found = measure_agreement(rig, sightings, frames, bounds_m)
-    points = find_common_points(rig, sightings, frames, bounds_m, fps)
+    seen = Seen(sightings, frames, wide_bounds(rig) if bounds_m is None else bounds_m, fps)
+    findings, rig = _check_numbers(rig, seen)
+    if bounds_m is None:
+        seen = replace(seen, bounds_m=wide_bounds(rig))
+    total = max(int(seen.count.sum()), 1)
+    explained, points = seen.explained(rig), seen.common_points(rig)
     # A small fault of one camera makes no interpretation of the whole rig likely.
-    share = max(found.share, float(np.mean(points.share)))
-    if share < SOUND_SHARE and found.num_sightings.any():
-        interpretation = find_better_interpretation(
-            rig, sightings, frames[:: max(1, len(frames) // INTERPRETATION_FRAMES)], bounds_m
-        )
-        better = (
-            found
-            if interpretation is None
-            else measure_agreement(interpretation.rig, sightings, frames, bounds_m)
-        )
-        if interpretation is not None and better.share > required_share(share):
-            who = (
-                f"cameras {' and '.join(interpretation.cameras)}"
-                if interpretation.cameras
-                else "the calibration"
+    share = max(explained.sum() / total, float(np.mean(points.share)))
+    if share < SOUND_SHARE and seen.count.any():
+        few = replace(seen, frames=frames[:: max(1, len(frames) // INTERPRETATION_FRAMES)])
+        better = find_best_interpretation(rig, few)
+        again = seen.explained(better.rig)
+        # It must explain at least half of what is missing.
+        if again.sum() / total > (1 + share) / 2:
+            who = f"cameras {' and '.join(better.cameras)}" if better.cameras else "the calibration"
+            numbers = (
+                f"(explains {again.sum() / total:.0%} of the detections, not {explained.sum() / total:.0%})"
             )
-            numbers = f"(explains {better.share:.0%} of the detections, not {found.share:.0%})"
-            message = f"{who}: {interpretation.words} {numbers}"
-            findings.append(
-                Finding(interpretation.kind, interpretation.cameras, message, interpretation.remedy)
-            )
-            rig, found = interpretation.rig, better
-            points = find_common_points(rig, sightings, frames, bounds_m, fps)
-    if max(found.share, float(points.share.max())) < MIN_SHARE or len(points.frame) < MIN_POINTS:
-        return _undecided(rig, found, [*findings, _nothing_agrees(found, points)], fps)
-    consistent = consistent_share(rig, points)
-    if consistent < MIN_CONSISTENT:
-        message = (
-            f"the detections: of those that agree over the cameras, only {consistent:.0%} go on from frame to frame, "
-            "so the others agree by chance"
-        )
-        finding = Finding(
-            "too little seen", (), message, "the rig cannot be checked; pass other --detections"
-        )
-        return _undecided(rig, found, [*findings, finding], fps)
-    lag, std = measure_lags(rig, points, fps)
-    gross, sound = _find_gross_faults(rig, found, points, sightings, frames, bounds_m, fps)
-    findings += gross
-    if gross and sound.sum() >= MIN_VIEWPOINTS:
-        rest, seen = _select(rig, sightings, sound)
-        small, _ = find_faults(rest, find_common_points(rest, seen, frames, bounds_m, fps))
-    else:
-        rest = rig
-        small, _ = find_faults(rig, points)
-    findings += [describe_fault(rest, fault, fps) for fault in small]
-    for fault in small:
-        if fault.certain and fault.best.hypothesis.kind == "clock":
-            # To the estimate of all lags together, the sightings of a very late video are outliers.
-            index, camera = (
-                rig.names.index(rest.names[fault.best.hypothesis.camera]),
-                fault.best.hypothesis.camera,
-            )
-            lag[index] = parameters_of(fault.best.step, camera)[-1]
-            std[index] = parameters_of(fault.best.std, camera)[-1]
+            message = f"{who}: {better.words} {numbers}"
+            findings.append(Finding(better.kind, better.cameras, message, better.remedy))
+            rig, explained, points = better.rig, again, seen.common_points(better.rig)
+    data = weigh(Corrected(rig, np.zeros(len(rig))), points)
+    diagnosis = Diagnosis(
+        cameras=rig.names,
+        fps=fps,
+        findings=(),
+        num_frames=len(frames),
+        num_sightings=seen.count,
+        num_explained=explained,
+        residual_px=np.full(len(rig), np.nan),
+        residual_std=np.full(len(rig), np.nan),
+        late_frames=np.full(len(rig), np.nan),
+        late_std_frames=np.full(len(rig), np.nan),
+        epipolar_px=_median_epipolar_distances(rig, points),
+        reference=None,
+    )
+    unknown = _why_unknown(rig, seen, explained, points, data)
+    if unknown is not None:
+        return replace(diagnosis, findings=(*findings, unknown))
+    lags = find_lags(rig, data)
+    findings += _find_faults(rig, seen, data, lags)
+    if not findings and explained.sum() < MIN_SHARE * total:
+        findings.append(_nothing_agrees(rig, seen, explained))
     fit = None
     if reference is not None:
-        inside = found.frame < reference.num_frames
-        fit = fit_reference(found.frame[inside], found.position_m[inside], reference, fps)
+        inside = points.frame < reference.num_frames
+        fit = fit_reference(points.frame[inside], points.start_m[inside], reference, fps)
         findings += describe_reference(fit, fps)
-    epipolar_px = _median_epipolar_distances(rig, found)
-    return Diagnosis(rig.names, fps, tuple(findings), found, lag, std, epipolar_px, fit)
-
-
-def _undecided(rig: Rig, found: Agreement, findings: list[Finding], fps: float) -> Diagnosis:
-    """The diagnosis of a rig that cannot be checked further."""
-    nothing = np.full(len(rig), np.nan)
-    epipolar_px = _median_epipolar_distances(rig, found)
-    return Diagnosis(rig.names, fps, tuple(findings), found, nothing, nothing, epipolar_px, None)
+    misfit = misfit_px(Corrected(rig, np.zeros(len(rig))), data)
+    return replace(
+        diagnosis,
+        findings=tuple(findings),
+        residual_px=medians(misfit),
+        residual_std=medians(misfit / (NOISE_PX + NOISE_SHARE * points.side_px)),
+        late_frames=lags[0],
+        late_std_frames=lags[1],
+        reference=fit,
+    )
 
 
 def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chosen"]:
@@ -167,9 +154,67 @@ def sampled_frames(num_frames: int, fps: float = 25.0) -> Int[np.ndarray, "chose
     return frames[frames < num_frames]
 
 
-def _check_numbers(
-    rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]
-) -> tuple[list[Finding], Rig]:
+def _find_faults(
+    rig: Rig, seen: Seen, data: WeightedPoints, lags: Float[np.ndarray, "2 cameras"]
+) -> list[Finding]:
+    """Find faults of cameras, the largest first, each without the cameras that were found wrong before.
+
+    The lags of wrong clocks are written into `lags`: to the estimate of all lags together, the sightings of a very
+    late video are outliers.
+    """
+    findings: list[Finding] = []
+    names, rest = list(rig.names), rig
+    # At least half of the cameras are taken as sound.
+    while len(findings) < max(1, len(rig) // 2):
+        finding = _gross_fault(rest, seen, data.points)
+        if finding is None:
+            fault = find_fault(rest, data)
+            if fault is None or (findings and not fault.certain):
+                break
+            finding = describe_fault(rest, fault, seen.fps)
+            if finding.kind == "clock":
+                column = list(fault.best.hypothesis.columns)
+                number = names.index(finding.cameras[0])
+                lags[:, number] = fault.best.step[column].item(), fault.best.std[column].item()
+        findings.append(finding)
+        index = [number for number, name in enumerate(rest.names) if name not in finding.cameras]
+        seen, rest = seen.by(index), rest.select([rest.names[number] for number in index])
+        if not finding.cameras or finding.kind == "unclear" or least_viewpoints(rest) < 3:
+            break
+        data = weigh(Corrected(rest, np.zeros(len(rest))), seen.common_points(rest))
+    return findings
+
+
+def _gross_fault(rig: Rig, seen: Seen, points: CommonPoints) -> Finding | None:
+    """The largest fault of a camera whose sightings take no part in the loose matching."""
+    wrong = []
+    for index in np.flatnonzero(points.share < SUSPECT_SHARE * np.median(points.share)).tolist():
+        others = [number for number in range(len(rig)) if number != index]
+        rest = rig.select([rig.names[number] for number in others])
+        if least_viewpoints(rest) < 3:
+            continue
+        known, boxes = seen.by(others).common_points(rest), seen.sightings
+        views = CameraViews(
+            known.start_m,
+            known.velocity_m,
+            boxes.centre_px[known.frame, index],
+            boxes.noise_px[known.frame, index],
+        )
+        # A camera that seldom has a detection is not known to be wrong.
+        if len(known.frame) < MIN_POINTS_OF_CAMERA:
+            continue
+        explained = explain_camera(rig.cameras[index], views)
+        gain = max(fault.explained for fault in explained) - explained[0].explained
+        often = np.isfinite(views.noise_px).any(axis=1).mean() >= 0.5
+        if gain > GROSS_GAIN or (often and explained[0].explained < NOTHING_EXPLAINED):
+            wrong.append((gain, index, explained))
+    if not wrong:
+        return None
+    _, index, explained = max(wrong, key=lambda each: each[0])
+    return describe_camera_fault(rig, index, explained, seen.fps)
+
+
+def _check_numbers(rig: Rig, seen: Seen) -> tuple[list[Finding], Rig]:
     """Find implausible lengths and principal points, and correct both: findings, and the corrected rig."""
     findings = []
     cameras = rig.cameras
@@ -178,29 +223,24 @@ def _check_numbers(
     # Between these limits every distance is plausible.
     factor = 1e-3 if apart_m > PLAUSIBLE_M[1] else 1e3 if apart_m < PLAUSIBLE_M[0] else 1.0
     if factor != 1.0 and PLAUSIBLE_M[0] <= factor * apart_m <= PLAUSIBLE_M[1]:
-        body_m = _body_size_m(rig, sightings, frames)
+        body_m = _body_size_m(rig, seen)
         # Far cameras that see bodies of plausible size are no fault: a drone that is flown over a wide field.
         if body_m is None or not PLAUSIBLE_BODY_M[0] <= body_m <= PLAUSIBLE_BODY_M[1]:
             read, right = ("metres", "millimetres") if factor < 1 else ("millimetres", "metres")
-            findings.append(
-                Finding(
-                    "unit",
-                    (),
-                    f"the calibration: cameras are {apart_m:.3g} m apart: {right} were read as {read}",
-                    f"name the unit in the header, cam_x[{'mm' if factor < 1 else 'm'}]",
-                )
-            )
+            message = f"the calibration: cameras are {apart_m:.3g} m apart: {right} were read as {read}"
+            remedy = f"name the unit in the header, cam_x[{'mm' if factor < 1 else 'm'}]"
+            findings.append(Finding("unit", (), message, remedy))
             T = cameras.T_cam_world.copy()
             T[:, :3, 3] *= factor
             cameras = replace(cameras, T_cam_world=T)
     of_lenses, K = _check_principal_points(rig)
-    findings += of_lenses
-    return findings, Rig(rig.names, replace(cameras, K=K))
+    return findings + of_lenses, Rig(rig.names, replace(cameras, K=K))
 
 
-def _body_size_m(rig: Rig, sightings: Sightings, frames: Int[np.ndarray, "chosen"]) -> float | None:
+def _body_size_m(rig: Rig, seen: Seen) -> float | None:
     """Median size of the bodies by the rig, metres; None if too few agree."""
-    points = find_common_points(rig, sightings, frames[: FEWEST_RUNS * RUN_FRAMES], wide_bounds(rig), 1.0)
+    few = replace(seen, frames=seen.frames[: FEWEST_RUNS * RUN_FRAMES], bounds_m=wide_bounds(rig))
+    points = few.common_points(rig)
     if len(points.frame) < MIN_POINTS:
         return None
     distance_m = np.linalg.norm(points.start_m[:, None] - rig.cameras.centre_world, axis=-1)
@@ -211,9 +251,8 @@ def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
     """Find principal points of another image size, one finding per ratio; return the findings and the corrected K."""
     cameras, K = rig.cameras, np.array(rig.cameras.K)
     ratio = K[:, :2, 2] / ((cameras.image_size_wh - 1) / 2)
-    off = np.abs(ratio - 1).max(axis=-1) > 2 * OFF_MIDDLE
     same_ratio: dict[tuple[str, ...], list[int]] = {}
-    for index in np.flatnonzero(off).tolist():
+    for index in np.flatnonzero(np.abs(ratio - 1).max(axis=-1) > FROM_MIDDLE).tolist():
         same_ratio.setdefault(tuple(f"{each:.2f}" for each in ratio[index]), []).append(index)
     findings = []
     for indices in same_ratio.values():
@@ -232,18 +271,36 @@ def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
     return findings, K
 
 
-def _nothing_agrees(found: Agreement, points: CommonPoints) -> Finding:
-    seen = int(found.num_sightings.sum())
-    # The few sightings may agree with each other.
-    if seen < MIN_POINTS_OF_CAMERA or found.share >= MIN_SHARE or points.share.max() >= MIN_SHARE:
+def _why_unknown(
+    rig: Rig, seen: Seen, explained: Int[np.ndarray, "cameras"], points: CommonPoints, data: WeightedPoints
+) -> Finding | None:
+    """Why the rig cannot be checked; None if it can."""
+    total = int(seen.count.sum())
+    agree = max(explained.sum() / max(total, 1), float(points.share.max(initial=0))) >= MIN_SHARE
+    remedy = "the rig cannot be checked; pass other --detections"
+    if total < MIN_POINTS_OF_CAMERA or (agree and len(points.frame) < MIN_POINTS):
         message = (
-            f"the detections: only {seen} in {found.num_frames} examined frames, which give {len(found.frame)} points "
-            f"that three viewpoints see"
+            f"the detections: only {total} in {len(seen.frames)} examined frames, which give {len(points.frame)} "
+            "points that the cameras see together for long enough"
         )
-        return Finding("too little seen", (), message, "the rig cannot be checked; pass other --detections")
+        return Finding("too little seen", (), message, remedy)
+    if not agree:
+        return _nothing_agrees(rig, seen, explained)
+    consistent = data.used.sum() / points.seen.sum()
+    if consistent >= MIN_CONSISTENT:
+        return None
     message = (
-        f"the rig or the detections: three viewpoints agree on only {found.share:.0%} of {seen} detections, "
-        "under every interpretation of the rig"
+        f"the detections: of those that agree over the cameras, only {consistent:.0%} go on from frame to frame, "
+        "so the others agree by chance"
+    )
+    return Finding("too little seen", (), message, remedy)
+
+
+def _nothing_agrees(rig: Rig, seen: Seen, explained: Int[np.ndarray, "cameras"]) -> Finding:
+    total, viewpoints = int(seen.count.sum()), "three" if least_viewpoints(rig) > 2 else "two"
+    message = (
+        f"the rig or the detections: {viewpoints} viewpoints agree on only {explained.sum() / total:.0%} of {total} "
+        "detections, under every interpretation of the rig"
     )
     # Blobs can be other parts of a body in each camera, if the body hardly moves: then the soundest rig disagrees.
     remedy = (
@@ -253,77 +310,11 @@ def _nothing_agrees(found: Agreement, points: CommonPoints) -> Finding:
     return Finding("no agreement", (), message, remedy)
 
 
-def _select(rig: Rig, sightings: Sightings, kept: Bool[np.ndarray, "cameras"]) -> tuple[Rig, Sightings]:
-    index = np.flatnonzero(kept)
-    rest = rig.select([rig.names[each] for each in index])
-    seen = Sightings(
-        sightings.centre_px[:, index],
-        sightings.size_px[:, index],
-        sightings.noise_px[:, index],
-        None if sightings.exposures is None else sightings.exposures.of_cameras(index),
-    )
-    return rest, seen
-
-
-def _find_gross_faults(
-    rig: Rig,
-    found: Agreement,
-    points: CommonPoints,
-    sightings: Sightings,
-    frames: Int[np.ndarray, "chosen"],
-    bounds_m: Float[np.ndarray, "2 3"],
-    fps: float,
-) -> tuple[list[Finding], Bool[np.ndarray, "cameras"]]:
-    """Find cameras with faults so large that their sightings take no part in the loose matching.
-
-    The worst camera is first. Each fault is searched without the cameras that were found wrong before.
-
-    Returns:
-        The findings, and (cameras,), False for wrong cameras.
-    """
-    findings: list[Finding] = []
-    sound = np.ones(len(rig), bool)
-    share = points.share
-    while sound.sum() > MIN_VIEWPOINTS:
-        rest, seen = _select(rig, sightings, sound)
-        if findings:
-            found = measure_agreement(rest, seen, frames, bounds_m)
-            share = find_common_points(rest, seen, frames, bounds_m, fps).share
-        suspects = np.flatnonzero(share < OFF_SHARE * np.median(share))
-        views = {each: collect_views(rest, found, seen, each) for each in suspects.tolist()}
-        explained = {
-            each: explain_camera(rest, of, each)
-            for each, of in views.items()
-            if len(of.point_m) >= MIN_POINTS_OF_CAMERA
-        }
-        won = {each: max(one.gain for one in faults) - faults[0].gain for each, faults in explained.items()}
-        off = [
-            each
-            for each, faults in explained.items()
-            if won[each] > GROSS_GAIN or faults[0].gain < NOTHING_EXPLAINED
-        ]
-        if not off:
-            break
-        worst = max(off, key=lambda each: won[each])
-        if won[worst] <= GROSS_GAIN and np.isfinite(views[worst].noise_px).any(axis=1).mean() < 0.5:
-            # A camera that seldom has a detection is not known to be wrong.
-            break
-        fault = describe_camera_fault(rest, worst, explained[worst], fps)
-        findings.append(fault)
-        # The other one of two exchanged cameras is wrong for the same reason.
-        concerned = [rig.names.index(name) for name in fault.cameras]
-        sound[concerned] = False
-    return findings, sound
-
-
-def _median_epipolar_distances(rig: Rig, found: Agreement) -> Float[np.ndarray, "cameras cameras"]:
+def _median_epipolar_distances(rig: Rig, points: CommonPoints) -> Float[np.ndarray, "cameras cameras"]:
     median_px = np.full((len(rig), len(rig)), np.nan)
-    for first, second in combinations(range(len(rig)), 2):
-        both = np.isfinite(found.noise_px[:, [first, second]]).all(axis=1)
-        if both.any():
-            px = found.centre_px[both]
-            pair = epipolar_distance(rig.cameras[first], rig.cameras[second], px[:, first], px[:, second])
-            median_px[first, second] = median_px[second, first] = np.median(
-                pair.max(axis=-1)[np.diag_indices(len(px))]
-            )
+    for pair in combinations(range(len(rig)), 2):
+        first, second = (rig.cameras[index] for index in pair)
+        px = points.centre_px[points.seen[:, pair].all(axis=1)][:, pair]
+        distance_px = epipolar_distance(first, second, px[:, 0], px[:, 1]).max(axis=-1)
+        median_px[pair] = median_px[pair[::-1]] = medians(np.diagonal(distance_px)[:, None])[0]
     return median_px

@@ -5,28 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from psotrack.calibration.doctor.camera_faults import CameraFault, pose_difference
+from psotrack.calibration.doctor.camera_faults import CameraFault
+from psotrack.calibration.doctor.corrections import Corrected
 from psotrack.calibration.doctor.evidence import Judged
 from psotrack.calibration.doctor.fault_search import FoundFault
-from psotrack.calibration.doctor.hypotheses import parameters_of
 from psotrack.calibration.doctor.reference_fit import NEAR_M, ReferenceFit
-from psotrack.geometry import Rig
+from psotrack.geometry import Camera, Rig
 
-#: Smallest gain of a fault, as a share of the camera's points: six parameters fitted to 30 points of a correct camera
-#: gain 0.015 by chance.
-CLEARLY = 0.05
-#: The simpler of two explanations is taken if its gain is at least this share of the larger gain.
-ALMOST = 0.9
+#: Smallest gain of a fault, as a fraction of the camera's points: six parameters fitted to 30 points of a correct
+#: camera gain 0.015 by chance.
+_CLEARLY = 0.05
+#: The simpler of two explanations is taken if its gain is at least this fraction of the larger gain.
+_ALMOST = 0.9
 #: Smallest relative difference between the scales of rig and reference that is reported: focal lengths are known to a
 #: few per cent.
-SAME_SCALE = 0.03
+_SAME_SCALE = 0.03
 #: What to do about a camera's place, and about its lens.
 _PLACE_ANEW = (
-    "place it anew with `psotrack calibrate extrinsics --pairs`, or all cameras with `psotrack calibrate rig`"
+    "place it anew with `psotrack calibrate rig --pairs`, or all cameras with `psotrack calibrate rig`"
 )
 _LENS_ANEW = "calibrate its lens anew with `psotrack calibrate intrinsics`"
-_LENSES_ANEW = "calibrate each lens anew with `psotrack calibrate intrinsics`"
 
 
 @dataclass(frozen=True)
@@ -53,104 +53,84 @@ class Finding:
 
 def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault], fps: float) -> Finding:
     """Describe the simplest explanation whose gain is almost as large as the largest gain."""
-    name, sound = rig.names[index], explained[0]
-    best = max(each.gain for each in explained)
-    fault = next(each for each in explained if each.gain - sound.gain >= ALMOST * (best - sound.gain))
-    if best - sound.gain <= CLEARLY:
-        message = f"camera {name}: it explains {sound.gain:.0%} of the drones that the others see; no correction helps"
-        return Finding("disagrees", (name,), message, f"leave {name} out with --cameras, or {_PLACE_ANEW}")
-    numbers = f"(explains {fault.gain:.0%} of the drones that the others see, not {sound.gain:.0%})"
-    if fault.kind == "clock":
-        late = "late" if fault.amount > 0 else "early"
-        message = f"camera {name}: its video is about {1e3 * abs(fault.amount) / fps:.0f} ms {late} {numbers}"
-        return Finding("clock", (name,), message, _clock_remedy(fault.amount / fps))
-    if fault.kind == "focal length":
-        percent = 100 * (1 / fault.amount - 1)
-        how = f"{abs(percent):.0f} % too {'short' if percent < 0 else 'long'}"
-        message = f"camera {name}: its focal length is {how} {numbers}"
-        f_px = fault.camera.K[0, 0]
-        return Finding("focal length", (name,), message, f"try {f_px:.0f} px, or {_LENS_ANEW}")
-    if fault.kind == "exchanged":
-        other = rig.names[int(fault.amount)]
-        message = f"camera {name}: what it sees fits the calibration of {other} {numbers}"
-        return Finding(
-            "exchanged", (name, other), message, "check which video and detections belong to which camera"
+    name, sound = rig.names[index], explained[0].explained
+    best = max(each.explained for each in explained)
+    if best - sound <= _CLEARLY:
+        message = (
+            f"camera {name}: it explains {sound:.0%} of the drones that the others see; no correction helps"
         )
-    turn_deg, shift_m = pose_difference(rig.cameras[index], fault.camera)
-    how = f"turned by {turn_deg:.1f} degrees" + (
-        f" and moved by {100 * shift_m:.0f} cm" if fault.kind == "moved" else ""
-    )
-    centre = ", ".join(f"{value:.2f}" for value in fault.camera.centre_world)
-    remedy = f"{_PLACE_ANEW}; the drones put it at ({centre}) m"
-    return Finding(fault.kind, (name,), f"camera {name}: it is {how} {numbers}", remedy)
+        return Finding("disagrees", (name,), message, f"leave {name} out with --cameras, or {_PLACE_ANEW}")
+    fault = next(each for each in explained if each.explained - sound >= _ALMOST * (best - sound))
+    words, remedy = _in_words(fault.kind, rig.cameras[index], fault.camera, fault.lag_frames / fps)
+    numbers = f"(explains {fault.explained:.0%} of the drones that the others see, not {sound:.0%})"
+    return Finding(_named(fault.kind), (name,), f"camera {name}: {words} {numbers}", remedy)
 
 
 def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
     """Describe a small fault, or the faults of several cameras that explain the sightings equally well."""
-    words, remedy = _in_words(rig, fault.best, fps)
-    numbers = f"which moves its boxes by {fault.shift_px:.0f} px"
-    hypothesis = fault.best.hypothesis
+    every = [fault.best, *fault.as_well]
+    (words, remedy), *also = (_of_judged(rig, one, fps) for one in every)
+    names = tuple(
+        dict.fromkeys(rig.names[one.hypothesis.camera] for one in every if one.hypothesis.camera >= 0)
+    )
     if not fault.certain:
-        several = [_in_words(rig, one, fps)[0] for one in (fault.best, *fault.as_well)]
-        names = tuple(
-            dict.fromkeys(
-                rig.names[one.hypothesis.camera]
-                for one in (fault.best, *fault.as_well)
-                if one.hypothesis.camera >= 0
-            )
-        )
-        message = (
-            f"the cameras disagree, and these faults explain it about equally well: {'; or '.join(several)}"
-        )
+        several = "; or ".join(f"{_who(rig, one)}: {_of_judged(rig, one, fps)[0]}" for one in every)
+        message = f"the cameras disagree, and these faults explain it about equally well: {several}"
         return Finding("unclear", names, message, "none is certain: check these cameras, or use more cameras")
-    if fault.as_well:
-        others = " or ".join(_in_words(rig, one, fps)[0].split(": ")[1] for one in fault.as_well)
-        numbers += f"; nearly as likely, {others}"
-    kind, *also = (_kind(one.hypothesis.kind) for one in (fault.best, *fault.as_well))
-    names = () if hypothesis.camera < 0 else (rig.names[hypothesis.camera],)
-    other_kinds = tuple(other for other in dict.fromkeys(also) if other != kind)
-    return Finding(kind, names, f"{words}, {numbers}", remedy, other_kinds)
+    numbers = f"which moves its boxes by {fault.shift_px:.0f} px"
+    if also:
+        numbers += f"; nearly as likely, {' or '.join(said for said, _ in also)}"
+    kind, *others = (_named(one.hypothesis.kind) for one in every)
+    other_kinds = tuple(other for other in dict.fromkeys(others) if other != kind)
+    return Finding(kind, names, f"{_who(rig, fault.best)}: {words}, {numbers}", remedy, other_kinds)
 
 
-def _clock_remedy(late_s: float) -> str:
-    """What to do about a camera that is late by some seconds."""
-    return f"track with --clocks auto, which finds it to a millisecond or so; or add {-late_s:.4f} to its time_offset_s"
-
-
-def _kind(kind: str) -> str:
+def _named(kind: str) -> str:
+    """The kind for programs: a camera that is turned and moved was moved."""
     return "moved" if kind == "turned and moved" else kind
 
 
-def _in_words(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
+def _who(rig: Rig, judged: Judged) -> str:
+    camera = judged.hypothesis.camera
+    return "the calibration" if camera < 0 else f"camera {rig.names[camera]}"
+
+
+def _of_judged(rig: Rig, judged: Judged, fps: float) -> tuple[str, str]:
     """What is wrong and by how much, and what to do."""
-    hypothesis, camera = judged.hypothesis, judged.hypothesis.camera
-    if camera < 0:
-        scale, scale_std = float(np.exp(judged.step[-1])), float(judged.std[-1])
-        how = f"{100 * abs(1 / scale - 1):.0f} % too {'short' if scale > 1 else 'long'} (± {100 * scale_std:.1f} %)"
-        words = f"the calibration: all focal lengths are {how}"
-        return words, f"multiply them by {scale:.3f}, or {_LENSES_ANEW}"
-    name = rig.names[camera]
-    step, std = parameters_of(judged.step, camera), parameters_of(judged.std, camera)
-    if hypothesis.kind == "clock":
-        lag, how = float(step[7]), "late" if step[7] > 0 else "early"
-        size_ms, std_ms = 1e3 * abs(lag) / fps, 1e3 * float(std[7]) / fps
-        return f"camera {name}: its video is {size_ms:.0f} ms {how} (± {std_ms:.0f} ms)", _clock_remedy(
-            lag / fps
+    # A fault of all lenses is the same factor for each camera.
+    kind, camera = judged.hypothesis.kind, max(judged.hypothesis.camera, 0)
+    after = Corrected(rig, np.zeros(len(rig))).by(judged.step)
+    late_s = float(after.lag_frames[camera]) / fps
+    std = judged.std[judged.hypothesis.columns[0]] / (fps if kind == "clock" else 1)
+    return _in_words(kind, rig.cameras[camera], after.rig.cameras[camera], late_s, std)
+
+
+def _in_words(
+    kind: str, before: Camera, after: Camera, late_s: float, std: float | None = None
+) -> tuple[str, str]:
+    """What is wrong and by how much, with a standard deviation where it is known, and what to do."""
+    if kind == "clock":
+        known = "" if std is None else f" (± {1e3 * std:.0f} ms)"
+        words = f"its video is {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}{known}"
+        return words, (
+            "track with --clocks auto, which finds it to a millisecond or so; "
+            f"or add {-late_s:.4f} to its time_offset_s"
         )
-    if hypothesis.kind == "focal length":
-        scale = float(np.exp(step[6]))
-        how = f"{100 * abs(1 / scale - 1):.1f} % too {'short' if scale > 1 else 'long'} (± {100 * std[6]:.1f} %)"
-        f_px = scale * rig.cameras.K[camera, 0, 0]
-        return (
-            f"camera {name}: its focal length is {how}",
-            f"try {f_px:.0f} px, or {_LENS_ANEW}",
+    scale = float(after.K[0, 0] / before.K[0, 0])
+    known = "" if std is None else f" (± {100 * std:.1f} %)"
+    how = f"{100 * abs(1 / scale - 1):.1f} % too {'short' if scale > 1 else 'long'}{known}"
+    if kind == "focal lengths":
+        return f"all focal lengths are {how}", (
+            f"multiply them by {scale:.3f}, or calibrate each lens anew with `psotrack calibrate intrinsics`"
         )
-    turn_deg, way_m = np.rad2deg(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
-    parts = [f"turned by {turn_deg:.1f} degrees"] if turn_deg else []
-    parts += [f"moved by {100 * way_m:.0f} cm"] if way_m else []
-    centre = ", ".join(f"{value:.2f}" for value in rig.cameras.centre_world[camera] + step[3:6])
-    remedy = f"{_PLACE_ANEW}; the boxes put it at ({centre}) m"
-    return f"camera {name}: it is {' and '.join(parts)}", remedy
+    if kind == "focal length":
+        return f"its focal length is {how}", f"try {after.K[0, 0]:.0f} px, or {_LENS_ANEW}"
+    turn = Rotation.from_matrix(after.T_cam_world[:3, :3] @ before.T_cam_world[:3, :3].T)
+    way_m = float(np.linalg.norm(after.centre_world - before.centre_world))
+    parts = [f"turned by {np.rad2deg(turn.magnitude()):.1f} degrees"] if "turned" in kind else []
+    parts += [f"moved by {100 * way_m:.0f} cm"] if "moved" in kind else []
+    centre = ", ".join(f"{value:.2f}" for value in after.centre_world)
+    return f"it is {' and '.join(parts)}", f"{_PLACE_ANEW}; the boxes put it at ({centre}) m"
 
 
 def describe_reference(fit: ReferenceFit, fps: float) -> list[Finding]:
@@ -182,7 +162,7 @@ def _motion_of(fit: ReferenceFit) -> tuple[str, str]:
     parts, kind = [], "reference moved"
     diagonal = np.diag(fit.R)
     turn_deg = np.rad2deg(np.arccos(np.clip((np.trace(fit.R) - 1) / 2, -1, 1)))
-    if abs(fit.scale - 1) > SAME_SCALE:
+    if abs(fit.scale - 1) > _SAME_SCALE:
         kind = "reference unit"
         parts.append(f"{fit.scale:.4g} times as large")
     if np.linalg.det(fit.R) < 0:

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from psotrack.calibration.doctor.agreement import measure_agreement
+from psotrack.calibration.doctor.common_points import Seen
 from psotrack.geometry import Camera, Rig
-from psotrack.tracking.matching import Sightings
 
 #: Common factors of the focal lengths: those tried first, and those tried around the best of the first.
 _SCALES = np.exp(np.arange(-0.7, 0.7001, 0.1))
@@ -39,39 +38,19 @@ class RigInterpretation:
     rig: Rig
 
 
-def find_better_interpretation(
-    rig: Rig,
-    sightings: Sightings,
-    frames: Int[np.ndarray, "chosen"],
-    bounds_m: Float[np.ndarray, "2 3"],
-) -> RigInterpretation | None:
-    """Find the interpretation that explains clearly more sightings (`required_share`); None if no interpretation does.
+def find_best_interpretation(rig: Rig, seen: Seen) -> RigInterpretation:
+    """Find the other interpretation of a rig that explains most sightings."""
 
-    Args:
-        rig: the rig as it was read.
-        sightings: sightings of the rig's cameras.
-        frames: (chosen,), numbers of the frames to examine.
-        bounds_m: (2, 3), corners of the region where bodies can be, metres.
-    """
-    share = measure_agreement(rig, sightings, frames, bounds_m).share
-
-    def explained(interpretation: RigInterpretation) -> float:
-        return measure_agreement(interpretation.rig, sightings, frames, bounds_m).share
-
-    def explained_in_few(interpretation: RigInterpretation) -> float:
-        return measure_agreement(interpretation.rig, sightings, frames[::_FEW], bounds_m).share
+    def explained(interpretation: RigInterpretation, step: int = 1) -> int:
+        return int(replace(seen, frames=seen.frames[::step]).explained(interpretation.rig).sum())
 
     every = [*_conventions(rig), *_exchanges(rig), *_lenses(rig, _SCALES)]
-    best = max(sorted(every, key=explained_in_few)[-_KEPT:], key=explained)
+    kept = sorted(every, key=lambda each: explained(each, _FEW))[-_KEPT:]
+    best = max(kept, key=explained)
     if best.kind == "focal lengths":
         scale = best.rig.cameras.K[0, 0, 0] / rig.cameras.K[0, 0, 0]
         best = max(_lenses(rig, scale * _FINER), key=explained)
-    return best if explained(best) > required_share(share) else None
-
-
-def required_share(share: float) -> float:
-    """Share of sightings that an interpretation must explain: the present share and half of the missing share."""
-    return (1 + share) / 2
+    return best
 
 
 def _conventions(rig: Rig) -> Iterator[RigInterpretation]:

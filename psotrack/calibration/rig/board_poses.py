@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
 from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
 from psotrack.calibration.lens_models import PINHOLE, LensModel
+from psotrack.calibration.pnp import ray_distances, solve_pnp
 from psotrack.calibration.rig.bundle import (
     BoardBundle,
     BoardProblem,
@@ -38,26 +38,11 @@ def find_board_poses(board: Board, rays: Float[np.ndarray, "corners 2"]) -> Floa
     """
     found: list[tuple[float, np.ndarray]] = []
     for order in board.labellings:
-        seen = np.isfinite(rays[:, 0])
-        if seen.sum() < board.least_corners:
+        if np.isfinite(rays[:, 0]).sum() < board.least_corners:
             break
-        points_m, ends = board.corners_m[order][seen], np.ascontiguousarray(rays[seen])
-        try:
-            count, turns, shifts, errors = cv2.solvePnPGeneric(
-                points_m, ends, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-            )
-        except cv2.error:
-            # OpenCV fails for corners on one line.
-            continue
-        if not count:
-            # OpenCV finds no pose where a lens that is far off spreads the corners of a view too far.
-            continue
-        for turn, shift, error in zip(turns, shifts, np.asarray(errors).ravel(), strict=True):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-            # The seen corners are in front of the camera; before a wide lens the board's origin may be beside it.
-            if np.isfinite(T).all() and (points_m @ T[2, :3] + T[2, 3] > 0).all():
-                found.append((float(error), T))
+        points_m = board.corners_m[order]
+        for T in solve_pnp(points_m, rays, "ippe"):
+            found.append((float(np.nanmean(ray_distances(points_m, rays, T) ** 2)), T))
     found.sort(key=lambda one: one[0])
     return np.array([T for _, T in found]).reshape(-1, 4, 4)
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from psotrack.calibration.board_recognition import describe_board, detect_board
 from psotrack.calibration.boards import Board
@@ -16,97 +15,17 @@ from psotrack.calibration.rig.adjustment import CalibratedRig, LensChoice, calib
 from psotrack.calibration.rig.findings import advise, figures_of, say_print, say_searched, worst_views
 from psotrack.calibration.rig.images import first_images, instants_of_numbers, open_images, open_recorded
 from psotrack.calibration.rig.point_files import fit_world, read_world, world_in_words
+from psotrack.calibration.rig.result import RigCalibration
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.views import find_views
 from psotrack.errors import errors_name
-from psotrack.geometry import Rig
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings.datasets import is_recording, open_recording
-from psotrack.support import (
-    POSITION,
-    Report,
-    format_numbers,
-    html_block,
-    html_table,
-    no_progress,
-    text_table,
-)
+from psotrack.support import POSITION, Report, format_numbers, no_progress
 
 _logger = logging.getLogger(__name__)
 
 _HEADINGS = ("camera", "views", "rms (px)", "f (px)", POSITION, "std (mm)")
-
-
-@dataclass(frozen=True, repr=False)
-class RigCalibration:
-    """A rig that was calibrated by a board; its text is what `psotrack calibrate rig` prints.
-
-    Attributes:
-        calibrated: the rig, and how it fits each view.
-        found: sentences on the board, and on which frames were searched for it.
-        printed: sentences on how the board was printed and seen.
-        world: what the world is.
-        path: file of the rig; None where it is not written.
-    """
-
-    calibrated: CalibratedRig
-    found: tuple[str, ...]
-    printed: tuple[str, ...]
-    world: str
-    path: Path | None = None
-
-    @property
-    def rig(self) -> Rig:
-        """The cameras."""
-        return self.calibrated.rig
-
-    def to_dict(self) -> dict[str, Any]:
-        """Figures of the cameras, the views that fit worst, and what to do."""
-        worst = worst_views(self.calibrated)
-        return {
-            "rig": None if self.path is None else str(self.path),
-            "cameras": {name: asdict(row) for name, row in figures_of(self.calibrated).items()},
-            "print": list(self.printed),
-            "worst_views": [
-                {"camera": name, "frame": frame, "residual_px": residual} for name, frame, residual in worst
-            ],
-            "advice": advise(self.calibrated),
-            "world": self.world,
-        }
-
-    def __str__(self) -> str:
-        models = ", ".join(f"{name} {row.lens}" for name, row in figures_of(self.calibrated).items())
-        worst = ", ".join(f"{name} {frame} {off:.2f}" for name, frame, off in worst_views(self.calibrated))
-        lines = [
-            *self.found,
-            *self.printed,
-            text_table(_HEADINGS, self._rows()),
-            f"lens models (distortion coefficients): {models}",
-            f"worst views (camera, frame, px): {worst}",
-            *advise(self.calibrated),
-            f"the world is {self.world}",
-        ]
-        return "\n".join(lines if self.path is None else [*lines, f"{self.path}"])
-
-    def __repr__(self) -> str:
-        return f"RigCalibration({', '.join(self.rig.names)}; the world is {self.world})"
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows: the table of the cameras, and what to do."""
-        return html_block("; ".join(advise(self.calibrated)), html_table(_HEADINGS, self._rows()))
-
-    def _rows(self) -> list[tuple[str, ...]]:
-        return [
-            (
-                name,
-                f"{row.views}",
-                f"{row.rms_px:.2f}",
-                f"{row.focal_px[0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row.focal_std_px[0]:.1f}",
-                format_numbers(row.centre_m, 3),
-                f"{1e3 * math.hypot(*row.centre_std_m):.1f}",
-            )
-            for name, row in figures_of(self.calibrated).items()
-        ]
 
 
 def calibrate_by_board(
@@ -141,9 +60,7 @@ def calibrate_by_board(
         every = {camera.name: len(camera.frames) for camera in cameras}
         searched = zip(found.views.names, found.searched.tolist(), strict=True)
         said += say_searched({name: (count, every[name]) for name, count in searched})
-        calibrated = calibrate_rig(
-            found.recognised.board, found.views, lenses, floor=settings.floor, report=report
-        )
+        calibrated = calibrate_rig(found.board, found.views, lenses, floor=settings.floor, report=report)
     if given is not None:
         with errors_name(given.path):
             change, left_m = fit_world(calibrated.rig, given, with_scale=False)
@@ -153,7 +70,46 @@ def calibrate_by_board(
     else:
         first = calibrated.rig.names[0]
         place = f"camera {first}: x right, y down, z forward; --floor and --world place it elsewhere"
-    return RigCalibration(calibrated, tuple(said), tuple(say_print(found)), place)
+    return _result(calibrated, said, say_print(found), place)
+
+
+def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], world: str) -> RigCalibration:
+    """The figures of the cameras, the views that fit worst, and what to do.
+
+    Args:
+        calibrated: the rig, and how it fits each view.
+        said: sentences on the board, and on which frames were searched for it.
+        printed: sentences on how the board was printed and seen.
+        world: what the world is.
+    """
+    figures, worst, advice = figures_of(calibrated), worst_views(calibrated), advise(calibrated)
+    rows = [
+        (
+            name,
+            f"{row.views}",
+            f"{row.rms_px:.2f}",
+            f"{row.focal_px[0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row.focal_std_px[0]:.1f}",
+            format_numbers(row.centre_m, 3),
+            f"{1e3 * math.hypot(*row.centre_std_m):.1f}",
+        )
+        for name, row in figures.items()
+    ]
+    models = ", ".join(f"{name} {row.lens}" for name, row in figures.items())
+    more = {
+        "print": printed,
+        "worst_views": [dict(zip(("camera", "frame", "residual_px"), view, strict=True)) for view in worst],
+        "advice": advice,
+        "world": world,
+    }
+    after = [
+        f"lens models (distortion coefficients): {models}",
+        f"worst views (camera, frame, px): {', '.join(f'{name} {frame} {px:.2f}' for name, frame, px in worst)}",
+        *advice,
+        f"the world is {world}",
+    ]
+    cameras = {name: asdict(row) for name, row in figures.items()}
+    table = _HEADINGS, rows
+    return RigCalibration(calibrated.rig, cameras, table, [*said, *printed], after, more, calibrated)
 
 
 def _lens_choice(settings: RigSettings) -> LensChoice:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.calibration.image_points import find_markers_in, read_image_points
-from psotrack.calibration.placed_cameras import PlacedCameras, place_cameras, row_of
+from psotrack.calibration.extrinsics import locate_camera
+from psotrack.calibration.image_points import find_markers, read_image_points
+from psotrack.calibration.intrinsics import lens_of_sensor, lens_of_view
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
@@ -29,19 +31,20 @@ from psotrack.calibration.rig.point_files import (
     world_in_words,
 )
 from psotrack.calibration.rig.point_shifts import find_point_shifts
+from psotrack.calibration.rig.result import PointFit, RigCalibration, calibration_by_points
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
-from psotrack.geometry import Rig, chosen_camera
+from psotrack.geometry import Rig, chosen_camera, make_rig
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings import read_detections
-from psotrack.recordings.datasets import open_recording
+from psotrack.recordings.datasets import is_recording, open_recording
 
-#: Share of the sightings below which the user is told how few are used.
+#: Fraction of the sightings below which the user is told how few are used.
 _FEW_USED = 0.5
 
 
-def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> PlacedCameras:
+def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> RigCalibration:
     """Place the cameras of a rig by a moving point, or by the two ends of a moving stick.
 
     Args:
@@ -67,51 +70,46 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
         if stick_m is not None and not views.point.any():
             expected = "the two ends of a stick, told apart by a column named point"
             raise InputError(sources[0], expected=expected, found="one point")
-    lenses = _lenses_of(views.names, settings.lenses)
+    lenses = _lenses_of(views.names, settings)
     with errors_name(sources[0]):
         found = calibrate_by_point(lenses, views)
-    stated = None if settings.world is None else read_world(settings.world)
+    given = None if settings.world is None else read_world(settings.world)
 
-    def world_of(found: PointRig) -> Similarity:
+    def world_of(found: PointRig) -> tuple[Similarity, str]:
         rig = found.adjusted.rig
-        if stated is not None:
-            return fit_world(rig, stated, _numbered(found), with_scale=True)[0]
-        if distance is not None:
-            return world_of_camera(rig, 0, distance[2] / distance_between(rig, *distance[:2]))
-        return world_of_camera(rig, 0, (stick_m or 1.0) / stick_length(found))
+        if given is not None:
+            change, left_m = fit_world(rig, given, _numbered(found), with_scale=True)
+            return change, world_in_words(given.path, left_m)
+        factor = (
+            (stick_m or 1.0) / stick_length(found)
+            if distance is None
+            else distance[2] / distance_between(rig, *distance[:2])
+        )
+        words = f"camera {rig.names[0]}: x right, y down, z forward; --world places it elsewhere"
+        return world_of_camera(rig, 0, factor), words
 
     with errors_name(settings.world or sources[0]):
-        change = world_of(found)
-    covariance_m2 = covariance_of_centres(found, world_of)
-    if stated is not None:
-        _, left_m = fit_world(found.adjusted.rig, stated, _numbered(found), with_scale=True)
-        place = world_in_words(stated.path, left_m)
-    else:
-        place = f"camera {views.names[0]}: x right, y down, z forward; --world places it elsewhere"
-    rig, rows = change.rig(found.adjusted.rig), {}
+        change, place = world_of(found)
+    covariance_m2 = covariance_of_centres(found, lambda found: world_of(found)[0])
+    rig, adjusted, fits = change.rig(found.adjusted.rig), found.adjusted, {}
     for index, name in enumerate(rig.names):
-        seen = np.isfinite(found.adjusted.residual_px[:, index])
-        rows[name] = row_of(
-            np.asarray(rig.cameras.centre_world[index]),
-            covariance_m2[index],
-            found.adjusted.residual_px[seen, index],
-            found.adjusted.used[seen, index],
-            found.views.number[seen],
-        )
-    shifts = map(str, find_point_shifts(found.adjusted.rig, views))
-    notes = [*_left_out(found, views), f"the world is {place}", *shifts]
-    return PlacedCameras(rig, rows, [*notes, *_unused(found), *_undetermined(rig, covariance_m2)])
+        seen = np.isfinite(adjusted.residual_px[:, index])
+        residual_px, used = adjusted.residual_px[seen, index], adjusted.used[seen, index]
+        fits[name] = PointFit(found.views.number[seen].tolist(), covariance_m2[index], residual_px, used)
+    shifts = map(str, find_point_shifts(adjusted.rig, views))
+    notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
+    return calibration_by_points(rig, fits, notes)
 
 
 def calibrate_by_known_points(
     sources: Sequence[Path],
     settings: RigSettings,
     marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]] | None = None,
-) -> PlacedCameras:
+) -> RigCalibration:
     """Place the cameras of a rig by points of known place, or by ArUco markers in their images.
 
     Args:
-        sources: with markers, the video of each camera; with points none.
+        sources: with markers, a recording or the video of each camera; with points none.
         settings: the points, and the lenses.
         marker_corners_m: corners of the markers by number, metres; None for points.
 
@@ -123,21 +121,35 @@ def calibrate_by_known_points(
         expected = "none with points of known place, which are the world"
         raise SettingsError("--world", expected=expected, found=f"{settings.world}")
     if marker_corners_m is not None:
+        if len(sources) == 1 and is_recording(sources[0]):
+            videos = open_recording(sources[0]).videos
+        else:
+            videos = {camera.name: camera.video for camera in open_images(sources, settings.names)}
         marks = {
-            camera.name: find_markers_in(
-                (grey for _, grey in camera.read(camera.spread(15))), marker_corners_m, settings.dictionary
-            )
-            for camera in open_images(sources)
+            name: find_markers(video, marker_corners_m, settings.dictionary) for name, video in videos.items()
         }
     elif sources:
         raise SettingsError("--pairs", expected="no video", found=f"{sources[0]}")
     else:
-        marks = read_image_points(settings.pairs or "")
-    lenses, world = _lenses_of(tuple(marks), settings.lenses), settings.pairs or settings.markers
-    by_name = {name: lenses.cameras[index] for index, name in enumerate(lenses.names)}
-    with errors_name(world):
-        placed = place_cameras(marks, by_name, settings.noise_px)
-    return PlacedCameras(placed.rig, placed.cameras, [f"the world is that of {world}"])
+        marks = read_image_points(settings.pairs or "", settings.places)
+    lenses, world = _lenses_of(tuple(marks), settings), settings.pairs or settings.markers
+    cameras, fits = {}, {}
+    for index, (name, mark) in enumerate(marks.items()):
+        lens = lenses.cameras[index]
+        with errors_name(world):
+            located = locate_camera(
+                mark.points_m,
+                mark.points_px,
+                np.asarray(lens.K),
+                np.asarray(lens.dist),
+                settings.noise_px,
+                fisheye=bool(lens.fisheye),
+                name=f"camera {name}",
+            )
+        cameras[name] = replace(lens, T_cam_world=located.T_cam_world)
+        covariance_m2 = located.centre_covariance_m2
+        fits[name] = PointFit(mark.points, covariance_m2, located.residual_px, located.used)
+    return calibration_by_points(make_rig(cameras), fits, [f"the world is that of {world}"])
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
@@ -155,51 +167,58 @@ def _left_out(found: PointRig, views: PointViews) -> list[str]:
     return [f"{used} of {seen} instants at which two cameras see the point are used, evenly spread"]
 
 
-def _unused(found: PointRig) -> list[str]:
-    """A sentence on sightings of two cameras, if the rig explains few of them."""
+def _weak(found: PointRig, rig: Rig, covariance_m2: Float[np.ndarray, "cameras 3 3"]) -> list[str]:
+    """Sentences on sightings that the rig does not explain, and on cameras that they hardly determine."""
+    sentences = []
     used, seen = int(found.adjusted.used.any(axis=1).sum()), len(found.views.number)
-    if used >= _FEW_USED * seen:
-        return []
-    return [
-        f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of one "
-        "instant, that the cameras see the same thing, and the lenses"
-    ]
-
-
-def _undetermined(rig: Rig, covariance_m2: np.ndarray) -> list[str]:
-    """A sentence on cameras whose places the sightings hardly determine."""
+    if used < _FEW_USED * seen:
+        sentences.append(
+            f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of "
+            "one instant, that the cameras see the same thing, and the lenses"
+        )
     centres = np.asarray(rig.cameras.centre_world)
-    apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    apart_m = np.linalg.norm(centres[:, None] - centres, axis=-1).max(axis=1)
     std_m = np.sqrt(np.trace(covariance_m2, axis1=1, axis2=2))
     loose = [
         f"{name} (± {std:.2g} m, {apart:.2g} m from the farthest camera)"
-        for name, std, apart in zip(rig.names, std_m, apart_m.max(axis=1), strict=True)
+        for name, std, apart in zip(rig.names, std_m, apart_m, strict=True)
         if std > LOOSE * apart
     ]
-    if not loose:
-        return []
-    return [
-        f"the sightings hardly determine the places of {', '.join(loose)}: move the point nearer to the cameras, "
-        "check the lenses, add a camera, or give points of known place with --pairs"
-    ]
+    if loose:
+        sentences.append(
+            f"the sightings hardly determine the places of {', '.join(loose)}: move the point nearer to the cameras, "
+            "check the lenses, add a camera, or give points of known place with --pairs"
+        )
+    return sentences
 
 
-def _lenses_of(names: Sequence[str], path: Path | None) -> Rig:
-    """Lenses of the cameras from a calibration; a file with one camera has the lens of all."""
-    if path is None:
+def _lenses_of(names: Sequence[str], settings: RigSettings) -> Rig:
+    """Lenses of the cameras, from a calibration or a data sheet; a file with one camera has the lens of all."""
+    path, fov_deg, focal_mm = settings.lenses, settings.fov_deg, settings.focal_length_mm
+    ways = sum(value is not None for value in (path, fov_deg, focal_mm))
+    if ways != 1 or (focal_mm is None) != (settings.sensor_mm is None):
         raise SettingsError(
             "--lenses",
-            expected="a calibration with the lens of each camera",
-            found="none",
-            remedy="calibrate intrinsics",
+            expected="a calibration with the lens of each camera, or --fov H,V, or --focal-length with --sensor",
+            found="another combination" if ways else "none",
         )
-    lenses = read_lenses(path)
+    if path is not None:
+        lenses = read_lenses(path, settings.size)
+    elif settings.size is None:
+        raise SettingsError("--size", expected="width and height of the images", found="none")
+    elif fov_deg is not None:
+        lenses = make_rig({"all": lens_of_view(*fov_deg, settings.size)})
+    else:
+        sensor_mm = settings.sensor_mm or (0.0, 0.0)
+        lenses = make_rig({"all": lens_of_sensor(focal_mm or 0.0, sensor_mm, settings.size)})
     if len(lenses) == 1:
         return Rig(tuple(names), lenses.cameras[np.zeros(len(names), np.int64)])
     chosen = [chosen_camera(name, lenses.names) for name in names]
     for name, found in zip(names, chosen, strict=True):
         if found is None:
-            raise InputError(path, expected=f"the lens of {name}", found=f"only {', '.join(lenses.names)}")
+            raise InputError(
+                path or "lenses", expected=f"the lens of {name}", found=f"only {', '.join(lenses.names)}"
+            )
     rows = np.array([lenses.names.index(found) for found in chosen if found is not None])
     return Rig(tuple(names), lenses.cameras[rows])
 

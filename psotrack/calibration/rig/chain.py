@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from psotrack.calibration.boards import Board
 from psotrack.calibration.lens_models import LensModel
@@ -21,7 +22,7 @@ from psotrack.errors import InputError
 
 #: Largest number of shared instants that give candidates, and that the candidates are compared on.
 _MOST_INSTANTS = 40
-#: Distance in the image, as a share of its width, up to which a first transform fits an instant.
+#: Distance in the image, as a fraction of its width, up to which a first transform fits an instant.
 _FITS = 0.02
 
 
@@ -103,48 +104,31 @@ def join_cameras(
     count = len(views.names)
     there = np.array([[len(candidates) > 0 for candidates in of_camera] for of_camera in seen.poses])
     shared = there.astype(np.int64) @ there.T.astype(np.int64)
-    pairs = []
+    cost, steps = np.zeros((count, count)), {}
     for first, second in combinations(range(count), 2):
         if shared[first, second]:
-            T, agreeing, error = _transform(seen, first, second, np.flatnonzero(there[first] & there[second]))
-            pairs.append((-agreeing, error, first, second, T))
-    group = list(range(count))
-    tree: dict[int, list[tuple[int, np.ndarray]]] = {camera: [] for camera in range(count)}
-    for _, _, first, second, T in sorted(pairs, key=lambda pair: pair[:4]):
-        if group[first] != group[second]:
-            tree[first].append((second, T))
-            tree[second].append((first, np.linalg.inv(T)))
-            group = [group[first] if one == group[second] else one for one in group]
-    if len(set(group)) > 1:
-        raise _not_joined(views, group)
-    placed = {0: np.eye(4)}
-    waiting = [0]
-    while waiting:
-        camera = waiting.pop()
-        for other, T in tree[camera]:
-            if other not in placed:
-                placed[other] = T @ placed[camera]
-                waiting.append(other)
-    T_cam_world = np.array([placed[camera] for camera in range(count)])
+            both = np.flatnonzero(there[first] & there[second])
+            T, agreeing, error = _transform(seen, first, second, both)
+            steps[first, second], steps[second, first] = T, np.linalg.inv(T)
+            # The error, which is below 1, decides between pairs of which equally many instants agree.
+            cost[first, second] = 1 + shared.max() - agreeing + error
+    order, before = breadth_first_order(minimum_spanning_tree(cost), 0, directed=False)
+    _check_joined(views, shared)
+    T_cam_world = np.tile(np.eye(4), (count, 1, 1))
+    for camera in order[1:]:
+        T_cam_world[camera] = steps[before[camera], camera] @ T_cam_world[before[camera]]
     return Chain(T_cam_world, *_place_boards(seen, T_cam_world), shared)
 
 
 def _find_poses(
     board: Board, views: BoardViews, models: tuple[LensModel, ...], lenses: tuple[np.ndarray, ...]
 ) -> _Seen:
-    rays = np.stack(
-        [
-            model.normalise(lens, corners_px.reshape(-1, 2)).reshape(corners_px.shape)
-            for model, lens, corners_px in zip(models, lenses, views.corners_px, strict=True)
-        ]
-    )
-    poses = [
-        [
-            find_board_poses(board, of_view) if is_seen else np.zeros((0, 4, 4))
-            for of_view, is_seen in zip(of_camera, seen, strict=True)
-        ]
-        for of_camera, seen in zip(rays, views.seen, strict=True)
-    ]
+    rays = np.full(views.corners_px.shape, np.nan)
+    for camera, (model, lens) in enumerate(zip(models, lenses, strict=True)):
+        there = views.seen[camera]
+        pixels = views.corners_px[camera, there]
+        rays[camera, there] = model.normalise(lens, pixels.reshape(-1, 2)).reshape(pixels.shape)
+    poses = [[find_board_poses(board, of_view) for of_view in of_camera] for of_camera in rays]
     widths = views.image_size_wh.max(axis=1)
     return _Seen(board, rays, np.array([lens[0] for lens in lenses]) / widths, poses)
 
@@ -162,15 +146,15 @@ def _transform(
             for there in seen.poses[second][instant]
         ]
     )
-    errors = np.full((len(candidates), len(some)), 1.0)
     most = max(len(seen.poses[first][instant]) for instant in some)
-    for rank in range(most):
-        # The rank-th pose of each instant; instants with fewer poses repeat their last one.
-        here = np.array(
+    # All poses of each instant; instants with fewer poses repeat their last one.
+    here = np.array(
+        [
             [seen.poses[first][instant][min(rank, len(seen.poses[first][instant]) - 1)] for instant in some]
-        )
-        found, _ = seen.errors(second, some, candidates[:, None] @ here)
-        errors = np.minimum(errors, found)
+            for rank in range(most)
+        ]
+    )
+    errors = seen.errors(second, some, candidates[:, None, None] @ here)[0].min(axis=1)
     total = np.minimum(errors, 5 * _FITS).mean(axis=1)
     best = int(total.argmin())
     # All shared instants count, not only those that gave candidates.
@@ -210,22 +194,18 @@ def check_joined(views: BoardViews) -> None:
         InputError: the cameras are not all joined.
     """
     seen = views.seen.astype(np.int64)
-    group = list(range(len(views.names)))
-    for first, second in zip(*np.nonzero(seen @ seen.T), strict=True):
-        group = [group[first] if one == group[second] else one for one in group]
-    if len(set(group)) > 1:
-        raise _not_joined(views, group)
+    _check_joined(views, seen @ seen.T)
 
 
-def _not_joined(views: BoardViews, group: list[int]) -> InputError:
-    """Error of cameras that no shared view joins to the others."""
-    parts = [
-        ", ".join(name for name, of in zip(views.names, group, strict=True) if of == one)
-        for one in sorted(set(group))
-    ]
-    return InputError(
-        "board",
-        expected="instants that join all cameras, pair by pair",
-        found=f"no instant at which one of {parts[0]} and one of {parts[1]} see the board together",
-        remedy=f"film the board where {parts[0].split(', ')[0]} and {parts[1].split(', ')[0]} both see it",
-    )
+def _check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"]) -> None:
+    """Raise `InputError` for cameras that no shared view joins to the others."""
+    count, group = connected_components(shared, directed=False)
+    if count > 1:
+        first, second = ([views.names[index] for index in np.flatnonzero(group == one)] for one in (0, 1))
+        parts = f"one of {', '.join(first)} and one of {', '.join(second)}"
+        raise InputError(
+            "board",
+            expected="instants that join all cameras, pair by pair",
+            found=f"no instant at which {parts} see the board together",
+            remedy=f"film the board where {first[0]} and {second[0]} both see it",
+        )

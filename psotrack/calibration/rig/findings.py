@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
+from psotrack.calibration.pnp import ray_distances, refine_pnp
 from psotrack.calibration.rig.adjustment import CalibratedRig
 from psotrack.calibration.rig.lens_choice import say_not_compared
 from psotrack.calibration.rig.views import FoundBoards
@@ -16,11 +16,11 @@ from psotrack.geometry import undistort
 
 #: Columns and rows of cells of an image; a cell with a corner is covered.
 CELLS = (8, 6)
-#: Smallest share of an image that the board should have covered.
+#: Smallest fraction of an image that the board should have covered.
 _COVERED = 0.5
 #: Smallest number of views that a camera should share with another one.
 _SHARED = 12
-#: Largest standard deviation of a focal length, as a share of it, that needs no advice.
+#: Largest standard deviation of a focal length, as a fraction of it, that needs no advice.
 _FOCAL_STD = 0.005
 #: A camera's views slip if the residuals are larger by this factor, and by this many pixels, than within the views.
 _SLIP_FACTOR, _SLIP_PX = 2.0, 0.3
@@ -42,7 +42,7 @@ class CameraFigures:
         rms_px: root mean square of the residuals of the corners that count, pixels.
         median_px: median residual of all corners found, pixels.
         own_median_px: median residual within the views, pixels: errors of the corners and of the lens alone.
-        covered: share of the image in which corners were found.
+        covered: fraction of the image in which corners were found.
         coverage: number of corners in each part of the image, row by row.
         image_size_wh: width and height of the images, pixels.
         focal_px: focal lengths along x and y, pixels.
@@ -69,6 +69,11 @@ class CameraFigures:
     centre_std_m: tuple[float, ...]
     best_partner: str
     shared: int
+
+    @property
+    def slip_px(self) -> float:
+        """How far the board is from where the other cameras have it, typically, pixels."""
+        return float(np.sqrt(max(self.median_px**2 - self.own_median_px**2, 0)))
 
 
 def figures_of(calibrated: CalibratedRig) -> dict[str, CameraFigures]:
@@ -142,10 +147,8 @@ def say_searched(searched: Mapping[str, tuple[int, int]]) -> list[str]:
 
 def say_print(found: FoundBoards) -> list[str]:
     """Sentences on how the board was printed and seen."""
-    recognised, sentences = found.recognised, []
-    if recognised.inverted:
-        sentences.append("the board is printed white on black")
-    if recognised.board.legacy:
+    sentences = []
+    if found.board.legacy:
         sentences.append(
             "the board has the pattern of OpenCV before version 4.6, with a marker in its first corner"
         )
@@ -162,49 +165,36 @@ def find_shifts(calibrated: CalibratedRig) -> dict[str, int]:
 
     The camera is placed again by where the other cameras have the board a few instants before and after.
     """
-    board = calibrated.board
-    number = calibrated.views.number
     shifts = {}
-    for index, row in enumerate(figures_of(calibrated).values()):
+    for index, (name, row) in enumerate(figures_of(calibrated).items()):
         if row.median_px < _SHIFT_PX or row.median_px < _SHIFT_FACTOR * row.own_median_px:
             continue
-        camera = calibrated.rig.cameras[index]
-        others = np.asarray(np.delete(calibrated.used, index, axis=0).any(axis=(0, 2)))
-        error_px = {}
-        instants = np.flatnonzero(calibrated.views.seen[index])
-        rays = undistort(camera, calibrated.views.corners_px[index, instants].reshape(-1, 2))
-        rays = rays.reshape(len(instants), -1, 2)
-        focal_px = float(np.asarray(camera.K)[0, 0])
-        for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1):
-            place = {int(n): k for k, n in enumerate(number) if others[k]}
-            rows = [
-                (k, place[int(number[i]) + shift])
-                for k, i in enumerate(instants)
-                if number[i] + shift in place
-            ]
-            if len(rows) >= _SHARED // 2:
-                views, boards = np.array(rows).T
-                T = calibrated.T_world_board[boards]
-                points_m = np.einsum("vij,nj->vni", T[:, :3, :3], board.corners_m) + T[:, None, :3, 3]
-                error_px[shift] = focal_px * _misplaced(points_m, rays[views], np.asarray(camera.T_cam_world))
-        best = min(error_px, key=lambda shift: error_px[shift], default=0)
-        if best and 0 in error_px and error_px[best] < error_px[0] / _SHIFT_FACTOR:
-            shifts[calibrated.rig.names[index]] = best
+        errors = {
+            shift: _error_of(calibrated, index, shift) for shift in range(-_MOST_SHIFT, _MOST_SHIFT + 1)
+        }
+        best = min(errors, key=lambda shift: errors[shift])
+        if best and errors[best] < errors[0] / _SHIFT_FACTOR and np.isfinite(errors[0]):
+            shifts[name] = best
     return shifts
 
 
-def _misplaced(
-    points_m: Float[np.ndarray, "views corners 3"],
-    rays: Float[np.ndarray, "views corners 2"],
-    T_cam_world: Float[np.ndarray, "4 4"],
-) -> float:
-    """Median distance x / z, y / z of points from where a camera sees them, if it stands where they fit best."""
-    seen = np.isfinite(rays[..., 0])
-    points_m, ends = points_m[seen], np.ascontiguousarray(rays[seen])
-    turn, shift = cv2.Rodrigues(T_cam_world[:3, :3])[0], T_cam_world[:3, 3].reshape(3, 1).copy()
-    _, turn, shift = cv2.solvePnP(points_m, ends, np.eye(3), None, turn, shift, True, cv2.SOLVEPNP_ITERATIVE)
-    found, _ = cv2.projectPoints(points_m, turn, shift, np.eye(3), None)
-    return float(np.median(np.linalg.norm(np.asarray(found).reshape(-1, 2) - ends, axis=-1)))
+def _error_of(calibrated: CalibratedRig, index: int, shift: int) -> float:
+    """Median distance x / z, y / z of corners from where a camera sees them, if its frames count more by `shift`.
+
+    The boards are those of the other cameras, and the camera stands where they fit best; infinite for few views.
+    """
+    views, camera = calibrated.views, calibrated.rig.cameras[index]
+    others = np.asarray(np.delete(calibrated.used, index, axis=0).any(axis=(0, 2)))
+    is_one = (views.number[:, None] + shift == views.number) & views.seen[index][:, None] & others
+    here, there = np.nonzero(is_one)
+    if len(here) < _SHARED // 2:
+        return np.inf
+    T = calibrated.T_world_board[there]
+    points_m = np.einsum("vij,nj->vni", T[:, :3, :3], calibrated.board.corners_m) + T[:, None, :3, 3]
+    points_m = points_m.reshape(-1, 3)
+    rays = undistort(camera, views.corners_px[index, here].reshape(-1, 2))
+    T_cam_world = refine_pnp(points_m, rays, np.asarray(camera.T_cam_world))
+    return float(np.nanmedian(ray_distances(points_m, rays, T_cam_world)))
 
 
 def advise(calibrated: CalibratedRig) -> list[str]:
@@ -217,36 +207,29 @@ def advise(calibrated: CalibratedRig) -> list[str]:
         for name, row in rows.items()
         if len(rows) > 1 and row.shared < _SHARED
     ]
-    bare = [f"{name} ({row.covered:.0%})" for name, row in rows.items() if row.covered < _COVERED]
-    if bare:
-        sentences.append(
-            f"the board was seen in small parts of the images of {', '.join(bare)}: move it into their corners"
-        )
-    open_focal = [
-        f"{name} (± {row.focal_std_px[0] / row.focal_px[0]:.1%})"
-        for name, row in rows.items()
-        if row.focal_std_px[0] > _FOCAL_STD * row.focal_px[0]
-    ]
-    if open_focal:
-        sentences.append(
-            f"the focal lengths of {', '.join(open_focal)} are not well known: tilt the board more, and film it nearer"
-        )
-    shifts = find_shifts(calibrated)
-    sentences_of_shifts = [
+    named = {
+        "the board was seen in small parts of the images of {}: move it into their corners": {
+            name: f"{row.covered:.0%}" for name, row in rows.items() if row.covered < _COVERED
+        },
+        "the focal lengths of {} are not well known: tilt the board more, and film it nearer": {
+            name: f"± {row.focal_std_px[0] / row.focal_px[0]:.1%}"
+            for name, row in rows.items()
+            if row.focal_std_px[0] > _FOCAL_STD * row.focal_px[0]
+        },
+        "the board is not where the other cameras see it for {}: hold it still, "
+        "or check that frames of equal number are of one instant": {
+            name: f"{row.slip_px:.1f} px"
+            for name, row in rows.items()
+            if row.median_px > _SLIP_FACTOR * row.own_median_px and row.slip_px > _SLIP_PX
+        },
+    }
+    for words, cameras in named.items():
+        if cameras:
+            sentences.append(words.format(", ".join(f"{name} ({value})" for name, value in cameras.items())))
+    number = int(calibrated.views.number[0])
+    return sentences + [
         f"{name} fits the others better if its frame {number} is their frame {number + shift}: it shows the scene "
         f"{abs(shift)} frame{'s' if abs(shift) > 1 else ''} {'early' if shift > 0 else 'late'}; write "
         f"time_offset_s = {shift} / fps for it in a recording.toml, and pass the recording.toml instead of the videos"
-        for name, shift in shifts.items()
-        for number in [int(calibrated.views.number[0])]
+        for name, shift in find_shifts(calibrated).items()
     ]
-    slipping = []
-    for name, row in rows.items():
-        slip_px = float(np.sqrt(max(row.median_px**2 - row.own_median_px**2, 0)))
-        if row.median_px > _SLIP_FACTOR * row.own_median_px and slip_px > _SLIP_PX:
-            slipping.append(f"{name} ({slip_px:.1f} px)")
-    if slipping:
-        sentences.append(
-            f"the board is not where the other cameras see it for {', '.join(slipping)}: hold it still, "
-            "or check that frames of equal number are of one instant"
-        )
-    return sentences + sentences_of_shifts

@@ -23,8 +23,8 @@ from psotrack.recordings import (
     image_files,
     make_timeline,
     probe,
-    read_frames,
-    read_mask,
+    probe_images,
+    read_frames_at,
 )
 
 _PATTERN = re.compile(r"[*?\[]")
@@ -41,18 +41,19 @@ class CameraImages:
     Attributes:
         name: name of the camera.
         path: the video, the folder or the pattern.
-        image_size_wh: width and height, pixels.
+        video: the video, or the images as one.
         frames: (frames,), numbers of the frames, increasing.
-        video: the video, or None.
-        files: image files, in the order of `frames`; none of a video.
     """
 
     name: str
     path: Path
-    image_size_wh: tuple[int, int]
+    video: VideoInfo
     frames: Int[np.ndarray, " frames"]
-    video: VideoInfo | None = None
-    files: tuple[Path, ...] = ()
+
+    @property
+    def image_size_wh(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.video.image_size_wh
 
     def read(
         self, chosen: Int[np.ndarray, " chosen"]
@@ -62,34 +63,9 @@ class CameraImages:
         Raises:
             InputError: an image cannot be read, or has another size than the first one.
         """
-        wanted = set(chosen.tolist())
-        if self.video is not None:
-            step = int(np.gcd.reduce(chosen)) or self.video.num_frames
-            last = max(wanted, default=-1)
-            for index, frame in enumerate(read_frames(self.video, step)):
-                if index * step in wanted:
-                    yield index * step, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                if index * step >= last:
-                    break
-            return
-        for number, file in zip(self.frames.tolist(), self.files, strict=True):
-            if number in wanted:
-                yield number, self._read_file(file)
-
-    def spread(self, count: int) -> Int[np.ndarray, " chosen"]:
-        """Numbers of frames, evenly spread: at least `count` and fewer than twice `count`, or all."""
-        step = max(1, len(self.frames) // count)
-        return self.frames[::step]
-
-    def _read_file(self, file: Path) -> UInt8[np.ndarray, "height width"]:
-        image = read_mask(file)
-        if image.shape[::-1] != self.image_size_wh:
-            raise InputError(
-                file,
-                expected=f"{self.image_size_wh[0]} x {self.image_size_wh[1]} pixels as in {self.files[0].name}",
-                found=f"{image.shape[1]} x {image.shape[0]}",
-            )
-        return image
+        rows = np.flatnonzero(np.isin(self.frames, chosen)).tolist()
+        for row, image in read_frames_at(self.video, rows):
+            yield int(self.frames[row]), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
 
 def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None) -> tuple[CameraImages, ...]:
@@ -114,7 +90,7 @@ def open_images(paths: Sequence[Path | str], names: Sequence[str] | None = None)
         if path in real[:index] or name in names[:index]:
             raise InputError(found[index], expected="each camera once", found=f"{name} again")
     cameras = tuple(_open(name, path) for name, path in zip(names, found, strict=True))
-    rates = {camera.name: camera.video.fps for camera in cameras if camera.video is not None}
+    rates = {camera.name: camera.video.fps for camera in cameras if not camera.video.images}
     for name, fps in rates.items():
         first = next(iter(rates))
         if abs(fps - rates[first]) > _SAME_RATE * rates[first]:
@@ -146,7 +122,7 @@ def open_recorded(
     if not recording.videos:
         raise InputError(recording.folder, expected="videos or images of a board", found="none")
     cameras = tuple(
-        CameraImages(name, video.path, video.image_size_wh, np.arange(video.num_frames), video)
+        CameraImages(name, video.path, video, np.arange(video.num_frames))
         for name, video in recording.videos.items()
     )
     # Not the timeline of the recording, which has only the cameras that are placed.
@@ -214,7 +190,7 @@ def _open(name: str, path: Path) -> CameraImages:
             raise InputError(path, expected="a folder with videos or images", found="neither in it")
     else:
         video = probe(path)
-        return CameraImages(name, path, video.image_size_wh, np.arange(video.num_frames), video)
+        return CameraImages(name, path, video, np.arange(video.num_frames))
     numbered: dict[int, Path] = {}
     for file in files:
         digits = re.findall(r"\d+", file.stem)
@@ -227,13 +203,10 @@ def _open(name: str, path: Path) -> CameraImages:
             )
         numbered[number] = file
     ordered = dict(sorted(numbered.items()))
-    first = read_mask(files[0])
-    return CameraImages(
-        name, path, (first.shape[1], first.shape[0]), np.array(list(ordered)), None, tuple(ordered.values())
-    )
+    return CameraImages(name, path, probe_images(list(ordered.values()), 1.0), np.array(list(ordered)))
 
 
-def first_images(cameras: Sequence[CameraImages], count: int = 10) -> list[UInt8[np.ndarray, "_ _"]]:
+def first_images(cameras: Sequence[CameraImages], count: int) -> list[UInt8[np.ndarray, "_ _"]]:
     """About `count` grey images of each camera, evenly spread over the recording, of the cameras in turn."""
-    readers = [camera.read(camera.spread(count)) for camera in cameras]
+    readers = [camera.read(camera.frames[:: max(1, len(camera.frames) // count)]) for camera in cameras]
     return [one[1] for of_all in zip_longest(*readers) for one in of_all if one is not None]

@@ -6,7 +6,7 @@ placed by points that are known already (perspective-n-point), and after each ca
 (`point_adjustment`). Detections of other things are left out by random sampling, first with a wide gate. Scale, axes
 and origin of the world stay open: see `world`.
 
-How well the cameras are known depends on what fixes the world, and on errors that last: of the lens, of a detector, of
+How well the cameras are known depends on what fixes the world, and on correlated errors: of the lens, of a detector, of
 GPS. So the covariances are those of a jackknife: the adjustment and the fit of the world again without each tenth of
 the recording (J. W. Tukey 1958; H. R. Künsch 1989 for parts of a series). Where it shows that the sightings hardly
 determine a camera, the rigs without each tenth are found from nothing, because others may fit as well.
@@ -23,16 +23,18 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.calibration.pnp import solve_pnp_ransac
 from psotrack.calibration.residuals import spread_px
 from psotrack.calibration.rig.point_adjustment import AdjustedRig, adjust
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, triangulate_linearly, undistort
+from psotrack.support import block_jackknife
 
 #: Distance in the image up to which a detection may be of the point, while the cameras are not yet adjusted, pixels.
 _WIDE_PX = 15.0
-#: Gates for the first pair of cameras, pixels: from the widest to that of a good detector.
-_GATES_PX = (_WIDE_PX, 5.0, 2.0, 1.0, 0.5)
+#: Distance in the image of sightings that give the first pair of cameras, pixels: the error of a usual detector.
+_NARROW_PX = 2.0
 #: Smallest number of instants that a pair of cameras must share, and of known points for a further camera.
 _LEAST_SHARED = 12
 #: Angle between two cameras' rays from which on a wider one is no better, degrees.
@@ -45,7 +47,7 @@ _FAR = (10.0, 4.0, 2.0, 1.5)
 _LEAST_NOISE_PX = 0.2
 #: Number of parts of the recording for the jackknife.
 _PARTS = 10
-#: A camera's place is hardly determined if its standard deviation is above this share of the rig's size.
+#: A camera's place is hardly determined if its standard deviation is above this fraction of the rig's size.
 LOOSE = 0.1
 
 
@@ -152,8 +154,9 @@ def _jackknife(
         if again is None:
             again = replace(found, adjusted=_adjust_near(found.adjusted.rig, kept_px, found.noise_px))
         centres.append(world_of(again).points(np.asarray(again.adjusted.rig.cameras.centre_world)))
-    off = np.array(centres) - np.mean(centres, axis=0)
-    return (_PARTS - 1) / _PARTS * np.einsum("pci,pcj->cij", off, off)
+    own = world_of(found).points(np.asarray(found.adjusted.rig.cameras.centre_world))
+    covariance = block_jackknife(own.ravel(), np.reshape(centres, (_PARTS, -1)))
+    return np.einsum("cicj->cij", covariance.reshape(len(own), 3, len(own), 3))
 
 
 def _thinned(views: PointViews) -> PointViews:
@@ -180,19 +183,14 @@ def _best_pair(
         focal_px = float(np.mean([lenses.cameras.K[index, 0, 0] for index in (first, second)]))
         here, there = np.ascontiguousarray(rays[both, first]), np.ascontiguousarray(rays[both, second])
         found = _relative_pose(here, there, focal_px)
-        if found is None:
+        if found is None or found[1].sum() < _LEAST_SHARED:
             continue
         T, good = found
-        count = int(good.sum())
-        if count < _LEAST_SHARED:
-            continue
-        directions = [np.column_stack([part[good], np.ones(count)]) for part in (here, there)]
-        directions[1] = directions[1] @ T[:3, :3]
-        cosine = np.vecdot(*directions) / np.prod(
-            [np.linalg.norm(part, axis=1) for part in directions], axis=0
-        )
+        directions = [np.column_stack([part[good], np.ones(good.sum())]) for part in (here, there)]
+        directions = [part / np.linalg.norm(part, axis=1, keepdims=True) for part in directions]
+        cosine = np.vecdot(directions[0], directions[1] @ T[:3, :3])
         angle_deg = float(np.median(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))))
-        score = count * min(angle_deg / _WIDE_DEG, 1.0)
+        score = good.sum() * min(angle_deg / _WIDE_DEG, 1.0)
         if best is None or score > best[0]:
             best = score, first, second, T
     if best is None:
@@ -211,30 +209,19 @@ def _relative_pose(
 ) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, " shared"]] | None:
     """Transform between two cameras from rays that meet, its shift of length 1, and which rays agree with it.
 
-    A wide gate accepts poses that are far off where the field of view is small, and a narrow one finds no pose where
-    the errors are large. So random sampling tries several gates, and the pose with the smallest robust loss is kept.
+    Random sampling with local optimisation (O. Chum, J. Matas & J. Kittler, Locally optimized RANSAC, 2003).
     """
-    candidates, distances_px = [], []
-    for gate_px in _GATES_PX:
-        E, _ = cv2.findEssentialMat(
-            here, there, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=gate_px / focal_px
-        )
-        if E is None or E.shape != (3, 3):
-            continue
-        _, R, t, mask = cv2.recoverPose(E, here, there, np.eye(3), mask=np.ones((len(here), 1), np.uint8))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, np.ravel(t)
-        distance_px = focal_px * _sampson_distance(E, here, there)
-        # A point behind a camera cannot be seen, however well the rays meet there.
-        candidates.append(T)
-        distances_px.append(np.where(np.ravel(mask) > 0, np.minimum(distance_px, _WIDE_PX), _WIDE_PX))
-    if not candidates:
+    E, _ = cv2.findEssentialMat(
+        here, there, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.9999, threshold=_NARROW_PX / focal_px
+    )
+    if E is None or E.shape != (3, 3):
         return None
-    # The width of the loss is the same for all candidates.
-    width_px = max(min(float(np.median(distance_px)) for distance_px in distances_px), _LEAST_NOISE_PX)
-    losses = [float(np.log1p((distance_px / width_px) ** 2).sum()) for distance_px in distances_px]
-    best = int(np.argmin(losses))
-    return candidates[best], distances_px[best] < _WIDE_PX
+    _, R, t, mask = cv2.recoverPose(E, here, there, np.eye(3), mask=np.ones((len(here), 1), np.uint8))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, np.ravel(t)
+    # A point behind a camera cannot be seen, however well the rays meet there.
+    is_near = focal_px * _sampson_distance(E, here, there) < _WIDE_PX
+    return T, is_near & (np.ravel(mask) > 0)
 
 
 def _sampson_distance(
@@ -263,27 +250,15 @@ def _next_camera(
     }
     index = max(seen, key=lambda one: int(seen[one].sum()))
     rays = undistort(lenses.cameras[index], views.points_px[seen[index], index])
-    usable = np.isfinite(rays[:, 0])
-    if usable.sum() >= _LEAST_SHARED:
-        focal_px = float(lenses.cameras.K[index, 0, 0])
-        found, turn, shift, inliers = cv2.solvePnPRansac(
-            points_m[seen[index]][usable],
-            np.ascontiguousarray(rays[usable]),
-            np.eye(3),
-            None,
-            iterationsCount=2000,
-            reprojectionError=_WIDE_PX / focal_px,
-            confidence=0.9999,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-        if found and inliers is not None and len(inliers) >= _LEAST_SHARED:
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-            return index, T
+    focal_px = float(lenses.cameras.K[index, 0, 0])
+    found = solve_pnp_ransac(points_m[seen[index]], rays, _WIDE_PX / focal_px, tries=2000)
+    if found is not None and found[1].sum() >= _LEAST_SHARED:
+        return index, found[0]
+    usable = int(np.isfinite(rays[:, 0]).sum())
     raise InputError(
         f"camera {views.names[index]}",
         expected=f"at least {_LEAST_SHARED} instants at which it sees the point with two other cameras",
-        found=f"{int(usable.sum())} that no pose of it fits" if usable.sum() else "none",
+        found=f"{usable} that no pose of it fits" if usable else "none",
         remedy="move the point where this camera and two others see it",
     )
 

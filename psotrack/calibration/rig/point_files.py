@@ -21,7 +21,7 @@ _SEPARATOR = ","
 #: Longest time between two frames between which a point is interpolated, in intervals of the camera: one frame in which
 #: the point was missed lies between them.
 _LONGEST_GAP = 2.5
-#: Shares of an interval below this are rounding.
+#: Fractions of an interval below this are rounding.
 _SAME = 1e-6
 #: Largest number of a frame.
 _LARGEST_FRAME = 2**31
@@ -72,7 +72,7 @@ def read_point_views(path: Path | str) -> PointViews:
 
 def views_of_detections(
     detections: Mapping[str, Detections],
-    frame_times: Mapping[str, FrameTimes] | None = None,
+    frame_times: Mapping[str, FrameTimes],
     line_time_s: Mapping[str, float] | None = None,
 ) -> PointViews:
     """Sightings from the middles of boxes: of each frame the box of highest confidence, if it is only one.
@@ -81,8 +81,7 @@ def views_of_detections(
         detections: boxes by camera name.
         frame_times: when the frames were exposed, by camera name. Instants are those of `make_timeline`, and a camera's
             pixel at an instant is interpolated between its frames before and after, which errs by at most an
-            eighth of the change of the point's speed, in pixels per frame, from frame to frame. None: frames of
-            equal number are one instant.
+            eighth of the change of the point's speed, in pixels per frame, from frame to frame.
         line_time_s: times from the exposure of one row to that of the next row by camera name, seconds.
 
     Raises:
@@ -91,38 +90,32 @@ def views_of_detections(
     if len(detections) < 2:
         raise InputError("detections", expected="at least two cameras", found=f"{len(detections)}")
     names = tuple(detections)
-    seen = [_middles(boxes) for boxes in detections.values()]
-    if frame_times is None:
-        numbers = np.unique(np.concatenate([frame for frame, _ in seen])).astype(np.int64)
-        points_px = np.full((len(numbers), len(names), 2), np.nan)
-        for index, (frame, middle_px) in enumerate(seen):
-            points_px[np.searchsorted(numbers, frame), index] = middle_px
-    else:
-        unknown = [name for name in names if name not in frame_times]
-        if unknown:
-            raise InputError(
-                f"camera {unknown[0]}", expected="times of its frames", found="none", remedy="state its fps"
-            )
-        timeline = make_timeline({name: frame_times[name] for name in names})
-        numbers = np.arange(timeline.num_instants)
-        points_px = np.full((len(numbers), len(names), 2), np.nan)
-        for index, (name, (frame, middle_px)) in enumerate(zip(names, seen, strict=True)):
-            times = frame_times[name]
-            is_there = frame < times.num_frames
-            frame, middle_px = frame[is_there], middle_px[is_there]
-            time_s = times.time_s[frame] + (line_time_s or {}).get(name, 0.0) * middle_px[:, 1]
-            points_px[:, index] = _at_times(timeline.time_s, time_s, middle_px, _LONGEST_GAP / times.fps)
+    unknown = [name for name in names if name not in frame_times]
+    if unknown:
+        raise InputError(
+            f"camera {unknown[0]}", expected="times of its frames", found="none", remedy="state its fps"
+        )
+    timeline = make_timeline({name: frame_times[name] for name in names})
+    points_px = np.full((timeline.num_instants, len(names), 2), np.nan)
+    for index, name in enumerate(names):
+        times = frame_times[name]
+        frame, middle_px = _middles(detections[name], times.num_frames)
+        time_s = times.time_s[frame] + (line_time_s or {}).get(name, 0.0) * middle_px[:, 1]
+        points_px[:, index] = _at_times(timeline.time_s, time_s, middle_px, _LONGEST_GAP / times.fps)
+    numbers = np.arange(timeline.num_instants)
     return PointViews(names, np.zeros(len(numbers), np.int64), numbers, points_px)
 
 
-def _middles(boxes: Detections) -> tuple[Int[np.ndarray, " frames"], Float[np.ndarray, "frames 2"]]:
-    """Numbers of the frames, and the pixel of the middle of the best box of each."""
+def _middles(
+    boxes: Detections, num_frames: int
+) -> tuple[Int[np.ndarray, " frames"], Float[np.ndarray, "frames 2"]]:
+    """Numbers of the frames, below `num_frames`, and the pixel of the middle of the best box of each."""
     # The last of a frame's boxes is the one of highest confidence.
     order = np.lexsort((boxes.confidence, boxes.frame))
     frame, confidence = boxes.frame[order], boxes.confidence[order]
     is_last = np.append(frame[1:] != frame[:-1], True)
     is_tied = np.append(False, (frame[1:] == frame[:-1]) & (confidence[1:] == confidence[:-1]))
-    chosen = order[is_last & ~is_tied]
+    chosen = order[is_last & ~is_tied & (frame < num_frames)]
     # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
     middle_px = (boxes.xyxy[chosen, :2] + boxes.xyxy[chosen, 2:]) / 2 - 0.5
     return boxes.frame[chosen].astype(np.int64), middle_px
@@ -135,21 +128,18 @@ def _at_times(
     longest_s: float,
 ) -> Float[np.ndarray, "wanted 2"]:
     """(wanted, 2), pixels at the wanted times, interpolated linearly; NaN in gaps longer than `longest_s`."""
-    found = np.full((len(wanted_s), 2), np.nan)
     if len(time_s) < 2:
-        return found
+        return np.full((len(wanted_s), 2), np.nan)
     order = np.argsort(time_s, kind="stable")
     time_s, point_px = time_s[order], point_px[order]
     after = np.clip(np.searchsorted(time_s, wanted_s), 1, len(time_s) - 1)
     gap_s = time_s[after] - time_s[after - 1]
-    share = (wanted_s - time_s[after - 1]) / np.maximum(gap_s, 1e-9)
-    between = (share > -_SAME) & (share < 1 + _SAME) & (gap_s <= longest_s)
+    fraction = (wanted_s - time_s[after - 1]) / np.maximum(gap_s, 1e-9)
     # Where the wanted time is that of a frame, the gap beside the frame does not matter.
-    exact = (np.abs(share) < _SAME) | (np.abs(share - 1) < _SAME)
-    usable = between | exact
-    pixel = point_px[after - 1] + share[:, None] * (point_px[after] - point_px[after - 1])
-    found[usable] = pixel[usable]
-    return found
+    is_exact = np.minimum(np.abs(fraction), np.abs(fraction - 1)) < _SAME
+    usable = is_exact | ((np.abs(fraction - 0.5) < 0.5) & (gap_s <= longest_s))
+    pixel = point_px[after - 1] + fraction[:, None] * (point_px[after] - point_px[after - 1])
+    return np.where(usable[:, None], pixel, np.nan)
 
 
 def stick_length(point_rig: PointRig) -> float:
@@ -159,17 +149,16 @@ def stick_length(point_rig: PointRig) -> float:
         InputError: the two ends are never known at one instant.
     """
     views, points_m = point_rig.views, point_rig.adjusted.points_m
-    known = np.isfinite(points_m[:, 0])
-    ends = [
-        {int(number): place for number, place in zip(views.number[rows], points_m[rows], strict=True)}
-        for rows in (known & (views.point == 0), known & (views.point == 1))
-    ]
-    lengths = [
-        float(np.linalg.norm(ends[0][number] - ends[1][number])) for number in ends[0] if number in ends[1]
-    ]
-    if not lengths:
+    first, second = (
+        dict(zip(views.number[views.point == end].tolist(), points_m[views.point == end], strict=True))
+        for end in (0, 1)
+    )
+    lengths = np.array(
+        [np.linalg.norm(first[number] - second[number]) for number in first if number in second]
+    )
+    if not np.isfinite(lengths).any():
         raise InputError("stick", expected="instants at which both ends are known", found="none")
-    return float(np.median(lengths))
+    return float(np.nanmedian(lengths))
 
 
 def check_two_cameras(names: Sequence[str], first: str, second: str) -> None:

@@ -5,7 +5,6 @@ Commands make their options of these records, so this module imports nothing tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -57,6 +56,28 @@ class LensSettings:
 
 
 @dataclass(frozen=True)
+class SheetSettings:
+    """The lens of all cameras by their data sheet.
+
+    Attributes:
+        fov_deg: horizontal and vertical field of view in degrees, with `size`, instead of `lenses`.
+        focal_length_mm: focal length in millimetres, with `sensor_mm` and `size`, instead of `lenses`.
+        sensor_mm: size of the sensor in millimetres.
+        size: size of the images in pixels, if no file states it.
+    """
+
+    fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
+    focal_length_mm: float | None = None
+    sensor_mm: Annotated[tuple[float, float], Meta(extra={"metavar": "W,H"})] | None = None
+    size: tuple[int, int] | None = None
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether the lens is known by the data sheet."""
+        return self.fov_deg is not None or self.focal_length_mm is not None
+
+
+@dataclass(frozen=True)
 class PointSettings:
     """What is seen instead of a board.
 
@@ -65,8 +86,10 @@ class PointSettings:
             camera,frame,x_px,y_px (and point, for the two ends of a stick). Needs --lenses.
         distance: distance between two cameras' centres in metres, for --points: a,b=4.20.
         stick_m: distance of the two points in metres, for --points.
-        pairs: points of known place instead of a board: camera,point,x_px,y_px,x_m,y_m,z_m. Needs --lenses.
-        markers: ArUco markers of known place instead of a board: a map of their corners. Needs --lenses.
+        pairs: points of known place, marked by hand, instead of a board: camera,point,x_px,y_px,x_m,y_m,z_m. Needs
+            the lenses.
+        places: positions of the points of --pairs, if it has none: point,x_m,y_m,z_m.
+        markers: ArUco markers of known place instead of a board: a map of their corners. Needs the lenses.
         noise_px: standard deviation of a point in the image, along x and along y, in pixels, with --pairs or --markers.
     """
 
@@ -74,27 +97,34 @@ class PointSettings:
     distance: tuple[str, str, float] | None = None
     stick_m: float | None = None
     pairs: Path | None = None
+    places: Path | None = None
     markers: Path | None = None
     noise_px: float = 1.0
 
 
 @dataclass(frozen=True)
-class RigSettings(PointSettings, LensSettings, BoardSettings):
-    """What is known before a rig is calibrated; of a board, the side of a square is enough.
-
-    The fields of `BoardSettings`, `LensSettings` and `PointSettings`, and:
+class WorldSettings:
+    """The names of the cameras, and the world.
 
     Attributes:
         names: names of the cameras; None: from the files' names.
         floor: frame in which the board lies on the floor: its first corner is the origin, and z points up; None: the
             first camera is the world.
-        world: file with three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a
-            frame of the moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.
+        world: three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a frame of the
+            moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.
     """
 
-    names: Sequence[str] | None = None
-    floor: int | None = None
-    world: Path | None = None
+    names: tuple[str, ...] | None = None
+    floor: Annotated[int, Meta(extra={"metavar": "FRAME"})] | None = None
+    world: Annotated[Path, Meta(extra={"metavar": "FILE"})] | None = None
+
+
+@dataclass(frozen=True)
+class RigSettings(WorldSettings, PointSettings, SheetSettings, LensSettings, BoardSettings):
+    """What is known before a rig is calibrated; of a board, the side of a square is enough.
+
+    Its fields are those of `BoardSettings`, `LensSettings`, `SheetSettings`, `PointSettings` and `WorldSettings`.
+    """
 
     def __post_init__(self) -> None:
         chosen = {
@@ -111,6 +141,8 @@ class RigSettings(PointSettings, LensSettings, BoardSettings):
             raise SettingsError("rig", expected=f"one of --square, {', '.join(chosen)}", found=found)
         if (self.distance or self.stick_m is not None) and not self.points:
             raise SettingsError("rig", expected="--distance and --stick with --points", found=used[0])
+        if self.is_stated and self.by_board:
+            raise SettingsError("--fov", expected="points or markers, not a board", found=used[0])
         if self.floor is not None and not self.by_board:
             raise SettingsError("rig", expected="--floor with --squares", found=used[0])
         if self.floor is not None and self.world is not None:

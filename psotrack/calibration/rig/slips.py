@@ -20,7 +20,7 @@ from psotrack.calibration.rig.bundle import BoardBundle
 _FREEDOM = 3.0
 #: Unknowns of a slip: three of the turn, three of the shift.
 _UNKNOWNS = 6
-#: Widths at the start and smallest widths: a turn, and a shift as a share of the board's size.
+#: Widths at the start and smallest widths: a turn, and a shift as a fraction of the board's size.
 _START, _LEAST = 0.01, 1e-5
 #: Largest factor of a width in one step.
 _LARGEST_STEP = 4.0

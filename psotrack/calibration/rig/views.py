@@ -9,10 +9,10 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from psotrack.calibration.board_corners import BoardFinder
 from psotrack.calibration.board_recognition import (
-    Recognised,
-    explain_markers_on_chessboard,
-    measure_marker_share,
+    markers_on_chessboard,
+    measure_markers,
     missing_board,
     number_of_first_images,
     recognise_board,
@@ -26,7 +26,7 @@ from psotrack.support import Report, no_progress
 _MOST_SAMPLES = 24
 #: Largest deviation of the measured size of a ChArUco board's markers from the stated one: corners of markers of 10
 #: pixels, the smallest that are read, are found to about half a pixel at each end.
-_MARKER_SHARE_OFF = 0.2
+_MARKER_SIZE_ERROR = 0.2
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class FoundBoards:
 
     Attributes:
         views: the views; instants at which no camera sees the board are left out.
-        recognised: how the board was printed.
+        board: the board, with the pattern that was found.
         mirrored: (cameras,), number of views in which the board is seen mirrored.
         searched: (cameras,), number of images that were searched.
     """
 
     views: BoardViews
-    recognised: Recognised
+    board: Board
     mirrored: Int[np.ndarray, " cameras"]
     searched: Int[np.ndarray, " cameras"]
 
@@ -93,14 +93,13 @@ def find_views(
     number, frames = instants
     if board.kind == "chessboard":
         first = list(islice(_samples(cameras, frames), number_of_first_images(len(cameras))))
-        if markers := explain_markers_on_chessboard(board, first):
-            raise InputError("board", expected=f"a {board}", found=markers[0], remedy=markers[1])
-    recognised = recognise_board(board, _samples(cameras, frames))
-    if not recognised.views:
-        images = list(islice(_samples(cameras, frames), _MOST_SAMPLES))
-        raise missing_board(board, images)
-    _check_markers(recognised, _samples(cameras, frames))
-    finder = recognised.finder()
+        if error := markers_on_chessboard(board, first):
+            raise error
+    board, seen_times = recognise_board(board, _samples(cameras, frames))
+    if not seen_times:
+        raise missing_board(board, list(islice(_samples(cameras, frames), _MOST_SAMPLES)))
+    _check_markers(board, _samples(cameras, frames))
+    finder = BoardFinder(board)
     corners_px = np.full((len(cameras), len(number), board.num_corners, 2), np.nan)
     mirrored = np.zeros(len(cameras), np.int64)
     with report("corners", int((frames >= 0).sum())) as advance:
@@ -128,21 +127,20 @@ def find_views(
                 found=f"none in {count} frames",
                 remedy="check that the board is in its images, sharp and large enough, or leave the camera out",
             )
-    return FoundBoards(views.select(np.asarray(views.seen.any(axis=0))), recognised, mirrored, searched)
+    return FoundBoards(views.select(np.asarray(views.seen.any(axis=0))), board, mirrored, searched)
 
 
-def _check_markers(recognised: Recognised, images: Iterator[UInt8[np.ndarray, "height width"]]) -> None:
+def _check_markers(board: Board, images: Iterator[UInt8[np.ndarray, "height width"]]) -> None:
     """Raise `InputError` for a board whose markers are of another size than stated."""
-    board = recognised.board
-    share = measure_marker_share(recognised, images)
-    if share is None or board.marker_m is None:
+    measured = measure_markers(board, images)
+    if measured is None or board.marker_m is None:
         return
     stated = board.marker_m / board.square_m
-    if abs(share / stated - 1) > _MARKER_SHARE_OFF:
+    if abs(measured / stated - 1) > _MARKER_SIZE_ERROR:
         raise InputError(
             "board",
             expected=f"markers with sides of {stated:.2f} squares, as --square and --marker say",
-            found=f"{share:.2f} squares in the images",
+            found=f"{measured:.2f} squares in the images",
             remedy="measure both with a ruler",
         )
 

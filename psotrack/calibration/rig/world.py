@@ -11,7 +11,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Rig
 from psotrack.support import similarity
 
-#: Points are on a line if their second extent is below this share of the first one.
+#: Points are on a line if their second extent is below this fraction of the first one.
 _FLAT = 0.01
 #: Smallest number of points that fix a world.
 LEAST_POINTS = 3

@@ -1,4 +1,4 @@
-"""Options that the commands of `calibrate` share."""
+"""Options of several commands of `calibrate`."""
 
 from __future__ import annotations
 

@@ -7,48 +7,30 @@ from typing import Any
 
 import click
 
-from psotrack.calibration.rig.settings import BoardSettings, LensSettings, PointSettings
+from psotrack.calibration.rig.settings import (
+    BoardSettings,
+    LensSettings,
+    PointSettings,
+    SheetSettings,
+    WorldSettings,
+)
 from psotrack.cli.calibrate.options import BOARD_NAMES, OUT
-from psotrack.cli.options import FORCE, JSON, plot_option, reporting
-from psotrack.cli.output import Output, pass_output
+from psotrack.cli.options import plot_option, running
+from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.cli.types import Names
 
 
 @click.command(cls=HelpfulCommand)
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
 @options_of(BoardSettings, "board", names=BOARD_NAMES, heading="Board", rare=("separation_m", "first_marker"))
 @options_of(LensSettings, "lens", heading="Lenses", rare=("same_lens",))
-@click.option("--names", type=Names(), help="Names of the cameras.  [default: from the files' names]")
-@click.option(
-    "--floor",
-    type=int,
-    metavar="FRAME",
-    help="Frame in which the board lies on the floor: its first corner is the origin, and z points up.  "
-    "[default: the first camera is the world]",
-)
-@click.option(
-    "--world",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Three or more points and where they are: point,x_m,y_m,z_m, where a point is a camera, or a frame of the "
-    "moving point; with camera,x_px,y_px for points that are marked in the images of two cameras.",
-)
+@options_of(SheetSettings, "sheet", heading="Lenses", rare=("focal_length_mm", "sensor_mm"))
+@options_of(WorldSettings, "world")
 @options_of(PointSettings, "points", heading="Instead of a board", rare=("stick_m",))
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
 @OUT
-@FORCE
-@reporting
-@JSON
-@pass_output
-def rig(
-    output: Output,
-    sources: tuple[Path, ...],
-    names: tuple[str, ...] | None,
-    plot: Path | None,
-    out: Path,
-    **known: Any,
-) -> None:
+@running()
+def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path, **known: Any) -> None:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
     Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'; a folder of videos
@@ -57,6 +39,9 @@ def rig(
     cameras. Of the board only --square must be stated: whether it is a ChArUco board or a chessboard, its squares,
     markers and dictionary are found in the images; --squares states them. With --points, VIDEO is a recording with
     detections, or a CSV file; with --pairs there is none.
+
+    Of points of known place, each camera needs at least four that are not on one line. Twelve that are spread over the
+    image and in depth are good. Points that disagree with the others are left out, and shown.
 
     \b
     Examples:
@@ -67,20 +52,14 @@ def rig(
       psotrack calibrate rig a b --squares 1x1 --marker 0.2 --first-marker 7 --lenses lenses.toml --out rig.toml
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
+      psotrack calibrate rig --pairs pairs.csv --places points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
+      psotrack calibrate rig SEQ --markers SEQ/aruco_corners.csv --lenses lenses.toml --out rig.toml
     """
     from psotrack import api
 
     output.refuse(out)
-    settings = {**vars(known.pop("board")), **vars(known.pop("lens")), **vars(known.pop("points")), **known}
+    settings = {name: value for record in known.values() for name, value in vars(record).items()}
     if plot is not None:
         plot = plot if plot.name else out.with_suffix(".png")
-    found = api.calibrate_rig(
-        sources,
-        out=out,
-        plot=plot,
-        force=output.force,
-        progress=output.report,
-        names=names,
-        **settings,
-    )
-    output.result(found)
+    common = {"out": out, "plot": plot, "force": output.force, "progress": output.report}
+    output.result(api.calibrate_rig(sources, **common, **settings))

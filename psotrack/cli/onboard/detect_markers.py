@@ -14,7 +14,7 @@ from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
-    from psotrack.inside_out.detection import DetectedMarkers
+    from psotrack.foreground.markers import DetectedMarkers
 
 
 @click.command("detect", cls=HelpfulCommand)
@@ -43,7 +43,7 @@ def detect_markers(
       psotrack onboard detect a.jpg b.png c.tif --dictionary 6x6_250 --out markers.csv --json -
       psotrack onboard detect flight.mp4 --dictionary 4x4_1000 --out markers.csv --frames 100
     """
-    from psotrack.foreground.detection import marker_dictionary
+    from psotrack.foreground.markers import marker_dictionary
     from psotrack.inside_out import markers_of_images, markers_of_video, open_source, write_marker_table
 
     check_suffix("--out", out, ".csv")

@@ -1,4 +1,4 @@
-"""2D detection of drones by a neural network, training data for such a network, and ArUco dictionaries.
+"""2D detection of drones by a neural network, and training data for such a network.
 
 In: videos, and for training data also a reference. Out: boxes per frame and camera, stored once per video; data sets in
 YOLO's layout. Other rooms may use every name in `__init__.pyi`.

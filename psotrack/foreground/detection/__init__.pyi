@@ -1,4 +1,3 @@
-from .aruco import marker_dictionary
 from .detector import (
     Detector,
     DetectorSettings,
@@ -19,7 +18,6 @@ __all__ = [
     "detect_drones",
     "find_detector",
     "label_boxes",
-    "marker_dictionary",
     "stored_detections",
     "write_data_set",
 ]

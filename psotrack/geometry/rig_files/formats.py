@@ -120,7 +120,7 @@ def read_rig(
             expected="the poses of cameras",
             found="none",
             remedy="read only the lenses (`psotrack calibrate convert --lenses`), and find the poses by "
-            "`psotrack calibrate extrinsics` with this file as --intrinsics",
+            "`psotrack calibrate rig --pairs` with this file as --lenses",
         )
     for what, names in lacking.items():
         if names:

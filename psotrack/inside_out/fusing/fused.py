@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack.calibration.clocks import Offset, find_offset
 from psotrack.errors import InputError
+from psotrack.evaluation import Offset, find_offset
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing.pairing import pair_tracks, reorder_tracks
 from psotrack.inside_out.fusing.sources import Inside, inside_at, nearest_index, outside_at

@@ -16,21 +16,20 @@ from scipy.optimize import minimize
 
 from psotrack.geometry import cross_matrices
 from psotrack.inside_out.fusing.sources import CHI2_3_MEDIAN, GATE, Inside
-from psotrack.support import standard_error
 
 #: Tracked point of a drone: the centre of its camera, or the middle of its silhouette.
 Point = Literal["camera", "middle"]
 
 #: Prior standard deviations of the logarithms of the variances. The differences determine only their sum; an outside
 #: track may be of any program.
-_PRIOR = np.array([1.5, 3.0])
+_PRIOR = np.array([1.0, 3.0])
 #: Number of times that the arm, the variances, and the frames in which the sources agree are estimated in turn.
 _ROUNDS = 3
 #: Distance from the median, in median distances, beyond which a frame is left out of the arm.
 _FAR = 4.0
-#: Standard errors of the arm count this many times: an estimate from the few independent parts of a short flight is too
-#: small itself.
-_ERRORS = 2.0
+#: Number of blocks of frames whose means show how certain the arm is, and the factor on its standard error: blocks are
+#: few, and those of a flight of some seconds are correlated with each other.
+_BLOCKS, _ERRORS = 6, 2.0
 #: Smallest variance of a position, m2, and smallest factor on variances, for sources that never differ at all.
 _LEAST_M2, _LEAST = 1e-10, 1e-6
 #: Largest standard deviation of an orientation about an axis, radians: nothing is known.
@@ -128,7 +127,7 @@ def estimate_arm(inside: Inside, middle_m: _Positions) -> tuple[Float[np.ndarray
 
     The arm (3,), in the camera's axes, metres, is constant, because the camera is fixed to the body. It is the mean of
     the arms near their median, which a minority of gross errors moves little. Errors of neighbouring frames are
-    correlated (see `standard_error`).
+    correlated, so that the standard error along an axis is that of the means of a few blocks of frames.
 
     Args:
         inside: the path at the frames.
@@ -141,10 +140,12 @@ def estimate_arm(inside: Inside, middle_m: _Positions) -> tuple[Float[np.ndarray
     away_m = np.linalg.norm(arms_m - np.median(arms_m, axis=0), axis=1)
     arms_m = arms_m[away_m <= _FAR * np.median(away_m) + np.sqrt(_LEAST_M2)]
     arm_m = arms_m.mean(axis=0)
-    error_m = float(np.linalg.norm(standard_error(arms_m, np.arange(len(arms_m))))) / np.sqrt(3)
-    if not error_m > 0:
+    if len(arms_m) < _BLOCKS:
         return arm_m, float(np.linalg.norm(arm_m)), 1.0
-    return arm_m, error_m, float(max(arms_m.var(axis=0).mean() / (_ERRORS * error_m) ** 2, 1.0))
+    means_m = [block.mean(axis=0) for block in np.array_split(arms_m, _BLOCKS)]
+    variance_m2 = float(np.var(means_m, axis=0, ddof=1).mean()) / _BLOCKS + _LEAST_M2
+    count = arms_m.var(axis=0).mean() / variance_m2 / _ERRORS**2
+    return arm_m, float(np.sqrt(variance_m2)), max(float(count), 1.0)
 
 
 def _arm_covariance_m2(inside: Inside, arm_m: Float[np.ndarray, "3"], arm_std_m: float) -> _Covariances:

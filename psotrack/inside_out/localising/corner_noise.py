@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.line_time import Detected
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import CornerResiduals, PoseSettings, RollingShutter, estimate_pose

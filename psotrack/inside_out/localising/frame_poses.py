@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
 from psotrack.inside_out.camera_path import Flag
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.filtering import PoseFilterParams
 from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.filtering.pose_filter import FilterRun, advance, expected, step

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from psotrack.errors import InputError
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.geometry import Camera
-from psotrack.inside_out.detection import DetectedMarkers, FirstPass, MarkerDetector
 from psotrack.inside_out.filtering.path_rows import PoseRow, join_rows
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
@@ -30,7 +30,7 @@ from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.support import Advance, Report, no_progress
 
-#: Number of threads of the first pass, each in a frame of its own; the calling thread has the rest of the work.
+#: Number of threads that detect markers, each in a frame of its own; the calling thread has the rest of the work.
 _WORKERS = max(1, min(4, (os.cpu_count() or 1) - 1))
 #: Number, time (seconds) and grey image of a frame.
 _GreyFrame = tuple[int, float, UInt8[np.ndarray, "height width"]]
@@ -180,21 +180,20 @@ def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
 
 def _detect_markers(
     source: FrameSource, detector: MarkerDetector, seconds: dict[str, float]
-) -> Iterator[tuple[int, float, DetectedMarkers]]:
-    def search(frame: _GreyFrame) -> tuple[_GreyFrame, FirstPass, float]:
+) -> Iterator[Detected]:
+    def found(frame: _GreyFrame) -> tuple[Detected, float]:
+        number, time_s, gray = frame
         start_s = time.perf_counter()
-        first = detector.first_pass(frame[2])
-        return frame, first, time.perf_counter() - start_s
+        # A map has every marker once.
+        markers = detector.detect(gray).of_single_ids()
+        return (number, time_s, markers), time.perf_counter() - start_s
 
     frames = read_ahead(_grey_frames(source, seconds), newest=source.newest)
     # Frames that wait in line would no longer be the newest.
     workers = 0 if source.newest else _WORKERS
-    for (number, time_s, gray), first, spent_s in map_ahead(search, frames, workers):
-        start_s = time.perf_counter()
-        # A map has every marker once.
-        markers = detector.detect(gray, first).of_single_ids()
-        seconds["detect"] += spent_s + time.perf_counter() - start_s
-        yield number, time_s, markers
+    for detected, spent_s in map_ahead(found, frames, workers):
+        seconds["detect"] += spent_s
+        yield detected
 
 
 def _check_size(source: FrameSource, lens: Camera) -> None:

@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import NEAR_M, Camera, undistort
-from psotrack.inside_out.detection import DetectedMarkers
 from psotrack.inside_out.mapping.sightings import SQUARE, FrameMarkers, collect_sightings, square_poses
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.inside_out.pose import PoseSettings, estimate_pose

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psotrack.inside_out.detection import DetectedMarkers
+from psotrack.foreground.markers import DetectedMarkers
 from psotrack.inside_out.line_time import Detected, LineTime, estimate_line_time
 from psotrack.inside_out.mapping.sightings import MarkerSightings
 from psotrack.inside_out.marker_map import MarkerMap

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.geometry import Camera, undistort
-from psotrack.inside_out.detection import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.pose import RollingShutter, row_times_s
 from psotrack.recordings import VideoInfo, read_frames
 from psotrack.support import Report, no_progress

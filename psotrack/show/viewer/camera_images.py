@@ -139,7 +139,7 @@ def encode_images(source: ImageSource) -> Iterator[EncodedImage]:
     """
     detector = None
     if source.dictionary is not None:
-        from psotrack.inside_out.detection import MarkerDetector
+        from psotrack.foreground.markers import MarkerDetector
 
         detector = MarkerDetector(source.dictionary)
     coverages = _read_coverages(source.silhouettes, range(0, source.video.num_frames, source.step))

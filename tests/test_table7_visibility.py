@@ -1,6 +1,8 @@
 """Visible markers, compared with markers placed by hand and with OpenCV's projection."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import make_camera
 from psotrack.inside_out import MarkerMap
-from psotrack.inside_out.comparison.visibility import visible_markers
+
+sys.path.append(str(Path(__file__).parents[1] / "experiments" / "table7"))
+from _visibility import visible_markers
 
 #: A camera at the origin (x to the right, y down, z ahead); a metre at 1 m is 100 px in an image of 201 x 101.
 LENS = make_camera(

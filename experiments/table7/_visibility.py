@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import NEAR_M, Camera, to_pixels
-from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out import MarkerMap
 
 #: Shortest visible side, pixels: 2 pixels for each of the 6 cells across a 4 x 4 marker with its border, because fewer
 #: do not distinguish neighbouring cells.

@@ -9,15 +9,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
-from psotrack.inside_out.detection.detector import DetectedMarkers, MarkerDetector
-from psotrack.inside_out.detection.search import FirstPass
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
 from psotrack.recordings import read_grey
 from psotrack.support import Report, atomic_write, no_progress, refuse_to_overwrite
 
-#: Number of threads that detect markers, or make a first pass, each in an image of its own.
+#: Number of threads that detect markers, each in an image of its own.
 _WORKERS = min(4, os.cpu_count() or 1)
 #: Columns of the table, after the one that says which image or frame.
 _COLUMNS = ("id", *(f"{axis}{corner}_px" for corner in range(4) for axis in "xy"), "std_px")
@@ -54,14 +52,13 @@ def markers_of_video(
     """
     detector = MarkerDetector(dictionary)
 
-    def search(frame: Frame) -> tuple[UInt8[np.ndarray, "height width"], FirstPass]:
-        grey = np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
-        return grey, detector.first_pass(grey)
+    def found(frame: Frame) -> DetectedMarkers:
+        return detector.detect(np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8))
 
     with report("markers", source.num_frames or 0) as advance:
-        for grey, first in map_ahead(search, read_ahead(source.frames()), _WORKERS):
+        for markers in map_ahead(found, read_ahead(source.frames()), _WORKERS):
             advance(1)
-            yield detector.detect(grey, first)
+            yield markers
 
 
 def write_marker_table(
