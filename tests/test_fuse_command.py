@@ -142,7 +142,11 @@ def test_point_offset_and_force_options(files, tmp_path) -> None:
             InputError,
             "blind.csv: expected a pose in at least",
         ),
-        (["dron1.csv", "blind.csv", "--out", "new.csv"], InputError, "blind.csv: expected a position in at"),
+        (
+            ["dron1.csv", "blind.csv", "--out", "new.csv"],
+            InputError,
+            "blind.csv, outside tracks: expected a pos",
+        ),
     ],
 )
 def test_errors_are_one_line(files, words, error, sentence) -> None:
@@ -161,9 +165,11 @@ def test_tracks_of_another_recording_are_refused(files, tmp_path) -> None:
     done = run(folder / "dron1.csv", folder / "elsewhere.csv", "--out", out)
     assert isinstance(done.exception, InputError)
     message = str(done.exception)
-    assert message.startswith(f"{folder / 'elsewhere.csv'}: expected a track within 0.5 m of a path")
+    assert message.startswith(
+        f"{folder / 'elsewhere.csv'}, outside tracks: expected a track within 0.5 m of a path"
+    )
     assert re.search(
-        r"found none \(the nearest is (49|5\d)\.\d\d m away\); .*one recording, one clock", message
+        r"found none \(the nearest is (4[5-9]|5\d)\.\d\d m away\); .*one recording, one clock", message
     )
     tracks = read_trajectories(folder / "tracks.csv")
     write_trajectories(tmp_path / "later.csv", replace(tracks, time_s=tracks.time_s + 100))

@@ -1,11 +1,11 @@
 """Fusion of on-board paths (inside-out) with tracks of static cameras (outside-in), as one track per drone.
 
 In: a `CameraPath` for each drone that carries a camera, and `Trajectories` of static cameras. Out: `FusedTracks`, with
-the arm between camera and silhouette, and the error models of both sources for each drone. Other rooms use `fuse`, its
-results, and `fused_table.write_fused`.
+the arm between camera and silhouette, and the scales of both sources' covariances for each drone. Other rooms use
+`fuse`, its results, and `fused_table.write_fused`.
 
-Imports go in this order: `resampling` (a path at other frames), `outside_tracks`, `pairing` (which track belongs to
-which drone), `joint_filter`, `error_models`, `gating`, `drone_fusion` (one drone), `fused` (all drones), `fused_table`.
+Imports go in this order: `sources` (both at the same frames), `pairing` (which track belongs to which drone),
+`weighting` (one drone), `fused` (all drones), `fused_table`.
 """
 
 from psotrack.inside_out.fusing.fused import FusedDrone, FusedTracks, fuse

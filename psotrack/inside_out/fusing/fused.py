@@ -1,31 +1,34 @@
 """Fusion of inside-out and outside-in: one track per drone from its own camera's path and the static cameras' tracks.
 
-Each source is weighted by its covariance, with a scale that is estimated from the differences between the two. Errors
-that last over several frames are modelled as such. Where one source is missing, the other continues alone. Where the
-two differ grossly, the source that fits the motion is used.
+The path is smoothed, and each source is weighted by its covariance, with a scale that is estimated from the differences
+between the two. Where one source is missing, the other continues alone. Where the two contradict each other, the source
+that does not jump is used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.evaluation import Offset, find_offset
 from psotrack.inside_out.camera_path import CameraPath
-from psotrack.inside_out.fusing.drone_fusion import DroneFusion, DroneTrack, Point, fuse_drone, unfused_path
-from psotrack.inside_out.fusing.outside_tracks import OutsideTracks, align_tracks, select_track
-from psotrack.inside_out.fusing.pairing import Pairing, pair_tracks
-from psotrack.inside_out.fusing.resampling import ResampledPath, estimate_arm, resample_path
+from psotrack.inside_out.fusing.pairing import pair_tracks, reorder_tracks
+from psotrack.inside_out.fusing.sources import Inside, inside_at, nearest_index, outside_at
+from psotrack.inside_out.fusing.weighting import Point, Weighted, weigh
 from psotrack.trajectories import GATE_M, UNASSIGNED, Status, Trajectories
 
-#: Smallest distance, metres, and multiple of the usual distance, from the expected middle of a drone, within which a
-#: track may belong to the drone.
-_LEAST_REACH_M, _FAR = 0.1, 4.0
+#: Longest time to the nearest pose during which a drone coasts without either source, seconds; beyond, it is lost.
+MAX_COASTING_S = 0.5
+
+#: The values of one drone in all frames, by their names.
+_Rows = dict[str, np.ndarray]
+_PARTS = ("position_m", "velocity_m_s", "covariance_m2", "status", "orientation_wxyz", "source")
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,7 @@ class FusedDrone:
         tracks: names of the outside tracks that belong to it, in the order of time; empty where there are none.
         offset: offset of the camera's clock; None if it was not estimated.
         frames_both, frames_inside, frames_outside: number of frames in which both sources, or only one, were used.
-        nearest_m: median distance of the camera from the nearest track, over the frames that have both, metres; NaN
-            without such frames.
-        fusion: arm and error models; None without a track.
+        weighted: arm, scales and positions; None without a track.
     """
 
     name: str
@@ -48,24 +49,24 @@ class FusedDrone:
     frames_both: int
     frames_inside: int
     frames_outside: int
-    nearest_m: float
-    fusion: DroneFusion | None
+    weighted: Weighted | None
 
     def to_dict(self) -> dict[str, Any]:
         """The result, fit for JSON; None for what is not known."""
-        fusion = self.fusion
+        offset, found = self.offset, self.weighted
+        sources = None if found is None else found.sources()
         return {
             "drone": self.name,
             "tracks": list(self.tracks),
-            "offset_s": None if self.offset is None else self.offset.offset_s,
-            "offset_std_s": None if self.offset is None else self.offset.std_s,
+            "offset_s": offset and offset.offset_s,
+            "offset_std_s": offset and offset.std_s,
             "frames_both": self.frames_both,
             "frames_inside": self.frames_inside,
             "frames_outside": self.frames_outside,
-            "lever_arm_m": None if fusion is None else fusion.arm_m.tolist(),
-            "lever_arm_std_m": None if fusion is None else fusion.arm_std_m.tolist(),
-            "inside": None if fusion is None else fusion.inside.to_dict(),
-            "outside": None if fusion is None else fusion.outside.to_dict(),
+            "lever_arm_m": found and found.arm_m.tolist(),
+            "lever_arm_std_m": found and [found.arm_std_m] * 3,
+            "inside": sources and sources["inside"],
+            "outside": sources and sources["outside"],
         }
 
     def __str__(self) -> str:
@@ -76,16 +77,16 @@ class FusedDrone:
         parts.append(
             f"frames of both {self.frames_both}, inside only {self.frames_inside}, outside only {self.frames_outside}"
         )
-        if self.fusion is not None:
-            arm = ", ".join(
-                f"{1e3 * value:.1f} ± {1e3 * std:.1f}"
-                for value, std in zip(self.fusion.arm_m, self.fusion.arm_std_m, strict=True)
+        if self.weighted is not None:
+            std_mm = 1e3 * self.weighted.arm_std_m
+            parts.append(
+                f"arm ({', '.join(f'{value:.1f} ± {std_mm:.1f}' for value in 1e3 * self.weighted.arm_m)}) mm"
             )
-            parts.append(f"arm ({arm}) mm")
-            parts.extend(
-                f"{word}: stated errors multiplied by {errors.scale:.2f}, {errors.gated} gross errors left out"
-                for word, errors in (("inside", self.fusion.inside), ("outside", self.fusion.outside))
-            )
+            parts += [
+                f"{word}: stated errors multiplied by {of_source['scale']:.2f}, "
+                f"{of_source['gross_frames']} gross errors left out"
+                for word, of_source in self.weighted.sources().items()
+            ]
         return "; ".join(parts)
 
 
@@ -106,7 +107,8 @@ class FusedTracks:
     As text, a line for each drone and each swap, and a line on the whole.
 
     Attributes:
-        trajectories: at the frames of both sources, by the clock of the outside tracks. Orientations are the cameras'.
+        trajectories: at the frames of both sources, by the clock of the outside tracks. Orientations are the cameras',
+            smoothed; velocities are those of the source that tracks `point`, and where it has none, of the other one.
         point: tracked point of the fused drones. Paths without a track are of the camera, tracks without a path of the
             middle.
         drones: results for the drones that carry cameras, one per path.
@@ -150,13 +152,14 @@ def fuse(
 ) -> FusedTracks:
     """Fuse the paths of on-board cameras with the tracks that static cameras have of the same drones.
 
-    Names of tracks do not matter: each path is assigned the track near it, piece by piece, so that identity swaps are
-    resolved. The arm between the camera's centre and the middle of the silhouette, constant in the camera's axes, is
-    estimated, and so are the scales of both covariances. A path without a track and a track without a path are kept as
-    they are. Only tracked poses and positions are used, neither coasting nor lost ones.
+    Names of tracks do not matter: each path is assigned the track near it, so that identity swaps are resolved. The arm
+    between the camera's centre and the middle of the silhouette, constant in the camera's axes, is estimated, and so
+    are the scales of both covariances. A path without a track is smoothed, and a track without a path is kept as it is.
+    Of tracks only tracked positions are used, neither coasting nor lost ones.
 
     Args:
-        inside: paths by the names of their drones; a single path is called `drone`.
+        inside: paths by the names of their drones; a single path is called `drone`. A path with velocities was smoothed
+            or filtered before, and is not smoothed again.
         outside: tracks of the middles of silhouettes; covariances are optional.
         point: tracked point of the result: the camera's centre, which the markers define, or the middle of the
             silhouette, which static cameras see.
@@ -164,7 +167,8 @@ def fuse(
             seconds; None for equal clocks.
 
     Raises:
-        InputError: there is nothing to fuse, or the motion does not determine a clock offset.
+        InputError: there is nothing to fuse, no track is near a path although both are known at the same times, or the
+            motion does not determine a clock offset.
         SettingsError: `max_offset_s` is smaller than the time between two poses of a path.
     """
     paths = {"drone": inside} if isinstance(inside, CameraPath) else dict(inside)
@@ -174,46 +178,61 @@ def fuse(
         raise InputError("outside tracks", expected="a position in at least one frame", found="none")
     offsets = {name: _find_clock_offset(name, path, outside, max_offset_s) for name, path in paths.items()}
     clocks_s = {name: 0.0 if offset is None else offset.offset_s for name, offset in offsets.items()}
-    tracks_in = align_tracks(
-        outside, (path.time_s[path.seen] - clocks_s[name] for name, path in paths.items())
-    )
-    frame, time_s = tracks_in.frame, tracks_in.time_s
-    cameras = [resample_path(path, time_s, clocks_s[name]) for name, path in paths.items()]
-    pairing = _pair(frame, cameras, tracks_in.tracked_m)
-    tracks: dict[str, DroneTrack] = {}
-    drones = []
-    for (name, path), camera, own_index in zip(paths.items(), cameras, pairing.track.T, strict=True):
-        names = tuple(dict.fromkeys(outside.drones[k] for k in own_index if k != UNASSIGNED))
-        found = None
+    tracks = outside_at(outside, [path.time_s[path.seen] - clocks_s[name] for name, path in paths.items()])
+    cameras = [inside_at(path, tracks.time_s, clocks_s[name]) for name, path in paths.items()]
+    tracked = np.asarray(tracks.status == Status.TRACKED)
+    middle_m = np.where(tracked[..., None], tracks.position_m, np.nan)
+    pairing = pair_tracks(np.stack([camera.position_m for camera in cameras], axis=1), middle_m)
+    _check_near(pairing, cameras, middle_m)
+    order, column = reorder_tracks(pairing, tracks.num_drones)
+    rows: dict[str, _Rows] = {}
+    drones, swaps = [], []
+    for name, camera, own in zip(paths, cameras, pairing.T, strict=True):
+        track, weighted = _outside_rows(tracks, own), None
+        names = [tracks.drones[index] for index in own[own != UNASSIGNED]]
         if names:
-            own_track = (
-                select_track(tracks_in.tracked_m, own_index),
-                select_track(tracks_in.covariance_m2, own_index),
-            )
-            found = fuse_drone(path, frame, time_s, clocks_s[name], *own_track, point)
-        tracks[name] = unfused_path(path, time_s, clocks_s[name]) if found is None else found.track
-        both, one, other = (int((_source(tracks[name]) == source).sum()) for source in (3, 1, 2))
-        nearest_m = _nearest_m(camera, tracks_in.tracked_m)
-        drones.append(FusedDrone(name, names, offsets[name], both, one, other, nearest_m, found))
-    for name, own_index in zip(outside.drones, pairing.rest.T, strict=True):
-        track = _outside_track(tracks_in, own_index)
-        if track.used.any():
-            tracks[_free_name(name, tracks)] = track
-    return FusedTracks(
-        trajectories=_join_tracks(tracks_in, tracks),
-        point=point,
-        drones=tuple(drones),
-        identity_swaps=tuple(
-            IdentitySwap(
-                drones[change.drone].name,
-                change.frame,
-                outside.drones[change.before],
-                outside.drones[change.after],
-            )
-            for change in pairing.changes
-        ),
-        source=np.stack([_source(track) for track in tracks.values()], axis=1),
-    )
+            own_m = np.where((track["source"] == 2)[:, None], track["position_m"], np.nan)
+            weighted = weigh(camera, own_m, track["covariance_m2"], point)
+            if weighted.gross[:, 0].any():
+                gross_s = tracks.time_s[weighted.gross[:, 0]] + clocks_s[name]
+                camera = inside_at(_without_poses(paths[name], gross_s), tracks.time_s, clocks_s[name])
+                again = weigh(camera, own_m, track["covariance_m2"], point)
+                weighted = replace(again, gross=again.gross | weighted.gross)
+        rows[name] = _fused_rows(camera, weighted, track["velocity_m_s"], point)
+        both, one, other = (int((rows[name]["source"] == which).sum()) for which in (3, 1, 2))
+        own_names = tuple(dict.fromkeys(names))
+        drones.append(FusedDrone(name, own_names, offsets[name], both, one, other, weighted))
+        steps = zip(tracks.frame[own != UNASSIGNED].tolist()[1:], names, names[1:], strict=False)
+        swaps += [
+            IdentitySwap(name, frame, before, after) for frame, before, after in steps if before != after
+        ]
+    for index in sorted(set(range(tracks.num_drones)) - set(column.values())):
+        rest = _outside_rows(tracks, order[:, index])
+        if rest["source"].any():
+            rows[_free_name(tracks.drones[index], rows)] = rest
+    joined = {part: np.stack([each[part] for each in rows.values()], axis=1) for part in _PARTS}
+    source = joined.pop("source")
+    trajectories = Trajectories(tracks.frame, tracks.time_s, tuple(rows), **joined)
+    swaps.sort(key=lambda swap: swap.frame)
+    return FusedTracks(trajectories, point, tuple(drones), tuple(swaps), source)
+
+
+def _check_near(
+    pairing: Int[np.ndarray, "frames paths"],
+    cameras: list[Inside],
+    middle_m: Float[np.ndarray, "frames tracks 3"],
+) -> None:
+    """Raise `InputError` if no path has a track, although both are known at the same times."""
+    if (pairing != UNASSIGNED).any():
+        return
+    apart_m = [np.linalg.norm(middle_m - camera.position_m[:, None], axis=-1) for camera in cameras]
+    if np.isfinite(apart_m).any():
+        raise InputError(
+            "outside tracks",
+            expected=f"a track within {GATE_M:g} m of a path in most frames that have both",
+            found=f"none (the nearest is {np.nanmin(apart_m):.2f} m away)",
+            remedy="all files must have one recording, one clock (see --max-offset) and one world",
+        )
 
 
 def _find_clock_offset(
@@ -230,67 +249,49 @@ def _find_clock_offset(
         raise InputError(f"the clock of {name}", expected="an offset", found=f"none ({error})") from error
 
 
-def _pair(
-    frame: Int[np.ndarray, "frames"],
-    cameras: list[ResampledPath],
-    middle_m: Float[np.ndarray, "frames tracks 3"],
-) -> Pairing:
-    """Pair tracks with paths, first by the cameras' positions, then by the middles expected from each camera's arm."""
-    expected_m = np.stack([camera.position_m for camera in cameras], axis=1)
-    reach_m = np.full(len(cameras), GATE_M)
-    pairing = pair_tracks(frame, expected_m, reach_m, middle_m)
-    for index, camera in enumerate(cameras):
-        own_m = select_track(middle_m, pairing.track[:, index])
-        arm_m, _ = estimate_arm(camera, own_m)
-        expected_m[:, index] += camera.rotation @ arm_m
-        off_m = np.linalg.norm(own_m - expected_m[:, index], axis=1)
-        if np.isfinite(off_m).any():
-            reach_m[index] = np.clip(_FAR * np.nanmedian(off_m), _LEAST_REACH_M, GATE_M)
-    return pair_tracks(frame, expected_m, reach_m, middle_m)
-
-
-def _nearest_m(camera: ResampledPath, middle_m: Float[np.ndarray, "frames tracks 3"]) -> float:
-    """Median distance of a camera from the nearest track, metres; NaN without frames that have both."""
-    distance_m = np.linalg.norm(middle_m - camera.position_m[:, None], axis=-1)
-    both = np.isfinite(distance_m).any(axis=1)
-    return float(np.median(np.nanmin(distance_m[both], axis=1))) if both.any() else np.nan
-
-
-def _outside_track(outside: OutsideTracks, track: Int[np.ndarray, "frames"]) -> DroneTrack:
-    """The outside track of a drone without a camera, unchanged."""
-    own_status = outside.status[np.arange(len(track)), track]
-    status = np.where(track == UNASSIGNED, int(Status.LOST), own_status)
-    return DroneTrack(
-        position_m=select_track(outside.position_m, track),
-        velocity_m_s=select_track(outside.velocity_m_s, track),
-        covariance_m2=select_track(outside.covariance_m2, track),
-        orientation_wxyz=np.full((len(track), 4), np.nan),
-        status=status,
-        used=np.stack([np.zeros(len(track), bool), status == Status.TRACKED], axis=1),
+def _fused_rows(
+    camera: Inside, weighted: Weighted | None, outside_m_s: Float[np.ndarray, "frames 3"], point: Point
+) -> _Rows:
+    """The rows of a drone that carries a camera; without a track, of the camera alone."""
+    if weighted is None:
+        position_m, covariance_m2 = camera.position_m, camera.at_variance_m2(max(camera.white, 1.0))
+        source = camera.tracked.astype(int)
+    else:
+        position_m, covariance_m2 = weighted.position_m, weighted.covariance_m2
+        source = (weighted.known[:, 0] & camera.tracked) + 2 * weighted.known[:, 1]
+    known = np.isfinite(position_m).all(axis=1) & ((source > 0) | (camera.away_s <= MAX_COASTING_S))
+    coasting = np.where(known, int(Status.COASTING), int(Status.LOST))
+    first_m_s, second_m_s = (
+        (camera.velocity_m_s, outside_m_s) if point == "camera" else (outside_m_s, camera.velocity_m_s)
     )
+    velocity_m_s = np.where(np.isnan(first_m_s), second_m_s, first_m_s)
+    wxyz = Rotation.from_matrix(camera.rotation).as_quat(scalar_first=True)
+    return {
+        "position_m": np.where(known[:, None], position_m, np.nan),
+        "velocity_m_s": np.where(known[:, None], velocity_m_s, np.nan),
+        "covariance_m2": np.where(known[:, None, None], covariance_m2, np.nan),
+        "orientation_wxyz": np.where(camera.oriented[:, None], wxyz, np.nan),
+        "status": np.where(source > 0, int(Status.TRACKED), coasting),
+        "source": source,
+    }
 
 
-def _free_name(name: str, taken: Mapping[str, DroneTrack]) -> str:
+def _outside_rows(tracks: Trajectories, index: Int[np.ndarray, "frames"]) -> _Rows:
+    """The rows of an outside track, unchanged; lost where the index is `UNASSIGNED`."""
+    rows = {part: getattr(tracks, part)[np.arange(len(index)), index] for part in _PARTS[:4]}
+    rows["status"] = np.where(index == UNASSIGNED, int(Status.LOST), rows["status"])
+    source = np.where(rows["status"] == Status.TRACKED, 2, 0)
+    return rows | {"orientation_wxyz": np.full((len(index), 4), np.nan), "source": source}
+
+
+def _without_poses(path: CameraPath, gross_s: Float[np.ndarray, "rows"]) -> CameraPath:
+    """The path without the poses nearest to some times."""
+    status = path.status.copy()
+    status[nearest_index(path.time_s, gross_s)] = Status.LOST
+    return replace(path, status=status)
+
+
+def _free_name(name: str, taken: Mapping[str, _Rows]) -> str:
     while name in taken:
         name += " outside"
     return name
-
-
-def _source(track: DroneTrack) -> Int[np.ndarray, "frames"]:
-    return track.used @ np.array([1, 2])
-
-
-def _join_tracks(outside: OutsideTracks, tracks: Mapping[str, DroneTrack]) -> Trajectories:
-    def stacked(part: str) -> np.ndarray:
-        return np.stack([getattr(track, part) for track in tracks.values()], axis=1)
-
-    return Trajectories(
-        frame=outside.frame,
-        time_s=outside.time_s,
-        drones=tuple(tracks),
-        position_m=stacked("position_m"),
-        velocity_m_s=stacked("velocity_m_s"),
-        orientation_wxyz=stacked("orientation_wxyz"),
-        status=stacked("status"),
-        covariance_m2=stacked("covariance_m2"),
-    )
