@@ -299,4 +299,9 @@ def _standard_deviations(
     inverse = np.linalg.inv(total)
     inverse -= inverse.mean(axis=0)
     inverse -= inverse.mean(axis=1, keepdims=True)
-    return np.sqrt(variance + np.einsum("kb,bc,kc->k", inverse, prior, inverse)), np.sqrt(np.diag(inverse))
+    white = np.diag(inverse)
+    by_prior = np.einsum("kb,bc,kc->k", inverse, prior, inverse)
+    # Few blocks know the variance of one camera badly: how far errors are correlated is the mean of all cameras.
+    shown = information.sum(axis=0) > np.diag(prior)
+    ratio = (variance[shown] / white[shown]).mean() if shown.any() else 0.0
+    return np.sqrt(np.where(shown, ratio * white, variance) + by_prior), np.sqrt(white)
