@@ -33,7 +33,7 @@ _WIDE_FIRST = (3.0, 3.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class PointViews:
+class SuspectViews:
     """Points of the other cameras, and a camera's sightings in the same frames.
 
     Attributes:
@@ -67,7 +67,7 @@ class CameraFault:
     lag_frames: float = 0.0
 
 
-def explain_camera(camera: Camera, views: PointViews) -> list[CameraFault]:
+def explain_camera(camera: Camera, views: SuspectViews) -> list[CameraFault]:
     """The camera as it was read, and the best fault of each kind, the simplest kinds first."""
     lag = max(_LAGS.tolist(), key=lambda lag: _explained(camera, views, lag))
     lens = max((_scaled(camera, scale) for scale in _SCALES), key=lambda each: _explained(each, views))
@@ -89,12 +89,12 @@ def _scaled(camera: Camera, scale: float) -> Camera:
     return replace(camera, K=K)
 
 
-def _explained(camera: Camera, views: PointViews, lag_frames: float = 0.0) -> float:
+def _explained(camera: Camera, views: SuspectViews, lag_frames: float = 0.0) -> float:
     return float(_fits(camera, views, lag_frames)[0].mean())
 
 
 def _fits(
-    camera: Camera, views: PointViews, lag_frames: float = 0.0, widen: float = 1.0
+    camera: Camera, views: SuspectViews, lag_frames: float = 0.0, widen: float = 1.0
 ) -> tuple[Float[np.ndarray, "points"], Int[np.ndarray, "points"]]:
     """How well each point is explained, from 0 to 1, and the index of the sighting that explains it."""
     pixels, depth = project_visible(camera, views.point_m - lag_frames * views.velocity_m)
@@ -104,7 +104,7 @@ def _fits(
     return np.maximum(0.0, 1 - squared[np.arange(len(best)), best] / _MAX_SQUARED_DISTANCE), best
 
 
-def _placed_anew(camera: Camera, views: PointViews) -> Camera:
+def _placed_anew(camera: Camera, views: SuspectViews) -> Camera:
     """The camera at the place that its sightings give; first it is turned by the most frequent shift of the image."""
     return max(
         (_located(start, views) for start in (camera, _shifted(camera, views))),
@@ -112,7 +112,7 @@ def _placed_anew(camera: Camera, views: PointViews) -> Camera:
     )
 
 
-def _turned(camera: Camera, moved: Camera, views: PointViews) -> Camera:
+def _turned(camera: Camera, moved: Camera, views: SuspectViews) -> Camera:
     """The camera turned until its rays agree with the points that the moved camera explains."""
     fit, best = _fits(moved, views)
     paired = np.flatnonzero(fit > 0)
@@ -129,7 +129,7 @@ def _turned(camera: Camera, moved: Camera, views: PointViews) -> Camera:
     return replace(camera, T_cam_world=T)
 
 
-def _shifted(camera: Camera, views: PointViews) -> Camera:
+def _shifted(camera: Camera, views: SuspectViews) -> Camera:
     """The camera turned so that most points fall on sightings, to the precision of a cell of the histogram."""
     pixels, depth = project_visible(camera, views.point_m)
     shift_px = (views.box_px - pixels[:, None])[depth > NEAR_M].reshape(-1, 2)
@@ -145,7 +145,7 @@ def _shifted(camera: Camera, views: PointViews) -> Camera:
     return replace(camera, T_cam_world=T)
 
 
-def _located(camera: Camera, views: PointViews) -> Camera:
+def _located(camera: Camera, views: SuspectViews) -> Camera:
     """The camera at the place that its sightings give."""
     K, dist, fisheye = np.asarray(camera.K), np.asarray(camera.dist), bool(camera.fisheye)
     for widen in _WIDE_FIRST:

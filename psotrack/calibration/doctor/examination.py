@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, PointViews, explain_camera
+from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, SuspectViews, explain_camera
 from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames, least_viewpoints
 from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, medians, misfit_px, weigh
 from psotrack.calibration.doctor.diagnosis import Diagnosis
@@ -192,7 +192,7 @@ def _gross_fault(rig: Rig, seen: ExaminedFrames, points: CommonPoints) -> Findin
         if least_viewpoints(rest) < 3:
             continue
         known, boxes = seen.by(others).common_points(rest), seen.sightings
-        views = PointViews(
+        views = SuspectViews(
             known.start_m,
             known.velocity_m,
             boxes.centre_px[known.frame, index],
