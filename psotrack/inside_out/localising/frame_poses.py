@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -199,7 +200,7 @@ def own_path(frames: Sequence[FollowedFrame], settings: PoseSettings) -> CameraP
     num_markers = np.array([frame.num_markers for frame in frames], int)
     num_markers[there] = [pose.num_markers for pose in poses]
 
-    def filled(values: Sequence[object], *shape: int) -> np.ndarray:
+    def filled(values: Sequence[Any], *shape: int) -> np.ndarray:
         """Values of the frames that have a pose; NaN in the others."""
         whole = np.full((len(frames), *shape), np.nan)
         whole[there] = np.reshape(values, (len(there), *shape))
