@@ -74,7 +74,7 @@ def raw_path(position_m, orientation, time_s=None) -> CameraPath:
         position_m=position_m,
         orientation_wxyz=orientation.as_quat(scalar_first=True).reshape(count, 4),
         covariance=np.tile(pose_covariance(), (count, 1, 1)),
-        num_markers=np.full(count, 8),
+        num_markers=np.full(count, 2),
         reprojection_px=np.full(count, 0.3),
         ambiguity=np.zeros(count),
         status=np.full(count, int(Status.TRACKED)),
@@ -255,7 +255,7 @@ def test_gated_frames_coast_with_growing_uncertainty() -> None:
     path = filter_path(move_poses(raw, slice(40, 46), [0.0, 3.0, 0.0]))
     assert (path.status[40:46] == Status.COASTING).all()
     assert (path.flags[40:46] == Flag.GATED).all()
-    assert (path.num_markers[40:46] == 8).all()
+    assert (path.num_markers[40:46] == 2).all()
     assert (np.diff(np.trace(path.covariance[39:46, :3, :3], axis1=1, axis2=2)) > 0).all()
     assert path.status[46] == Status.TRACKED
 
@@ -345,13 +345,12 @@ def test_after_a_gap_agreeing_markers_do_not_outweigh_the_motion_of_a_hovering_c
 def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> None:
     raw, position_m, _ = flight(120, acceleration=2.0, shake=2.0, seed=41)
     raw = remove_poses(raw, slice(60, 90))
-    path = filter_path(raw)
+    path = filter_path(replace(raw, num_markers=np.full(120, 3)))
     assert (path.status[90:94] == Status.TRACKED).all()
     assert (path.status[90:] != Status.LOST).all()
     assert np.linalg.norm(path.position_m[90:] - position_m[90:], axis=1).max() < 0.05
     # Without such markers more poses are needed, because the gap is too long for the motion to predict a pose.
-    few = replace(raw, num_markers=np.full(120, 2))
-    assert (filter_path(few).status[90:99] == Status.LOST).all()
+    assert (filter_path(raw).status[90:99] == Status.LOST).all()
 
 
 # First poses, and paths with few poses.

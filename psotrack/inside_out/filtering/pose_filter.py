@@ -130,6 +130,7 @@ class FilterRun:
         track: the track; None before the first pose.
         rival: track by poses that contradict the track.
         needed: number of poses after which the rival replaces the track.
+        turns: whether the rival is the track after an unpredicted turn, and not another one.
         restarted_s: time since when the frame's track is another one than in the frame before, seconds; None if it is
             the same.
         jumped: whether the camera cannot have moved from one to the other.
@@ -140,6 +141,7 @@ class FilterRun:
     track: Track | None = None
     rival: Track | None = None
     needed: int = 0
+    turns: bool = False
     restarted_s: float | None = None
     jumped: bool = False
     used: bool = False
@@ -214,29 +216,29 @@ def step(
     accepts = updated.fits and (is_fresh or _is_predicted(updated, params))
     rival = run.rival
     if rival is not None and time_s - rival.seen_s <= params.longest_gap_s:
-        rivalling = _updated(rival, pose, params, agility)
+        rivalling = _updated(rival, pose, params, _WILDEST if run.turns else agility)
         if rivalling.fits and not (accepts and updated.log_density >= rivalling.log_density):
             # The pose belongs to the rival, even where the track has grown uncertain enough to accept it.
-            return _rivalled(run, rivalling.track, run.needed, run.jumped)
+            return _rivalled(run, rivalling.track, run.needed, run.turns)
     if accepts:
         return replace(run, track=updated.track, rival=None, used=True)
     if is_fresh:
         turned = _updated(track, pose, params, _WILDEST)
         if turned.fits and _is_predicted(turned, params) and confirmed(run, params):
             turn = replace(turned.track, began_s=time_s)
-            return _rivalled(run, turn, track.support + _TURN_POSES, False)
+            return _rivalled(run, turn, track.support + _TURN_POSES, True)
     first = _first_track(pose, params, agility)
     needed = params.restart_after if track.sure else min(params.restart_after, track.support + 1)
     if not is_fresh:
         needed = 1 if updated.fits and first.sure else max(params.confirm, params.restart_after)
-    return _rivalled(run, first, needed, True)
+    return _rivalled(run, first, needed, False)
 
 
-def _rivalled(run: FilterRun, rival: Track, needed: int, jumped: bool) -> FilterRun:
+def _rivalled(run: FilterRun, rival: Track, needed: int, turns: bool) -> FilterRun:
     """The run with a rival track, which replaces the track if it has enough poses."""
     if rival.support < needed:
-        return replace(run, rival=rival, needed=needed)
-    return replace(run, track=rival, rival=None, restarted_s=rival.began_s, jumped=jumped, used=True)
+        return replace(run, rival=rival, needed=needed, turns=turns)
+    return replace(run, track=rival, rival=None, restarted_s=rival.began_s, jumped=not turns, used=True)
 
 
 def _first_track(pose: FramePose, params: PoseFilterParams, agility: Agility) -> Track:
