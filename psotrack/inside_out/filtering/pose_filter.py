@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
+from scipy.special import chdtri, gammaln
 
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import rotation_matrices
@@ -42,6 +42,8 @@ _OTHER_POSE_STD = 1.0
 #: Degrees of freedom of the Student distribution of an innovation: heavy tails, so that a single wild pose does not
 #: make a hovering camera race.
 _FREEDOM = 4.0
+#: Logarithm of this distribution's density where it is largest, relative to that of a normal distribution.
+_LOG_PEAK = float(gammaln(_FREEDOM / 2 + 3) - gammaln(_FREEDOM / 2) - 3 * np.log(_FREEDOM / 2))
 
 
 @dataclass(frozen=True)
@@ -263,7 +265,7 @@ def _updated(track: Track, pose: FramePose, params: PoseFilterParams, agility: A
     found = innovation(predicted, pose.position_m, pose.R_world_cam, pose.covariance)
     spread = found.covariance + pose.constant
     nis, log_size = float(found.off @ np.linalg.solve(spread, found.off)), float(np.linalg.slogdet(spread)[1])
-    robust = -((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
+    robust = _LOG_PEAK - ((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
     right = probability_right(found.off, spread, pose.ambiguity)
     more = Track(
         correct(predicted, found, right),
