@@ -29,6 +29,7 @@ from psotrack.inside_out.filtering.motion import (
     initial_motion,
     innovation,
     predict,
+    turning,
 )
 from psotrack.trajectories import Status
 
@@ -225,11 +226,11 @@ def step(
     if accepts:
         return replace(run, track=updated.track, rival=None, used=True)
     if is_fresh:
-        turned = _updated(track, pose, params, _WILDEST)
+        turned = _updated(replace(track, motion=turning(track.motion, _WILDEST)), pose, params, _WILDEST)
         if turned.fits and _is_predicted(turned, params) and confirmed(run, params):
             turn = replace(turned.track, began_s=time_s)
             return _rivalled(run, turn, track.support + _TURN_POSES, True)
-    first = _first_track(pose, params, agility)
+    first = _first_track(pose, params, _WILDEST)
     needed = params.restart_after if track.sure else min(params.restart_after, track.support + 1)
     if not is_fresh:
         needed = 1 if updated.fits and first.sure else max(params.confirm, params.restart_after)
