@@ -21,6 +21,7 @@ from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath, Flag
 from psotrack.inside_out.filtering.motion import (
+    ACCELERATION_TIME_S,
     Agility,
     Motion,
     MotionEstimate,
@@ -134,6 +135,7 @@ class FilterRun:
         rival: track by poses that contradict the track.
         needed: number of poses after which the rival replaces the track.
         turns: whether the rival is the track after an unpredicted turn, and not another one.
+        turned_s: time of the last unpredicted turn of the track, seconds.
         restarted_s: time since when the frame's track is another one than in the frame before, seconds; None if it is
             the same.
         jumped: whether the camera cannot have moved from one to the other.
@@ -145,10 +147,15 @@ class FilterRun:
     rival: Track | None = None
     needed: int = 0
     turns: bool = False
+    turned_s: float = -np.inf
     restarted_s: float | None = None
     jumped: bool = False
     used: bool = False
     log_likelihood: float = 0.0
+
+    def agility_at(self, time_s: float, agility: Agility) -> Agility:
+        """How wildly the track may move: as wildly as any drone for the acceleration's time constant after a turn."""
+        return _WILDEST if time_s - self.turned_s < ACCELERATION_TIME_S else agility
 
 
 @dataclass(frozen=True)
@@ -180,7 +187,7 @@ def expected(run: FilterRun, time_s: float, params: PoseFilterParams, agility: A
     track = run.track
     if track is None or not confirmed(run, params) or time_s - track.seen_s > params.longest_gap_s:
         return Estimated(None)
-    found = estimate(predict(track.motion, time_s - track.seen_s, agility)[0])
+    found = estimate(predict(track.motion, time_s - track.seen_s, run.agility_at(time_s, agility))[0])
     return Estimated(
         replace(found, covariance=found.covariance + track.constant),
         run.used and time_s == track.seen_s,
@@ -213,7 +220,7 @@ def step(
     if track is None:
         first = _first_track(pose, params, agility)
         return replace(run, track=first, restarted_s=time_s, jumped=True, used=True)
-    updated = _updated(track, pose, params, agility)
+    updated = _updated(track, pose, params, run.agility_at(time_s, agility))
     run = replace(run, log_likelihood=run.log_likelihood + updated.log_density)
     is_fresh = time_s - track.seen_s <= params.longest_gap_s
     accepts = updated.fits and (is_fresh or _is_predicted(updated, params))
@@ -241,7 +248,15 @@ def _rivalled(run: FilterRun, rival: Track, needed: int, turns: bool) -> FilterR
     """The run with a rival track, which replaces the track if it has enough poses."""
     if rival.support < needed:
         return replace(run, rival=rival, needed=needed, turns=turns)
-    return replace(run, track=rival, rival=None, restarted_s=rival.began_s, jumped=not turns, used=True)
+    return replace(
+        run,
+        track=rival,
+        rival=None,
+        turned_s=rival.began_s if turns else -np.inf,
+        restarted_s=rival.began_s,
+        jumped=not turns,
+        used=True,
+    )
 
 
 def _first_track(pose: FramePose, params: PoseFilterParams, agility: Agility) -> Track:
