@@ -164,7 +164,7 @@ class Estimated:
 
     Attributes:
         motion: pose and motion, with the constant part of the covariance; None of a frame that is lost.
-        used: whether the frame's own pose was used for it.
+        used: whether the frame's own pose fits the motion; also true of the poses before the track is confirmed.
         ambiguity: probability that it belongs to another camera pose that looks the same.
     """
 
@@ -185,14 +185,11 @@ class _Updated:
 def expected(run: FilterRun, time_s: float, params: PoseFilterParams, agility: Agility) -> Estimated:
     """Estimate at the time of a frame, without the frame's pose."""
     track = run.track
+    used = track is not None and run.used and time_s == track.seen_s
     if track is None or not confirmed(run, params) or time_s - track.seen_s > params.longest_gap_s:
-        return Estimated(None)
+        return Estimated(None, used)
     found = estimate(predict(track.motion, time_s - track.seen_s, run.agility_at(time_s, agility))[0])
-    return Estimated(
-        replace(found, covariance=found.covariance + track.constant),
-        run.used and time_s == track.seen_s,
-        track.ambiguity,
-    )
+    return Estimated(replace(found, covariance=found.covariance + track.constant), used, track.ambiguity)
 
 
 def confirmed(run: FilterRun, params: PoseFilterParams) -> bool:
@@ -355,7 +352,7 @@ def poses_of(
 def path_of(raw: CameraPath, estimates: Sequence[Estimated]) -> CameraPath:
     """The path with the estimated poses of its frames.
 
-    `TRACKED` where the frame's own pose was used, `COASTING` where there was none or it was gated, and `LOST`, with
+    `TRACKED` where the frame's own pose fits the motion, `COASTING` where there was none or it was gated, and `LOST`, with
     NaN, where there is no estimate.
     """
     count, has_pose = raw.num_frames, np.isfinite(raw.position_m).all(axis=1)
