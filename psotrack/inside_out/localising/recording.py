@@ -135,16 +135,20 @@ def _motions_around(
 ) -> Callable[[float], MotionAround | None]:
     """The motion around each frame, by splines through the smoothed poses."""
     times = np.array([frame.time_s for frame in found])
-    smoothed = smoothed_motions(times, [frame.own(rows=False) for frame in found], params)
+    smoothed = smoothed_motions(times, [frame.own() for frame in found], params)
     known = {time_s: one.motion for time_s, one in zip(times.tolist(), smoothed, strict=True) if one.motion}
     if not known:
         return lambda time_s: None
-    # At the ends, a spline's slope would rest on the last pose, and errors of the two would amplify each other.
+    # Beyond the ends, a pose gives the spline the smoothed velocity of the end: it lies as far from the pose inside as
+    # the camera moves in the time between the two.
+    times_s = sorted(known)
     frame_s = float(np.diff(times).min(initial=1.0))
-    first, last = min(known), max(known)
-    ends = [(first, first - frame_s), (last, last + frame_s)]
+    ends = ((times_s[0], times_s[:2][-1], -frame_s), (times_s[-1], times_s[-2:][0], frame_s))
     beyond = {
-        outside: constant_motion(known[inside], inside)(np.array([outside])) for inside, outside in ends
+        end + late_s: constant_motion(
+            replace(known[inside], velocity_m_s=known[end].velocity_m_s, rate_rad_s=known[end].rate_rad_s), inside
+        )(np.array([end + late_s]))
+        for end, inside, late_s in ends
     }
     poses = {time_s: (motion.position_m, motion.R_world_cam) for time_s, motion in known.items()}
     poses |= {time_s: (position_m[0], R[0]) for time_s, (position_m, R) in beyond.items()}
@@ -152,6 +156,8 @@ def _motions_around(
     # A velocity is the difference of the poses before and after, divided by the time between the two.
     scale = np.sqrt(2) / (2 * frame_s)
     roots = {time_s: scale * np.linalg.cholesky(motion.covariance) for time_s, motion in known.items()}
+    for end in (times_s[0], times_s[-1]):
+        roots[end] = np.linalg.cholesky(known[end].rate_covariance)
 
     def around(time_s: float) -> MotionAround | None:
         nearest = min(roots, key=lambda other: abs(other - time_s))
