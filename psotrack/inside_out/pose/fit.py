@@ -106,7 +106,7 @@ def _explained(
     whole = np.where(used[:, None, None], found.covariance - of_fit, found.covariance + of_fit)
     corner = whole.reshape(-1, 4, 2, 4, 2)[:, np.arange(4), :, np.arange(4)].swapaxes(0, 1)
     squares = _squares(off_px.reshape(-1, 4, 2), corner, found.covariance[:, :2, :2][:, None])
-    is_ahead = np.asarray(found.depth_m > NEAR_M)
+    is_ahead = np.greater(found.depth_m, NEAR_M)
     of_used = squares[found.fits & is_ahead]
     scale2 = max(1.0, float(np.median(of_used)) / _MEDIAN) if len(of_used) > 4 else 1.0
     good = is_ahead & (squares < scale2 * _GATE)
