@@ -506,7 +506,7 @@ def test_a_stream_that_ends_is_not_interrupted(room, monkeypatch):
 
 
 def test_ctrl_c_in_a_recording_writes_nothing(room, tmp_path, monkeypatch):
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("psotrack.inside_out.localising.frame_poses.estimate_pose", interrupted)

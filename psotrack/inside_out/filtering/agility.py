@@ -12,11 +12,13 @@ from psotrack.inside_out.filtering.pose_filter import FilterRun, FramePose, Pose
 
 #: Factor between neighbouring values, and largest number of steps from the defaults: accelerations from 0.05 to
 #: 500 m/s², changes of the turn rate from 0.03 to 300 rad/s.
-_FACTOR, _MOST_STEPS = np.sqrt(10.0), 4
+_FACTOR, _MOST_STEPS = 10.0**0.25, 8
+#: Lengths of the search's steps: with the last alone, a flight like none of the defaults would take many.
+_STRIDES = (2, 1)
 #: Number of successive poses that are looked at together, and largest number of such windows.
 _WINDOW, _MOST_WINDOWS = 60, 4
 #: What a step from the defaults costs of the log likelihood, so that a few poses do not decide.
-_STEP_COST = 0.5
+_STEP_COST = 0.25
 
 
 def choose_agility(poses: Sequence[FramePose | None], params: PoseFilterParams) -> Agility:
@@ -40,12 +42,17 @@ def choose_agility(poses: Sequence[FramePose | None], params: PoseFilterParams) 
         return sum(found) - _STEP_COST * sum(steps)
 
     best = (0, 0)
-    while True:
-        around = [(best[0] + along, best[1] + about) for along, about in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-        better = max(around, key=lambda steps: likelihood(*steps))
-        if likelihood(*better) <= likelihood(*best):
-            return _agility(*best)
-        best = better
+    for stride in _STRIDES:
+        while (better := max(_around(best, stride), key=lambda steps: likelihood(*steps))) != best:
+            best = better
+    return _agility(*best)
+
+
+def _around(steps: tuple[int, int], stride: int) -> list[tuple[int, int]]:
+    """These steps, and those that differ from them by a stride in one number."""
+    along, about = steps
+    beside = [(along + sign * stride, about) for sign in (-1, 1)]
+    return [steps, *beside, *((along, about + sign * stride) for sign in (-1, 1))]
 
 
 def _agility(along: int, about: int) -> Agility:

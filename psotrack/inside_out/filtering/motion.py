@@ -31,7 +31,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 #: Size of the error state: position, velocity, acceleration, turn, turn rate (3 each), and the correlated error u (6).
 SIZE = 21
-_TURN, _RATE, _CORRELATED = slice(9, 12), slice(12, 15), slice(15, 21)
+_ACCELERATION, _TURN, _RATE, _CORRELATED = slice(6, 9), slice(9, 12), slice(12, 15), slice(15, 21)
 #: Indices of position and turn in the error state, and of velocity and turn rate.
 POSE, RATES = np.r_[0:3, 9:12], np.r_[3:6, 12:15]
 
@@ -168,6 +168,14 @@ def predict(motion: Motion, dt_s: float, agility: Agility) -> tuple[Motion, Matr
         F @ motion.covariance @ F.T + Q,
     )
     return later, F, Q
+
+
+def turning(motion: Motion, agility: Agility) -> Motion:
+    """The motion with an acceleration that may be any: what it was before the turn says nothing about it."""
+    spread = motion.covariance.copy()
+    spread[_ACCELERATION], spread[:, _ACCELERATION] = 0.0, 0.0
+    spread[_ACCELERATION, _ACCELERATION] = agility.acceleration_std_m_s2**2 * np.eye(3)
+    return replace(motion, acceleration_m_s2=np.zeros(3), covariance=spread)
 
 
 def innovation(

@@ -15,12 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
+from scipy.special import chdtri, gammaln
 
 from psotrack.errors import InputError, SettingsError, check_positive
 from psotrack.geometry import rotation_matrices
 from psotrack.inside_out.camera_path import CameraPath, Flag
 from psotrack.inside_out.filtering.motion import (
+    ACCELERATION_TIME_S,
     Agility,
     Motion,
     MotionEstimate,
@@ -29,6 +30,7 @@ from psotrack.inside_out.filtering.motion import (
     initial_motion,
     innovation,
     predict,
+    turning,
 )
 from psotrack.trajectories import Status
 
@@ -42,6 +44,8 @@ _OTHER_POSE_STD = 1.0
 #: Degrees of freedom of the Student distribution of an innovation: heavy tails, so that a single wild pose does not
 #: make a hovering camera race.
 _FREEDOM = 4.0
+#: Logarithm of this distribution's density where it is largest, relative to that of a normal distribution.
+_LOG_PEAK = float(gammaln(_FREEDOM / 2 + 3) - gammaln(_FREEDOM / 2) - 3 * np.log(_FREEDOM / 2))
 
 
 @dataclass(frozen=True)
@@ -131,6 +135,7 @@ class FilterRun:
         rival: track by poses that contradict the track.
         needed: number of poses after which the rival replaces the track.
         turns: whether the rival is the track after an unpredicted turn, and not another one.
+        turned_s: time of the last unpredicted turn of the track, seconds.
         restarted_s: time since when the frame's track is another one than in the frame before, seconds; None if it is
             the same.
         jumped: whether the camera cannot have moved from one to the other.
@@ -142,10 +147,15 @@ class FilterRun:
     rival: Track | None = None
     needed: int = 0
     turns: bool = False
+    turned_s: float = -np.inf
     restarted_s: float | None = None
     jumped: bool = False
     used: bool = False
     log_likelihood: float = 0.0
+
+    def agility_at(self, time_s: float, agility: Agility) -> Agility:
+        """How wildly the track may move: as wildly as any drone for the acceleration's time constant after a turn."""
+        return _WILDEST if time_s - self.turned_s < ACCELERATION_TIME_S else agility
 
 
 @dataclass(frozen=True)
@@ -154,7 +164,7 @@ class Estimated:
 
     Attributes:
         motion: pose and motion, with the constant part of the covariance; None of a frame that is lost.
-        used: whether the frame's own pose was used for it.
+        used: whether the frame's own pose fits the motion; also true of the poses before the track is confirmed.
         ambiguity: probability that it belongs to another camera pose that looks the same.
     """
 
@@ -175,14 +185,11 @@ class _Updated:
 def expected(run: FilterRun, time_s: float, params: PoseFilterParams, agility: Agility) -> Estimated:
     """Estimate at the time of a frame, without the frame's pose."""
     track = run.track
+    used = track is not None and run.used and time_s == track.seen_s
     if track is None or not confirmed(run, params) or time_s - track.seen_s > params.longest_gap_s:
-        return Estimated(None)
-    found = estimate(predict(track.motion, time_s - track.seen_s, agility)[0])
-    return Estimated(
-        replace(found, covariance=found.covariance + track.constant),
-        run.used and time_s == track.seen_s,
-        track.ambiguity,
-    )
+        return Estimated(None, used)
+    found = estimate(predict(track.motion, time_s - track.seen_s, run.agility_at(time_s, agility))[0])
+    return Estimated(replace(found, covariance=found.covariance + track.constant), used, track.ambiguity)
 
 
 def confirmed(run: FilterRun, params: PoseFilterParams) -> bool:
@@ -210,7 +217,7 @@ def step(
     if track is None:
         first = _first_track(pose, params, agility)
         return replace(run, track=first, restarted_s=time_s, jumped=True, used=True)
-    updated = _updated(track, pose, params, agility)
+    updated = _updated(track, pose, params, run.agility_at(time_s, agility))
     run = replace(run, log_likelihood=run.log_likelihood + updated.log_density)
     is_fresh = time_s - track.seen_s <= params.longest_gap_s
     accepts = updated.fits and (is_fresh or _is_predicted(updated, params))
@@ -223,11 +230,11 @@ def step(
     if accepts:
         return replace(run, track=updated.track, rival=None, used=True)
     if is_fresh:
-        turned = _updated(track, pose, params, _WILDEST)
+        turned = _updated(replace(track, motion=turning(track.motion, _WILDEST)), pose, params, _WILDEST)
         if turned.fits and _is_predicted(turned, params) and confirmed(run, params):
             turn = replace(turned.track, began_s=time_s)
             return _rivalled(run, turn, track.support + _TURN_POSES, True)
-    first = _first_track(pose, params, agility)
+    first = _first_track(pose, params, _WILDEST)
     needed = params.restart_after if track.sure else min(params.restart_after, track.support + 1)
     if not is_fresh:
         needed = 1 if updated.fits and first.sure else max(params.confirm, params.restart_after)
@@ -238,7 +245,15 @@ def _rivalled(run: FilterRun, rival: Track, needed: int, turns: bool) -> FilterR
     """The run with a rival track, which replaces the track if it has enough poses."""
     if rival.support < needed:
         return replace(run, rival=rival, needed=needed, turns=turns)
-    return replace(run, track=rival, rival=None, restarted_s=rival.began_s, jumped=not turns, used=True)
+    return replace(
+        run,
+        track=rival,
+        rival=None,
+        turned_s=rival.began_s if turns else -np.inf,
+        restarted_s=rival.began_s,
+        jumped=not turns,
+        used=True,
+    )
 
 
 def _first_track(pose: FramePose, params: PoseFilterParams, agility: Agility) -> Track:
@@ -263,7 +278,7 @@ def _updated(track: Track, pose: FramePose, params: PoseFilterParams, agility: A
     found = innovation(predicted, pose.position_m, pose.R_world_cam, pose.covariance)
     spread = found.covariance + pose.constant
     nis, log_size = float(found.off @ np.linalg.solve(spread, found.off)), float(np.linalg.slogdet(spread)[1])
-    robust = -((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
+    robust = _LOG_PEAK - ((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
     right = probability_right(found.off, spread, pose.ambiguity)
     more = Track(
         correct(predicted, found, right),
@@ -337,7 +352,7 @@ def poses_of(
 def path_of(raw: CameraPath, estimates: Sequence[Estimated]) -> CameraPath:
     """The path with the estimated poses of its frames.
 
-    `TRACKED` where the frame's own pose was used, `COASTING` where there was none or it was gated, and `LOST`, with
+    `TRACKED` where the frame's own pose fits the motion, `COASTING` where there was none or it was gated, and `LOST`, with
     NaN, where there is no estimate.
     """
     count, has_pose = raw.num_frames, np.isfinite(raw.position_m).all(axis=1)

@@ -41,11 +41,13 @@ class _Findings:
         fits: (frames,), True if the frame's pose fits the motion, judged at the end of the run.
         track: (frames,), number of the track, which changes where the camera jumps.
         ambiguity: (frames,), ambiguity of the track.
+        agility: how wildly the camera may move into each frame.
     """
 
     fits: Bool[np.ndarray, "frames"]
     track: Int[np.ndarray, "frames"]
     ambiguity: Float[np.ndarray, "frames"]
+    agility: Sequence[Agility]
 
 
 def filter_path(
@@ -109,7 +111,7 @@ def smoothed_motions(
     for span in _spans(time_s, fits, forward.track, params.longest_gap_s):
         constant = np.zeros((6, 6))
         for k, motion in zip(
-            range(span.start, span.stop), _smooth_span(time_s, poses, fits, span, agility), strict=True
+            range(span.start, span.stop), _smooth_span(time_s, poses, fits, span, forward.agility), strict=True
         ):
             pose = poses[k]
             constant = pose.constant if pose is not None and fits[k] else constant
@@ -127,6 +129,7 @@ def _findings(
     """Run the causal filter; poses of a track that is never confirmed do not count."""
     count = len(poses)
     fits, track, ambiguity = np.zeros(count, bool), np.zeros(count, int), np.full(count, np.nan)
+    agilities = [agility] * count
     has_pose, run, good = np.array([pose is not None for pose in poses], bool), FilterRun(), [False]
     for k, pose in enumerate(poses):
         run = step(run, float(time_s[k]), pose, params, agility)
@@ -138,10 +141,12 @@ def _findings(
             if run.jumped:
                 good.append(False)
                 track[since:k] = len(good) - 1
+            agilities[since:k] = [run.agility_at(run.restarted_s, agility)] * (k - since)
+        agilities[k] = run.agility_at(float(time_s[k]), agility)
         track[k], good[-1] = len(good) - 1, confirmed(run, params)
         if run.track is not None:
             ambiguity[k] = run.track.ambiguity
-    return _Findings(fits & np.array(good)[track], track, ambiguity)
+    return _Findings(fits & np.array(good)[track], track, ambiguity, agilities)
 
 
 def _spans(
@@ -167,17 +172,17 @@ def _smooth_span(
     poses: Sequence[FramePose | None],
     fits: Bool[np.ndarray, "frames"],
     span: slice,
-    agility: Agility,
+    agility: Sequence[Agility],
 ) -> list[pose_motion.MotionEstimate]:
     """Smoothed motions of a span of frames whose first pose fits, without constant errors."""
     first = poses[span.start]
     if first is None:
         raise ValueError("expected a pose in the first frame of a span")
-    filtered = [pose_motion.initial_motion(first.position_m, first.R_world_cam, first.covariance, agility)]
+    filtered = [pose_motion.initial_motion(first.position_m, first.R_world_cam, first.covariance, agility[span.start])]
     ahead: list[tuple[Motion, pose_motion.Matrix, pose_motion.Matrix]] = []
     for k in range(span.start + 1, span.stop):
         pose = poses[k] if fits[k] else None
-        ahead.append(pose_motion.predict(filtered[-1], float(time_s[k] - time_s[k - 1]), agility))
+        ahead.append(pose_motion.predict(filtered[-1], float(time_s[k] - time_s[k - 1]), agility[k]))
         motion = ahead[-1][0]
         if pose is not None:
             found = pose_motion.innovation(motion, pose.position_m, pose.R_world_cam, pose.covariance)

@@ -48,7 +48,7 @@ PAPER_MARKERS = 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
 _AMBIGUOUS = 0.05
 #: Numbers of poses of a stream after which the camera's agility is chosen anew, each time by the last ones.
-_CHOICES = (8, 16, 32, 64, 128)
+_CHOICES = (4, 8, 16, 32, 64, 128)
 #: Standard deviations of velocity (m/s) and turn rate (rad/s) where nothing is known of the motion.
 _UNKNOWN_RATES = np.repeat([5.0, 3.0], 3)
 
