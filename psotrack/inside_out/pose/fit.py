@@ -101,12 +101,12 @@ def _explained(
     """Corners whose residuals, and whose marker's mean residual, are in the gate; and the gate's factor, 1 or more."""
     off_px = found.residual_px - found.slopes @ step
     of_fit = found.slopes @ covariance @ found.slopes.swapaxes(1, 2)
-    used = found.fits.any(axis=1)
+    used = np.asarray(found.fits.any(axis=1))
     # The covariance of a residual is smaller than that of the error for corners that were used, else larger.
     whole = np.where(used[:, None, None], found.covariance - of_fit, found.covariance + of_fit)
     corner = whole.reshape(-1, 4, 2, 4, 2)[:, np.arange(4), :, np.arange(4)].swapaxes(0, 1)
     squares = _squares(off_px.reshape(-1, 4, 2), corner, found.covariance[:, :2, :2][:, None])
-    is_ahead = np.asarray(found.depth_m > NEAR_M)
+    is_ahead = found.depth_m > NEAR_M
     of_used = squares[found.fits & is_ahead]
     scale2 = max(1.0, float(np.median(of_used)) / _MEDIAN) if len(of_used) > 4 else 1.0
     good = is_ahead & (squares < scale2 * _GATE)
