@@ -352,8 +352,8 @@ def poses_of(
 def path_of(raw: CameraPath, estimates: Sequence[Estimated]) -> CameraPath:
     """The path with the estimated poses of its frames.
 
-    `TRACKED` where the frame's own pose fits the motion, `COASTING` where there was none or it was gated, and `LOST`, with
-    NaN, where there is no estimate.
+    `TRACKED` where the frame's own pose fits the motion, `COASTING` where there was none or it was gated, and `LOST`,
+    with NaN, where there is no estimate.
     """
     count, has_pose = raw.num_frames, np.isfinite(raw.position_m).all(axis=1)
     motions = [one.motion for one in estimates]

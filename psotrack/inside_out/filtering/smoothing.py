@@ -111,7 +111,9 @@ def smoothed_motions(
     for span in _spans(time_s, fits, forward.track, params.longest_gap_s):
         constant = np.zeros((6, 6))
         for k, motion in zip(
-            range(span.start, span.stop), _smooth_span(time_s, poses, fits, span, forward.agility), strict=True
+            range(span.start, span.stop),
+            _smooth_span(time_s, poses, fits, span, forward.agility),
+            strict=True,
         ):
             pose = poses[k]
             constant = pose.constant if pose is not None and fits[k] else constant
@@ -178,7 +180,9 @@ def _smooth_span(
     first = poses[span.start]
     if first is None:
         raise ValueError("expected a pose in the first frame of a span")
-    filtered = [pose_motion.initial_motion(first.position_m, first.R_world_cam, first.covariance, agility[span.start])]
+    filtered = [
+        pose_motion.initial_motion(first.position_m, first.R_world_cam, first.covariance, agility[span.start])
+    ]
     ahead: list[tuple[Motion, pose_motion.Matrix, pose_motion.Matrix]] = []
     for k in range(span.start + 1, span.stop):
         pose = poses[k] if fits[k] else None

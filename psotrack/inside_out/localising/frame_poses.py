@@ -87,8 +87,8 @@ class FollowedFrame:
     by_line_time: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
     estimated: Estimated = field(default_factory=Estimated)
 
-    def own(self, *, rows: bool = True) -> FramePose | None:
-        """The own pose for the filter; with or without the covariances by the rows."""
+    def own(self) -> FramePose | None:
+        """The own pose for the filter."""
         pose = self.pose
         if pose is None:
             return None
@@ -96,8 +96,8 @@ class FollowedFrame:
             self.time_s,
             pose.position_m,
             pose.R_world_cam,
-            pose.covariance - pose.constant + rows * self.by_motion,
-            pose.constant + rows * self.by_line_time,
+            pose.covariance - pose.constant + self.by_motion,
+            pose.constant + self.by_line_time,
             pose.ambiguity,
             int(pose.used.sum()),
         )

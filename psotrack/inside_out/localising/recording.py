@@ -143,13 +143,13 @@ def _motions_around(
     # the camera moves in the time between the two.
     times_s = sorted(known)
     frame_s = float(np.diff(times).min(initial=1.0))
-    ends = ((times_s[0], times_s[:2][-1], -frame_s), (times_s[-1], times_s[-2:][0], frame_s))
-    beyond = {
-        end + late_s: constant_motion(
-            replace(known[inside], velocity_m_s=known[end].velocity_m_s, rate_rad_s=known[end].rate_rad_s), inside
-        )(np.array([end + late_s]))
-        for end, inside, late_s in ends
-    }
+    beyond = {}
+    ends = (times_s[0], times_s[:2][-1], -frame_s), (times_s[-1], times_s[-2:][0], frame_s)
+    for end, inside, late_s in ends:
+        velocity_m_s, rate_rad_s = known[end].velocity_m_s, known[end].rate_rad_s
+        as_end = replace(known[inside], velocity_m_s=velocity_m_s, rate_rad_s=rate_rad_s)
+        onwards = constant_motion(as_end, inside)
+        beyond[end + late_s] = onwards(np.array([end + late_s]))
     poses = {time_s: (motion.position_m, motion.R_world_cam) for time_s, motion in known.items()}
     poses |= {time_s: (position_m[0], R[0]) for time_s, (position_m, R) in beyond.items()}
     poses_at = spline_through(sorted(poses), [poses[time_s] for time_s in sorted(poses)])
