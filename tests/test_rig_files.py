@@ -183,7 +183,7 @@ def test_a_file_of_opencvs_sample(tmp_path):
     np.testing.assert_array_equal(lenses.cameras.dist[0], [0.25, -0.5, 0, 0, 0.125])
     np.testing.assert_array_equal(lenses.cameras.image_size_wh[0], [640, 480])
     with pytest.raises(
-        InputError, match=r"left\.yml: expected the poses of cameras, found none; .*extrinsics"
+        InputError, match=r"left\.yml: expected the poses of cameras, found none; .*calibrate rig"
     ):
         read_rig(path)
 

@@ -11,8 +11,9 @@ import numpy as np
 from _recordings import Recording
 from jaxtyping import Float, Int
 
+from psotrack.foreground import markers
 from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
-from psotrack.inside_out import MarkerMap, detection
+from psotrack.inside_out import MarkerMap
 from psotrack.recordings import read_frames
 from psotrack.support import atomic_write, progress_bar
 
@@ -70,7 +71,7 @@ def detected(recording: Recording, kept: Path) -> Sightings:
 def _made_of(recording: Recording) -> str:
     """Text that changes whenever an input of the detection changes."""
     video, lens, status = recording.video, recording.lens, recording.video.path.stat()
-    sources = sorted(Path(str(detection.__file__)).parent.glob("*.py"))
+    sources = sorted(Path(str(markers.__file__)).parent.glob("*.py"))
     detector = zlib.crc32(b"".join(source.read_bytes() for source in sources))
     seen = (status.st_size, status.st_mtime_ns, video.num_frames, recording.marker_map.ids.tolist())
     return repr((*seen, np.asarray(lens.K).tolist(), np.asarray(lens.dist).tolist(), detector))

@@ -147,5 +147,5 @@ def map_markers(
             sys.exit(FOUND)
     elif out is not None:
         built = build_map(sightings, known, side_m=world.side_m, estimate_sides=world.estimate_sides)
-        write_marker_corners(out, built.marker_map.corners_m, built.marker_map.std_m)
+        write_marker_corners(out, built.marker_map.corners_m, built.marker_map.std_m or None)
         show_built(output, built, list(videos), out)

@@ -171,7 +171,9 @@ def _result(
     of_marker = used.marker == ids[:, None]
     good = of_marker & adjusted.used
     squares = (adjusted.residual_px**2).mean(axis=1)
-    std_m = dict(zip(ids.tolist(), _std_m(adjusted).tolist(), strict=True))
+    stds_m = _std_m(adjusted)
+    # A marker that is not determined leaves no covariance known.
+    std_m = dict(zip(ids.tolist(), stds_m.tolist(), strict=True)) if np.isfinite(stds_m).all() else {}
     return BuiltMap(
         MarkerMap({marker: one.corners_m for marker, one in adjusted.markers.items()}, std_m),
         ids,

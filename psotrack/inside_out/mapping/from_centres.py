@@ -83,7 +83,8 @@ def complete_map(
             remedy="a table of corners needs fewer markers in sight",
         )
     to_m = np.array([centres.centres_m[marker] for marker in ids])
-    std_m = np.linalg.norm(built.std_m, axis=1)
+    # Few frames state no standard deviation.
+    std_m = np.nan_to_num(np.linalg.norm(built.std_m, axis=1))
     fits, scale, R = _fit(centre_m, to_m, std_m, with_scale=side_m is None)
     if fits.sum() < _LEAST_CENTRES:
         raise InputError(
