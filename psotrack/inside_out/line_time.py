@@ -219,7 +219,7 @@ def _followed(
     return motion, np.array(sums)
 
 
-def _ratio(runs: Sequence[Float[np.ndarray, "frames 2"]]) -> tuple[float, float]:
+def _ratio(runs: Sequence[Float[np.ndarray, "_ 2"]]) -> tuple[float, float]:
     """Ratio of the sums of products and squares of all frames, and its standard deviation."""
     frames, ratio = np.concatenate(runs), 0.0
     for _ in range(5):
