@@ -36,7 +36,7 @@ VERY_STRONG, STRONG = 5.0, 3.0
 LEAST_PX = 1.5
 #: Smallest fraction of this shift that the correction takes from the boxes' distances from where the other cameras put
 #: the bodies: what moves boxes must be visible in the residuals.
-_VISIBLE = 0.5
+_VISIBLE = 0.3
 #: Number of hypotheses that are fitted without linearisation, and number of their steps.
 _REFINED, _STEPS = 6, 3
 #: Largest number of errors without a name that are corrected.
