@@ -438,7 +438,8 @@ class TestCovariances:
             errors = learn_camera_errors(views, FPS, USUAL)
             systematic = systematic_covariances(views, errors)
             rates.append(inside_rate(moved_m, noise_covariance(views, errors) + systematic.absolute_m2))
-        assert 0.8 <= np.mean(rates) <= 0.97
+        # In 75 frames are four independent errors of 18 frames: Student's t widens their variance.
+        assert 0.8 <= np.mean(rates) <= (0.98 if frames > 1 else 0.97)
 
 
 class TestFilteredVariance:
