@@ -47,8 +47,10 @@ Covariance = Float[np.ndarray, "6 6"]
 PAPER_MARKERS = 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
 _AMBIGUOUS = 0.05
-#: Numbers of poses of a stream after which the camera's agility is chosen anew, each time by the last ones.
-_CHOICES = (4, 8, 16, 32, 64, 128)
+#: Numbers of poses of a stream after which the camera's agility is chosen anew by them, and they are filtered anew.
+_CHOICES = (5, 10, 20, 40, 80)
+#: Number of times that the motion of a stream and a frame's pose are estimated by turns.
+_TURNS = 3
 #: Standard deviations of velocity (m/s) and turn rate (rad/s) where nothing is known of the motion.
 _UNKNOWN_RATES = np.repeat([5.0, 3.0], 3)
 
@@ -131,37 +133,46 @@ def follow(
         began_s = time.perf_counter()
         predicted = expected(run, time_s, params, model).motion
         predicted_s = time.perf_counter()
-        motion = around(time_s) if around is not None else None
-        if around is None and predicted is not None:
-            motion = MotionAround(
-                constant_motion(predicted, time_s), np.linalg.cholesky(predicted.rate_covariance)
-            )
         corners_m = marker_map.corners_of(markers.ids.tolist())
-        moved = markers
-        if rolls and motion is not None:
-            corners_px = at_middle_row(
-                markers.corners_px, corners_m, lens, shutter.line_time_s, time_s, motion.poses_at
-            )
-            moved = DetectedMarkers(markers.ids, corners_px, markers.std_px)
-        pose = _own_pose(moved, corners_m, marker_map, lens, settings, predicted)
-        frame = FollowedFrame(number, time_s, len(markers), pose)
-        if rolls and pose is not None:
-            of_motion, of_line_time = _by_rows(pose, markers, corners_m, lens, shutter, time_s, motion)
-            frame = replace(frame, by_motion=of_motion, by_line_time=of_line_time)
+        motion = around(time_s) if around is not None else _constant(predicted, time_s)
+        for turn in range(_TURNS if rolls and around is None else 1):
+            moved = markers
+            if rolls and motion is not None:
+                corners_px = at_middle_row(
+                    markers.corners_px, corners_m, lens, shutter.line_time_s, time_s, motion.poses_at
+                )
+                moved = DetectedMarkers(markers.ids, corners_px, markers.std_px)
+            pose = _own_pose(moved, corners_m, marker_map, lens, settings, predicted)
+            frame = FollowedFrame(number, time_s, len(markers), pose)
+            if rolls and pose is not None:
+                of_motion, of_line_time = _by_rows(pose, markers, corners_m, lens, shutter, time_s, motion)
+                frame = replace(frame, by_motion=of_motion, by_line_time=of_line_time)
+                if turn < _TURNS - 1 and around is None:
+                    trial = _stepped(run, time_s, frame.own(), params, model)
+                    now = expected(trial, time_s, params, model)
+                    motion = _constant(now.motion, time_s) or motion
         located_s = time.perf_counter()
         own = frame.own()
-        try:
-            run = step(run, time_s, own, params, model)
-        except np.linalg.LinAlgError:
-            # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
-            run = FilterRun()
+        run = _stepped(run, time_s, own, params, model)
         if agility is None and own is not None and len(recent) < _CHOICES[-1]:
             recent.append(own)
             if len(recent) in _CHOICES:
-                model = choose_agility(recent, params)
+                model, run = choose_agility(recent, params), FilterRun()
+                for earlier in recent:
+                    run = _stepped(run, earlier.time_s, earlier, params, model)
         spent_s["locate"] += located_s - predicted_s
         spent_s["filter"] += time.perf_counter() - located_s + predicted_s - began_s
         yield replace(frame, estimated=expected(run, time_s, params, model))
+
+
+def _stepped(
+    run: FilterRun, time_s: float, own: FramePose | None, params: PoseFilterParams, agility: Agility
+) -> FilterRun:
+    try:
+        return step(run, time_s, own, params, agility)
+    except np.linalg.LinAlgError:
+        # Poses by a wrong map may contradict the motion without any doubt: the filter starts anew.
+        return FilterRun()
 
 
 def _own_pose(
@@ -224,6 +235,13 @@ def own_path(frames: Sequence[FollowedFrame], settings: PoseSettings) -> CameraP
         status=status,
         flags=flags | np.where(ambiguity > _AMBIGUOUS, int(Flag.AMBIGUOUS), 0),
     )
+
+
+def _constant(predicted: MotionEstimate | None, time_s: float) -> MotionAround | None:
+    """The motion around a frame by an estimate at its time."""
+    if predicted is None:
+        return None
+    return MotionAround(constant_motion(predicted, time_s), np.linalg.cholesky(predicted.rate_covariance))
 
 
 def constant_motion(predicted: MotionEstimate, time_s: float) -> PosesAt:
