@@ -66,7 +66,9 @@ def test_faults_of_small_bodies_are_named(fault):
         sightings = from_detections(case.seen, case.rig, case.frames)
         rows.append(judge(case, examine(case.rig, sightings, fps=_boxes.FPS)))
     assert not any(row["wrong"] for row in rows), rows
-    assert sum(bool(row["named first"]) for row in rows) >= len(rows) - (fault in ("focal length 2 %", "turned 0.5")), rows
+    assert sum(bool(row["named first"]) for row in rows) >= len(rows) - (
+        fault in ("focal length 2 %", "turned 0.5")
+    ), rows
 
 
 @pytest.mark.parametrize(("number", "fault"), [(1, "moved 5 cm"), (2, "turned 0.5"), (4, "exchanged")])
