@@ -149,12 +149,15 @@ def _log_evidence(seen: SeenMarkers, found: Equations, covariance: Float[np.ndar
     """Logarithm of the density of all corners of a frame.
 
     Residuals of fitting corners have Student's t distribution, because their variance is not exactly known. Other
-    corners have a uniform density. The poses are integrated out by Laplace's approximation.
+    corners have a uniform density. The poses are integrated out by Laplace's approximation, whose curvature is that of
+    this distribution.
     """
     std_px = np.repeat(seen.std_px, 4)[found.fits.ravel()]
     off = found.residual_px.reshape(-1, 2)[found.fits.ravel()] / std_px[:, None]
     count, half = off.size, (_PRIOR_RESIDUALS + off.size) / 2
     of_fitted = lgamma(half) - lgamma(_PRIOR_RESIDUALS / 2) - count / 2 * log(pi * _PRIOR_RESIDUALS)
-    of_fitted -= half * log(1 + np.sum(off**2) / _PRIOR_RESIDUALS) + 2 * np.log(std_px).sum()
+    squares = float(np.sum(off**2))
+    of_fitted -= half * log(1 + squares / _PRIOR_RESIDUALS) + 2 * np.log(std_px).sum()
     of_others = (found.fits.size - len(off)) * _LOG_ANYWHERE
-    return float(of_fitted + of_others + 3 * log(2 * pi) + np.linalg.slogdet(covariance)[1] / 2)
+    of_poses = 3 * log(2 * pi * (_PRIOR_RESIDUALS + squares) / (_PRIOR_RESIDUALS + count))
+    return float(of_fitted + of_others + of_poses + np.linalg.slogdet(covariance)[1] / 2)
