@@ -12,7 +12,7 @@ from .image_points import (
 )
 from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
 from .lens_models import LensModel, known_lenses, parse_lens_model
-from .pnp import ray_distances, refine_pnp, solve_pnp, solve_pnp_ransac
+from .pnp import Solver, ray_distances, refine_pnp, solve_pnp, solve_pnp_ransac
 from .residuals import GATE, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
 from .rig.by_board import calibrate_by_board
@@ -75,6 +75,7 @@ __all__ = [
     "RigCalibration",
     "RigSettings",
     "Similarity",
+    "Solver",
     "advise",
     "align",
     "calibrate_by_board",

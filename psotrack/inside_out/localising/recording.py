@@ -30,7 +30,8 @@ from psotrack.inside_out.pose import CornerNoise, RollingShutter, estimate_noise
 _NOISE_FRAMES, _NOISE_TURNS = 60, 2
 #: Number of times that the motion of a rolling shutter and its poses are estimated by turns.
 _ROLLING_TURNS = 3
-#: A marker is wrong if it disagrees in more than this fraction of the poses of its frames, of at least so many.
+#: A marker is wrong if it disagrees in more than this fraction of the poses of its frames; smallest number of these
+#: poses that decides.
 _WRONG, _LEAST_FRAMES = 0.5, 3
 #: Number of right markers that a pose needs where wrong ones are left out.
 _ENOUGH = 2

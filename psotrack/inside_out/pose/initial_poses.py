@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import combinations
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from psotrack.calibration import Solver, solve_pnp
 from psotrack.geometry import NEAR_M
 from psotrack.inside_out.pose.equations import SeenMarkers
 from psotrack.inside_out.pose.fit import MIN_CORNERS
@@ -45,7 +45,7 @@ def near_px(seen: SeenMarkers) -> Float[np.ndarray, "markers"]:
 
 def pose_of_all(seen: SeenMarkers) -> list[InitialPose]:
     """Poses of all markers together: at most one, if all markers are right."""
-    return _solve(seen.corners_m, seen.rays, cv2.SOLVEPNP_SQPNP)
+    return _solve(seen.corners_m, seen.rays, "sqpnp")
 
 
 def poses_of_pairs(seen: SeenMarkers) -> list[tuple[InitialPose, Bool[np.ndarray, "markers 4"]]]:
@@ -67,12 +67,10 @@ def poses_of_pairs(seen: SeenMarkers) -> list[tuple[InitialPose, Bool[np.ndarray
 def mirrored_poses(seen: SeenMarkers, best: MarkerPose) -> list[InitialPose]:
     """Second poses of markers that lie nearly in a plane, without those that equal the best pose."""
     corners_m = seen.corners_m[best.used]
-    middle_m = corners_m.mean(axis=(0, 1))
-    _, extent_m, axes = np.linalg.svd((corners_m - middle_m).reshape(-1, 3), full_matrices=False)
+    extent_m = np.linalg.svd((corners_m - corners_m.mean(axis=(0, 1))).reshape(-1, 3), compute_uv=False)
     if extent_m[2] > _NEARLY_FLAT * extent_m[0]:
         return []
-    flat_m = corners_m - ((corners_m - middle_m) @ axes[2])[..., None] * axes[2]
-    poses = _solve(flat_m, seen.rays[best.used], cv2.SOLVEPNP_IPPE)
+    poses = _solve(corners_m, seen.rays[best.used], "ippe")
     if not poses:
         return []
     rms_px = np.sqrt(np.mean(_distances_px(seen, poses)[:, best.fits] ** 2, axis=1))
@@ -105,24 +103,14 @@ def _poses_of_few(seen: SeenMarkers) -> Iterator[InitialPose]:
         pairs = [pairs[index] for index in chosen]
     for pair in pairs:
         opposite = [[marker] for marker in pair], [[0, 2], [1, 3]]
-        yield from _solve(seen.corners_m[opposite], seen.rays[opposite], cv2.SOLVEPNP_AP3P)
+        yield from _solve(seen.corners_m[opposite], seen.rays[opposite], "ap3p")
     for marker in range(count if count <= _FEW_MARKERS else 0):
-        yield from _solve(seen.corners_m[marker], seen.rays[marker], cv2.SOLVEPNP_IPPE)
+        yield from _solve(seen.corners_m[marker], seen.rays[marker], "ippe")
 
 
 def _solve(
-    corners_m: Float[np.ndarray, "*corners 3"], rays: Float[np.ndarray, "*corners 2"], method: int
+    corners_m: Float[np.ndarray, "*corners 3"], rays: Float[np.ndarray, "*corners 2"], solver: Solver
 ) -> list[InitialPose]:
-    """Finite poses that a solver of OpenCV finds for corners on rays."""
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(
-            corners_m.reshape(-1, 3), rays.reshape(-1, 2), np.eye(3), None, flags=method
-        )
-    except cv2.error:
-        # OpenCV fails for degenerate corners, such as corners on one line.
-        return []
-    poses = [
-        (np.asarray(cv2.Rodrigues(turn)[0]).T, shift.ravel())
-        for turn, shift in zip(turns, shifts, strict=True)
-    ]
-    return [(-R @ t_m, R) for R, t_m in poses if np.isfinite(R).all() and np.isfinite(t_m).all()]
+    """Poses that a solver finds for corners on rays, the pose of smallest reprojection error first."""
+    poses = solve_pnp(corners_m.reshape(-1, 3), rays.reshape(-1, 2), solver)
+    return [(-T[:3, :3].T @ T[:3, 3], T[:3, :3].T) for T in poses]
