@@ -70,7 +70,8 @@ def ray_distances(
     in_camera = points_m @ T_cam_world[..., :3, :3].swapaxes(-1, -2) + T_cam_world[..., None, :3, 3]
     is_ahead = in_camera[..., 2] > NEAR_M
     depth_m = np.where(is_ahead, in_camera[..., 2], 1.0)[..., None]
-    return np.where(is_ahead, np.linalg.norm(in_camera[..., :2] / depth_m - rays, axis=-1), np.inf)
+    distance = np.linalg.norm(in_camera[..., :2] / depth_m - rays, axis=-1)
+    return np.where(is_ahead | np.isnan(distance), distance, np.inf)
 
 
 def solve_pnp_ransac(

@@ -20,14 +20,14 @@ from psotrack.calibration.rig.board_poses import find_lens, fit_boards
 from psotrack.support import Advance
 
 #: Models that are compared, the simplest first.
-_MODELS = (LensModel(5), LensModel(4, fisheye=True), LensModel(8))
+_MODELS = (LensModel(5), LensModel(4, fisheye=True), LensModel(8), LensModel(12), LensModel(14))
 #: Number of parts of the views, and smallest number of views for a comparison.
 _FOLDS, LEAST_VIEWS = 3, 9
 #: Largest number of fits of a comparison, for a display of the progress.
 MOST_FITS = len(_MODELS) * _FOLDS
 #: Standard errors, and fraction of the median error, by which a model must be better than a simpler one.
 _CERTAIN, _VISIBLE = 2.0, 0.02
-#: Largest number of views that are used: a comparison takes nine fits.
+#: Largest number of views that are used: a comparison of five models takes 15 fits.
 _MOST_VIEWS = 45
 
 
