@@ -32,6 +32,8 @@ _LEAST_MARKERS, _LEAST_IMAGES = 3, 3
 _MARKERS_OF_PLANE, _IMAGES_OF_SIZE = 6, 40
 #: A marker that is nearer than this to its place in another image stands still, pixels.
 _STILL_PX = 2.0
+#: Smallest number of images that show a marker of the board, as a fraction of those that show its most frequent marker.
+_OFTEN = 0.25
 #: Number of images in which markers are looked for before a chessboard is, and side of these images, pixels.
 _FIRST_IMAGES, _FIRST_SIDE_PX = 6, 1000
 #: Largest number of squares along a side of a board that is recognised by its markers.
@@ -82,7 +84,7 @@ def detect_board(square_m: float, images: _Images) -> Board:
     family, seen = _family_of_board(_small(images))
     if not family:
         return Board(_size_of_chessboard(images), square_m, None, kind="chessboard")
-    clearest = sorted(filter(None, seen), key=len, reverse=True)[:_IMAGES]
+    clearest = sorted(filter(None, _without_chance(seen)), key=len, reverse=True)[:_IMAGES]
     lowest, highest = min(map(min, clearest)), max(map(max, clearest))
     fits: list[tuple[float, Board]] = []
     sides = range(3, _MOST_SQUARES + 1)
@@ -269,6 +271,16 @@ def _moved(seen: Sequence[_Markers]) -> list[_Markers]:
         {marker: quad for marker, quad in found.items() if not stands_still(number, marker)}
         for number, found in enumerate(seen)
     ]
+
+
+def _without_chance(seen: Sequence[_Markers]) -> list[_Markers]:
+    """The markers of each image, without those that few of the images show.
+
+    A marker of few bits is read by chance in some images, such as in a part of another dictionary's marker.
+    """
+    times = Counter(marker for found in seen for marker in found)
+    least = _OFTEN * max(times.values())
+    return [{marker: quad for marker, quad in found.items() if times[marker] >= least} for found in seen]
 
 
 def _small(images: _Images) -> _Images:
