@@ -12,11 +12,19 @@ from helpers import make_once
 
 from psotrack.support import atomic_write
 
-#: Runs `psotrack` as at a terminal: shells start programs in the background with Ctrl-C ignored.
+#: Runs `psotrack` as at a terminal: shells start programs in the background with Ctrl-C ignored. The program says when
+#: it begins to import the command line, which is when it answers signals.
 AT_A_TERMINAL = """
-import signal
+import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from psotrack.__main__ import main
+
+class Announcer:
+    def find_spec(self, name, path=None, target=None):
+        if name == "psotrack.cli":
+            print("imports", flush=True)
+
+sys.meta_path.insert(0, Announcer())
 main()
 """
 #: A command that is in a long computation, which is not Python's, while it writes a file.
@@ -67,8 +75,8 @@ LONGEST_S = 6.0
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
-    """A small recording, which no test changes."""
-    return make_once(tmp_path_factory, "recording_of_signals", make_sequence)
+    """A recording that takes some seconds, which no test changes."""
+    return make_once(tmp_path_factory, "recording_of_signals", lambda folder: make_sequence(folder, repeat=8))
 
 
 def end(process, number):
@@ -93,13 +101,15 @@ def assert_nothing_left(process, wait_s=5.0):
 
 
 @pytest.mark.parametrize("number", CODES, ids=lambda number: number.name)
-@pytest.mark.parametrize("wait_s", [0.3, 1.5])
-def test_a_command_ends_with_one_line(start_python, flight, tmp_path, number, wait_s):
+@pytest.mark.parametrize("stage", ["imports", "computes"])
+def test_a_command_ends_with_one_line(start_python, flight, tmp_path, number, stage):
     out = tmp_path / "silhouettes"
     process = start_python(
         "-c", AT_A_TERMINAL, "track", flight, "--out", out / "tracks.csv", "--cache", tmp_path / "cache"
     )
-    time.sleep(wait_s)
+    assert process.stdout.readline() == "imports\n"
+    while stage == "computes" and process.poll() is None and not list((tmp_path / "cache").glob("**/*")):
+        time.sleep(0.01)
     err, took_s = end(process, number)
     code, word = CODES[number]
     assert process.returncode == code, err
@@ -141,7 +151,7 @@ def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(start_python, 
     process = start_python(
         "-c", program, "track", flight, "--out", tmp_path / "tracks.csv", "--cache", tmp_path / "cache"
     )
-    time.sleep(0.3)
+    assert process.stdout.readline() == "imports\n"
     process.send_signal(signal.SIGINT)
     time.sleep(0.3)
     assert process.poll() is None
