@@ -16,6 +16,7 @@ from psotrack.inside_out import CameraPath, Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import FilterRun, filter_path, poses_of, step
 from psotrack.inside_out.filtering import motion as pose_motion
 from psotrack.inside_out.filtering.pose_filter import probability_right
+from psotrack.inside_out.pose import CameraPose
 from psotrack.trajectories import Status
 
 FPS = 25.0
@@ -162,7 +163,7 @@ def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> Non
     jerk = 2 * AGILITY.acceleration_std_m_s2**2 / pose_motion.ACCELERATION_TIME_S
     driven = np.diag([0.0] * 6 + [jerk] * 3 + [2 / correlated_s] * 3)
 
-    motion = pose_motion.initial_motion(np.zeros(3), np.eye(3), covariance, AGILITY)
+    motion = pose_motion.initial_motion(CameraPose(np.zeros(3), np.eye(3), covariance), AGILITY)
     part = np.r_[0:9, 15:18]
     x, P = np.zeros(12), motion.covariance[np.ix_(part, part)]
     for dt_s in (0.04, 0.04, 0.01, 0.3, 0.04):
@@ -175,7 +176,9 @@ def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> Non
         x, P = x + K @ (z - H @ x), P - K @ S @ K.T
 
         motion, _, _ = pose_motion.predict(motion, dt_s, AGILITY)
-        motion = pose_motion.correct(motion, pose_motion.innovation(motion, z, np.eye(3), covariance))
+        motion = pose_motion.correct(
+            motion, pose_motion.innovation(motion, CameraPose(z, np.eye(3), covariance))
+        )
         found = np.concatenate(
             [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2, motion.correlated[:3]]
         )
@@ -187,9 +190,8 @@ def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> Non
 def test_transition_matrix_is_the_derivative_of_the_motion() -> None:
     """F equals the numerical derivative of the motion, turns included."""
     rng = np.random.default_rng(2)
-    motion = pose_motion.initial_motion(
-        rng.normal(size=3), Rotation.random(rng=rng).as_matrix(), pose_covariance(), AGILITY
-    )
+    pose = CameraPose(rng.normal(size=3), Rotation.random(rng=rng).as_matrix(), pose_covariance())
+    motion = pose_motion.initial_motion(pose, AGILITY)
     motion = pose_motion.moved(motion, rng.normal(size=pose_motion.SIZE))
     later, F, _ = pose_motion.predict(motion, 0.3, AGILITY)
     for k, change in enumerate(1e-6 * np.eye(pose_motion.SIZE)):
@@ -549,9 +551,9 @@ def test_invalid_settings_are_refused(setting, message) -> None:
 def test_decreasing_times_and_invalid_covariances_are_refused() -> None:
     raw, _, _ = flight(5, seed=24)
     first, later = poses_of(raw)[:2]
-    run = step(FilterRun(), later.time_s, later, PoseFilterParams(), AGILITY)
+    run = step(FilterRun(), raw.time_s[1], later, PoseFilterParams(), AGILITY)
     with pytest.raises(InputError, match=r"time_s: expected a time after 0.04 s, found 0 s"):
-        step(run, first.time_s, first, PoseFilterParams(), AGILITY)
+        step(run, raw.time_s[0], first, PoseFilterParams(), AGILITY)
     raw.covariance[3] = np.nan
     with pytest.raises(InputError, match=r"covariance at 0.12 s: expected a positive definite matrix"):
         filter_path(raw)

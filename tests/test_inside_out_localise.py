@@ -337,34 +337,6 @@ def test_the_covariance_includes_the_error_of_the_focal_length(room, tmp_path):
     assert (content["map_error_m"], content["focal_error"]) == (0.003, 0.01)
 
 
-def test_a_plot_distinguishes_bridged_frames_from_gaps(room, tmp_path):
-    """Colours of the plot: tracked frames, bridged frames, and the background of frames without a pose."""
-    colours = {"tracked": (0x00, 0x72, 0xB2), "bridged": (0xD5, 0x5E, 0x00), "none": (0xDD, 0xE1, 0xE6)}
-
-    def share(png):
-        image = cv2.imread(str(png))[..., ::-1].astype(int)
-        # The background is a solid block, in contrast to the lines of the grid.
-        return {
-            name: np.mean(
-                cv2.erode((np.abs(image - rgb).max(axis=-1) < 3).astype(np.uint8), np.ones((size, size)))
-            )
-            for (name, rgb), size in zip(colours.items(), (1, 1, 9), strict=True)
-        }
-
-    files = ["--markers", room.markers, "--camera", room.lens, "--out", tmp_path / "track.csv", "--force"]
-    run(room.video, *files, "--plot")
-    bridged = share(tmp_path / "track.png")
-    run(room.video, *files, "--no-filter", "--plot", tmp_path / "raw.png")
-    raw = share(tmp_path / "raw.png")
-    assert bridged["tracked"] > 0
-    assert bridged["bridged"] > 0
-    assert raw["bridged"] == 0
-    assert raw["none"] > bridged["none"]
-    with pytest.raises(OutputError, match=r"raw.png.*pass --force to replace it"):
-        run(room.video, *files[:-1], "--plot", tmp_path / "raw.png", "--out", tmp_path / "other.csv")
-    assert not (tmp_path / "other.csv").exists()
-
-
 def test_the_filter_bridges_frames_without_markers(room, tmp_path):
     out, report = tmp_path / "track.csv", tmp_path / "report.json"
     run(
@@ -416,8 +388,8 @@ def test_a_field_of_view_replaces_a_calibration_file(room, tmp_path):
 def test_a_stream_gives_the_path_of_its_file(room, tmp_path):
     """FFmpeg opens a file by its address; its times are the timestamps in the file."""
     for name, source in (("file", room.video), ("stream", f"file://{room.video}")):
-        # Without a line time, a file is searched for a rolling shutter, and a stream is not.
-        lens = ["--camera", room.lens, "--line-time", "0"]
+        # Without a readout, a file is searched for a rolling shutter, and a stream is not.
+        lens = ["--camera", room.lens, "--readout", "0"]
         run(source, "--markers", room.markers, *lens, "--out", tmp_path / f"{name}.csv")
     (file, _), (stream, name) = (read_camera_path(tmp_path / f"{name}.csv") for name in ("file", "stream"))
     assert name == "camera"
@@ -555,7 +527,7 @@ def test_a_sequence_provides_markers_and_intrinsics(room, sequence, tmp_path):
 
 @pytest.mark.parametrize("options", [[], ["--drone", "dron7"]], ids=["none", "unknown"])
 def test_a_sequence_of_several_drones_lists_its_drones(sequence, tmp_path, options):
-    with pytest.raises(SettingsError, match=r"--drone: expected one of dron1, dron2, found"):
+    with pytest.raises(SettingsError, match=r"--drone: expected .* dron1, dron2, found"):
         run(sequence, *options, "--out", tmp_path / "track.csv")
 
 

@@ -14,7 +14,7 @@ from scipy.stats import binom, chi2
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import PoseSettings
-from psotrack.inside_out.pose import CornerNoise, ExpectedPose, estimate_pose
+from psotrack.inside_out.pose import CameraPose, CornerNoise, estimate_pose
 from psotrack.inside_out.pose.fit import FALSE_ALARM
 
 K = np.array([[920.0, 0, 959.5], [0, 921.0, 539.5], [0, 0, 1]])
@@ -385,7 +385,7 @@ def test_expected_pose_decides_between_the_poses_of_a_single_marker():
     rng = np.random.default_rng(6)
     for _ in range(20):
         view, corners_m, corners_px = far_marker(rng)
-        expected = ExpectedPose(
+        expected = CameraPose(
             view.centre_world + np.array([0.2, -0.1, 0.1]),
             view.T_cam_world[:3, :3].T,
             np.diag([0.1] * 3 + [0.01] * 3),
@@ -398,7 +398,7 @@ def test_expected_pose_decides_between_the_poses_of_a_single_marker():
 def test_markers_outweigh_a_wrong_expected_pose():
     view, corners_m = camera_looking_at(), two_walls(6)
     corners_px = image_corners(view, corners_m)
-    elsewhere = ExpectedPose(view.centre_world + 30.0, np.eye(3), 1e-6 * np.eye(6))
+    elsewhere = CameraPose(view.centre_world + 30.0, np.eye(3), 1e-6 * np.eye(6))
     found = estimate_pose(corners_px, corners_m, without_pose(view), SETTINGS, elsewhere)
     np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-9)
 
@@ -429,7 +429,7 @@ def test_two_markers_that_contradict_each_other_are_ambiguous_without_an_expecte
     mapped_m = np.stack([corners_m[0], all_m[8]])
     found = estimate_pose(corners_px, mapped_m, without_pose(view), ANY_NUMBER)
     assert found is None or (found.used.sum() == 1 and found.ambiguity > 0.01)
-    expected = ExpectedPose(
+    expected = CameraPose(
         view.centre_world + 0.05, view.T_cam_world[:3, :3].T, np.diag([0.01] * 3 + [0.003] * 3)
     )
     found = estimate_pose(corners_px, mapped_m, without_pose(view), ANY_NUMBER, expected)

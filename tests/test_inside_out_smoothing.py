@@ -21,6 +21,7 @@ from psotrack.errors import InputError
 from psotrack.inside_out import Flag, PoseFilterParams, smooth
 from psotrack.inside_out.filtering import choose_agility, filter_path, poses_of
 from psotrack.inside_out.filtering import motion as pose_motion
+from psotrack.inside_out.pose import CameraPose
 from psotrack.trajectories import Status
 
 
@@ -41,12 +42,12 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
         remove_poses(replace(raw, covariance=np.tile(covariance, (frames, 1, 1))), slice(5, 8)),
         slice(5, 8),
     )
-    agility = choose_agility(poses_of(raw), PoseFilterParams())
+    agility = choose_agility(raw.time_s, poses_of(raw), PoseFilterParams())
     path = smooth(raw)
     assert (path.flags == 0).all()
 
     part = np.r_[0:9, 15:18]
-    start = pose_motion.initial_motion(measured_m[0], np.eye(3), covariance, agility)
+    start = pose_motion.initial_motion(CameraPose(measured_m[0], np.eye(3), covariance), agility)
     _, F, Q = pose_motion.predict(start, dt_s, agility)
     F, Q, first = (matrix[np.ix_(part, part)] for matrix in (F, Q, start.covariance))
     H = np.hstack([np.eye(3), np.zeros((3, 6)), np.sqrt(fraction * noise_m2)])
@@ -80,8 +81,8 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
 
 def test_agility_distinguishes_calm_from_violent_flights() -> None:
     calm, violent = (
-        choose_agility(poses_of(flight(100, acceleration=size, shake=size, seed=33)[0]), PoseFilterParams())
-        for size in (0.5, 25.0)
+        choose_agility(raw.time_s, poses_of(raw), PoseFilterParams())
+        for raw, _, _ in (flight(100, acceleration=size, shake=size, seed=33) for size in (0.5, 25.0))
     )
     assert violent.acceleration_std_m_s2 > 8 * calm.acceleration_std_m_s2
     assert violent.rate_change_std_rad_s > 8 * calm.rate_change_std_rad_s

@@ -28,7 +28,7 @@ from psotrack.inside_out import (
 )
 from psotrack.inside_out.localising import frame_poses, localise_frames
 from psotrack.inside_out.mapping.from_centres import complete_map
-from psotrack.inside_out.mapping.sightings import SQUARE
+from psotrack.inside_out.marker_map import SQUARE
 from psotrack.recordings import VideoWriter
 from psotrack.recordings.datasets import write_marker_corners
 

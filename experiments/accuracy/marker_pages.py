@@ -25,10 +25,10 @@ sys.path.append(str(HERE.parents[1] / "tests"))
 from marker_pictures import Sheet, picture
 
 from psotrack import detect_markers
-from psotrack.foreground.markers import marker_dictionary
+from psotrack.foreground.markers import DetectedMarkers, marker_dictionary
 from psotrack.geometry import Camera, look_at, make_camera, project
 from psotrack.inside_out import BuiltMap, build_map, corners_in_own_frame
-from psotrack.inside_out.mapping.sightings import FrameMarkers, MarkerSightings, collect_sightings
+from psotrack.inside_out.mapping.sightings import MarkerSightings, collect_sightings
 from psotrack.support import COLOURS
 
 DICTIONARY = "4x4_50"
@@ -135,7 +135,7 @@ def _sighted(
     position_m: Float[np.ndarray, "3"],
     corners_m: dict[int, Float[np.ndarray, "4 3"]],
     rng: np.random.Generator,
-) -> FrameMarkers:
+) -> tuple[int, float, DetectedMarkers]:
     """The markers in one frame that face the camera and are in the image."""
     ids, quads = [], []
     for marker, corners in corners_m.items():
@@ -145,7 +145,8 @@ def _sighted(
         if ahead and ((pixels > 0) & (pixels < np.array(SIZE_WH) - 1)).all():
             ids.append(marker)
             quads.append(pixels + NOISE_PX * rng.standard_normal((4, 2)))
-    return FrameMarkers(0, frame / 30, np.array(ids, int), np.array(quads).reshape(-1, 4, 2))
+    corners_px, std_px = np.array(quads).reshape(-1, 4, 2), np.full(len(ids), NOISE_PX)
+    return 0, frame / 30, DetectedMarkers(np.array(ids, int), corners_px, std_px)
 
 
 def draw_map() -> Figure:

@@ -7,7 +7,7 @@
 A camera is carried by hand through the laboratory: sinusoids from slow walking to tremor at 7 Hz. The simulator draws
 every row at its own time, with lens distortion, motion blur of 1/200 s, noise, JPEG 60 and an automatic exposure that
 swings between 0.3 and 2. Cases: a global shutter, and a rolling shutter of 20 ms whose line time is given, estimated,
-or left out on purpose (`--line-time 0`). Truths: the pose when the middle row is exposed. The videos are kept in the
+or left out on purpose (`--readout 0`). Truths: the pose when the middle row is exposed. The videos are kept in the
 folder and drawn once.
 """
 

@@ -1,11 +1,11 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .filtering import PoseFilterParams, smooth
-from .flight_picture import save_flight
 from .frames import FrameSource, open_source
 from .fusing import FusedTracks, fuse
 from .fusing.fused_table import write_fused
 from .lens_files import choose_lens, lens_from_matrix
-from .localising import LineTime, LocalisedVideo, LocaliseSettings, localise_video
+from .line_time import LineTime
+from .localising import LocalisedVideo, LocaliseSettings, localise_video
 from .mapping import BuiltMap, build_map, corners_in_own_frame
 from .mapping.checking import MapCheck, check_map
 from .mapping.sightings import find_sightings
@@ -46,7 +46,6 @@ __all__ = [
     "read_marker_map",
     "read_marker_table",
     "read_measured_corners",
-    "save_flight",
     "smooth",
     "write_camera_path",
     "write_fused",

@@ -16,11 +16,13 @@ from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import MarkerRow, read_marker_centres, read_marker_rows
-from psotrack.support import short_repr
+from psotrack.support import short_repr, similarity
 
-#: Largest deviation of a corner from its square, as a share of the side. Corners measured by motion capture are off by
-#: some 3 mm each: three standard deviations of one corner against the three others, 2 x 3 x 3 mm, are 9 % of 0.2 m.
-SQUARE_TOLERANCE = 0.1
+#: Corners of a marker with sides of 1 in its own axes, x to its right, y up, z out of the print, in OpenCV's order.
+SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+#: Largest distance of a marker's corners from the nearest square (root of the sum of squares), as a fraction of its
+#: side. Four corners that motion capture measures, off by 3 mm each, are 6 mm or 3 % of 0.2 m off.
+SQUARE_TOLERANCE = 0.06
 #: Smallest and largest side of a marker, metres. A table in millimetres that is read as metres is far above.
 _SIDES_M = (0.005, 5.0)
 #: Distance of two centres, in sides, below which two markers that face the same way are at the same place. The two
@@ -30,6 +32,24 @@ _SAME_PLACE = 0.5
 _IN_PLANE = 1.0
 #: Largest width, in sides, of an object with markers on its outside. A room is wider.
 _OBJECT_EXTENT = 10.0
+
+
+@dataclass(frozen=True)
+class PlacedMarker:
+    """A square.
+
+    Attributes:
+        T_world_marker: (4, 4), from the square's own axes (see `SQUARE`) to the world, metres.
+        side_m: side, metres.
+    """
+
+    T_world_marker: Float[np.ndarray, "4 4"]
+    side_m: float
+
+    @property
+    def corners_m(self) -> Float[np.ndarray, "4 3"]:
+        """(4, 3), corners, world, metres."""
+        return self.T_world_marker[:3, 3] + self.side_m * SQUARE @ self.T_world_marker[:3, :3].T
 
 
 @dataclass(frozen=True, repr=False)
@@ -145,7 +165,7 @@ def read_marker_map(path: Path | str) -> MarkerMap:
     path = Path(path)
     rows = read_marker_rows(path)
     for marker, row in rows.items():
-        _check_square(marker, row)
+        check_square(f"{row.where}, marker {marker}", row.corners_m)
     marker_map = MarkerMap(
         {marker: row.corners_m for marker, row in rows.items()},
         {marker: row.std_m for marker, row in rows.items() if row.std_m},
@@ -168,43 +188,38 @@ def normals(corners_m: Float[np.ndarray, "*markers 4 3"]) -> Float[np.ndarray, "
     return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
 
 
-def _check_square(marker: int, row: MarkerRow) -> None:
-    corners, side = row.corners_m, float(sides_m(row.corners_m[None])[0])
-    where = f"{row.where}, marker {marker}"
+def fit_square(points_m: Float[np.ndarray, "4 3"], side_m: float | None = None) -> PlacedMarker:
+    """Fit a square to four points in OpenCV's order, metres; `side_m` is its side, None fits the side."""
+    scale, R, centre_m = similarity(SQUARE, points_m, with_scale=side_m is None)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, centre_m
+    return PlacedMarker(T, scale if side_m is None else side_m)
+
+
+def check_square(
+    where: str, corners_m: Float[np.ndarray, "4 3"], side_m: float | None = None
+) -> PlacedMarker:
+    """The square of a marker's corners, (4, 3), metres; `side_m` is its side, None fits the side.
+
+    Raises:
+        InputError: the corners are no square of the size of a marker, at a place that `where` names.
+    """
+    side = float(sides_m(corners_m[None])[0])
     if not _SIDES_M[0] <= side <= _SIDES_M[1]:
-        found = f"{side:g} m"
         remedy = "is it in millimetres? then call the columns x1[mm] and so on" if side > _SIDES_M[1] else ""
         remedy = remedy or "is the unit in the header right?"
         expected = f"a marker with a side of {_SIDES_M[0]:g} to {_SIDES_M[1]:g} m"
-        raise InputError(where, expected=expected, found=found, remedy=remedy)
-    tolerance_m = SQUARE_TOLERANCE * side
-    edges = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    diagonals = np.linalg.norm(corners[2:] - corners[:2], axis=1)
-    # Corners in an order such as 1, 2, 4, 3 have a square's six distances, but two diagonals as short as its sides.
-    six = np.sort([*edges, *diagonals]) / max(edges.min(), 1e-300)
-    square = np.allclose(six, [1, 1, 1, 1, np.sqrt(2), np.sqrt(2)], atol=SQUARE_TOLERANCE)
-    if square and diagonals.min() < 0.9 * edges.max():
-        expected = "corners one after the other around the marker"
-        raise InputError(where, expected=expected, found="two that are exchanged", remedy="put them in order")
-    # Height of one corner over the plane of the three others; it is the same for each corner.
-    normal, twist = normals(corners), corners[0] - corners[1] + corners[2] - corners[3]
-    height = abs(float(twist @ normal))
-    if height > tolerance_m:
+        raise InputError(where, expected=expected, found=f"{side:g} m", remedy=remedy)
+    square = fit_square(corners_m, side_m)
+    off_m = float(np.linalg.norm(square.corners_m - corners_m))
+    if off_m > SQUARE_TOLERANCE * side:
         raise InputError(
             where,
-            expected=f"corners in a plane to {SQUARE_TOLERANCE:.0%} of the side",
-            found=f"one corner {1e3 * height:.0f} mm off the plane of the others; the side is {1e3 * side:.0f} mm",
+            expected=f"a flat square, its corners one after the other around it, to {SQUARE_TOLERANCE:.0%} of its side",
+            found=f"corners {1e3 * off_m:.0f} mm off the nearest square; the side is {1e3 * side:.0f} mm",
             remedy="measure its corners again",
         )
-    off = np.abs([*(edges - side), *(diagonals - np.sqrt(2) * side)])
-    if off.max() > tolerance_m:
-        lengths = ", ".join(f"{1e3 * length:.0f}" for length in (*edges, *diagonals))
-        raise InputError(
-            where,
-            expected=f"a square, its sides and diagonals right to {SQUARE_TOLERANCE:.0%} of the side",
-            found=f"sides and diagonals of {lengths} mm",
-            remedy="measure its corners again",
-        )
+    return square
 
 
 def _check_apart(rows: Mapping[int, MarkerRow], marker_map: MarkerMap) -> None:

@@ -10,35 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 from msgspec import Meta
 
-from psotrack.cli.onboard.shutter import ShutterOptions, shutter_content, shutter_sentence
-from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions
-from psotrack.cli.options import frames_option, out_option, plot_option, running
+from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, onboard_videos
+from psotrack.cli.options import frames_option, out_option, running
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import InputError, SettingsError
 from psotrack.support.interrupts import unhurried_end
 
 if TYPE_CHECKING:
-    from psotrack.geometry import Camera
-    from psotrack.inside_out import CameraPath, FrameSource, LocalisedVideo
+    from psotrack.inside_out import FrameSource, LineTime, LocalisedVideo, RollingShutter
     from psotrack.recordings import OnboardVideo
-
-
-@dataclass(frozen=True)
-class _Input:
-    """A video, and the table of markers and the intrinsics of its sequence, if the video belongs to a sequence.
-
-    Attributes:
-        source: frames of the video.
-        name: name of the drone.
-        onboard: the on-board video in the sequence, with intrinsics; None outside of a sequence.
-        markers: table of marker corners in the sequence; None outside of a sequence.
-    """
-
-    source: FrameSource
-    name: str
-    onboard: OnboardVideo | None = None
-    markers: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -74,6 +55,8 @@ class PoseOptions:
         smooth: smooth the path: every pose is estimated from all frames.
         map_error: standard deviation of a marker's position, in millimetres, where the table states none.
         focal_error: standard deviation of the focal length, in percent.
+        readout_s: time in which a rolling shutter exposes all rows of a frame, one after the other, seconds; 0 is a
+            global shutter; None: estimated from the video.
     """
 
     min_markers: Annotated[int, Meta(ge=1)] = 4
@@ -81,6 +64,7 @@ class PoseOptions:
     smooth: bool = False
     map_error: Annotated[float, Meta(ge=0, lt=1000, extra={"metavar": "MM"})] = 0.0
     focal_error: Annotated[float, Meta(ge=0, lt=100, extra={"metavar": "PERCENT"})] = 0.0
+    readout_s: Annotated[float, Meta(extra={"metavar": "S"})] | None = None
 
 
 @click.command(cls=HelpfulCommand)
@@ -88,16 +72,13 @@ class PoseOptions:
 @out_option("CSV file of the poses, one row per frame.  [default: NAME.csv, by the drone's name]")
 @options_of(SourceOptions, "given", names={"side_m": "marker-size"})
 @options_of(OnboardLensOptions, "lenses", names=LENS_NAMES, heading="Lens", rare=("names", "scale"))
-@options_of(PoseOptions, "poses", heading="Poses")
-@options_of(ShutterOptions, "shutter", heading="Rolling shutter", rare=("line_time_s", "readout_s"))
-@plot_option("the path from above, and the height over time", "beside --out, as .png")
+@options_of(PoseOptions, "poses", heading="Poses", rare=("readout_s",))
 @frames_option
 @running()
 def localise(
     output: Output,
     video: str,
     out: Path | None,
-    plot: Path | None,
     num_frames: int | None,
     given: SourceOptions,
     **known: Any,
@@ -115,9 +96,9 @@ def localise(
     Errors of the map and of the focal length are the same in all frames and do not average out. With --map-error and
     --focal-error the covariances include these errors, and poses from several markers become more accurate.
 
-    Most cameras expose the rows of a frame one after the other (rolling shutter). The time from row to row is estimated
-    from the video, unless --line-time or --readout gives it; in a stream, without either, it is 0. A pose is that of
-    the moment when the middle row is exposed, which is also the frame's time.
+    Most cameras expose the rows of a frame one after the other (rolling shutter). The time that this takes is estimated
+    from the video, unless --readout gives it; in a stream, without it, it is 0. A pose is that of the moment when the
+    middle row is exposed, which is also the frame's time.
 
     \b
     Examples:
@@ -125,7 +106,7 @@ def localise(
       psotrack onboard localise GOPR0017.MP4 --markers corners.csv --fov 92.45,60.83 --out track.csv --smooth
       psotrack onboard localise data/Simulated_Data/S01_D2_A --drone dron1 --out dron1.csv
       psotrack onboard localise images --fps 25 --markers corners.csv --camera lens.yml --out track.csv --frames 100
-      psotrack onboard localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv --plot
+      psotrack onboard localise flight.mp4 --markers corners.csv --fov 92,61 --focal-error 0.5 --out track.csv
       psotrack onboard localise phone.mp4 --markers corners.csv --camera lens.yml --readout 0.02 --out track.csv
       psotrack onboard localise flight.mp4 --markers centres.csv --camera lens.toml --out track.csv --map-error 5
       psotrack onboard localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
@@ -139,21 +120,19 @@ def localise(
         PoseFilterParams,
         PoseSettings,
         read_marker_table,
-        save_flight,
         write_camera_path,
     )
     from psotrack.inside_out import localise_video as localise_camera
+    from psotrack.recordings.datasets import find_marker_corners
 
     poses: PoseOptions = known["poses"]
-    filmed = _input(video, given.drone, given.fps, given.live)
-    drone_name = given.name or filmed.name
+    source, drone_name, onboard = _input(video, given)
     out = out or Path(f"{drone_name}.csv")
     check_suffix("--out", out, ".csv")
-    picture = None if plot is None else plot if plot.name else out.with_suffix(".png")
-    output.refuse(out, picture)
-    if given.markers is None and filmed.markers is None:
+    output.refuse(out)
+    if given.markers is None and onboard is None:
         raise SettingsError("--markers", expected="a table of marker corners", found="none")
-    table = Path(f"{given.markers or filmed.markers}")
+    table = given.markers or find_marker_corners(video)
     marker_map = read_marker_table(table)
     centres_only = not isinstance(marker_map, MarkerMap)
     if given.side_m is not None:
@@ -162,10 +141,10 @@ def localise(
             raise SettingsError(
                 "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
             )
-    lens = _lens(filmed, known["lenses"])
-    source = filmed.source.first(num_frames)
+    lens = known["lenses"].of(source.image_size_wh, K=None if onboard is None else onboard.K)
+    name, source = source.name, source.first(num_frames)
     rows = source.image_size_wh[1]
-    shutter = known["shutter"].of(rows, source.fps)
+    shutter = _shutter(poses.readout_s, rows, source.fps)
     settings = LocaliseSettings(
         dictionary=given.dictionary,
         pose=PoseSettings(
@@ -182,78 +161,59 @@ def localise(
         if poses.smooth:
             found = replace(found, path=found.smoothed(settings.filter))
         write_camera_path(out, found.path, drone_name, force=output.force)
-    if picture is not None:
-        save_flight(
-            picture,
-            found.path,
-            found.marker_map,
-            caption=f"{drone_name}: {filmed.source.name}",
-            force=output.force,
-        )
-    content = _content(found, filmed.source.name, drone_name, settings.pose.min_markers)
+    content = _content(found, name, drone_name, settings.pose.min_markers)
     content |= {"track": str(out), "filtered": poses.filter, "smoothed": poses.smooth}
     content |= {"map_error_m": settings.pose.map_error_m, "focal_error": settings.pose.focal_error}
-    content |= {"shutter": shutter_content(shutter, found.shutter, found.line_time, rows)}
+    content |= {"shutter": _shutter_content(shutter, found.shutter, found.line_time, rows)}
     content |= {"map": "centres" if centres_only else "corners"}
     output.json(content)
-    of_shutter = shutter_sentence(shutter, found.line_time)
-    output.say(_sentence(out, content) + (f"; {of_shutter}" if of_shutter else ""))
-    for line in _lines_on_map(table, found, centres_only, video):
-        output.say(line)
+    output.say(_sentence(out, content) + _shutter_sentence(shutter, found.line_time))
+    output.say(*_lines_on_map(table, found, centres_only, video))
 
 
-def _input(video: str, drone: str | None, fps: float | None, live: bool) -> _Input:
-    """The input that VIDEO names: a video, a folder of images, a stream, or one drone's video in a sequence."""
+def _input(video: str, given: SourceOptions) -> tuple[FrameSource, str, OnboardVideo | None]:
+    """Frames, drone's name, and on-board video, if VIDEO is a sequence's folder and no video, images or stream."""
     from psotrack.inside_out import open_source
-    from psotrack.recordings import is_picture_folder
-    from psotrack.recordings.datasets import find_marker_corners, read_onboard
+    from psotrack.recordings import IMAGE_SUFFIXES, is_picture_folder
+    from psotrack.recordings.datasets import read_onboard
 
-    stream, folder = live or "://" in video, Path(video)
+    stream, folder = given.live or "://" in video, Path(video)
     of_folder = not stream and folder.is_dir()
     if video.isdecimal() and not stream and not folder.exists():
         raise InputError(
             video, expected="a video", found="no such file", remedy="pass --live if it is a camera's number"
         )
-    has_images = of_folder and is_picture_folder(folder)
-    onboard = read_onboard(folder) if of_folder else {}
-    if not onboard:
-        if drone is not None:
-            raise SettingsError(
-                "--drone", expected="a folder with videos of drones' own cameras", found=video
-            )
-        if of_folder and not has_images:
-            raise _nothing_to_localise(folder)
-        name = "camera" if stream else folder.name if of_folder else folder.stem
-        return _Input(open_source(video, fps=fps, live=live), name)
-    names = ", ".join(onboard)
-    if drone is None and len(onboard) > 1:
-        raise SettingsError("--drone", expected=f"one of {names}", found="none")
-    chosen = drone or next(iter(onboard))
-    if chosen not in onboard:
-        raise SettingsError("--drone", expected=f"one of {names}", found=chosen)
-    one = onboard[chosen]
-    return _Input(open_source(one.video.path, fps=fps), chosen, one, find_marker_corners(folder))
+    if of_folder and read_onboard(folder):
+        chosen = onboard_videos(folder, None if given.drone is None else (given.drone,))
+        if len(chosen) > 1:
+            raise SettingsError("--drone", expected=f"one of {', '.join(chosen)}", found="none")
+        ((drone, onboard),) = chosen.items()
+        return open_source(onboard.video.path, fps=given.fps), given.name or drone, onboard
+    if given.drone is not None:
+        raise SettingsError("--drone", expected="a folder with videos of drones' own cameras", found=video)
+    if of_folder and not is_picture_folder(folder):
+        raise InputError(
+            folder,
+            expected=f"images, which end in {', '.join(IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
+            found="neither",
+            remedy="to use a video in a folder, name the video itself",
+        )
+    name = "camera" if stream else folder.name if of_folder else folder.stem
+    return open_source(video, fps=given.fps, live=given.live), given.name or name, None
 
 
-def _nothing_to_localise(folder: Path) -> InputError:
-    """The error of a folder without images and without on-board videos of the dataset."""
-    from psotrack.recordings import IMAGE_SUFFIXES
+def _shutter(readout_s: float | None, rows: int, fps: float | None) -> RollingShutter | None:
+    """The shutter that --readout states; None without it."""
+    from psotrack.inside_out import RollingShutter
 
-    return InputError(
-        folder,
-        expected=f"images, which end in {', '.join(IMAGE_SUFFIXES)}, or an _A sequence of the dataset",
-        found="neither",
-        remedy="to use a video in a folder, name the video itself",
-    )
-
-
-def _lens(given: _Input, lenses: OnboardLensOptions) -> Camera:
-    from psotrack.inside_out import lens_from_matrix
-
-    K = None if given.onboard is None else given.onboard.K
-    if lenses.file is None and lenses.fov_deg is None and K is not None:
-        return lens_from_matrix(K, given.source.image_size_wh)
-    return lenses.of(given.source.image_size_wh)
+    if readout_s is None:
+        return None
+    longest_s = 1.0 if fps is None else 1 / fps
+    if not 0 <= readout_s <= longest_s * (1 + 1e-9):
+        of_frame = "" if fps is None else f", the time between two frames at {fps:g} frames per second"
+        expected = f"0 to {longest_s:.3g} s{of_frame}"
+        raise SettingsError("--readout", expected=expected, found=f"{readout_s:g}")
+    return RollingShutter(readout_s / rows)
 
 
 def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> dict[str, Any]:
@@ -273,7 +233,7 @@ def _content(found: LocalisedVideo, video: str, name: str, min_markers: int) -> 
         "poses": int(path.seen.sum()),
         "own_poses": int(found.raw.seen.sum()),
         "status": {status.label: int((path.status == status).sum()) for status in Status},
-        "flags": {flag.label: _flagged(path, flag) for flag in Flag},
+        "flags": {flag.label: int(((path.flags & flag) != 0).sum()) for flag in Flag},
         "min_markers": min_markers,
         "median_markers": float(np.median(path.num_markers)),
         "most_markers": int(path.num_markers.max()),
@@ -320,8 +280,43 @@ def _lines_on_map(table: Path, found: LocalisedVideo, centres_only: bool, video:
     return lines
 
 
-def _flagged(path: CameraPath, flag: int) -> int:
-    return int(((path.flags & flag) != 0).sum())
+def _shutter_content(
+    given: RollingShutter | None, used: RollingShutter, shown: LineTime | None, rows: int
+) -> dict[str, Any]:
+    """The shutter as JSON: that of --readout, that of the poses, and what the video shows, if it was looked for."""
+    is_estimated = shown is not None and shown.is_shown
+    return {
+        "line_time_s": used.line_time_s,
+        "line_time_std_s": used.std_s,
+        "readout_s": used.line_time_s * rows,
+        "reference_row": (rows - 1) / 2,
+        "source": "given" if given is not None else "estimated" if is_estimated else "assumed",
+        "shown": shown
+        and {
+            "line_time_s": shown.line_time_s,
+            "std_s": shown.std_s,
+            "frames": shown.frames,
+            "is_sure": shown.is_shown,
+            "contradicts": given is not None and shown.contradicts(given.line_time_s),
+        },
+    }
+
+
+def _shutter_sentence(given: RollingShutter | None, shown: LineTime | None) -> str:
+    """What the video shows of the shutter; empty where it confirms a global shutter or the given one."""
+    if shown is None or (given is None and shown.is_shown and not shown.rolls):
+        return ""
+    readout = f"{1e3 * shown.readout_s:.2f} +- {1e3 * shown.readout_std_s:.2f} ms for a frame"
+    if given is not None:
+        if not shown.contradicts(given.line_time_s):
+            return ""
+        return f"; warning: the video shows a shutter of {readout}; the covariances include the difference"
+    if shown.rolls:
+        return f"; rolling shutter of {readout}, by {shown.frames} frames; poses are those of the middle row"
+    return (
+        f"; the motion does not show whether the shutter rolls ({readout}): taken as global, with this uncertainty; "
+        "--readout states it"
+    )
 
 
 def _sentence(out: Path, content: dict[str, Any]) -> str:

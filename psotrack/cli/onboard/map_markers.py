@@ -32,14 +32,12 @@ class WorldOptions:
         markers: table with the corners of the known markers; None: SEQ's, if there is no --side.
         side_m: side of the markers' black squares, in metres.
         estimate_sides: estimate the sides of unknown markers, too.
-        seen_from_m: position that all measured markers face, in metres; None: the mean of their corners.
     """
 
     known: Annotated[str, Meta(extra={"metavar": "ID,ID..."})] | None = None
     markers: Path | None = None
     side_m: float | None = None
     estimate_sides: bool = False
-    seen_from_m: Annotated[tuple[float, float, float], Meta(extra={"metavar": "X,Y,Z"})] | None = None
 
 
 @dataclass(frozen=True)
@@ -126,10 +124,7 @@ def map_markers(
             raise SettingsError(
                 "SOURCE", expected="one file of measured corners", found=f"{len(sources)} files"
             )
-        import numpy as np
-
-        viewer = None if world.seen_from_m is None else np.array(world.seen_from_m)
-        measured = fit_squares(read_measured_corners(sources[0]), side_m=world.side_m, seen_from_m=viewer)
+        measured = fit_squares(read_measured_corners(sources[0]), side_m=world.side_m)
         write_marker_corners(out, measured.marker_map.corners_m, measured.marker_map.std_m)
         show_measured(output, measured, out)
         return

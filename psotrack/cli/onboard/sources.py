@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from psotrack.geometry import Camera
-    from psotrack.recordings import VideoInfo
+    from psotrack.recordings import OnboardVideo, VideoInfo
 
 #: Rate of pictures where none is given. A map does not depend on the rate, only the time from row to row does.
 PICTURES_FPS = 25.0
@@ -67,10 +67,14 @@ class OnboardLensOptions:
     scale: bool = False
     fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
 
-    def of(self, size_wh: tuple[int, int], index: int = 0, count: int = 1) -> Camera:
-        """Lens of video number `index` of `count` videos, whose images have `size_wh` pixels."""
-        from psotrack.inside_out import choose_lens
+    def of(
+        self, size_wh: tuple[int, int], index: int = 0, count: int = 1, K: np.ndarray | None = None
+    ) -> Camera:
+        """Lens of video number `index` of `count` videos, whose images have `size_wh` pixels; K is the sequence's."""
+        from psotrack.inside_out import choose_lens, lens_from_matrix
 
+        if K is not None and self.file is None and self.fov_deg is None:
+            return lens_from_matrix(K, size_wh)
         names: tuple[str | None, ...] = self.names or (None,)
         if len(names) not in (1, count):
             expected = f"one name, or one for each of {count} videos"
@@ -96,7 +100,11 @@ def videos_of(
     if is_recording(sources[0]):
         if len(sources) > 1:
             raise SettingsError("SOURCE", expected="one sequence, or videos", found=f"{len(sources)} sources")
-        return _of_sequence(sources[0], drones, lenses)
+        onboard = onboard_videos(sources[0], drones)
+        return {
+            name: (one.video, lenses.of(one.video.image_size_wh, index, len(onboard), one.K))
+            for index, (name, one) in enumerate(onboard.items())
+        }
     if drones is not None:
         raise SettingsError("--drone", expected="a sequence's folder as SOURCE", found=f"{sources[0]}")
     rates = [fps or (PICTURES_FPS if is_picture_folder(path) else None) for path in sources]
@@ -107,30 +115,18 @@ def videos_of(
     }
 
 
-def _of_sequence(
-    folder: Path, drones: tuple[str, ...] | None, lenses: OnboardLensOptions
-) -> dict[str, tuple[VideoInfo, Camera]]:
-    from psotrack.inside_out import lens_from_matrix
-    from psotrack.recordings.datasets import open_recording
+def onboard_videos(folder: Path, names: tuple[str, ...] | None) -> dict[str, OnboardVideo]:
+    """Videos of the cameras on a sequence's drones, by name: all of them, or those of some names."""
+    from psotrack.recordings.datasets import read_onboard
 
-    onboard = open_recording(folder).onboard
+    onboard = read_onboard(folder)
     if not onboard:
-        raise InputError(
-            folder, expected="videos of drones' own cameras, such as dron1_cam_s.avi", found="none"
-        )
-    chosen = list(onboard) if drones is None else list(drones)
-    unknown = [name for name in chosen if name not in onboard]
+        expected = "videos of drones' own cameras, such as dron1_cam_s.avi"
+        raise InputError(folder, expected=expected, found="none")
+    unknown = [name for name in names or () if name not in onboard]
     if unknown:
         raise SettingsError("--drone", expected=f"names among {', '.join(onboard)}", found=", ".join(unknown))
-    videos = {}
-    for index, name in enumerate(chosen):
-        video, K = onboard[name].video, onboard[name].K
-        if K is None or lenses.file is not None or lenses.fov_deg is not None:
-            lens = lenses.of(video.image_size_wh, index, len(chosen))
-        else:
-            lens = lens_from_matrix(K, video.image_size_wh)
-        videos[name] = (video, lens)
-    return videos
+    return {name: onboard[name] for name in names or onboard}
 
 
 def leading(video: VideoInfo, num_frames: int | None) -> VideoInfo:

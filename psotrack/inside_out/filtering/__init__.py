@@ -8,33 +8,6 @@ Imports go in this order: `motion` (a Kalman filter), `pose_filter` (which poses
 wildly the camera moves), `smoothing`.
 """
 
-from psotrack.inside_out.filtering.agility import choose_agility
-from psotrack.inside_out.filtering.motion import Agility, MotionEstimate
-from psotrack.inside_out.filtering.pose_filter import (
-    Estimated,
-    FilterRun,
-    FramePose,
-    PoseFilterParams,
-    expected,
-    path_of,
-    poses_of,
-    step,
-)
-from psotrack.inside_out.filtering.smoothing import filter_path, smooth, smoothed_motions
+import lazy_loader
 
-__all__ = [
-    "Agility",
-    "Estimated",
-    "FilterRun",
-    "FramePose",
-    "MotionEstimate",
-    "PoseFilterParams",
-    "choose_agility",
-    "expected",
-    "filter_path",
-    "path_of",
-    "poses_of",
-    "smooth",
-    "smoothed_motions",
-    "step",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

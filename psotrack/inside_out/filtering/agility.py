@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 
 from psotrack.inside_out.filtering.motion import Agility
-from psotrack.inside_out.filtering.pose_filter import FilterRun, FramePose, PoseFilterParams, step
+from psotrack.inside_out.filtering.pose_filter import FilterRun, PoseFilterParams, step
+from psotrack.inside_out.pose import CameraPose
 
 #: Factor between neighbouring values, and largest number of steps from the defaults: accelerations from 0.05 to
 #: 500 m/s², changes of the turn rate from 0.03 to 300 rad/s.
@@ -21,14 +22,17 @@ _WINDOW, _MOST_WINDOWS = 60, 4
 _STEP_COST = 0.25
 
 
-def choose_agility(poses: Sequence[FramePose | None], params: PoseFilterParams) -> Agility:
+def choose_agility(
+    time_s: Sequence[float], poses: Sequence[CameraPose | None], params: PoseFilterParams
+) -> Agility:
     """The most likely agility of a camera, by a search along both numbers in turn.
 
     Args:
+        time_s: times of the frames, seconds.
         poses: the frames' own poses; None for a frame without one.
         params: parameters of the filter.
     """
-    seen = [pose for pose in poses if pose is not None]
+    seen = [one for one in zip(time_s, poses, strict=True) if one[1] is not None]
     last = max(len(seen) - _WINDOW, 0)
     starts = np.unique(np.linspace(0, last, min(_MOST_WINDOWS, 1 + -(-last // _WINDOW))).astype(int))
     windows = [seen[start : start + _WINDOW] for start in starts]
@@ -63,8 +67,10 @@ def _agility(along: int, about: int) -> Agility:
     )
 
 
-def _log_likelihood(poses: Sequence[FramePose], params: PoseFilterParams, agility: Agility) -> float:
+def _log_likelihood(
+    poses: Sequence[tuple[float, CameraPose | None]], params: PoseFilterParams, agility: Agility
+) -> float:
     run = FilterRun()
-    for pose in poses:
-        run = step(run, pose.time_s, pose, params, agility)
+    for time_s, pose in poses:
+        run = step(run, float(time_s), pose, params, agility)
     return run.log_likelihood

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import cross_matrices
 from psotrack.geometry.estimation import backward_step
+from psotrack.inside_out.pose import CameraPose
 
 #: (21, 21), matrix of the error state.
 Matrix = Float[np.ndarray, "n n"]
@@ -80,23 +81,18 @@ class Motion:
     covariance: Float[np.ndarray, "n n"]
 
 
-@dataclass(frozen=True)
-class MotionEstimate:
+@dataclass(frozen=True, kw_only=True)
+class MotionEstimate(CameraPose):
     """An estimated pose of a camera and its motion.
 
     Attributes:
-        position_m, velocity_m_s: (3,), world.
-        R_world_cam: (3, 3), camera to world.
+        velocity_m_s: (3,), world.
         rate_rad_s: (3,), turn rate about the camera's axes.
-        covariance: (6, 6), of the pose, as in `CameraPath`.
         rate_covariance: (6, 6), of velocity and turn rate.
     """
 
-    position_m: Float[np.ndarray, "3"]
     velocity_m_s: Float[np.ndarray, "3"]
-    R_world_cam: Float[np.ndarray, "3 3"]
     rate_rad_s: Float[np.ndarray, "3"]
-    covariance: Float[np.ndarray, "6 6"]
     rate_covariance: Float[np.ndarray, "6 6"]
 
 
@@ -115,17 +111,12 @@ class Innovation:
     cross: Float[np.ndarray, "n 6"]
 
 
-def initial_motion(
-    position_m: Float[np.ndarray, "3"],
-    R_world_cam: Float[np.ndarray, "3 3"],
-    covariance: Float[np.ndarray, "6 6"],
-    agility: Agility,
-) -> Motion:
+def initial_motion(pose: CameraPose, agility: Agility) -> Motion:
     """Make the state after the first pose; velocity, acceleration and turn rate have mean 0."""
-    root = _correlated_root(covariance)
+    root = _correlated_root(pose.varying)
     spread = np.zeros((SIZE, SIZE))
     # The state's pose error contains the correlated error with the opposite sign.
-    spread[np.ix_(POSE, POSE)] = covariance
+    spread[np.ix_(POSE, POSE)] = pose.varying
     spread[POSE, _CORRELATED] = -root
     spread[_CORRELATED, POSE] = -root
     acceleration, rate_change = agility.acceleration_std_m_s2, agility.rate_change_std_rad_s
@@ -139,7 +130,7 @@ def initial_motion(
     others = np.r_[3:9, 12:21]
     spread[others, others] = np.square(np.repeat(of_others, 3))
     zero = np.zeros(3)
-    return Motion(position_m, zero, zero, R_world_cam, zero, np.zeros(6), spread)
+    return Motion(pose.position_m, zero, zero, pose.R_world_cam, zero, np.zeros(6), spread)
 
 
 def predict(motion: Motion, dt_s: float, agility: Agility) -> tuple[Motion, Matrix, Matrix]:
@@ -178,22 +169,17 @@ def turning(motion: Motion, agility: Agility) -> Motion:
     return replace(motion, acceleration_m_s2=np.zeros(3), covariance=spread)
 
 
-def innovation(
-    motion: Motion,
-    position_m: Float[np.ndarray, "3"],
-    R_world_cam: Float[np.ndarray, "3 3"],
-    covariance: Float[np.ndarray, "6 6"],
-) -> Innovation:
-    """Compare a measured pose, with its covariance as in `CameraPath`, with the predicted one."""
-    turn = turn_between(motion.R_world_cam, R_world_cam)
+def innovation(motion: Motion, pose: CameraPose) -> Innovation:
+    """Compare a measured pose with the predicted one; the constant part of its covariance is left out."""
+    turn = turn_between(motion.R_world_cam, pose.R_world_cam)
     # The measurement's small turns are about its own axes; the innovation's turn is a logarithm.
     by_noise = np.eye(6)
     by_noise[3:, 3:] = np.linalg.inv(right_jacobian(turn))
     H = np.zeros((6, SIZE))
     H[np.arange(6), POSE] = 1.0
-    H[:, _CORRELATED] = by_noise @ _correlated_root(covariance)
-    white = (1 - CORRELATED_FRACTION) * by_noise @ covariance @ by_noise.T
-    off = np.append(position_m - motion.position_m, turn) - H[:, _CORRELATED] @ motion.correlated
+    H[:, _CORRELATED] = by_noise @ _correlated_root(pose.varying)
+    white = (1 - CORRELATED_FRACTION) * by_noise @ pose.varying @ by_noise.T
+    off = np.append(pose.position_m - motion.position_m, turn) - H[:, _CORRELATED] @ motion.correlated
     cross = motion.covariance @ H.T
     return Innovation(off, _symmetric(H @ cross + white), cross)
 
@@ -265,11 +251,11 @@ def estimate(motion: Motion) -> MotionEstimate:
     """Pose and motion of a state."""
     return MotionEstimate(
         motion.position_m,
-        motion.velocity_m_s,
         motion.R_world_cam,
-        motion.rate_rad_s,
         motion.covariance[np.ix_(POSE, POSE)],
-        motion.covariance[np.ix_(RATES, RATES)],
+        velocity_m_s=motion.velocity_m_s,
+        rate_rad_s=motion.rate_rad_s,
+        rate_covariance=motion.covariance[np.ix_(RATES, RATES)],
     )
 
 

@@ -32,6 +32,7 @@ from psotrack.inside_out.filtering.motion import (
     predict,
     turning,
 )
+from psotrack.inside_out.pose import CameraPose
 from psotrack.trajectories import Status
 
 #: Number of successive poses that distinguish a turn, which only the wildest drone flies, from an outlier.
@@ -81,27 +82,6 @@ class PoseFilterParams:
     def within(self, num_frames: int | None) -> PoseFilterParams:
         """Parameters for a recording of `num_frames` frames: `confirm` is at most this number. None is a stream."""
         return self if num_frames is None else replace(self, confirm=max(1, min(self.confirm, num_frames)))
-
-
-@dataclass(frozen=True)
-class FramePose:
-    """The pose of a camera from one frame alone.
-
-    Attributes:
-        time_s: time of the frame, seconds.
-        position_m, R_world_cam, ambiguity: as in `MarkerPose`.
-        covariance: (6, 6), as in `CameraPath`, without the constant part.
-        constant: (6, 6), the part by errors that are the same in all frames: no number of frames averages them out.
-        num_markers: number of markers behind the pose.
-    """
-
-    time_s: float
-    position_m: Float[np.ndarray, "3"]
-    R_world_cam: Float[np.ndarray, "3 3"]
-    covariance: Float[np.ndarray, "6 6"]
-    constant: Float[np.ndarray, "6 6"]
-    ambiguity: float
-    num_markers: int
 
 
 @dataclass(frozen=True)
@@ -198,7 +178,7 @@ def confirmed(run: FilterRun, params: PoseFilterParams) -> bool:
 
 
 def step(
-    run: FilterRun, time_s: float, pose: FramePose | None, params: PoseFilterParams, agility: Agility
+    run: FilterRun, time_s: float, pose: CameraPose | None, params: PoseFilterParams, agility: Agility
 ) -> FilterRun:
     """Follow the camera into the next frame, whose own pose is `pose`; None if it has none.
 
@@ -211,30 +191,31 @@ def step(
         raise InputError("time_s", expected=f"a time after {track.seen_s:g} s", found=f"{time_s:g} s")
     if pose is None:
         return run
-    if not (np.isfinite(pose.covariance).all() and np.linalg.eigvalsh(pose.covariance)[0] > 0):
+    if not (np.isfinite(pose.covariance).all() and np.linalg.eigvalsh(pose.varying)[0] > 0):
         where = f"covariance at {time_s:g} s"
         raise InputError(where, expected="a positive definite matrix", found="another")
     if track is None:
-        first = _first_track(pose, params, agility)
+        first = _first_track(time_s, pose, params, agility)
         return replace(run, track=first, restarted_s=time_s, jumped=True, used=True)
-    updated = _updated(track, pose, params, run.agility_at(time_s, agility))
+    updated = _updated(track, time_s, pose, params, run.agility_at(time_s, agility))
     run = replace(run, log_likelihood=run.log_likelihood + updated.log_density)
     is_fresh = time_s - track.seen_s <= params.longest_gap_s
     accepts = updated.fits and (is_fresh or _is_predicted(updated, params))
     rival = run.rival
     if rival is not None and time_s - rival.seen_s <= params.longest_gap_s:
-        rivalling = _updated(rival, pose, params, _WILDEST if run.turns else agility)
+        rivalling = _updated(rival, time_s, pose, params, _WILDEST if run.turns else agility)
         if rivalling.fits and not (accepts and updated.log_density >= rivalling.log_density):
             # The pose belongs to the rival, even where the track has grown uncertain enough to accept it.
             return _rivalled(run, rivalling.track, run.needed, run.turns)
     if accepts:
         return replace(run, track=updated.track, rival=None, used=True)
     if is_fresh:
-        turned = _updated(replace(track, motion=turning(track.motion, _WILDEST)), pose, params, _WILDEST)
+        anew = replace(track, motion=turning(track.motion, _WILDEST))
+        turned = _updated(anew, time_s, pose, params, _WILDEST)
         if turned.fits and _is_predicted(turned, params) and confirmed(run, params):
             turn = replace(turned.track, began_s=time_s)
             return _rivalled(run, turn, track.support + _TURN_POSES, True)
-    first = _first_track(pose, params, _WILDEST)
+    first = _first_track(time_s, pose, params, _WILDEST)
     needed = params.restart_after if track.sure else min(params.restart_after, track.support + 1)
     if not is_fresh:
         needed = 1 if updated.fits and first.sure else max(params.confirm, params.restart_after)
@@ -256,26 +237,28 @@ def _rivalled(run: FilterRun, rival: Track, needed: int, turns: bool) -> FilterR
     )
 
 
-def _first_track(pose: FramePose, params: PoseFilterParams, agility: Agility) -> Track:
+def _first_track(time_s: float, pose: CameraPose, params: PoseFilterParams, agility: Agility) -> Track:
     """The track of a single pose."""
-    motion = initial_motion(pose.position_m, pose.R_world_cam, pose.covariance, agility)
-    return Track(motion, pose.time_s, pose.time_s, 1, pose.ambiguity, _is_sure(pose, params), pose.constant)
+    motion = initial_motion(pose, agility)
+    return Track(motion, time_s, time_s, 1, pose.ambiguity, _is_sure(pose, params), pose.constant)
 
 
-def _is_sure(pose: FramePose, params: PoseFilterParams) -> bool:
+def _is_sure(pose: CameraPose, params: PoseFilterParams) -> bool:
     """Whether the markers of a pose agree beyond chance, and no other pose explains them."""
     return pose.num_markers >= _BEYOND_CHANCE and pose.ambiguity < params.false_alarm
 
 
-def _updated(track: Track, pose: FramePose, params: PoseFilterParams, agility: Agility) -> _Updated:
+def _updated(
+    track: Track, time_s: float, pose: CameraPose, params: PoseFilterParams, agility: Agility
+) -> _Updated:
     """A track with one more pose.
 
     A pose is gated where its squared Mahalanobis distance from the prediction exceeds the value that chi-square with 6
     degrees of freedom exceeds with probability `false_alarm`. An ambiguous pose is weighted by the probability that it
     is the right one, given how well it fits.
     """
-    predicted, _, _ = predict(track.motion, pose.time_s - track.seen_s, agility)
-    found = innovation(predicted, pose.position_m, pose.R_world_cam, pose.covariance)
+    predicted, _, _ = predict(track.motion, time_s - track.seen_s, agility)
+    found = innovation(predicted, pose)
     spread = found.covariance + pose.constant
     nis, log_size = float(found.off @ np.linalg.solve(spread, found.off)), float(np.linalg.slogdet(spread)[1])
     robust = _LOG_PEAK - ((_FREEDOM + 6) * float(np.log1p(nis / _FREEDOM)) + log_size) / 2
@@ -283,7 +266,7 @@ def _updated(track: Track, pose: FramePose, params: PoseFilterParams, agility: A
     more = Track(
         correct(predicted, found, right),
         track.began_s,
-        pose.time_s,
+        time_s,
         track.support + 1,
         min(track.ambiguity, pose.ambiguity),
         track.sure or _is_sure(pose, params),
@@ -324,29 +307,22 @@ def _is_predicted(updated: _Updated, params: PoseFilterParams) -> bool:
 
 def poses_of(
     path: CameraPath, constant: Float[np.ndarray, "frames 6 6"] | None = None
-) -> list[FramePose | None]:
+) -> list[CameraPose | None]:
     """The frames' own poses of a path; None for frames without one.
 
     Args:
         path: the path; an unknown ambiguity counts as 0.
         constant: (frames, 6, 6), the part of the covariances by errors that are the same in all frames; None is 0.
     """
-    constant = np.zeros((path.num_frames, 6, 6)) if constant is None else constant
-    matrices = rotation_matrices(path.orientation_wxyz)
-    return [
-        FramePose(
-            float(path.time_s[k]),
-            path.position_m[k],
-            matrices[k],
-            path.covariance[k] - constant[k],
-            constant[k],
-            float(np.nan_to_num(path.ambiguity[k])),
-            int(path.num_markers[k]),
-        )
-        if np.isfinite(path.position_m[k]).all()
-        else None
-        for k in range(path.num_frames)
-    ]
+    values = (
+        path.position_m,
+        rotation_matrices(path.orientation_wxyz),
+        path.covariance,
+        np.zeros((path.num_frames, 6, 6)) if constant is None else constant,
+        np.nan_to_num(path.ambiguity).tolist(),
+        path.num_markers.tolist(),
+    )
+    return [CameraPose(*one) if np.isfinite(one[0]).all() else None for one in zip(*values, strict=True)]
 
 
 def path_of(raw: CameraPath, estimates: Sequence[Estimated]) -> CameraPath:
@@ -355,32 +331,35 @@ def path_of(raw: CameraPath, estimates: Sequence[Estimated]) -> CameraPath:
     `TRACKED` where the frame's own pose fits the motion, `COASTING` where there was none or it was gated, and `LOST`,
     with NaN, where there is no estimate.
     """
-    count, has_pose = raw.num_frames, np.isfinite(raw.position_m).all(axis=1)
-    motions = [one.motion for one in estimates]
+    has_pose, motions = np.isfinite(raw.position_m).all(axis=1), [one.motion for one in estimates]
     there = np.array([motion is not None for motion in motions], bool)
     used = np.array([one.used for one in estimates], bool)
     ambiguity = np.where(there, [one.ambiguity for one in estimates], np.nan)
-
-    def of_motions(name: str, shape: tuple[int, ...]) -> Float[np.ndarray, "frames *shape"]:
-        values = np.full((count, *shape), np.nan)
-        for k, motion in enumerate(motions):
-            if motion is not None:
-                values[k] = getattr(motion, name)
-        return values
-
-    orientation_wxyz = np.full((count, 4), np.nan)
-    if there.any():
-        turns = Rotation.from_matrix(of_motions("R_world_cam", (3, 3))[there])
-        orientation_wxyz[there] = turns.as_quat(scalar_first=True)
     flags = raw.flags | np.where(has_pose & ~used, int(Flag.GATED), 0)
     surer = there & (ambiguity < raw.ambiguity)
     return replace(
         raw,
-        position_m=of_motions("position_m", (3,)),
-        orientation_wxyz=orientation_wxyz,
-        covariance=of_motions("covariance", (6, 6)),
+        position_m=filled(motions, "position_m", 3),
+        orientation_wxyz=orientations(motions),
+        covariance=filled(motions, "covariance", 6, 6),
         ambiguity=ambiguity,
         status=np.where(there, np.where(used, int(Status.TRACKED), int(Status.COASTING)), int(Status.LOST)),
         flags=np.where(surer, flags & ~int(Flag.AMBIGUOUS), flags),
-        velocity_m_s=of_motions("velocity_m_s", (3,)) if there.any() else None,
+        velocity_m_s=filled(motions, "velocity_m_s", 3) if there.any() else None,
     )
+
+
+def filled(poses: Sequence[CameraPose | None], name: str, *shape: int) -> np.ndarray:
+    """(frames, *shape), an attribute of the frames' poses; NaN in frames without one."""
+    unknown = np.full(shape, np.nan)
+    values = [unknown if pose is None else getattr(pose, name) for pose in poses]
+    return np.array(values, float).reshape(len(poses), *shape)
+
+
+def orientations(poses: Sequence[CameraPose | None]) -> Float[np.ndarray, "frames 4"]:
+    """(frames, 4), unit quaternions, camera to world, of the frames' poses; NaN in frames without one."""
+    wxyz, R = np.full((len(poses), 4), np.nan), filled(poses, "R_world_cam", 3, 3)
+    there = np.isfinite(R[:, 0, 0])
+    if there.any():
+        wxyz[there] = Rotation.from_matrix(R[there]).as_quat(scalar_first=True)
+    return wxyz

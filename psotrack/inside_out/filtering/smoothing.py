@@ -19,7 +19,6 @@ from psotrack.inside_out.filtering.motion import Agility, Motion
 from psotrack.inside_out.filtering.pose_filter import (
     Estimated,
     FilterRun,
-    FramePose,
     PoseFilterParams,
     confirmed,
     expected,
@@ -28,6 +27,7 @@ from psotrack.inside_out.filtering.pose_filter import (
     probability_right,
     step,
 )
+from psotrack.inside_out.pose import CameraPose
 
 #: (frames, 6, 6), parts of covariances.
 Covariances = Float[np.ndarray, "frames 6 6"]
@@ -64,7 +64,7 @@ def filter_path(
         InputError: a pose's covariance is not positive definite.
     """
     params, poses = params or PoseFilterParams(), poses_of(path, constant)
-    agility = choose_agility(poses, params)
+    agility = choose_agility(path.time_s.tolist(), poses, params)
     run, estimates = FilterRun(), []
     for time_s, pose in zip(path.time_s.tolist(), poses, strict=True):
         run = step(run, time_s, pose, params, agility)
@@ -94,17 +94,12 @@ def smooth(
 
 
 def smoothed_motions(
-    time_s: Float[np.ndarray, "frames"], poses: Sequence[FramePose | None], params: PoseFilterParams
+    time_s: Float[np.ndarray, "frames"], poses: Sequence[CameraPose | None], params: PoseFilterParams
 ) -> list[Estimated]:
     """Smoothed pose and motion of every frame, from the frames' own poses at these times, seconds."""
-    agility = choose_agility(poses, params)
+    agility = choose_agility(time_s.tolist(), poses, params)
     forward = _findings(time_s, poses, params, agility)
-    backward = _findings(
-        -time_s[::-1],
-        [pose and replace(pose, time_s=-pose.time_s) for pose in reversed(poses)],
-        params,
-        agility,
-    )
+    backward = _findings(-time_s[::-1], poses[::-1], params, agility)
     fits = forward.fits & backward.fits[::-1]
     ambiguity = np.fmin(forward.ambiguity, backward.ambiguity[::-1])
     found = [Estimated(None)] * len(poses)
@@ -124,7 +119,7 @@ def smoothed_motions(
 
 def _findings(
     time_s: Float[np.ndarray, "frames"],
-    poses: Sequence[FramePose | None],
+    poses: Sequence[CameraPose | None],
     params: PoseFilterParams,
     agility: Agility,
 ) -> _Findings:
@@ -171,7 +166,7 @@ def _spans(
 
 def _smooth_span(
     time_s: Float[np.ndarray, "frames"],
-    poses: Sequence[FramePose | None],
+    poses: Sequence[CameraPose | None],
     fits: Bool[np.ndarray, "frames"],
     span: slice,
     agility: Sequence[Agility],
@@ -180,16 +175,14 @@ def _smooth_span(
     first = poses[span.start]
     if first is None:
         raise ValueError("expected a pose in the first frame of a span")
-    filtered = [
-        pose_motion.initial_motion(first.position_m, first.R_world_cam, first.covariance, agility[span.start])
-    ]
+    filtered = [pose_motion.initial_motion(first, agility[span.start])]
     ahead: list[tuple[Motion, pose_motion.Matrix, pose_motion.Matrix]] = []
     for k in range(span.start + 1, span.stop):
         pose = poses[k] if fits[k] else None
         ahead.append(pose_motion.predict(filtered[-1], float(time_s[k] - time_s[k - 1]), agility[k]))
         motion = ahead[-1][0]
         if pose is not None:
-            found = pose_motion.innovation(motion, pose.position_m, pose.R_world_cam, pose.covariance)
+            found = pose_motion.innovation(motion, pose)
             right = probability_right(found.off, found.covariance + pose.constant, pose.ambiguity)
             motion = pose_motion.correct(motion, found, right)
         filtered.append(motion)

@@ -8,21 +8,6 @@ Imports go in this order: `records`, `frame_poses` (poses frame by frame), `reco
 `video`.
 """
 
-from psotrack.inside_out.line_time import LineTime, estimate_line_time
-from psotrack.inside_out.localising.frame_poses import FollowedFrame, own_path
-from psotrack.inside_out.localising.recording import localise_frames
-from psotrack.inside_out.localising.records import STAGES, LocalisedFrames, LocalisedVideo, LocaliseSettings
-from psotrack.inside_out.localising.video import localise_video
+import lazy_loader
 
-__all__ = [
-    "STAGES",
-    "FollowedFrame",
-    "LineTime",
-    "LocaliseSettings",
-    "LocalisedFrames",
-    "LocalisedVideo",
-    "estimate_line_time",
-    "localise_frames",
-    "localise_video",
-    "own_path",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

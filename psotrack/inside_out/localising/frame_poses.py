@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,18 +17,19 @@ from psotrack.inside_out.filtering import (
     Agility,
     Estimated,
     FilterRun,
-    FramePose,
     MotionEstimate,
     PoseFilterParams,
     choose_agility,
     expected,
+    filled,
+    orientations,
     step,
 )
 from psotrack.inside_out.line_time import Detected
 from psotrack.inside_out.localising.records import LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import (
-    ExpectedPose,
+    CameraPose,
     MarkerPose,
     PosesAt,
     PoseSettings,
@@ -41,8 +41,6 @@ from psotrack.inside_out.pose import (
 )
 from psotrack.trajectories import Status
 
-#: (6, 6), covariance of a pose, as in `CameraPath`.
-Covariance = Float[np.ndarray, "6 6"]
 #: Number of markers that the paper requires. A pose from fewer markers is flagged, even if the settings allow it.
 PAPER_MARKERS = 4
 #: Probability that another pose is the right one above which a pose is flagged as ambiguous.
@@ -76,8 +74,6 @@ class FollowedFrame:
         number, time_s: number and time of the frame, seconds.
         num_markers: number of detected markers.
         pose: the frame's own pose; None without one.
-        by_motion, by_line_time: (6, 6), parts of the covariance of this pose by the motion during the frame, and by the
-            line time, which is the same in all frames.
         estimated: the filter's estimate.
     """
 
@@ -85,24 +81,7 @@ class FollowedFrame:
     time_s: float
     num_markers: int
     pose: MarkerPose | None
-    by_motion: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
-    by_line_time: Covariance = field(default_factory=lambda: np.zeros((6, 6)))
     estimated: Estimated = field(default_factory=Estimated)
-
-    def own(self) -> FramePose | None:
-        """The own pose for the filter."""
-        pose = self.pose
-        if pose is None:
-            return None
-        return FramePose(
-            self.time_s,
-            pose.position_m,
-            pose.R_world_cam,
-            pose.covariance - pose.constant + self.by_motion,
-            pose.constant + self.by_line_time,
-            pose.ambiguity,
-            int(pose.used.sum()),
-        )
 
 
 def follow(
@@ -128,7 +107,7 @@ def follow(
     spent_s = {"locate": 0.0, "filter": 0.0} if seconds is None else seconds
     shutter, params = settings.shutter or RollingShutter(0.0), settings.filter or PoseFilterParams()
     rolls = bool(shutter.line_time_s or shutter.std_s)
-    model, run, recent = agility or Agility(), FilterRun(), list[FramePose]()
+    model, run, recent = agility or Agility(), FilterRun(), list[tuple[float, CameraPose]]()
     for number, time_s, markers in detected:
         began_s = time.perf_counter()
         predicted = expected(run, time_s, params, model).motion
@@ -141,32 +120,29 @@ def follow(
                 corners_px = at_middle_row(
                     markers.corners_px, corners_m, lens, shutter.line_time_s, time_s, motion.poses_at
                 )
-                moved = DetectedMarkers(markers.ids, corners_px, markers.std_px)
+                moved = replace(markers, corners_px=corners_px)
             pose = _own_pose(moved, corners_m, marker_map, lens, settings, predicted)
-            frame = FollowedFrame(number, time_s, len(markers), pose)
             if rolls and pose is not None:
-                of_motion, of_line_time = _by_rows(pose, markers, corners_m, lens, shutter, time_s, motion)
-                frame = replace(frame, by_motion=of_motion, by_line_time=of_line_time)
+                pose = _with_rows(pose, markers, corners_m, lens, shutter, time_s, motion)
                 if turn < _TURNS - 1 and around is None:
-                    trial = _stepped(run, time_s, frame.own(), params, model)
+                    trial = _stepped(run, time_s, pose, params, model)
                     now = expected(trial, time_s, params, model)
                     motion = _constant(now.motion, time_s) or motion
         located_s = time.perf_counter()
-        own = frame.own()
-        run = _stepped(run, time_s, own, params, model)
-        if agility is None and own is not None and len(recent) < _CHOICES[-1]:
-            recent.append(own)
+        run = _stepped(run, time_s, pose, params, model)
+        if agility is None and pose is not None and len(recent) < _CHOICES[-1]:
+            recent.append((time_s, pose))
             if len(recent) in _CHOICES:
-                model, run = choose_agility(recent, params), FilterRun()
-                for earlier in recent:
-                    run = _stepped(run, earlier.time_s, earlier, params, model)
+                model, run = choose_agility(*zip(*recent, strict=True), params), FilterRun()
+                for earlier_s, earlier in recent:
+                    run = _stepped(run, earlier_s, earlier, params, model)
         spent_s["locate"] += located_s - predicted_s
         spent_s["filter"] += time.perf_counter() - located_s + predicted_s - began_s
-        yield replace(frame, estimated=expected(run, time_s, params, model))
+        yield FollowedFrame(number, time_s, len(markers), pose, expected(run, time_s, params, model))
 
 
 def _stepped(
-    run: FilterRun, time_s: float, own: FramePose | None, params: PoseFilterParams, agility: Agility
+    run: FilterRun, time_s: float, own: CameraPose | None, params: PoseFilterParams, agility: Agility
 ) -> FilterRun:
     try:
         return step(run, time_s, own, params, agility)
@@ -184,9 +160,7 @@ def _own_pose(
     predicted: MotionEstimate | None,
 ) -> MarkerPose | None:
     """The pose by one frame's markers; the filter's prediction decides between poses that fit about equally well."""
-    prior = None
-    if predicted is not None and settings.filter is not None:
-        prior = ExpectedPose(predicted.position_m, predicted.R_world_cam, predicted.covariance)
+    prior = None if settings.filter is None else predicted
     map_std_m = marker_map.std_of(markers.ids.tolist())
     try:
         return estimate_pose(
@@ -205,34 +179,23 @@ def _own_pose(
 
 def own_path(frames: Sequence[FollowedFrame], settings: PoseSettings) -> CameraPath:
     """The path of the frames' own poses; without a pose, the number of markers counts the detected markers."""
-    own = [frame.own() for frame in frames]
-    there = [k for k, pose in enumerate(own) if pose is not None]
-    poses = [pose for pose in own if pose is not None]
-    num_markers = np.array([frame.num_markers for frame in frames], int)
-    num_markers[there] = [pose.num_markers for pose in poses]
-
-    def filled(values: Sequence[Any], *shape: int) -> np.ndarray:
-        """Values of the frames that have a pose; NaN in the others."""
-        whole = np.full((len(frames), *shape), np.nan)
-        whole[there] = np.reshape(values, (len(there), *shape))
-        return whole
-
-    ambiguity = filled([pose.ambiguity for pose in poses])
+    poses = [frame.pose for frame in frames]
+    there = np.array([pose is not None for pose in poses], bool)
+    seen = np.array([frame.num_markers for frame in frames], int)
+    num_markers = np.where(there, filled(poses, "num_markers"), seen).astype(int)
+    ambiguity = filled(poses, "ambiguity")
     few = (num_markers > 0) & (num_markers < max(PAPER_MARKERS, settings.min_markers))
     flags = np.where(few, int(Flag.FEW_MARKERS), 0)
-    status = np.full(len(frames), int(Status.LOST))
-    status[there] = int(Status.TRACKED)
-    turns = [Rotation.from_matrix(pose.R_world_cam).as_quat(scalar_first=True) for pose in poses]
     return CameraPath(
         frame=np.array([frame.number for frame in frames], int),
         time_s=np.array([frame.time_s for frame in frames], float),
-        position_m=filled([pose.position_m for pose in poses], 3),
-        orientation_wxyz=filled(turns, 4),
-        covariance=filled([pose.covariance + pose.constant for pose in poses], 6, 6),
+        position_m=filled(poses, "position_m", 3),
+        orientation_wxyz=orientations(poses),
+        covariance=filled(poses, "covariance", 6, 6),
         num_markers=num_markers,
-        reprojection_px=filled([frame.pose.reprojection_px for frame in frames if frame.pose is not None]),
+        reprojection_px=filled(poses, "reprojection_px"),
         ambiguity=ambiguity,
-        status=status,
+        status=np.where(there, int(Status.TRACKED), int(Status.LOST)),
         flags=flags | np.where(ambiguity > _AMBIGUOUS, int(Flag.AMBIGUOUS), 0),
     )
 
@@ -255,7 +218,7 @@ def constant_motion(predicted: MotionEstimate, time_s: float) -> PosesAt:
     return poses_at
 
 
-def _by_rows(
+def _with_rows(
     pose: MarkerPose,
     markers: DetectedMarkers,
     corners_m: Float[np.ndarray, "markers 4 3"],
@@ -263,11 +226,11 @@ def _by_rows(
     shutter: RollingShutter,
     time_s: float,
     motion: MotionAround | None,
-) -> tuple[Covariance, Covariance]:
-    """Covariances of a pose by an uncertain motion during the frame, and by an uncertain line time."""
+) -> MarkerPose:
+    """A pose with covariances by an uncertain motion during the frame, and by an uncertain line time."""
     equations, corners_px = pose.equations, markers.corners_px
     if equations is None or len(equations.fits) < len(corners_px):
-        return np.zeros((6, 6)), np.zeros((6, 6))
+        return pose
     gain = equations.gain()
     root = np.diag(_UNKNOWN_RATES) if motion is None else motion.rate_root
 
@@ -280,4 +243,6 @@ def _by_rows(
         line_times_s = shutter.line_time_s, shutter.line_time_s + shutter.std_s
         shift_px = shift_of_rows(corners_px, corners_m, lens, line_times_s, time_s, motion.poses_at)
         of_line_time = np.column_stack([of_line_time, gain @ shift_px.ravel()])
-    return of_motion @ of_motion.T, of_line_time @ of_line_time.T
+    constant = of_line_time @ of_line_time.T
+    covariance = pose.covariance + of_motion @ of_motion.T + constant
+    return replace(pose, covariance=covariance, constant=pose.constant + constant)

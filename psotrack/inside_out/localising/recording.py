@@ -13,7 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from psotrack.geometry import Camera
-from psotrack.inside_out.filtering import Agility, PoseFilterParams, filter_path, path_of, smoothed_motions
+from psotrack.inside_out.filtering import (
+    Agility,
+    PoseFilterParams,
+    filled,
+    filter_path,
+    path_of,
+    smoothed_motions,
+)
 from psotrack.inside_out.line_time import Detected, estimate_line_time
 from psotrack.inside_out.localising.frame_poses import (
     FollowedFrame,
@@ -22,7 +29,7 @@ from psotrack.inside_out.localising.frame_poses import (
     follow,
     own_path,
 )
-from psotrack.inside_out.localising.records import LocalisedFrames, LocaliseSettings
+from psotrack.inside_out.localising.records import LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
 from psotrack.inside_out.pose import CornerNoise, RollingShutter, estimate_noise, spline_through
 
@@ -43,7 +50,7 @@ def localise_frames(
     lens: Camera,
     settings: LocaliseSettings,
     seconds: dict[str, float] | None = None,
-) -> LocalisedFrames:
+) -> LocalisedVideo:
     """Localise a camera in frames whose markers are detected.
 
     Args:
@@ -63,7 +70,7 @@ def localise_frames(
             if not shown:
                 raise
             interrupted = True
-        return replace(_localised(shown, settings), interrupted=interrupted)
+        return replace(_localised(shown, marker_map, settings), interrupted=interrupted)
     if settings.filter is not None:
         settings = replace(settings, filter=settings.filter.within(len(detected)))
     localised, found = _recording(detected, marker_map, lens, settings, seconds)
@@ -90,7 +97,7 @@ def _recording(
     lens: Camera,
     settings: LocaliseSettings,
     seconds: dict[str, float] | None,
-) -> tuple[LocalisedFrames, list[FollowedFrame]]:
+) -> tuple[LocalisedVideo, list[FollowedFrame]]:
     """Localise a recording with all its markers."""
     line_time = estimate_line_time(detected, marker_map, lens, settings.pose)
     if line_time is not None:
@@ -114,21 +121,19 @@ def _recording(
             noise = estimate_noise([pose.equations for pose in poses if pose.equations is not None], noise)
         settings = replace(settings, pose=replace(settings.pose, noise=noise))
     found = list(follow(detected, marker_map, lens, settings, agility, around, seconds))
-    return replace(_localised(found, settings, anew=True), line_time=line_time), found
+    return replace(_localised(found, marker_map, settings, anew=True), line_time=line_time), found
 
 
 def _localised(
-    found: Sequence[FollowedFrame], settings: LocaliseSettings, *, anew: bool = False
-) -> LocalisedFrames:
+    found: Sequence[FollowedFrame], marker_map: MarkerMap, settings: LocaliseSettings, *, anew: bool = False
+) -> LocalisedVideo:
     """The paths of frames; filtered anew with the agility of all frames, or as they were estimated."""
-    raw, own = own_path(found, settings.pose), [frame.own() for frame in found]
-    constant = np.array([np.zeros((6, 6)) if pose is None else pose.constant for pose in own])
-    constant = constant.reshape(-1, 6, 6)
-    path = raw
+    path = raw = own_path(found, settings.pose)
+    constant = np.nan_to_num(filled([frame.pose for frame in found], "constant", 6, 6))
     if settings.filter is not None:
-        estimated = path_of(raw, [frame.estimated for frame in found])
-        path = filter_path(raw, settings.filter, constant) if anew else estimated
-    return LocalisedFrames(path, raw, constant, settings.shutter or RollingShutter(0.0))
+        estimated = [frame.estimated for frame in found]
+        path = filter_path(raw, settings.filter, constant) if anew else path_of(raw, estimated)
+    return LocalisedVideo(path, raw, constant, settings.shutter or RollingShutter(0.0), marker_map)
 
 
 def _motions_around(
@@ -136,7 +141,7 @@ def _motions_around(
 ) -> Callable[[float], MotionAround | None]:
     """The motion around each frame, by splines through the smoothed poses."""
     times = np.array([frame.time_s for frame in found])
-    smoothed = smoothed_motions(times, [frame.own() for frame in found], params)
+    smoothed = smoothed_motions(times, [frame.pose for frame in found], params)
     known = {time_s: one.motion for time_s, one in zip(times.tolist(), smoothed, strict=True) if one.motion}
     if not known:
         return lambda time_s: None

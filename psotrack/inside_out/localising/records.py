@@ -36,49 +36,40 @@ class LocaliseSettings:
 
 
 @dataclass(frozen=True)
-class LocalisedFrames:
-    """Path of a camera in frames whose markers are detected.
+class LocalisedVideo:
+    """Path of a camera in a video, or in frames whose markers are detected.
 
     Attributes:
         path: filtered path; equal to `raw` without a filter.
         raw: path of each frame's own pose.
         constant: (frames, 6, 6), part of the covariances of `raw` by errors that are the same in all frames.
         shutter: the shutter with which the poses were estimated.
+        marker_map: the map; where only centres were given, with the corners that were found.
         line_time: the line time that the frames show; None if it was not estimated: in a stream, and without five
             consecutive frames that show enough markers.
         wrong_markers: ids of the markers that are not where the map has them; they were left out, unless most
             of the seen markers are wrong.
+        unknown_markers: ids of seen markers whose centres were given, but whose corners could not be found.
         interrupted: whether Ctrl-C ended a stream.
+        seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
+        wall_s: seconds from the first frame to the last.
     """
 
     path: CameraPath
     raw: CameraPath
     constant: Float[np.ndarray, "frames 6 6"]
     shutter: RollingShutter
+    marker_map: MarkerMap
     line_time: LineTime | None = None
     wrong_markers: tuple[int, ...] = ()
+    unknown_markers: tuple[int, ...] = ()
     interrupted: bool = False
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    wall_s: float = 0.0
 
     def smoothed(self, params: PoseFilterParams | None = None) -> CameraPath:
         """The path with every pose estimated from all frames."""
         return smooth(self.raw, params, self.constant)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocalisedVideo(LocalisedFrames):
-    """Path of a camera in a video, with the time that it took to compute.
-
-    Attributes:
-        marker_map: the map; where only centres were given, with the corners that were found.
-        seconds: seconds by stage of `STAGES`, summed over frames; stages run in parallel.
-        wall_s: seconds from the first frame to the last.
-        unknown_markers: ids of seen markers whose centres were given, but whose corners could not be found.
-    """
-
-    marker_map: MarkerMap
-    seconds: Mapping[str, float]
-    wall_s: float
-    unknown_markers: tuple[int, ...] = ()
 
     @property
     def frames_per_second(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -72,13 +73,8 @@ def localise_video(
         if isinstance(marker_map, MarkerCentres):
             marker_map, unknown, detected = _completed(source, marker_map, lens, detected, side_m)
         found = localise_frames(detected, marker_map, lens, settings, seconds)
-    return LocalisedVideo(
-        **vars(found),
-        marker_map=marker_map,
-        seconds=seconds,
-        wall_s=time.perf_counter() - began_s,
-        unknown_markers=unknown,
-    )
+    wall_s = time.perf_counter() - began_s
+    return replace(found, seconds=seconds, wall_s=wall_s, unknown_markers=unknown)
 
 
 def _completed(

@@ -29,8 +29,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.calibration import GATE, Bundle, BundleProblem, BundleState, spread_px, summed
 from psotrack.geometry import Camera, to_pixels_with_jacobian
 from psotrack.geometry.estimation import covariance_from_information
-from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings, outward
-from psotrack.inside_out.mapping.square_fitting import PlacedMarker
+from psotrack.inside_out.mapping.sightings import MarkerSightings, outward
+from psotrack.inside_out.marker_map import SQUARE, PlacedMarker
 
 #: Standard deviation of the inset, px: the effect of an error of 0.1 in the power, about 0.5, by which a camera encodes
 #: light.
@@ -90,7 +90,7 @@ class _KnownLens:
         return pixels, slopes, np.zeros((len(points_m), 2, 1))
 
 
-def adjust(
+def adjusted_roughly(
     sightings: MarkerSightings,
     markers: Mapping[int, PlacedMarker],
     T_cam_world: Float[np.ndarray, "views 4 4"],
@@ -98,62 +98,18 @@ def adjust(
     *,
     noise_px: float,
     estimate_sides: bool = False,
-) -> AdjustedMap:
-    """Adjust markers and views so that the projections agree with the measured corners.
-
-    The covariance includes noise that is independent in every frame, and errors that a marker's corner has in all
-    frames and that many frames do not average out. Both are estimated from the residuals.
+) -> Bundle:
+    """Markers and views whose projections agree with most of the measured corners, by a robust loss.
 
     Args:
         sightings: corners of these markers in these views.
-        markers: approximate markers.
+        markers: approximate markers, all that the sightings have.
         T_cam_world: approximate poses.
         fixed: ids of markers that do not move.
-        noise_px: approximate standard deviation of a corner along x and along y, to find outliers at the start.
+        noise_px: approximate standard deviation of a corner along x and along y.
         estimate_sides: whether the sides of markers that are not fixed are unknowns.
     """
-    bundle = _start(sightings, markers, T_cam_world, fixed, noise_px, estimate_sides).solved()
-    unknowns = bundle.problem.size + 6 * sightings.num_views
-    bundle, sigma_px = _without_outliers(bundle, unknowns)
-    rolling = _with_motion(sightings, bundle)
-    if rolling is not None:
-        moved, moved_px = _without_outliers(rolling, unknowns + 6 * sightings.num_views)
-        bundle, sigma_px = (moved, moved_px) if moved_px < sigma_px else (bundle, sigma_px)
-    inset_px = np.ravel(bundle.state.lenses)
-    return AdjustedMap(
-        _markers(markers, bundle.state),
-        bundle.state.T_cam_world,
-        inset_px,
-        bundle.distance_px,
-        bundle.used[:, 0],
-        _covariance(bundle, sightings),
-        sigma_px,
-    )
-
-
-def improved(
-    sightings: MarkerSightings,
-    markers: Mapping[int, PlacedMarker],
-    T_cam_world: Float[np.ndarray, "views 4 4"],
-    fixed: Collection[int],
-    *,
-    noise_px: float,
-    estimate_sides: bool = False,
-) -> tuple[dict[int, PlacedMarker], Float[np.ndarray, "views 4 4"]]:
-    """The markers and the poses, adjusted with the robust loss alone: faster, for what is adjusted again."""
-    bundle = _start(sightings, markers, T_cam_world, fixed, noise_px, estimate_sides).solved()
-    return _markers(markers, bundle.state), bundle.state.T_cam_world
-
-
-def _start(
-    sightings: MarkerSightings,
-    markers: Mapping[int, PlacedMarker],
-    T_cam_world: Float[np.ndarray, "views 4 4"],
-    fixed: Collection[int],
-    noise_px: float,
-    estimate_sides: bool,
-) -> Bundle:
-    ids, videos = np.array(sorted(markers)), len(sightings.lenses)
+    ids, videos = np.array(sightings.ids), len(sightings.lenses)
     free = np.tile(np.array([True] * 6 + [estimate_sides]), (len(ids), 1))
     free[np.isin(ids, list(fixed))] = False
     views = np.bincount(sightings.lens, minlength=videos)
@@ -173,15 +129,40 @@ def _start(
         is_whole=True,
         inward=-outward(sightings),
     )
-    targets = np.array([markers[marker].T_world_marker for marker in ids.tolist()])
-    sides = np.array([markers[marker].side_m for marker in ids.tolist()])
+    targets = np.array([markers[marker].T_world_marker for marker in sightings.ids])
+    sides = np.array([markers[marker].side_m for marker in sightings.ids])
     state = BundleState((np.zeros(1),) * videos, T_cam_world, targets, sides)
-    return Bundle(problem, state, np.ones(sightings.corners_px.shape[:2], bool), is_robust=True)
+    return Bundle(problem, state, np.ones(sightings.corners_px.shape[:2], bool), is_robust=True).solved()
 
 
-def _markers(ids: Collection[int], state: BundleState) -> dict[int, PlacedMarker]:
-    rows = zip(sorted(ids), state.T_world_target, state.size.tolist(), strict=True)
+def markers_of(sightings: MarkerSightings, bundle: Bundle) -> dict[int, PlacedMarker]:
+    """The markers of a bundle, by id."""
+    state = bundle.state
+    rows = zip(sightings.ids, state.T_world_target, state.size.tolist(), strict=True)
     return {marker: PlacedMarker(T, side_m) for marker, T, side_m in rows}
+
+
+def adjust(sightings: MarkerSightings, bundle: Bundle) -> AdjustedMap:
+    """Adjust a rough bundle without outliers, and with the motion during the frames where shutters roll.
+
+    The covariance includes noise that is independent in every frame, and errors that a marker's corner has in all
+    frames and that many frames do not average out. Both are estimated from the residuals.
+    """
+    unknowns = bundle.problem.size + 6 * sightings.num_views
+    bundle, sigma_px = _without_outliers(bundle, unknowns)
+    rolling = _with_motion(sightings, bundle)
+    if rolling is not None:
+        moved, moved_px = _without_outliers(rolling, unknowns + 6 * sightings.num_views)
+        bundle, sigma_px = (moved, moved_px) if moved_px < sigma_px else (bundle, sigma_px)
+    return AdjustedMap(
+        markers_of(sightings, bundle),
+        bundle.state.T_cam_world,
+        np.ravel(bundle.state.lenses),
+        bundle.distance_px,
+        bundle.used[:, 0],
+        _covariance(bundle, sightings),
+        sigma_px,
+    )
 
 
 def _without_outliers(bundle: Bundle, unknowns: int) -> tuple[Bundle, float]:

@@ -14,11 +14,10 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, check_positive
 from psotrack.geometry import cross_matrices
-from psotrack.inside_out.mapping.adjusting import AdjustedMap, adjust
+from psotrack.inside_out.mapping.adjusting import AdjustedMap, adjust, adjusted_roughly
 from psotrack.inside_out.mapping.initial_map import MarkerPlacer
-from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings
-from psotrack.inside_out.mapping.square_fitting import PlacedMarker, fit_square
-from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.mapping.sightings import MarkerSightings
+from psotrack.inside_out.marker_map import SQUARE, MarkerMap, PlacedMarker, fit_square
 
 #: Number of views for the initial map; the other views are used for markers that none of these shows.
 _FIRST_VIEWS = 100
@@ -115,8 +114,8 @@ def build_map(
     used = sightings
     while True:
         used, T = _connected(used, placed, T_before)
-        placed = {marker: placed[marker] for marker in used.ids}
-        adjusted = adjust(used, placed, T, fixed, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
+        rough = adjusted_roughly(used, placed, T, fixed, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
+        adjusted = adjust(used, rough)
         explained = {marker: adjusted.used[used.marker == marker].mean() for marker in used.ids}
         bad = [marker for marker, share in explained.items() if share < _EXPLAINED and marker not in fixed]
         if not bad:

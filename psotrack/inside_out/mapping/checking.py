@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,12 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import spread_px
 from psotrack.errors import InputError
-from psotrack.inside_out.mapping.adjusting import adjust, improved
+from psotrack.inside_out.mapping.adjusting import adjust, adjusted_roughly
 from psotrack.inside_out.mapping.building import BuiltMap, build_map
 from psotrack.inside_out.mapping.initial_map import MarkerPlacer
 from psotrack.inside_out.mapping.sightings import MarkerSightings
-from psotrack.inside_out.mapping.square_fitting import PlacedMarker, fit_square
-from psotrack.inside_out.marker_map import MarkerMap
+from psotrack.inside_out.marker_map import MarkerMap, PlacedMarker, fit_square
 
 #: Median residual of a suspect marker, as a multiple of the usual median residual.
 _SUSPECT = 4.0
@@ -101,6 +101,23 @@ class MapCheck:
     num_views: int
     not_in_map: tuple[int, ...]
 
+    def to_dict(self) -> dict[str, Any]:
+        """The result, fit for JSON."""
+        found = {marker: dict(vars(one)) for marker, one in self.differences.items()}
+        for one in found.values():
+            one |= {name: one[name].tolist() for name in ("moved_m", "std_m")}
+        counts = sorted(self.sightings.items())
+        return {
+            "findings": [{**vars(one), "markers": list(one.markers)} for one in self.findings],
+            "frames": self.num_views,
+            "noise_px": self.noise_px,
+            "not_in_map": list(self.not_in_map),
+            "markers": {
+                marker: {"frames": count, "residual_px": self.residual_px.get(marker)} | found.get(marker, {})
+                for marker, count in counts
+            },
+        }
+
 
 def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
     """Check a map against sightings.
@@ -129,20 +146,24 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
     suspects = [marker for marker, value in residual_px.items() if value > _SUSPECT * 1.18 * noise_px]
     differences: dict[int, MarkerDifference] = {}
     findings: list[MapFinding] = []
-    sound = len(residual_px) - len(suspects)
-    if 2 * sound <= len(residual_px) or noise_px > _NOISES_PX[0]:
-        message = f"the map as a whole does not fit the video: {sound} of {len(residual_px)} markers agree"
+    sound = [marker for marker in residual_px if marker not in suspects]
+    if 2 * len(sound) <= len(residual_px) or noise_px > _NOISES_PX[0]:
+        message = (
+            f"the map as a whole does not fit the video: {len(sound)} of {len(residual_px)} markers agree"
+        )
         remedy = "check that lens, dictionary and map are those of this room, and that no axis is mirrored"
         findings.append(MapFinding("map", (), f"{message} with one another", remedy))
     elif suspects:
-        known = {marker: marker_map.corners_m[marker] for marker in residual_px if marker not in suspects}
+        known = {marker: marker_map.corners_m[marker] for marker in sound}
         built = build_map(sightings, known, estimate_sides=True)
-        placed = {
-            marker: fit_square(built.marker_map.corners_m[marker])
-            for marker, count in zip(built.ids.tolist(), built.sightings, strict=True)
-            if marker in suspects and count >= _LEAST_FRAMES
+        rows = {marker: row for row, marker in enumerate(built.ids.tolist())}
+        rows = {
+            one: rows[one] for one in suspects if one in rows and built.sightings[rows[one]] >= _LEAST_FRAMES
         }
-        differences = {marker: _difference(built, marker, given[marker]) for marker in placed}
+        placed = {marker: fit_square(built.marker_map.corners_m[marker]) for marker in rows}
+        differences = {
+            marker: _difference(built, row, given[marker], placed[marker]) for marker, row in rows.items()
+        }
         findings = _find_faults(given, placed, differences, {one: residual_px[one] for one in suspects})
     counts = {marker: int((sightings.marker == marker).sum()) for marker in given}
     found = (tuple(findings), counts, residual_px, differences)
@@ -155,17 +176,15 @@ def _distances_by_map(
     """Distances in the image in views that agree with most markers, with all markers where the map has them."""
     placer, T = MarkerPlacer(sightings, 1.0), None
     markers = {marker: given[marker] for marker in sightings.ids}
-    for noise_px in _NOISES_PX:
+    for noise_px in (*_NOISES_PX, _NOISES_PX[-1]):
         # Near the end, a view in a wrong pose may find a better one.
-        T = placer.locate_views(markers, T).T[:, 0]
-        _, T = improved(sightings, markers, T, sightings.ids, noise_px=noise_px)
-    T = placer.locate_views(markers, T).T[:, 0]
-    return adjust(sightings, markers, T, sightings.ids, noise_px=_NOISES_PX[-1]).residual_px
+        views = placer.locate_views(markers, T).T[:, 0]
+        rough = adjusted_roughly(sightings, markers, views, sightings.ids, noise_px=noise_px)
+        T = rough.state.T_cam_world
+    return adjust(sightings, rough).residual_px
 
 
-def _difference(built: BuiltMap, marker: int, given: PlacedMarker) -> MarkerDifference:
-    found = fit_square(built.marker_map.corners_m[marker])
-    row = built.ids.tolist().index(marker)
+def _difference(built: BuiltMap, row: int, given: PlacedMarker, found: PlacedMarker) -> MarkerDifference:
     moved = found.T_world_marker @ np.linalg.inv(given.T_world_marker)
     return MarkerDifference(
         found.T_world_marker[:3, 3] - given.T_world_marker[:3, 3],
@@ -183,33 +202,27 @@ def _find_faults(
     suspects: Mapping[int, float],
 ) -> list[MapFinding]:
     """Faults of suspect markers, which have these residuals in pixels; two exchanged markers are one fault."""
-    findings, done = [], set()
+    findings = []
+    at = {
+        marker: next((other for other, one in given.items() if _are_together(found, one)), marker)
+        for marker, found in placed.items()
+    }
     for marker, off_px in suspects.items():
-        if marker in done:
-            continue
-        if marker not in placed:
+        other = at.get(marker)
+        if other is None:
             message = f"marker {marker}: it is {off_px:.1f} px off where the map has it"
             remedy = "too few frames show it beside others to tell where it is: film it with them, or measure it again"
             findings.append(MapFinding("disagrees", (marker,), message, remedy))
-            continue
-        found, shift_m = placed[marker], float(np.linalg.norm(differences[marker].moved_m))
-        there = (other for other, one in given.items() if other != marker and _are_together(found, one))
-        other = next(there, None)
-        if other is not None and other in placed and _are_together(placed[other], given[marker]):
-            done.add(other)
+        elif other == marker:
+            findings += _own_fault(marker, given[marker], placed[marker], differences[marker])
+        elif at.get(other) != marker:
+            message = f"marker {marker}: it is where the map has marker {other}"
+            remedy = "correct its id, in the map or on the wall"
+            findings.append(MapFinding("exchanged", (marker, other), message, remedy))
+        elif marker < other:
             message = f"markers {marker} and {other}: each is where the map has the other one"
             remedy = "exchange their ids in the map, or on the wall"
             findings.append(MapFinding("exchanged", (marker, other), message, remedy))
-        elif (turned := _counted_wrongly(marker, given[marker], found)) is not None:
-            findings.append(turned)
-        elif other is not None:
-            message = (
-                f"marker {marker}: it is where the map has marker {other}, {shift_m:.2f} m from its own place"
-            )
-            remedy = "correct its id, in the map or on the wall"
-            findings.append(MapFinding("exchanged", (marker, other), message, remedy))
-        elif (moved := _moved(marker, given[marker], found, differences[marker])) is not None:
-            findings.append(moved)
     return findings
 
 
@@ -220,30 +233,27 @@ def _are_together(one: PlacedMarker, other: PlacedMarker) -> bool:
     return bool(is_near and T[:3, 2] @ T_other[:3, 2] > 0)
 
 
-def _counted_wrongly(marker: int, given: PlacedMarker, found: PlacedMarker) -> MapFinding | None:
-    """The fault of a marker at its place whose corners are counted from another one, or backwards."""
+def _own_fault(
+    marker: int, given: PlacedMarker, found: PlacedMarker, by: MarkerDifference
+) -> list[MapFinding]:
+    """The fault of a marker that is not at another one's place: its corners' order, or its place, turn or size.
+
+    Empty if the differences are usual.
+    """
     T = np.linalg.inv(given.T_world_marker) @ found.T_world_marker
-    if np.linalg.norm(T[:3, 3]) >= _SAME_PLACE * given.side_m:
-        return None
-    if T[2, 2] < -np.sqrt(0.5):
-        message = f"marker {marker}: the map counts its corners backwards, so that it faces the wall"
-        remedy = "count them clockwise as seen from the room, from the marker's own top left"
-        return MapFinding("backwards", (marker,), message, remedy)
-    clockwise_deg = float(np.rad2deg(np.arctan2(T[0, 1], T[0, 0])))
-    quarter = round(clockwise_deg / 90) % 4
-    rest_deg = abs((clockwise_deg - 90 * quarter + 180) % 360 - 180)
-    if not quarter or rest_deg > _QUARTER_DEG or T[2, 2] < np.cos(np.deg2rad(_QUARTER_DEG)):
-        return None
-    message = f"marker {marker}: the map counts its corners from another one, {90 * quarter} degrees around"
-    remedy = (
-        f"what the map calls corner {quarter + 1} is corner 1, the marker's own top left; or hang it upright"
-    )
-    return MapFinding("corner order", (marker,), message, remedy)
-
-
-def _moved(marker: int, given: PlacedMarker, found: PlacedMarker, by: MarkerDifference) -> MapFinding | None:
-    """The fault of a marker that is elsewhere, turned or of another size; None if the differences are usual."""
-    shift_m, std_m = float(np.linalg.norm(by.moved_m)), float(np.linalg.norm(by.std_m))
+    turn, shift_m = Rotation.from_matrix(T[:3, :3]), float(np.linalg.norm(by.moved_m))
+    if shift_m < _SAME_PLACE * given.side_m:
+        if T[2, 2] < -np.sqrt(0.5):
+            message = f"marker {marker}: the map counts its corners backwards, so that it faces the wall"
+            remedy = "count them clockwise as seen from the room, from the marker's own top left"
+            return [MapFinding("backwards", (marker,), message, remedy)]
+        for quarter in (1, 2, 3):
+            rest = Rotation.from_euler("z", 90 * quarter, degrees=True) * turn
+            if rest.magnitude() < np.deg2rad(_QUARTER_DEG):
+                message = f"marker {marker}: the map counts its corners from another one, {90 * quarter} degrees around"
+                remedy = f"what the map calls corner {quarter + 1} is corner 1, its own top left; or hang it upright"
+                return [MapFinding("corner order", (marker,), message, remedy)]
+    std_m = float(np.linalg.norm(by.std_m))
     faults = {}
     if shift_m > max(_SHIFT_M, _SIGNIFICANT * std_m):
         place = ", ".join(f"{value:.3f}" for value in found.T_world_marker[:3, 3])
@@ -254,11 +264,9 @@ def _moved(marker: int, given: PlacedMarker, found: PlacedMarker, by: MarkerDiff
         faults["turned"] = f"turned by {by.turned_deg:.1f} degrees, give or take {by.turn_std_deg:.1f}"
     if abs(by.grown - 1) > _SIDE_CHANGE:
         faults["side"] = f"{1e3 * found.side_m:.0f} mm wide, not {1e3 * given.side_m:.0f} mm"
-    if not faults:
-        return None
     remedy = "measure it again; `psotrack onboard map --known` with sound markers builds a map from the video"
     message = f"marker {marker}: it is {' and '.join(faults.values())}"
-    return MapFinding(next(iter(faults)), (marker,), message, remedy)
+    return [MapFinding(next(iter(faults)), (marker,), message, remedy)] if faults else []
 
 
 def _metres(length_m: float) -> str:

@@ -17,7 +17,7 @@ from psotrack.errors import InputError
 from psotrack.foreground.markers import DetectedMarkers
 from psotrack.geometry import Camera
 from psotrack.inside_out.mapping.building import build_map, corners_in_own_frame
-from psotrack.inside_out.mapping.sightings import MOST_FRAMES, FrameMarkers, collect_sightings
+from psotrack.inside_out.mapping.sightings import MOST_FRAMES, collect_sightings
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
 from psotrack.support import similarity
 
@@ -61,11 +61,7 @@ def complete_map(
         InputError: too few markers of the table are seen beside one another, or they do not fit.
     """
     known = [one.select(np.isin(one.ids, centres.ids)) for one in frames]
-    several = [
-        FrameMarkers(0, float(number), one.ids, np.asarray(one.corners_px, np.float64))
-        for number, one in enumerate(known)
-        if len(one) > 1
-    ]
+    several = [(0, float(number), one) for number, one in enumerate(known) if len(one) > 1]
     several = several[:: max(1, -(-len(several) // MOST_FRAMES))]
     sightings = collect_sightings(several, [lens], name) if several else None
     ids: list[int] = [] if sightings is None else sightings.ids
@@ -112,23 +108,17 @@ def _fit(
 
     Least median of squares over triples (P. J. Rousseeuw, 1984), then least squares of the points that fit.
     """
+
+    def left_by(rows: np.ndarray) -> tuple[Float[np.ndarray, " markers"], float, Float[np.ndarray, "3 3"]]:
+        scale, R, shift_m = similarity(from_m[rows], to_m[rows], with_scale=with_scale)
+        return np.linalg.norm(scale * from_m @ R.T + shift_m - to_m, axis=1), scale, R
+
     rng = np.random.default_rng(0)
-    triples = [rng.choice(len(from_m), 3, replace=False) for _ in range(_TRIPLES)]
-    tried = [_distances(from_m, to_m, rows, with_scale) for rows in triples]
+    tried = [left_by(rng.choice(len(from_m), 3, replace=False)) for _ in range(_TRIPLES)]
     distance_m, scale, R = min(tried, key=lambda one: float(np.median(one[0])))
     for _ in range(3):
         # The median of the length of a vector with three normal components is 1.54 standard deviations.
         spread_m = float(np.median(distance_m)) / 1.54
         fits = distance_m <= GATE * np.hypot(spread_m, scale * std_m)
-        distance_m, scale, R = _distances(from_m, to_m, np.flatnonzero(fits), with_scale)
+        distance_m, scale, R = left_by(np.flatnonzero(fits))
     return fits, scale, R
-
-
-def _distances(
-    from_m: Float[np.ndarray, "markers 3"],
-    to_m: Float[np.ndarray, "markers 3"],
-    rows: np.ndarray,
-    with_scale: bool,
-) -> tuple[Float[np.ndarray, " markers"], float, Float[np.ndarray, "3 3"]]:
-    scale, R, shift_m = similarity(from_m[rows], to_m[rows], with_scale=with_scale)
-    return np.linalg.norm(scale * from_m @ R.T + shift_m - to_m, axis=1), scale, R

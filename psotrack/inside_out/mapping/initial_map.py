@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.geometry import NEAR_M
-from psotrack.inside_out.mapping.adjusting import improved
-from psotrack.inside_out.mapping.sightings import SQUARE, MarkerSightings, square_poses
-from psotrack.inside_out.mapping.square_fitting import PlacedMarker
+from psotrack.inside_out.mapping.adjusting import adjusted_roughly, markers_of
+from psotrack.inside_out.mapping.sightings import MarkerSightings, square_poses
+from psotrack.inside_out.marker_map import SQUARE, PlacedMarker
 
 #: Number of sightings from which candidates of a marker's pose are taken, and in which they are compared.
 _COMPARED_SIGHTINGS = 24
@@ -127,15 +127,15 @@ class MarkerPlacer:
             kept = np.isin(self.sightings.marker, list(placed)) & (views.count[self.sightings.view] >= 2)
             if kept.any():
                 part, rows = self.sightings.select(kept), np.unique(self.sightings.view[kept])
-                seen = {marker: placed[marker] for marker in part.ids}
-                better, T[rows] = improved(
+                bundle = adjusted_roughly(
                     part,
-                    seen,
+                    placed,
                     views.T[rows, 0],
                     known,
                     noise_px=noise_px,
                     estimate_sides=self._estimate_sides,
                 )
+                better, T[rows] = markers_of(part, bundle), bundle.state.T_cam_world
                 placed |= {marker: one for marker, one in better.items() if marker not in known}
 
     def _next_marker(self, views: ViewPoses, done: set[int]) -> int | None:

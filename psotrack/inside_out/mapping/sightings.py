@@ -12,34 +12,14 @@ from jaxtyping import Bool, Float, Int
 
 from psotrack.calibration import solve_pnp
 from psotrack.errors import InputError
-from psotrack.foreground.markers import MarkerDetector
+from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.geometry import Camera, undistort
+from psotrack.inside_out.marker_map import SQUARE
 from psotrack.recordings import VideoInfo, read_frames_at
 from psotrack.support import Report, no_progress
 
-#: Corners of a marker with sides of 1 in its own axes, x to its right, y up, z out of the print, in OpenCV's order.
-SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-
-
 #: Largest number of frames of a video that are searched.
 MOST_FRAMES = 300
-
-
-@dataclass(frozen=True)
-class FrameMarkers:
-    """Markers in one frame.
-
-    Attributes:
-        source: number of the video.
-        time_s: time of the frame in its video, seconds.
-        ids: (markers,).
-        corners_px: (markers, 4, 2), in the order of OpenCV's ArUco, pixels.
-    """
-
-    source: int
-    time_s: float
-    ids: Int[np.ndarray, " markers"]
-    corners_px: Float[np.ndarray, "markers 4 2"]
 
 
 @dataclass(frozen=True)
@@ -131,8 +111,7 @@ def find_sightings(
         for source, (video, _) in enumerate(videos):
             for number, frame in read_frames_at(video, numbers[source]):
                 gray = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8)
-                found = detectors[source].detect(gray)
-                seen.append(FrameMarkers(source, number / video.fps, found.ids, found.corners_px))
+                seen.append((source, number / video.fps, detectors[source].detect(gray)))
                 advance(1)
     name = ", ".join(str(video.path) for video, _ in videos)
     return collect_sightings(seen, [lens for _, lens in videos], name)
@@ -147,33 +126,37 @@ def _searched(num_frames: int, most: int) -> list[int]:
 
 
 def collect_sightings(
-    seen: Iterable[FrameMarkers], lenses: Sequence[Camera], name: str = "video"
+    seen: Iterable[tuple[int, float, DetectedMarkers]], lenses: Sequence[Camera], name: str = "video"
 ) -> MarkerSightings:
     """The sightings of frames. Two markers with one id in a frame are left out: at least one is misread.
+
+    Args:
+        seen: for each frame the number of its video, its time (seconds), and its markers.
+        lenses: lenses of the videos' cameras.
+        name: name of the videos, for messages.
 
     Raises:
         InputError: no frame shows a marker.
     """
-    views: list[tuple[int, float]] = []
-    rows: list[tuple[int, int, Float[np.ndarray, "4 2"]]] = []
-    for frame in seen:
-        ids, counts = np.unique(frame.ids, return_counts=True)
-        single = np.flatnonzero(np.isin(frame.ids, ids[counts == 1]))
-        rows += [
-            (len(views), int(frame.ids[row]), frame.corners_px[row].astype(np.float64)) for row in single
-        ]
-        if len(single):
-            views.append((frame.source, frame.time_s))
-    if not rows:
+    singles = ((source, time_s, found.of_single_ids()) for source, time_s, found in seen)
+    views = [one for one in singles if len(one[2])]
+    if not views:
         raise InputError(
             name,
             expected="frames that show markers",
             found="none in any frame",
             remedy="check that --dictionary names the printed markers",
         )
-    view, marker, corners_px = map(np.array, zip(*rows, strict=True))
-    source, time_s = map(np.array, zip(*views, strict=True))
-    return MarkerSightings(tuple(lenses), source, time_s, view, marker, corners_px, name)
+    source, time_s, found = zip(*views, strict=True)
+    return MarkerSightings(
+        tuple(lenses),
+        np.array(source),
+        np.array(time_s),
+        np.repeat(np.arange(len(views)), [len(one) for one in found]),
+        np.concatenate([one.ids for one in found]),
+        np.concatenate([one.corners_px for one in found]).astype(np.float64),
+        name,
+    )
 
 
 def outward(sightings: MarkerSightings) -> Float[np.ndarray, "sightings 4 2"]:

@@ -9,31 +9,6 @@ an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (
 variances of a recording); `rows` (the rolling shutter).
 """
 
-from psotrack.inside_out.pose.equations import Equations
-from psotrack.inside_out.pose.estimating import estimate_pose
-from psotrack.inside_out.pose.noise import estimate_noise
-from psotrack.inside_out.pose.records import CornerNoise, ExpectedPose, MarkerPose, PoseSettings
-from psotrack.inside_out.pose.rows import (
-    PosesAt,
-    RollingShutter,
-    at_middle_row,
-    row_times_s,
-    shift_of_rows,
-    spline_through,
-)
+import lazy_loader
 
-__all__ = [
-    "CornerNoise",
-    "Equations",
-    "ExpectedPose",
-    "MarkerPose",
-    "PoseSettings",
-    "PosesAt",
-    "RollingShutter",
-    "at_middle_row",
-    "estimate_noise",
-    "estimate_pose",
-    "row_times_s",
-    "shift_of_rows",
-    "spline_through",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,7 +20,7 @@ from psotrack.geometry import Camera, undistort
 from psotrack.inside_out.pose.equations import SeenMarkers
 from psotrack.inside_out.pose.fit import fit
 from psotrack.inside_out.pose.initial_poses import mirrored_poses, near_px, pose_of_all, poses_of_pairs
-from psotrack.inside_out.pose.records import CornerNoise, ExpectedPose, MarkerPose, PoseSettings
+from psotrack.inside_out.pose.records import CameraPose, CornerNoise, MarkerPose, PoseSettings
 
 #: Number of markers that suffices for a pose; in frames of fewer than eight markers, half of the markers suffice.
 _ENOUGH_MARKERS = 4
@@ -39,7 +39,7 @@ def estimate_pose(
     corners_m: Float[np.ndarray, "markers 4 3"],
     lens: Camera,
     settings: PoseSettings,
-    expected: ExpectedPose | None = None,
+    expected: CameraPose | None = None,
     *,
     std_px: Float[np.ndarray, " markers"] | None = None,
     map_std_m: Float[np.ndarray, " markers"] | None = None,
@@ -120,7 +120,7 @@ def _distinct(fits: Iterable[MarkerPose | None]) -> list[MarkerPose]:
     return found
 
 
-def _mahalanobis2(pose: MarkerPose, other: MarkerPose | ExpectedPose) -> tuple[float, float]:
+def _mahalanobis2(pose: MarkerPose, other: CameraPose) -> tuple[float, float]:
     """Squared Mahalanobis distance of two poses, and the log determinant of the sum of their covariances."""
     turn = Rotation.from_matrix(other.R_world_cam.T @ pose.R_world_cam).as_rotvec()
     apart = np.concatenate([pose.position_m - other.position_m, turn])
@@ -128,7 +128,7 @@ def _mahalanobis2(pose: MarkerPose, other: MarkerPose | ExpectedPose) -> tuple[f
     return float(apart @ np.linalg.solve(both, apart)), float(np.linalg.slogdet(both)[1])
 
 
-def _log_prior(pose: MarkerPose, expected: ExpectedPose | None) -> float:
+def _log_prior(pose: MarkerPose, expected: CameraPose | None) -> float:
     """Log density of a pose given the pose that motion predicts."""
     if expected is None:
         return 0.0

@@ -82,16 +82,17 @@ def fit(
     # The inset is an error of the measurement, so the reported distances are without the inset.
     off_px = found.residual_px.reshape(-1, 4, 2) + extra[0] * seen.inward
     by_shift, constant = _other_errors(found, covariance)
+    used = np.any(found.fits, axis=1)
     return MarkerPose(
         position_m,
         R_world_cam,
         covariance[:6, :6] + by_shift,
-        np.any(found.fits, axis=1),
-        float(np.sqrt(np.mean((off_px[found.fits] ** 2).sum(axis=-1)))),
-        0.0,
         constant,
-        found,
-        _log_evidence(seen, found, covariance[:6, :6]),
+        num_markers=int(used.sum()),
+        used=used,
+        reprojection_px=float(np.sqrt(np.mean((off_px[found.fits] ** 2).sum(axis=-1)))),
+        equations=found,
+        log_evidence=_log_evidence(seen, found, covariance[:6, :6]),
     )
 
 

@@ -56,45 +56,46 @@ class PoseSettings:
 
 
 @dataclass(frozen=True)
-class ExpectedPose:
-    """Pose of a camera as its motion predicts it.
-
-    Attributes:
-        position_m: (3,), the camera's centre, world, metres.
-        R_world_cam: (3, 3), camera to world.
-        covariance: (6, 6), as in `CameraPath`.
-    """
-
-    position_m: Float[np.ndarray, "3"]
-    R_world_cam: Float[np.ndarray, "3 3"]
-    covariance: Float[np.ndarray, "6 6"]
-
-
-@dataclass(frozen=True)
-class MarkerPose:
-    """Pose of a camera from the markers in one frame, with its uncertainty.
+class CameraPose:
+    """Pose of a camera, with its uncertainty.
 
     Attributes:
         position_m: (3,), the camera's centre, world, metres.
         R_world_cam: (3, 3), camera to world; camera axes x right, y down, z ahead.
         covariance: (6, 6), as in `CameraPath`: of the position along the world's axes (m) and of a small turn about the
             camera's axes (rad).
-        used: (markers,), True for the markers that the pose explains.
-        reprojection_px: root mean square distance, over the used corners, between image and projection, pixels.
+        constant: (6, 6), the part of the covariance by errors that are the same in all frames, such as those of the map
+            and of the focal length: no number of frames averages them out.
         ambiguity: probability that another pose is the right one, 0 to 1/2.
-        constant: (6, 6), the part of the covariance that comes from errors of the map and of the focal length, which
-            are the same in all frames.
-        equations: linear equations of the corners at this pose; None if unknown.
-        log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
+        num_markers: number of markers behind the pose.
     """
 
     position_m: Float[np.ndarray, "3"]
     R_world_cam: Float[np.ndarray, "3 3"]
     covariance: Float[np.ndarray, "6 6"]
+    constant: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
+    ambiguity: float = 0.0
+    num_markers: int = 0
+
+    @property
+    def varying(self) -> Float[np.ndarray, "6 6"]:
+        """(6, 6), covariance without the constant part."""
+        return self.covariance - self.constant
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerPose(CameraPose):
+    """Pose of a camera from the markers in one frame.
+
+    Attributes:
+        used: (markers,), True for the markers that the pose explains.
+        reprojection_px: root mean square distance, over the used corners, between image and projection, pixels.
+        equations: linear equations of the corners at this pose; None if unknown.
+        log_evidence: logarithm of the probability density of all corners, integrated over poses near this pose.
+    """
+
     used: Bool[np.ndarray, "markers"]
     reprojection_px: float
-    ambiguity: float
-    constant: Float[np.ndarray, "6 6"] = field(default_factory=lambda: np.zeros((6, 6)))
     equations: Equations | None = None
     log_evidence: float = 0.0
 
