@@ -133,7 +133,8 @@ def follow(
         if agility is None and pose is not None and len(recent) < _CHOICES[-1]:
             recent.append((time_s, pose))
             if len(recent) in _CHOICES:
-                model, run = choose_agility(*zip(*recent, strict=True), params), FilterRun()
+                times_s, poses = zip(*recent, strict=True)
+                model, run = choose_agility(times_s, poses, params), FilterRun()
                 for earlier_s, earlier in recent:
                     run = _stepped(run, earlier_s, earlier, params, model)
         spent_s["locate"] += located_s - predicted_s
