@@ -26,6 +26,9 @@ _REACH, _LEAST_REACH_PX = 0.7, 2.0
 _SPREADS, _BOWS = 3.0, 2.5
 #: Number of passes over the edges in grey levels, with ever smaller reach, and in linear light after them.
 _GREY_PASSES, _LIGHT_PASSES = 2, 2
+#: Factor of the smallest bend that counts, before the last pass: the edges of the first corners are inexact, and what
+#: blur mixes into them looks like a bend.
+_EARLY_BEND = 4.0
 #: Points along an edge at which it is measured, as fractions of its length. Near a corner the blur mixes two edges.
 _ALONG = np.linspace(0.15, 0.85, 16)
 #: Largest distance that a corner may move, in units of the first search distance.
@@ -99,6 +102,7 @@ def refine_corners(
             np.where(shown[..., None], points_px, 0.0),
             np.where(shown, height, 0.0),
             spread_px,
+            least_bend=1.0 if number == _GREY_PASSES + _LIGHT_PASSES - 1 else _EARLY_BEND,
         )
         fitted_px = distort_pixels(fitted.corners_px, lens)
         near = np.linalg.norm(fitted_px - corners_px, axis=-1) <= largest_move_px[:, None]

@@ -94,7 +94,9 @@ class FittedCorners:
     scatter_px: _Sides
 
 
-def fit_corners(near_px: _Corners, points_px: _Points, weight: _Weights, spread_px: _Sides) -> FittedCorners:
+def fit_corners(
+    near_px: _Corners, points_px: _Points, weight: _Weights, spread_px: _Sides, *, least_bend: float
+) -> FittedCorners:
     """Fit each side of quadrangles by a line, or by a parabola where it is bent, and intersect neighbouring sides.
 
     A parabola that the points do not require would only be less certain at its ends, and the corners are at the ends.
@@ -106,6 +108,7 @@ def fit_corners(near_px: _Corners, points_px: _Points, weight: _Weights, spread_
         weight: (markers, 4, points), 0 where a point is not measured.
         spread_px: (markers, 4), width of the transition that a point is measured from: nearer points have pixels and
             errors in common.
+        least_bend: factor of the smallest bend that counts as bent.
     """
     side = near_px[:, NEXT] - near_px
     length = np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
@@ -123,7 +126,7 @@ def fit_corners(near_px: _Corners, points_px: _Points, weight: _Weights, spread_
     curve, curve_variance = _fit_powers(place, off, weight, correlated, 3)
     bend = np.abs(curve[..., 2])
     bent = (bend > _BENT * np.sqrt(curve_variance[..., 2, 2])) & (
-        bend > _LEAST_BEND * wide + _BLURRED_BEND * wide**2 / half
+        bend > least_bend * (_LEAST_BEND * wide + _BLURRED_BEND * wide**2 / half)
     )
     powers = np.where(bent[..., None], curve, line)
     variance = np.where(bent[..., None, None], curve_variance, line_variance)
