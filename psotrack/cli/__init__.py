@@ -51,7 +51,7 @@ COMMANDS = commands_in(
             "sweep": "Track with every combination of a grid's settings, and keep one row per run.",
             "detect": "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, "
             "or as blobs of foreground.",
-            "cache": "List, check, prune and empty the cache of silhouettes and compiled programs.",
+            "cache": "List, prune and empty the cache of silhouettes and compiled programs.",
         },
         "On-board": {
             "onboard": "Localise drones by their own cameras, from ArUco markers of known place.",

@@ -1,8 +1,7 @@
-"""`psotrack cache`: list, check, prune and empty the cache of silhouettes and compiled programs."""
+"""`psotrack cache`: list, prune and empty the cache of silhouettes and compiled programs."""
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,6 @@ from msgspec import Meta
 from psotrack.cli.options import CACHE, cache_folder, running
 from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.errors import SettingsError
 
 if TYPE_CHECKING:
     from psotrack.foreground.silhouettes import CacheEntry
@@ -22,26 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is done with the entries, instead of listing them.
+    """What is removed; entries are listed otherwise.
 
     Attributes:
-        check: check every byte of the silhouettes, and name what is damaged; the exit code is then 2.
         older_than: remove entries that were not used for DAYS days.
         max_gb: then remove entries until the rest has at most GB gigabytes, those first that were used longest ago.
         empty: remove all entries.
-        dry_run: say what would be removed, and remove nothing.
     """
 
-    check: bool = False
     older_than: Annotated[float, Meta(ge=0, extra={"metavar": "DAYS"})] | None = None
     max_gb: Annotated[float, Meta(ge=0, extra={"metavar": "GB"})] | None = None
     empty: bool = False
-    dry_run: bool = False
-
-    @property
-    def removes(self) -> bool:
-        """Whether entries are removed."""
-        return self.empty or self.older_than is not None or self.max_gb is not None
 
 
 @click.command(cls=HelpfulCommand)
@@ -49,7 +38,7 @@ class Wanted:
 @CACHE
 @running(progress=False)
 def cache(output: Output, wanted: Wanted, cache: Path | None) -> None:
-    """List, check, prune and empty the cache of silhouettes and compiled programs.
+    """List, prune and empty the cache of silhouettes and compiled programs.
 
     The next run makes anew what is missing or damaged. A running command has read its silhouettes and is not disturbed.
     What psotrack did not put into the folder is left alone.
@@ -57,36 +46,15 @@ def cache(output: Output, wanted: Wanted, cache: Path | None) -> None:
     \b
     Examples:
       psotrack cache
-      psotrack cache --check --cache /shared/cache --json damaged.json
-      psotrack cache --older-than 30 --max-gb 20 --dry-run
+      psotrack cache --older-than 30 --max-gb 20
       psotrack cache --empty
     """
-    from psotrack.foreground.silhouettes import choose_to_prune, is_damaged, list_entries, remove_entry
+    from psotrack.foreground.silhouettes import choose_to_prune, list_entries, remove_entry
 
-    if wanted.check and wanted.removes:
-        raise SettingsError("--check", expected="no option that removes entries", found="one")
-    if wanted.dry_run and not wanted.removes:
-        raise SettingsError("--dry-run", expected="--older-than, --max-gb or --empty", found="none of them")
     folder, now_s = cache_folder(cache), time.time()
     entries = list_entries(folder)
     content: dict[str, Any] = {"cache": str(folder), "entries": [_described(each, now_s) for each in entries]}
-    if wanted.removes:
-        max_bytes = None if wanted.max_gb is None else 1e9 * wanted.max_gb
-        chosen = entries
-        if not wanted.empty:
-            chosen = choose_to_prune(entries, now_s, wanted.older_than, max_bytes)
-        for each in [] if wanted.dry_run else chosen:
-            remove_entry(each)
-        output.json({**content, "dry_run": wanted.dry_run, "removed": [str(each.path) for each in chosen]})
-        output.say(f"{folder}: {'would be removed' if wanted.dry_run else 'removed'}: {_counted(chosen)}")
-    elif wanted.check:
-        damaged = [str(each.path) for each in entries if is_damaged(each)]
-        output.json({**content, "damaged": damaged})
-        output.say(*(f"damaged: {path}" for path in damaged))
-        output.say(f"{folder}: {_counted(entries)}, {len(damaged)} damaged")
-        if damaged:
-            sys.exit(2)
-    else:
+    if wanted == Wanted():
         output.json(content)
         rows = (
             (each.path.name, each.video, f"{each.size_bytes / 1e6:.1f}", f"{_days(each, now_s):.1f}")
@@ -95,6 +63,13 @@ def cache(output: Output, wanted: Wanted, cache: Path | None) -> None:
         )
         output.table(("silhouettes", "video", "MB", "days unused"), rows)
         output.say(f"{folder}: {_counted(entries)}")
+        return
+    max_bytes = None if wanted.max_gb is None else 1e9 * wanted.max_gb
+    chosen = entries if wanted.empty else choose_to_prune(entries, now_s, wanted.older_than, max_bytes)
+    for each in chosen:
+        remove_entry(each)
+    output.json({**content, "removed": [str(each.path) for each in chosen]})
+    output.say(f"{folder}: removed: {_counted(chosen)}")
 
 
 def _counted(entries: list[CacheEntry]) -> str:

@@ -11,7 +11,6 @@ from msgspec import Meta
 from msgspec.structs import replace
 
 from psotrack.cli.options import (
-    DETECTOR_SIZE,
     SEQUENCE,
     Extent,
     beside,
@@ -24,6 +23,7 @@ from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.cli.settings import settings_options
 from psotrack.errors import SettingsError
+from psotrack.foreground.detection import DetectorSettings
 from psotrack.foreground.silhouettes import SilhouetteSettings
 from psotrack.settings import TrackSettings
 
@@ -53,26 +53,11 @@ class DetectOptions:
     masks: Annotated[Path, Meta(extra={"metavar": "FOLDER|FILE.mp4"})] | None = None
 
 
-@dataclass(frozen=True)
-class NetworkOptions:
-    """Settings of a network, as `psotrack.foreground.detection.DetectorSettings`, whose import takes long.
-
-    Attributes:
-        confidence: smallest score of a detection that is kept.
-        nms: intersection over union above which two boxes are taken for one drone.
-        size: side of the network's square input, in pixels.
-    """
-
-    confidence: float = 0.25
-    nms: float = 0.45
-    size: int = DETECTOR_SIZE
-
-
 @click.command(cls=HelpfulCommand)
 @SEQUENCE
 @options_of(DetectOptions, "what")
 @out_option("Folder of the detections.  [default: SEQ/results/detections]")
-@options_of(NetworkOptions, "network", heading="With --detector")
+@options_of(DetectorSettings, "network", heading="With --detector")
 @settings_options("silhouettes.background", "silhouettes.drone_px", part="silhouettes.")
 @extent_options
 @running()
@@ -81,7 +66,7 @@ def detect(
     sequence: Path,
     what: DetectOptions,
     out: Path | None,
-    network: NetworkOptions,
+    network: DetectorSettings,
     settings: dict[str, Any],
     extent: Extent,
 ) -> None:
@@ -143,11 +128,11 @@ def _write(output: Output, sequence: Path, recording: Recording, out: Path | Non
     )
 
 
-def _by_network(output: Output, recording: Recording, chosen: str, network: NetworkOptions) -> Any:
+def _by_network(output: Output, recording: Recording, chosen: str, network: DetectorSettings) -> Any:
     """Detections of each camera by a network, one camera after the other."""
-    from psotrack.foreground.detection import DetectorSettings, detect_drones, find_detector
+    from psotrack.foreground.detection import detect_drones, find_detector
 
-    detector = find_detector(chosen, DetectorSettings(**vars(network)))
+    detector = find_detector(chosen, network)
     for name, video in recording.videos.items():
         yield name, detect_drones(detector, name, video, report=output.report)
 

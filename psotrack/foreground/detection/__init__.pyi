@@ -1,12 +1,12 @@
 from .detector import (
     Detector,
-    DetectorSettings,
     OnnxDetector,
     detect_drones,
     find_detector,
     stored_detections,
 )
-from .training_data import DATA_SET, LabelSettings, box_corners, label_boxes, write_data_set
+from .settings import DetectorSettings, LabelSettings
+from .training_data import DATA_SET, box_corners, label_boxes, write_data_set
 
 __all__ = [
     "DATA_SET",

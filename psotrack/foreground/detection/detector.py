@@ -19,15 +19,15 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
-from msgspec import Meta
 
 from psotrack.errors import InputError, SettingsError
+from psotrack.foreground.detection.settings import DetectorSettings
 from psotrack.recordings import (
     Detections,
     Recording,
@@ -40,7 +40,6 @@ from psotrack.recordings import (
 from psotrack.support import (
     Report,
     check_file_name,
-    check_types,
     digest_file,
     digest_record,
     identify,
@@ -57,27 +56,6 @@ _GREY = (114, 114, 114)
 _V10_SHAPE = (300, 6)
 #: Largest excess of a score over 1 that is ignored as rounding.
 _ROUNDING = 1e-3
-
-
-class DetectorSettings(msgspec.Struct, frozen=True):
-    """Settings of the detection.
-
-    Attributes:
-        confidence: smallest confidence of a detection, in (0, 1].
-        nms: threshold of the non-maximum suppression, in (0, 1]: of boxes with a larger intersection over union, only
-            the box with the highest confidence is kept.
-        size: side of the network's square input, pixels.
-
-    Raises:
-        SettingsError: a value is out of range.
-    """
-
-    confidence: Annotated[float, Meta(gt=0, le=1)] = 0.25
-    nms: Annotated[float, Meta(gt=0, le=1)] = 0.45
-    size: Annotated[int, Meta(ge=1)] = 640
-
-    def __post_init__(self) -> None:
-        check_types(self)
 
 
 @runtime_checkable

@@ -11,26 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated
 
 import cv2
-import msgspec
 import numpy as np
 import yaml
 from jaxtyping import Float
-from msgspec import Meta
 
 from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.foreground.detection.settings import LabelSettings
 from psotrack.geometry import Camera, has_image, rotation_matrices, to_camera, to_pixels
 from psotrack.recordings import Recording, VideoInfo, read_frames_at
 from psotrack.support import (
     Advance,
-    Positive,
     Report,
-    Share,
     atomic_write,
     check_file_name,
-    check_types,
     map_in_processes,
     no_progress,
     refuse_to_overwrite,
@@ -38,31 +33,6 @@ from psotrack.support import (
 from psotrack.trajectories import Trajectories, resample
 
 _SIGNS = np.array(list(product((-0.5, 0.5), repeat=3)))
-
-
-class LabelSettings(msgspec.Struct, frozen=True):
-    """Settings of the labels.
-
-    Attributes:
-        drone_size_m: full lengths of a drone's box along the body's axes, metres; along the world's axes if the
-            reference has no orientations.
-        offset_m: vector from the reference's tracked point to the middle of the box, along the same axes, metres.
-        min_inside: smallest share of a box that must lie in the image.
-        max_hidden: largest share of the visible box that one nearer box may cover.
-        every: step between the frames that are used.
-
-    Raises:
-        SettingsError: a value is out of range.
-    """
-
-    drone_size_m: tuple[Positive, Positive, Positive]
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    min_inside: Share = 0.3
-    max_hidden: Share = 0.7
-    every: Annotated[int, Meta(ge=1)] = 1
-
-    def __post_init__(self) -> None:
-        check_types(self)
 
 
 def box_corners(truth: Trajectories, settings: LabelSettings) -> Float[np.ndarray, "frames drones 8 3"]:

@@ -1,5 +1,5 @@
 from .blobs import blob_detections, border_cells, find_blobs
-from .cache import CacheEntry, choose_to_prune, is_damaged, list_entries, remove_entry
+from .cache import CacheEntry, choose_to_prune, list_entries, remove_entry
 from .computation import (
     compute,
     find_background,
@@ -44,7 +44,6 @@ __all__ = [
     "find_blobs",
     "foreground_is_everywhere",
     "ignored_pixels",
-    "is_damaged",
     "is_whole",
     "learning_step",
     "list_entries",

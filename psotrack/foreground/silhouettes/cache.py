@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from psotrack.errors import InputError, OutputError
-from psotrack.foreground.silhouettes.store import CHUNKS, SEAL_FILE, is_whole
+from psotrack.foreground.silhouettes.store import CHUNKS, SEAL_FILE
 from psotrack.recordings import ARRAY_FILE
 from psotrack.support import left_over
 
@@ -60,11 +60,6 @@ def list_entries(cache: Path) -> list[CacheEntry]:
         raise InputError(cache, expected="a cache folder", found=found) from error
     entries = [entry for path in paths if (entry := _entry(path, is_left_over=path in killed)) is not None]
     return sorted(entries, key=lambda entry: entry.used_s)
-
-
-def is_damaged(entry: CacheEntry) -> bool:
-    """Whether silhouettes were changed or cut short after they were written; every byte is read."""
-    return entry.kind == "silhouettes" and not is_whole(entry.path)
 
 
 def choose_to_prune(
