@@ -35,7 +35,7 @@ SCENARIO = {
     "hall": "large_hall",
     "cameras": "laboratory_corners",
     "num_frames": NUM_FRAMES,
-    "imaging": {"reflections": 0.0, "contact_shadows": False},
+    "imaging": {"reflections": 0.0},
     "variation": {"centre_m": 0.0, "period": 0.0},
     "limits": {
         "max_speed_m_s": 3.2,

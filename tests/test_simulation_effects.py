@@ -13,7 +13,7 @@ from placed_drones import cube, drone_masks, pixel_of, straight_flight, with_dro
 from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.flights.motion import Heading
-from psotrack.simulation.imaging import reflections, sensor, shadows
+from psotrack.simulation.imaging import reflections, sensor
 from psotrack.simulation.scenarios import Imaging
 from psotrack.simulation.world.lighting import AMBIENT
 
@@ -23,7 +23,6 @@ PLAIN = Imaging(
     shutter_s=0.0,
     lens_blur_px=0.0,
     shadows=False,
-    contact_shadows=False,
     reflections=0.0,
     exposure_drift=0.0,
     white_balance_drift=0.0,
@@ -105,7 +104,6 @@ def test_without_effects_pixels_have_the_colour_of_the_room_or_of_a_drone(scene)
         ({"antialiasing": True}, "edges"),
         ({"lens_blur_px": 1.0}, "edges"),
         ({"shadows": True}, "floor"),
-        ({"contact_shadows": True}, "floor"),
         ({"reflections": 0.04}, "floor"),
     ],
 )
@@ -353,85 +351,31 @@ def test_shadows_dim_only_the_diffuse_light_of_the_floor(scene):
     assert gain.min() < 0.9
 
 
-# --- contact shadows
-
-
-@pytest.mark.parametrize("height_m", [0.06, 0.2, 0.6])
-def test_blocked_ambient_light_agrees_with_random_rays(height_m):
-    """Random rays from floor points have a cosine-weighted density (Malley's method)."""
-    cell_m, half = 0.02, 100
-    outline = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-    outline[half - 8 : half + 7, half - 3 : half + 13] = 0.6
-    low, high = np.array([-3.5, -8.5]) * cell_m, np.array([12.5, 6.5]) * cell_m  # (x, y) of the corners
-    blocked = shadows.ambient_blocked(outline, cell_m, height_m)
-    rng = np.random.default_rng(1)
-    radius, angle = np.sqrt(rng.uniform(size=200_000)), rng.uniform(0, 2 * np.pi, 200_000)
-    reach = height_m * radius / np.sqrt(1 - radius**2)
-    rays = np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=-1)
-    for column, row in ((0, 0), (5, -1), (13, 0), (20, 10), (-30, 4)):
-        at = rays + np.array([column, row]) * cell_m
-        expected = 0.6 * np.mean(np.all((at > low) & (at < high), axis=-1))
-        # 200,000 rays estimate a share with a standard error of 0.001; measured difference 0.0011 at most.
-        assert blocked[half + row, half + column] == pytest.approx(expected, abs=0.004)
-
-
-def test_the_blocked_share_below_a_disc_is_its_form_factor():
-    cell_m, half, radius_m, height_m = 0.02, 120, 0.3, 0.4
-    rows, columns = np.mgrid[-half : half + 1, -half : half + 1] * cell_m
-    disc = (np.hypot(rows, columns) < radius_m).astype(np.float32)
-    blocked = shadows.ambient_blocked(disc, cell_m, height_m)
-    # 0.01 corresponds to a third of a cell at the disc's edge.
-    assert blocked[half, half] == pytest.approx(radius_m**2 / (radius_m**2 + height_m**2), abs=0.01)
-
-
-def square_form_factor(side_m, height_m):
-    """Return the form factor of a horizontal square whose centre is straight above the point.
-
-    The form factor is four times the form factor of a quarter square, whose corner is straight above the point.
-    """
-    half = side_m / 2
-    slant = np.hypot(half, height_m)
-    return 4 * 2 * half / slant * np.arctan(half / slant) / (2 * np.pi)
-
-
-def test_contact_shadows_agree_with_the_form_factor_and_end_at_a_height(scene):
-    side_m, foot = 0.3, np.array([0.41, 0.21, 0.0])  # in the middle of a cell
-    all_light = scene.room.panels.on_faces(foot, np.array([[0.0, 0.0, 1.0]]))[0]
-    for height_m in (0.05, 0.15, 0.35, 0.7):
-        flying = hovering(cube(side_m), (*foot[:2], height_m + side_m / 2))
-        gain = make_renderer(scene, plain_imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
-        expected = 1 - AMBIENT / all_light * square_form_factor(side_m, height_m)
-        # The rasterised outline is up to one cell (0.01 m) wider, which is 7 % of the blocked light.
-        assert gain.min() == pytest.approx(expected, abs=0.08 * (1 - expected) + 0.002)
-    high = hovering(cube(side_m), (*foot[:2], 1.9))
-    assert (
-        make_renderer(scene, plain_imaging(contact_shadows=True), high).shadows.floor_gain(0.0).min() == 1.0
-    )
-
-
 def test_a_rotor_lets_three_quarters_of_the_light_through(scene):
-    radius_m, height_m, foot = 0.3, 0.3, np.array([0.41, 0.21, 0.0])
-    rotor = replace(cube(0.01), rotor_radii_m=np.array([radius_m]))
-    flying = hovering(rotor, (*foot[:2], height_m))
-    gain = make_renderer(scene, plain_imaging(contact_shadows=True), flying).shadows.floor_gain(0.0)
-    all_light = scene.room.panels.on_faces(foot, np.array([[0.0, 0.0, 1.0]]))[0]
-    expected = 1 - AMBIENT / all_light * 0.25 * radius_m**2 / (radius_m**2 + height_m**2)
-    # One cell of 0.01 m at the disc's edge is 7 % of the blocked light.
-    assert gain.min() == pytest.approx(expected, abs=0.08 * (1 - expected))
+    foot = np.array([[0.41, 0.21, 0.0]])
+    rotor = replace(cube(0.01), rotor_radii_m=np.array([0.3]))
+    flying = hovering(rotor, (*foot[0, :2], 0.05))
+    gain = make_renderer(scene, plain_imaging(shadows=True), flying).shadows.floor_gain(0.0)
+    panels, up = scene.room.panels, np.array([[0.0, 0.0, 1.0]])
+    direct = np.array([panels.direct(foot, up, lamp)[0] for lamp in panels.centres_m])
+    expected = np.prod(1 - 0.25 * direct / (direct.sum() + AMBIENT))
+    # Half way between the hub, which is solid, and the rim; the shadows of all lamps overlap there.
+    row, column = int((4.0 - 0.21) / 0.02), int((0.41 + 0.15 + 5.0) / 0.02)
+    assert gain[row, column] == pytest.approx(expected, abs=0.005)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.6, -1.1])
 def test_shadows_turn_with_their_drone(scene, yaw_rad):
     bar = replace(cube(0.3), triangles_m=cube(0.3).triangles_m * [2.0, 0.2, 0.2])
-    flight = replace(straight_flight((0.4, 0.2, 0.08)), heading=Heading(yaw_rad))
-    renderer = make_renderer(scene, plain_imaging(contact_shadows=True), (bar, flight, BLACK))
+    flight = replace(straight_flight((0.4, 0.2, 0.02)), heading=Heading(yaw_rad))
+    renderer = make_renderer(scene, plain_imaging(shadows=True), (bar, flight, BLACK))
     lost = 1 - renderer.shadows.floor_gain(0.0)
     assert lost.max() > 0.1
     # Row numbers of the floor's map grow in the direction of -y.
     rows, columns = np.indices(lost.shape)
     spread = np.cov(np.stack([columns, -rows]).reshape(2, -1), aweights=lost.ravel())
     angle_rad = np.arctan2(2 * spread[0, 1], spread[0, 0] - spread[1, 1]) / 2
-    # The bar covers 30 x 3 cells; the tolerance covers the rasterisation of its axis.
+    # The bar covers 30 x 3 cells; the tolerance covers the rasterisation of its axis, and lamps 1.5 cm apart.
     assert angle_rad == pytest.approx(yaw_rad, abs=0.02)
 
 

@@ -221,7 +221,7 @@ def test_masks_of_one_camera_are_disjoint_and_boxes_bound_them(scene):
 
 def test_masks_and_frames_agree():
     """Without shadows, reflections and noise, a frame differs from the empty room exactly inside the masks."""
-    plain = {"shadows": False, "contact_shadows": False, "reflections": 0, "exposure_drift": 0, "flicker": 0}
+    plain = {"shadows": False, "reflections": 0, "exposure_drift": 0, "flicker": 0}
     plain |= {"white_balance_drift": 0, "read_noise": 0, "shot_noise": 0, "shutter_s": 0, "lens_blur_px": 0}
     recipe = change_scenario(S02, {f"imaging.{field}": value for field, value in plain.items()})
     recipe = change_scenario(recipe, {f"drones[{i}].paint_bgr": [0.0, 0.0, 0.9] for i in range(4)})

@@ -41,7 +41,7 @@ CORNERS = 0.03 * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in 
 @pytest.fixture(scope="module")
 def scene():
     """A small scene without blur, motion and shadows."""
-    effects = {"shutter_s": 0.0, "lens_blur_px": 0.0, "shadows": False, "contact_shadows": False}
+    effects = {"shutter_s": 0.0, "lens_blur_px": 0.0, "shadows": False}
     imaging = msgspec.structs.replace(S02.imaging, reflections=0.0, **effects)
     return build(msgspec.structs.replace(S02, imaging=imaging), scale=0.25)
 

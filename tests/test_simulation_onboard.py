@@ -6,8 +6,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from placed_drones import cube, straight_flight, with_drones
 from scipy.spatial.transform import Rotation
 
@@ -16,10 +14,11 @@ from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.imaging import backdrop, raster, sensor
 from psotrack.simulation.imaging.onboard import OnboardRenderer, intrinsics, onboard_poses
-from psotrack.simulation.imaging.painter import LIGHT_UNIT, Order, RoomPainter
+from psotrack.simulation.imaging.painter import LIGHT_UNIT, RoomPainter
 from psotrack.simulation.imaging.shadows import FloorLight
 from psotrack.simulation.scenarios import OnboardCamera
-from psotrack.simulation.world.rooms import MARKER_DICTIONARY, Surface
+from psotrack.simulation.world.halls import HALLS
+from psotrack.simulation.world.rooms import MARKER_DICTIONARY, room
 
 S02 = scenario("S02_D4_A")
 BLACK = (0.0, 0.0, 0.0)
@@ -56,7 +55,7 @@ def scene_with_onboard_camera(scene, flight, *placed, **onboard):
         placed: further drones, each as (side in metres, flight).
         onboard: fields of `OnboardCamera`.
     """
-    imaging = msgspec.structs.replace(scene.scenario.imaging, shadows=False, contact_shadows=False)
+    imaging = msgspec.structs.replace(scene.scenario.imaging, shadows=False)
     recipe = msgspec.structs.replace(scene.scenario, imaging=imaging, onboard=OnboardCamera(**onboard))
     return with_drones(
         replace(scene, scenario=recipe),
@@ -170,50 +169,25 @@ def test_the_painted_room_agrees_with_a_depth_buffer(scene, drone, frame):
     assert (floor != (number == 0)).mean() < 2e-4
 
 
-def random_rectangles(rng, num):
-    """Make rectangles with random positions and directions, which may intersect each other."""
-    found = []
-    for turn in Rotation.random(num, rng=rng).as_matrix():
-        along, down = turn[:2] * rng.uniform(0.5, 3.0, (2, 1))
-        found.append(Surface(rng.uniform(-2, 2, 3), along, down, np.zeros((2, 2, 3), np.float32)))
-    return found
-
-
-@given(seed=st.integers(0, 10**6), num=st.integers(1, 8))
-def test_pieces_are_ordered_from_far_to_near_along_every_ray(seed, num):
-    """The oracle intersects a ray with each piece; distances must decrease in the drawing order."""
-    rng = np.random.default_rng(seed)
-    surfaces = random_rectangles(rng, num)
-    order = Order(surfaces)
-    eye = rng.uniform(-3, 3, 3)
-    # Each ray passes through a point of a rectangle, so it meets at least that rectangle.
-    inside = [s.corner_m + rng.uniform(0, 1) * s.along_m + rng.uniform(0, 1) * s.down_m for s in surfaces]
-    for target in inside:
-        ray = target - eye
-        distances = []
-        for index in order.far_to_near(eye):
-            piece = order.pieces[index]
-            normal = surfaces[piece.surface].normal
-            at = normal @ (piece.corners_m[0] - eye) / (normal @ ray)
-            sides = np.cross(
-                np.roll(piece.corners_m, -1, axis=0) - piece.corners_m, eye + at * ray - piece.corners_m
-            )
-            if at > 1e-9 and (np.all(sides @ normal >= 0) or np.all(sides @ normal <= 0)):
-                distances.append(at)
-        assert distances, "the ray meets at least its target"
-        assert np.all(np.diff(distances) <= 1e-9)
-
-
-@given(seed=st.integers(0, 10**6), num=st.integers(1, 8))
-def test_the_pieces_of_a_surface_have_its_area(seed, num):
-    surfaces = random_rectangles(np.random.default_rng(seed), num)
-    area = np.zeros(num)
-    for piece in Order(surfaces).pieces:
-        a, b = piece.corners_m[1:-1] - piece.corners_m[0], piece.corners_m[2:] - piece.corners_m[0]
-        area[piece.surface] += np.linalg.norm(np.cross(a, b), axis=-1).sum() / 2
-    expected = [np.linalg.norm(np.cross(s.along_m, s.down_m)) for s in surfaces]
-    # The tolerance covers pieces thinner than a micrometre, which may be dropped.
-    np.testing.assert_allclose(area, expected, atol=1e-4)
+@pytest.mark.parametrize("hall", HALLS)
+def test_a_hall_is_painted_from_far_to_near_wherever_the_eye_is(hall):
+    surfaces = room(hall, True, 0.1).surfaces
+    painter, rng = RoomPainter(surfaces), np.random.default_rng(0)
+    ahead = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    for _ in range(20):
+        eye_m = rng.uniform([-0.4, -0.4, 0.3], [0.4, 0.4, 0.9]) * HALLS[hall].size_m
+        R = (
+            ahead
+            @ Rotation.from_euler("zyx", rng.uniform([0, -0.5, -0.5], [2 * np.pi, 0.5, 0.5])).as_matrix()
+        )
+        cam = raster.Pinhole(R, -R @ eye_m, np.array([[92.0, 0, 95.5], [0, 92, 53.5], [0, 0, 1]]), 192, 108)
+        painted = np.empty((cam.height, cam.width, 4), np.uint16)
+        painter.paint(raster.full_view(cam), painted)
+        expected = backdrop.render_light(surfaces, cam, antialiasing=False)
+        difference = np.abs(painted[..., :3] / LIGHT_UNIT - expected).max(axis=-1)
+        wrong = cv2.morphologyEx((difference > 0.2).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2)))
+        # Without single pixels on edges, where the reduced textures differ; measured at most 3.9e-4.
+        assert wrong.mean() < 1e-3
 
 
 def test_colours_agree_with_a_fixed_camera_at_the_same_pose(scene):
@@ -331,7 +305,6 @@ def test_drones_cast_shadows_on_the_visible_floor(scene):
     )
     imaging = scene.scenario.imaging
     assert imaging.shadows
-    assert imaging.contact_shadows
     shaded = replace(plain, scenario=msgspec.structs.replace(plain.scenario, imaging=imaging))
     without, with_them = OnboardRenderer(plain, 0), OnboardRenderer(shaded, 0)
     before, after = (

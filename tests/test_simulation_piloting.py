@@ -4,7 +4,7 @@ import functools
 import re
 import signal
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError, SettingsError, install_command
 from psotrack.simulation import flight_space
 from psotrack.simulation.flights import devices
-from psotrack.simulation.flights.devices import Gamepad, Panel, Pilot, Script, key_sticks, open_device
+from psotrack.simulation.flights.devices import Gamepad, Panel, flying, key_sticks, open_device, poll
 from psotrack.simulation.flights.motion import Heading
 from psotrack.simulation.flights.piloting import (
     DYNAMICS,
@@ -25,7 +25,6 @@ from psotrack.simulation.flights.piloting import (
     Sticks,
     fly,
     read_sticks,
-    until,
     write_sticks,
 )
 from psotrack.simulation.flights.recordings import read_recorded_flight, recorded_flight
@@ -46,7 +45,7 @@ MOST_M_S2 = np.hypot(
 def record_flight(*rows, space=LABORATORY, start_m=START_M, **settings):
     """Fly rows of (time, sticks) and return the recorded flight."""
     samples = [Sample(float(time_s), Sticks(*sticks)) for time_s, *sticks in rows]
-    return fly(samples, start_m, space, **settings).recorded
+    return fly(samples, start_m, space, **settings)[0]
 
 
 def velocity_and_acceleration(recorded):
@@ -257,8 +256,10 @@ def test_stick_times_must_increase_and_a_flight_needs_six_samples():
 
 def test_a_flight_ends_at_the_maximum_duration():
     samples = [Sample(0.0, Sticks(1.0)), Sample(1.0, Sticks(0.5)), Sample(2.0, Sticks())]
-    assert list(until(samples, 1.5)) == [*samples[:2], Sample(1.5, Sticks(0.5))]
-    assert list(until(samples, 3.0)) == samples
+    recorded, used = fly(samples, START_M, LABORATORY, max_s=1.5)
+    assert used == (*samples[:2], Sample(1.5, Sticks(0.5)))
+    assert recorded.duration_s == pytest.approx(1.48)
+    assert fly(samples, START_M, LABORATORY, max_s=3.0)[1] == tuple(samples)
 
 
 def test_a_recorded_flight_is_replayed_exactly(tmp_path):
@@ -295,8 +296,8 @@ SCRIPT = (Sample(0.0, Sticks(1.0, -0.5, 0.1, 0.0)), Sample(1 / 3, Sticks(turn=-1
 def test_written_sticks_are_read_back_exactly(tmp_path):
     write_sticks(tmp_path / "s.csv", SCRIPT)
     assert read_sticks(tmp_path / "s.csv") == SCRIPT
-    with open_device(str(tmp_path / "s.csv"), LABORATORY) as device:
-        assert list(device.samples()) == list(SCRIPT)
+    with open_device(str(tmp_path / "s.csv"), LABORATORY) as (samples, _):
+        assert tuple(samples) == SCRIPT
 
 
 @pytest.mark.parametrize(
@@ -322,33 +323,21 @@ def test_broken_sticks_are_named_by_file_line_and_column(tmp_path, old, new, mes
 # --- devices
 
 
-@dataclass
 class FakePanel(Panel):
-    """Fake of the pilot's window.
+    """Fake of the pilot's window, which closes after `lasts` calls of `pump`; `on_pump` is called by each.
 
-    Attributes:
-        lasts: number of `pump` calls until the window closes.
-        now_s: time of the fake clock, which `sleep` and `pump` advance, seconds.
-        shown: (time, position) of each drawn frame.
-        gone: whether `close` has been called.
-        on_pump: function that every `pump` calls.
+    The fake clock, `now_s`, is advanced by `sleep` and `pump`.
     """
 
-    lasts: int = 10**9
-    now_s: float = 100.0
-    shown: list = field(default_factory=list)
-    gone: bool = False
-    on_pump: object = None
-
-    @property
-    def closed(self):
-        return self.lasts <= 0
+    def __init__(self, lasts=10**9, on_pump=lambda: None):
+        self.lasts, self.on_pump, self.now_s, self.shown = lasts, on_pump, 100.0, []
+        self.closed, self.gone = False, False
 
     def pump(self):
         self.lasts -= 1
         self.now_s += 1e-4
-        if self.on_pump:
-            self.on_pump()
+        self.on_pump()
+        self.closed = self.closed or self.lasts <= 0
 
     def draw(self, time_s, state):
         self.shown.append((time_s, state.position_m))
@@ -397,12 +386,12 @@ def test_keys_act_as_full_sticks_and_opposite_keys_cancel(keys, sticks):
 
 def test_a_controller_uses_mode_2():
     pad = FakeController()
-    device = Gamepad(pad)
+    device = Gamepad(pad, lambda: None)
     pad.move("leftstick", 1.0, 0.0)
-    assert device.sticks() == Sticks(turn=-1.0)
+    assert device.sticks == Sticks(turn=-1.0)
     pad.move("leftstick", 0.0, -1.0)
     pad.move("rightstick", -1.0, 1.0)
-    assert device.sticks() == Sticks(forward=1.0, left=1.0, up=-1.0)
+    assert device.sticks == Sticks(forward=1.0, left=1.0, up=-1.0)
 
 
 @pytest.mark.parametrize(
@@ -411,9 +400,9 @@ def test_a_controller_uses_mode_2():
 )
 def test_sticks_rest_within_the_dead_zone_and_reach_their_ends(raw, live):
     pad = FakeController()
-    device = Gamepad(pad)
+    device = Gamepad(pad, lambda: None)
     pad.move("rightstick", 0.0, raw)
-    assert device.sticks().forward == pytest.approx(live, abs=1e-12)
+    assert device.sticks.forward == pytest.approx(live, abs=1e-12)
 
 
 def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
@@ -428,29 +417,27 @@ def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
             pad.press("start")
 
     panel.on_pump = pilot
-    gamepad = Gamepad(pad)
-    device = Pilot(panel, gamepad.sticks, **panel.timing())
-    gamepad.on_end = device.stop
-    with device.flying():
-        live = fly(device.samples(), START_M, LABORATORY, watch=device.watch)
+    gamepad = Gamepad(pad, panel.end)
+    samples = poll(panel, lambda: gamepad.sticks, **panel.timing())
+    with flying(panel):
+        recorded, used = fly(samples, START_M, LABORATORY, watch=panel.draw)
     assert panel.gone
-    times_s = np.array([sample.time_s for sample in live.samples])
+    times_s = np.array([sample.time_s for sample in used])
     assert len(times_s) == 241
     # The sleep is shortened by the time of drawing, so the rate is kept.
     np.testing.assert_allclose(np.diff(times_s), 1 / 60, atol=2e-4)
-    assert live.recorded.time_s[-1] == 4.0
+    assert recorded.time_s[-1] == 4.0
     assert [time_s for time_s, _ in panel.shown] == list(times_s)
-    np.testing.assert_allclose(panel.shown[-1][1], live.recorded.position_m[-1], atol=0.05)
-    again = fly(Script(live.samples).samples(), START_M, LABORATORY)
-    np.testing.assert_array_equal(again.recorded.position_m, live.recorded.position_m)
-    assert np.linalg.norm(live.recorded.position_m[-1] - START_M) > 1.0
+    np.testing.assert_allclose(panel.shown[-1][1], recorded.position_m[-1], atol=0.05)
+    again, _ = fly(used, START_M, LABORATORY)
+    np.testing.assert_array_equal(again.position_m, recorded.position_m)
+    assert np.linalg.norm(recorded.position_m[-1] - START_M) > 1.0
 
 
 def test_a_slow_machine_samples_less_often_but_keeps_the_time():
     panel = FakePanel(lasts=20)
     panel.on_pump = lambda: panel.sleep(0.1)
-    device = Pilot(panel, lambda: Sticks(forward=1.0), **panel.timing())
-    samples = list(device.samples())
+    samples = list(poll(panel, lambda: Sticks(forward=1.0), **panel.timing()))
     assert len(samples) == 20
     assert samples[-1].time_s == pytest.approx(2.0, rel=0.2)
     assert np.all(np.diff([sample.time_s for sample in samples]) > 0.1)
@@ -459,8 +446,8 @@ def test_a_slow_machine_samples_less_often_but_keeps_the_time():
 def test_samples_missed_in_a_stall_are_not_repeated():
     panel = FakePanel(lasts=60)
     panel.on_pump = lambda: panel.sleep(1.0 if panel.lasts == 50 else 1e-4)
-    device = Pilot(panel, lambda: Sticks(forward=1.0), **panel.timing())
-    gaps_s = np.diff([sample.time_s for sample in device.samples()])
+    samples = poll(panel, lambda: Sticks(forward=1.0), **panel.timing())
+    gaps_s = np.diff([sample.time_s for sample in samples])
     assert gaps_s.max() > 0.99
     # About sixty samples were missed; at most two samples come early to return to the schedule.
     assert np.count_nonzero(gaps_s < 1 / 60 - 3e-4) <= 2
@@ -470,10 +457,10 @@ def test_ctrl_c_ends_a_flight_keeps_it_and_is_restored_afterwards():
     panel = FakePanel()
     panel.on_pump = lambda: panel.lasts == 10**9 - 60 and signal.raise_signal(signal.SIGINT)
     before = signal.getsignal(signal.SIGINT)
-    with Pilot(panel, lambda: Sticks(up=1.0), **panel.timing()).flying() as device:
-        live = fly(device.samples(), START_M, LABORATORY)
-    assert len(live.samples) in (60, 61)
-    assert live.recorded.position_m[-1, 2] > 1.3
+    with flying(panel):
+        recorded, used = fly(poll(panel, lambda: Sticks(up=1.0), **panel.timing()), START_M, LABORATORY)
+    assert len(used) in (60, 61)
+    assert recorded.position_m[-1, 2] > 1.3
     assert signal.getsignal(signal.SIGINT) == before
 
 
@@ -520,7 +507,7 @@ def test_a_missing_controller_is_an_error(code, pyglet):
 
 
 def test_a_missing_display_is_an_error_of_one_line(pyglet):
-    pyglet(app="", shapes="", text="", window="raise RuntimeError('Cannot connect to \"None\"')")
+    pyglet(app="", shapes="", window="raise RuntimeError('Cannot connect to \"None\"')")
     sentence = (
         "device keyboard: expected a display with OpenGL for the pilot's window, found Cannot connect to"
     )
@@ -558,6 +545,9 @@ class Window:
     def push_handlers(self, keys):
         self.keys = keys
 
+    def set_caption(self, words):
+        log.append(("caption", words))
+
     def dispatch_events(self):
         self.count += 1
         self.keys[key.W] = self.count > 5
@@ -581,25 +571,24 @@ class Shape:
 
 
 def test_the_keyboard_flies_in_a_window_that_shows_keys_and_position(pyglet):
-    kinds = "".join(f"\nclass {name}(Shape): pass\n" for name in ("Box", "Line", "Circle", "Rectangle"))
+    kinds = "".join(f"\nclass {name}(Shape): pass\n" for name in ("Box", "Line", "Circle"))
     pyglet(
         app="class platform_event_loop:\n    start = stop = lambda *ignored: None\n    step = lambda timeout: None\n",
         window=FAKE_WINDOW,
         shapes=FAKE_SHAPES + kinds,
-        text=FAKE_SHAPES + "\nclass Label(Shape): pass\n",
     )
-    with open_device("keyboard", LABORATORY) as device:
-        live = fly(device.samples(), START_M, LABORATORY, watch=device.watch)
+    with open_device("keyboard", LABORATORY) as (samples, watch):
+        _, used = fly(samples, START_M, LABORATORY, watch=watch)
     log = sys.modules["pyglet.window"].log
     assert log[0] == "open"
     assert log[-1] == "close"
-    assert log.count("flip") == len(live.samples) == 41
-    texts = [entry[1] for entry in log if entry[0] == "Label"]
-    assert texts[1:4] == list(devices.KEYBOARD_HELP)
+    assert log.count("flip") == len(used) == 41
+    title = next(entry[1] for entry in log if entry[0] == "caption")
     # The device uses the real clock, so the first time may be above 0.
-    assert re.fullmatch(r" +\d+\.\d s   x \+0\.00   y \+0\.00   z 1\.00 m   0\.00 m/s     0 deg", texts[0])
-    assert live.samples[0].sticks == Sticks()
-    assert live.samples[-1].sticks == Sticks(forward=1.0)
+    assert re.match(r"\d+\.\d s  x \+0\.00  y \+0\.00  z 1\.00 m  0\.00 m/s", title)
+    assert devices.KEYBOARD_HELP in title
+    assert used[0].sticks == Sticks()
+    assert used[-1].sticks == Sticks(forward=1.0)
     places = np.array([entry[1:3] for entry in log if entry[0] == "Circle"])
     assert np.all(np.diff(places[:, 0]) >= 0)
     assert places[-1, 0] - places[0, 0] > 1

@@ -24,7 +24,7 @@ FOV_DEG = (92.45, 60.83)
 def made(**onboard):
     """A scene without shadows and noise whose drones carry cameras of 640 x 360 pixels."""
     imaging = msgspec.structs.replace(
-        S02.imaging, shadows=False, contact_shadows=False, read_noise=0.0, shot_noise=0.0, antialiasing=False
+        S02.imaging, shadows=False, read_noise=0.0, shot_noise=0.0, antialiasing=False
     )
     fields = {"image_size_wh": SIZE_WH, "fov_deg": FOV_DEG, "shutter_s": 1 / 10_000, "pitch_deg": 10.0}
     camera = OnboardCamera(**{**fields, **onboard})

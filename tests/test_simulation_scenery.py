@@ -20,7 +20,6 @@ from psotrack.simulation import (
 )
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.scenery import Scenery
-from psotrack.simulation.imaging.sky import Sky
 from psotrack.simulation.labels.masks import silhouettes
 from psotrack.simulation.scenarios import CameraPlace, Imaging, Surroundings
 
@@ -31,7 +30,6 @@ PLAIN = Imaging(
     shutter_s=0.0,
     lens_blur_px=0.0,
     shadows=False,
-    contact_shadows=False,
     reflections=0.0,
     exposure_drift=0.0,
     white_balance_drift=0.0,
@@ -39,7 +37,7 @@ PLAIN = Imaging(
     read_noise=0.0,
     shot_noise=0.0,
 )
-EVERYTHING = Surroundings(lamp_drop=0.2, screen=0.03, foliage=0.03, person=0.5, clouds=0.5)
+EVERYTHING = Surroundings(lamp_drop=0.2, screen=0.03, foliage=0.03, person=0.5)
 
 
 def covered(seen_layers, shape=SHAPE):
@@ -189,75 +187,6 @@ def test_the_halves_and_places_differ_between_cameras_and_seeds():
         assert places[0] != places[1]
 
 
-# --- clouds
-
-
-@pytest.mark.parametrize("index", [0, 5])
-def test_the_sky_takes_the_place_of_walls_and_ceiling_alone(still_scene, index):
-    scene = with_surroundings(still_scene, clouds=0.8)
-    calm, cloudy = CameraRenderer(still_scene, index), CameraRenderer(scene, index)
-    changed = (calm.clean_frame(3) != cloudy.clean_frame(3)).any(axis=-1)
-    drone = drone_masks(still_scene, calm.cam, calm.backdrop.depth_m, 0) > 0
-    shell = calm.backdrop.shell & ~drone
-    assert 0.2 < shell.mean() < 0.8
-    assert not (calm.backdrop.floor & calm.backdrop.shell).any()
-    # Edges are blurred by 0.4 px.
-    near = cv2.dilate(shell.astype(np.uint8), np.ones((5, 5))) > 0
-    inside = cv2.erode(shell.astype(np.uint8), np.ones((5, 5))) > 0
-    assert changed[inside].mean() > 0.99
-    assert not changed[~near].any()
-
-
-def test_cameras_see_the_same_clouds_in_the_same_direction(still_scene):
-    scene = with_surroundings(still_scene, clouds=1.0)
-    one, other = CameraRenderer(scene, 0), CameraRenderer(scene, 4)
-    images = [camera.clean_frame(40).astype(int) for camera in (one, other)]
-    rng, differences = np.random.default_rng(0), []
-    shells = [cv2.erode(camera.backdrop.shell.astype(np.uint8), np.ones((7, 7))) for camera in (one, other)]
-    for x, y in rng.integers(0, (one.cam.width, one.cam.height), (4000, 2)):
-        ray = other.cam.K @ other.cam.R @ one.cam.R.T @ np.linalg.inv(one.cam.K) @ [x, y, 1.0]
-        if ray[2] <= 0:
-            continue
-        u, v = np.round(ray[:2] / ray[2]).astype(int)
-        if 0 <= u < other.cam.width and 0 <= v < other.cam.height and shells[0][y, x] and shells[1][v, u]:
-            differences.append(np.abs(images[0][y, x] - images[1][v, u]).max())
-    assert len(differences) > 100
-    # Directions differ by half a pixel, and clouds are drawn for every second pixel.
-    assert np.median(differences) <= 3
-    assert np.ptp(images[0][shells[0] > 0], axis=0).max() > 60, "there are clouds and blue sky"
-
-
-@pytest.mark.parametrize("contrast", [0.2, 1.0])
-def test_the_contrast_is_the_share_of_white_in_the_clouds(still_scene, contrast):
-    shown = CameraRenderer(with_surroundings(still_scene, clouds=contrast), 0)
-    sky = sensor.undevelop(shown.clean_frame(0))[
-        cv2.erode(shown.backdrop.shell.astype(np.uint8), np.ones((7, 7))) > 0
-    ]
-    white, blue = np.percentile(sky[:, 2], [99.9, 0.1])
-    # Red light: 0.2 of the sky, 0.92 of white clouds; rounding to grey levels.
-    assert blue == pytest.approx(0.2, abs=0.01)
-    assert white == pytest.approx(0.2 + contrast * (0.92 - 0.2), abs=0.01)
-
-
-def test_clouds_drift_and_change_slowly(still_scene):
-    shown = CameraRenderer(with_surroundings(still_scene, clouds=1.0), 0)
-    inside = cv2.erode(shown.backdrop.shell.astype(np.uint8), np.ones((7, 7))) > 0
-    frames = [shown.clean_frame(frame)[inside].astype(int) for frame in (0, 1, 100)]
-    first, late = (np.abs(frames[0] - frame).mean() for frame in frames[1:])
-    assert 0.05 < first < 1.5
-    assert late > 8
-
-
-@pytest.mark.parametrize("all_sky", [True, False])
-def test_a_view_may_be_all_sky_or_have_none(still_scene, all_sky):
-    """A view of a lens with distortion may look at the ceiling alone: it has no edge between sky and objects."""
-    calm = CameraRenderer(still_scene, 0)
-    empty = replace(calm.backdrop, shell=np.full(calm.backdrop.shell.shape, all_sky))
-    image = calm.empty_room()
-    Sky(0.8, 0, calm.cam, empty, 0.0).draw(image, 1.0)
-    assert (image != calm.empty_room()).any(axis=-1).mean() == pytest.approx(float(all_sky), abs=0.001)
-
-
 # --- exposure
 
 
@@ -289,7 +218,7 @@ def test_an_exposure_needs_the_smaller_factor_first():
 
 
 def test_drones_are_in_front_and_masks_are_theirs(still_scene):
-    scene = with_surroundings(still_scene, foliage=0.9, screen=0.25, person=1.0, clouds=1.0)
+    scene = with_surroundings(still_scene, foliage=0.9, screen=0.25, person=1.0)
     calm, restless = CameraRenderer(still_scene, 0), CameraRenderer(scene, 0)
     inside = drone_masks(still_scene, calm.cam, calm.backdrop.depth_m, 0) > 0
     inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3))) > 0

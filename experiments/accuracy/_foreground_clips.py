@@ -35,7 +35,6 @@ SCENES: Mapping[str, Mapping[str, Any]] = {
     "simulated, screen": {name: value for name, value in RESTLESS.items() if "screen" in name},
     "simulated, restless": RESTLESS,
     "simulated, person": {"surroundings.person": 0.5},
-    "simulated, clouds": {"surroundings.clouds": 0.6},
 }
 #: The camera of the simulated scenes: one of the laboratory's; frames, and scale of the images.
 _CAMERA = {"position_m": [-4.7, -3.7, 3.1], "target_m": [0.1, 0.0, 1.25]}

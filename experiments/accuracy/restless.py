@@ -4,7 +4,7 @@
     python experiments/accuracy/restless.py --data data --seeds 1 2 --kinds calm restless --background mog2 living
 
 Simulates each flight (8 cameras at half size, 4 drones, 200 frames) if it is missing, once without and once with
-`psotrack simulate --restless`; the kinds lamp, exposure, screen, foliage, person and clouds have one change alone.
+`psotrack simulate --restless`; the kinds lamp, exposure, screen, foliage and person have one change alone.
 Each run is `psotrack track` in a process of its own, twice: the first run compiles, the second is measured, with its
 silhouettes computed anew. Writes a row per run (CSV) and the record (JSON), and prints the table, where `time_ratio`
 and `error_ratio` compare with the calm flight of the same seed and background.
@@ -42,7 +42,6 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
         for part in ("exposure", "lamp", "screen", "foliage")
     },
     "person": {"surroundings.person": 0.5},
-    "clouds": {"surroundings.clouds": 0.6},
 }
 #: Largest distance of a track from its drone, metres; a track that is farther from every drone is false.
 GATE_M = 0.5

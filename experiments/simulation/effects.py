@@ -45,7 +45,6 @@ OFF = Imaging(
     shutter_s=0,
     lens_blur_px=0.5,
     shadows=False,
-    contact_shadows=False,
     reflections=0,
     exposure_drift=0,
     white_balance_drift=0,
@@ -65,7 +64,6 @@ ANYWHERE = Limits(
 )
 HIGH = CameraPlace(position_m=(-4.7, -3.7, 3.1), target_m=(0.1, 0.0, 1.25))
 LOW = CameraPlace(position_m=(-4.4, -2.2, 0.7), target_m=(0.4, 0.6, 0.35))
-NEAR = CameraPlace(position_m=(-4.5, -3.2, 0.8), target_m=(-3.0, -2.2, 0.0))
 ABOVE = CameraPlace(position_m=(-4.6, -3.3, 2.3), target_m=(-2.8, -1.9, 0.0))
 TITLE_PX, GAP_PX, FONT_PX = 24, 6, 14
 
@@ -143,19 +141,6 @@ PAIRS = (
         difference=6,
     ),
     Pair(
-        "contact_shadows",
-        ("contact_shadows off, standing", "contact_shadows on, standing"),
-        with_it={"contact_shadows": True},
-        at_m=(-3.0, -2.2, 0.045),
-        aim_m=(-3.0, -2.2, 0.045),
-        camera=NEAR,
-        model="x_frame",
-        paint_bgr=(0.3, 0.25, 0.22),
-        size_px=(290, 200),
-        zoom=1,
-        difference=6,
-    ),
-    Pair(
         "reflections",
         ("reflections off", "reflections = 0.04, looking across the floor"),
         with_it={"reflections": 0.04},
@@ -183,7 +168,6 @@ PAIRS = (
             ("screen", ("no screen", "screen = 0.025"), Surroundings(screen=0.025), 1.0),
             ("foliage", ("no foliage", "foliage = 0.025"), Surroundings(foliage=0.025), 1.0),
             ("person", ("nobody", "person = 0.5"), Surroundings(person=0.5), 4.0),
-            ("clouds", ("no clouds", "clouds = 0.6"), Surroundings(clouds=0.6), 4.0),
         )
     ),
 )

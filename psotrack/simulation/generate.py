@@ -6,7 +6,7 @@ import itertools
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -40,7 +40,7 @@ from psotrack.recordings.datasets import (
 )
 from psotrack.simulation import scenarios
 from psotrack.simulation.imaging.onboard import camera_record, intrinsics, lens, onboard_poses
-from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario
+from psotrack.simulation.scenarios import FlightFromFile, Mesh, Scenario, SimulationSettings
 from psotrack.simulation.scene import Scene, build
 from psotrack.simulation.segments import (
     Stream,
@@ -71,25 +71,6 @@ _RIG = "rig.toml"
 _ONBOARD_LENSES = "drone_cameras.toml"
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class SimulationSettings:
-    """Settings of a simulation. Scenario and settings together decide every byte of the sequence.
-
-    Attributes:
-        num_frames: number of first frames to simulate; None: all frames of the scenario.
-        scale: scale of the image size; 1 is the scenario's full size.
-        seed: seed of the flights and the noise, 0 or more.
-        masks: whether to write `drone_masks.zip`.
-        onboard: whether to render the videos of on-board cameras, if the scenario has on-board cameras.
-    """
-
-    num_frames: int | None = None
-    scale: float = 1.0
-    seed: int = 0
-    masks: bool = True
-    onboard: bool = True
 
 
 def simulate(

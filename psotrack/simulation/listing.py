@@ -1,16 +1,13 @@
-"""List of the package's scenarios, as records and as a table for the terminal."""
+"""List of the package's scenarios."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from psotrack.simulation.scenarios import preset_names, scenario
 from psotrack.simulation.scene import build
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 def catalogue() -> list[dict[str, Any]]:
@@ -36,20 +33,3 @@ def catalogue() -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def render(rows: list[dict[str, Any]]) -> Table:
-    """Table of the records of `catalogue`, one row per scenario."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    headings = ("name", "drones", "cameras", "frames", "hall", "m/s", "flights")
-    for heading in headings:
-        numeric = heading in {"drones", "cameras", "frames", "m/s"}
-        table.add_column(heading, justify="right" if numeric else "left", no_wrap=heading != "flights")
-    for row in rows:
-        hall = row["hall"].removesuffix("_hall").replace("_", " ")
-        told = row | {"hall": hall, "m/s": f"{row['mean_speed_m_s']:.1f}", "flights": row["description"]}
-        table.add_row(*(f"{told[heading]}" for heading in headings))
-    return table

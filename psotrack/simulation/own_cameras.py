@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, replace
+from importlib import resources
 from pathlib import Path
 
 import cv2
@@ -22,11 +23,10 @@ from psotrack.geometry import Rig, look_at, make_camera, make_rig
 from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import VideoWriter
 from psotrack.simulation import scenarios
-from psotrack.simulation.generate import SimulationSettings
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.renderer import CameraRenderer
 from psotrack.simulation.imaging.sensor import Sensor
-from psotrack.simulation.scenarios import Scenario
+from psotrack.simulation.scenarios import Scenario, SimulationSettings, Vector
 from psotrack.simulation.scene import Scene, build
 from psotrack.support import (
     Advance,
@@ -50,8 +50,7 @@ _REFERENCE_HZ = 100.0
 _BOARD_STREAM = 2000
 
 
-@dataclass(frozen=True)
-class OwnCamera:
+class OwnCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A camera of the laboratory.
 
     Attributes:
@@ -69,32 +68,15 @@ class OwnCamera:
     flight: str
     fps: float
     start_s: float
-    position_m: tuple[float, float, float]
-    target_m: tuple[float, float, float]
+    position_m: Vector
+    target_m: Vector
     size: tuple[int, int]
     focal_px: float
     distortion: tuple[float, float, float, float]
 
 
-#: The cameras stand on one side of the laboratory; the last one is one and a half frames late.
-OWN_CAMERAS = (
-    OwnCamera(
-        "left", "left.avi", 25.0, 0.0,
-        (-3.7, -3.4, 2.7), (-0.1, 0.2, 1.3), (1920, 1080), 1160.0, (-0.08, 0.02, 0.0004, -0.0003),
-    ),
-    OwnCamera(
-        "right", "right_flight.avi", 30.0, 0.011,
-        (3.8, -3.3, 2.8), (0.1, 0.2, 1.3), (1920, 1080), 1175.0, (-0.07, 0.015, -0.0003, 0.0002),
-    ),
-    OwnCamera(
-        "GoPro 3", "gopro3_clip.avi", 50.0, 0.007,
-        (-1.3, -3.8, 2.6), (0.0, 0.3, 1.3), (1280, 960), 900.0, (-0.16, 0.035, 0.0002, 0.0005),
-    ),
-    OwnCamera(
-        "60881257", "cam_60881257.avi", 25.0, 0.06,
-        (1.4, -3.8, 2.7), (0.0, 0.3, 1.3), (1280, 960), 880.0, (-0.09, 0.02, 0.0, -0.0004),
-    ),
-)  # fmt: skip
+_LISTED = resources.files("psotrack.simulation.world").joinpath("own_cameras.toml").read_bytes()
+OWN_CAMERAS = tuple(msgspec.toml.decode(_LISTED, type=dict[str, list[OwnCamera]])["cameras"])
 #: The hall in which the cameras stand.
 _HALL = "laboratory"
 

@@ -7,6 +7,7 @@ numbers start at 1, as in the names of the written files.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -311,7 +312,6 @@ class Imaging(_Record, frozen=True, kw_only=True):
         shutter_s: exposure time, which decides the motion blur.
         lens_blur_px: standard deviation of the lens's blur.
         shadows: whether drones cast soft shadows of the lamps on the floor.
-        contact_shadows: whether ambient light is weaker under drones that are close to the floor.
         reflections: share of light that the floor reflects at normal incidence; the share grows towards grazing angles.
         exposure_drift: standard deviation of the slow relative change of brightness, per camera.
         exposure: smallest and largest factor of the light of the static cameras' images, between which an automatic
@@ -331,7 +331,6 @@ class Imaging(_Record, frozen=True, kw_only=True):
     shutter_s: NotNegative = 1 / 125
     lens_blur_px: Annotated[float, msgspec.Meta(ge=0, le=50)] = 0.3
     shadows: bool = True
-    contact_shadows: bool = True
     reflections: Share = 0.04
     exposure_drift: Annotated[float, msgspec.Meta(ge=0, le=0.3)] = 0.01
     exposure: tuple[Positive, Positive] = (1.0, 1.0)
@@ -358,8 +357,6 @@ class Surroundings(_Record, frozen=True, kw_only=True):
         foliage: share of each image that swaying leaves cover: a plant in a room (0.03), or trees (0.3).
         person: height of a person, as a share of the image's height, who walks in and out at the side of each image.
         person_period_s: time from one entrance of the person to the next.
-        clouds: contrast of clouds that drift and change in a blue sky, which takes the place of walls and ceiling, as
-            on a roof; 1 is white clouds, 0 is no sky. All cameras see the same clouds.
     """
 
     lamp_drop: Share = 0.0
@@ -368,7 +365,6 @@ class Surroundings(_Record, frozen=True, kw_only=True):
     foliage: Annotated[float, msgspec.Meta(ge=0, le=0.9)] = 0.0
     person: Share = 0.0
     person_period_s: Period = 8.0
-    clouds: Share = 0.0
 
 
 class SimulatedDetector(_Record, frozen=True, kw_only=True):
@@ -472,6 +468,25 @@ class Scenario(_Record, frozen=True, kw_only=True):
     surroundings: Surroundings = Surroundings()
     detector: SimulatedDetector = SimulatedDetector()
     variation: Variation = Variation()
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Settings of a simulation. Scenario and settings together decide every byte of the sequence.
+
+    Attributes:
+        num_frames: simulate the first N frames only; None: all.
+        scale: scale of the image size; 1 is full size.
+        seed: seed of flights and noise, 0 or more.
+        masks: write drone_masks.zip.
+        onboard: render the videos of on-board cameras, if the scenario has any.
+    """
+
+    num_frames: Annotated[int, msgspec.Meta(extra={"metavar": "N"})] | None = None
+    scale: float = 1.0
+    seed: int = 0
+    masks: bool = True
+    onboard: bool = True
 
 
 #: Changes of a scenario that make its surroundings restless: an automatic exposure that changes grey levels by 15 % to

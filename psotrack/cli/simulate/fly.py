@@ -64,16 +64,13 @@ def fly(output: Output, flight: PilotingOptions) -> None:
     check_suffix("--out", out, ".csv")
     output.refuse(out, sticks_path)
     space = flight_space(flight.hall)
-    start = np.array(flight.start_m)
-    piloting.check(start, space, flight.rate_hz)
     # Ctrl-C ends the flight, which is then written.
     with unhurried_end(), errors_name(flight.device):
-        with devices.open_device(flight.device, space) as opened:
-            samples = piloting.until(opened.samples(), flight.max_seconds)
-            flown = piloting.fly(samples, start, space, rate_hz=flight.rate_hz, watch=opened.watch)
-        recorded = flown.recorded
+        with devices.open_device(flight.device, space) as (samples, watch):
+            start_m, rate_hz, max_s = np.array(flight.start_m), flight.rate_hz, flight.max_seconds
+            recorded, used = piloting.fly(samples, start_m, space, rate_hz=rate_hz, max_s=max_s, watch=watch)
         write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
-        piloting.write_sticks(sticks_path, flown.samples)
+        piloting.write_sticks(sticks_path, used)
     output.say(
         f"{out}: {len(recorded.time_s)} samples at {flight.rate_hz:g} Hz, {recorded.duration_s:.1f} s",
         f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}',

@@ -13,7 +13,6 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,142 +22,16 @@ import numpy as np
 from psotrack.errors import SettingsError, install_command
 from psotrack.simulation.flights.piloting import FlightState, Sample, Space, Sticks, read_sticks
 
-_PLAN_PX = 520
-_MARGIN_PX = 30
-_LINE_PX = 20
-#: Width of the column beside the plan that shows the height.
-_HEIGHT_PX = 40
-_DRONE_PX = 7
-_AHEAD_PX = 24
-
-_GREY = (150, 150, 150, 255)
-_WHITE = (255, 255, 255, 255)
-_ORANGE = (255, 170, 60, 255)
-
-
-def pyglet_module(name: str, device: str) -> ModuleType:
-    """Import a module of pyglet, such as `input`.
-
-    Raises:
-        SettingsError: pyglet is not installed, or there is no display with OpenGL, which pyglet needs.
-    """
-    try:
-        importlib.import_module("pyglet")
-    except ImportError as error:
-        raise SettingsError(
-            f"device {device}",
-            expected="the package pyglet",
-            found="it is not installed",
-            remedy=install_command("control"),
-        ) from error
-    try:
-        return importlib.import_module(f"pyglet.{name}")
-    # The import opens a display, and the classes of its errors cannot be imported before.
-    except Exception as error:
-        raise _no_display(device, error) from error
-
-
-def _no_display(device: str, error: Exception) -> SettingsError:
-    """Error for a machine that cannot open a window."""
-    return SettingsError(
-        f"device {device}",
-        expected="a display with OpenGL for the pilot's window",
-        found=f"{error}".partition("\n")[0] or type(error).__name__,
-        remedy="run it on a desktop, or give a file of sticks as --device",
-    )
-
-
-class Panel:
-    """A window with the hall seen from above."""
-
-    def __init__(self, device: str, space: Space, help_lines: tuple[str, ...]) -> None:
-        self._pyglet = {name: pyglet_module(name, device) for name in ("app", "shapes", "text", "window")}
-        self._space = space
-        length_m, width_m = (space.upper_m - space.lower_m)[:2]
-        self._px_per_m = _PLAN_PX / max(length_m, width_m)
-        self._plan_px = np.array([length_m, width_m]) * self._px_per_m
-        self._text_px = _LINE_PX * (len(help_lines) + 1)
-        extra_px = np.array([_MARGIN_PX + _HEIGHT_PX, _MARGIN_PX + self._text_px])
-        size_px = self._plan_px + extra_px + 2 * _MARGIN_PX
-        window = self._pyglet["window"]
-        try:
-            self._window = window.Window(
-                *(round(side) for side in size_px), caption="psotrack simulate fly", vsync=False
-            )
-        # pyglet has different classes for a missing display and for screens without OpenGL.
-        except Exception as error:
-            raise _no_display(device, error) from error
-        self._keys = window.key.KeyStateHandler()
-        self._window.push_handlers(self._keys)
-        self._pyglet["app"].platform_event_loop.start()
-        self._help_lines = help_lines
-
-    @property
-    def closed(self) -> bool:
-        """Whether the pilot pressed Esc or closed the window."""
-        return bool(self._window.has_exit)
-
-    def is_down(self, name: str) -> bool:
-        """Whether the named key is pressed."""
-        return self._keys[getattr(self._pyglet["window"].key, name)]
-
-    def pump(self) -> None:
-        """Process events of keys, sticks and the window."""
-        self._pyglet["app"].platform_event_loop.step(0.0)
-        self._window.switch_to()
-        self._window.dispatch_events()
-
-    def draw(self, time_s: float, state: FlightState) -> None:
-        """Draw the drone's state."""
-        x, y, z = state.position_m
-        speed = float(np.linalg.norm(state.velocity_m_s))
-        yaw_deg = np.degrees(state.yaw_rad) % 360
-        now = (
-            f"{time_s:6.1f} s   x {x:+.2f}   y {y:+.2f}   z {z:.2f} m   {speed:.2f} m/s   {yaw_deg:3.0f} deg"
-        )
-        self._window.clear()
-        for row, (line, colour) in enumerate([(now, _WHITE), *((line, _GREY) for line in self._help_lines)]):
-            height_px = _MARGIN_PX + self._text_px - row * _LINE_PX
-            label = self._pyglet["text"].Label(line, x=_MARGIN_PX, y=height_px, font_size=11, color=colour)
-            label.draw()
-        self._draw_plan(state)
-        self._window.flip()
-
-    def _draw_plan(self, state: FlightState) -> None:
-        shapes = self._pyglet["shapes"]
-        corner = np.array([_MARGIN_PX, 2 * _MARGIN_PX + self._text_px], float)
-        shapes.Box(*corner, *self._plan_px, thickness=2, color=_GREY).draw()
-        at = corner + (state.position_m - self._space.lower_m)[:2] * self._px_per_m
-        ahead = at + _AHEAD_PX * np.array([np.cos(state.yaw_rad), np.sin(state.yaw_rad)])
-        shapes.Line(*at, *ahead, thickness=3, color=_WHITE).draw()
-        shapes.Circle(*at, _DRONE_PX, color=_ORANGE).draw()
-        left, bottom = corner[0] + self._plan_px[0] + _MARGIN_PX, corner[1]
-        shapes.Box(left, bottom, _HEIGHT_PX, self._plan_px[1], thickness=2, color=_GREY).draw()
-        height_m = self._space.upper_m[2] - self._space.lower_m[2]
-        share = float((state.position_m[2] - self._space.lower_m[2]) / height_m)
-        shapes.Rectangle(left, bottom + share * self._plan_px[1] - 2, _HEIGHT_PX, 4, color=_ORANGE).draw()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._window.close()
-        self._pyglet["app"].platform_event_loop.stop()
-
-
+#: Longer side of the hall in the window, its margin, the drone, and the line ahead of it, pixels.
+_PLAN_PX, _MARGIN_PX, _DRONE_PX, _AHEAD_PX = 520, 30, 7, 24
+_GREY, _WHITE, _ORANGE = (150, 150, 150, 255), (255, 255, 255, 255), (255, 170, 60, 255)
 #: Half width of the range around the middle that counts as 0, because springs do not return sticks exactly to 0.
 DEAD_ZONE = 0.12
 #: Time between two readings of the sticks; the flight itself is integrated in finer steps.
 _POLL_S = 1 / 60
 
-GAMEPAD_HELP = (
-    "left stick: up, down, turn",
-    "right stick: forward, back, left, right",
-    "start, back or Esc: end",
-)
-KEYBOARD_HELP = (
-    "W S: forward, back      A D: left, right",
-    "arrows up, down: rise, sink      arrows left, right: turn",
-    "Esc: end",
-)
+GAMEPAD_HELP = "left stick: up, down, turn; right stick: forward, back, left, right; start, back or Esc: end"
+KEYBOARD_HELP = "W S A D: forward, back, left, right; arrows: rise, sink, turn; Esc: end"
 #: Stick positions that each key adds, by the key's name in pyglet.
 KEYS: Mapping[str, Sticks] = {
     "W": Sticks(forward=1.0),
@@ -171,23 +44,109 @@ KEYS: Mapping[str, Sticks] = {
     "RIGHT": Sticks(turn=-1.0),
 }
 
-
-@dataclass(frozen=True)
-class Script:
-    """Stick samples from a file; the flight ends at the time of the last sample, and nothing is shown."""
-
-    script: tuple[Sample, ...]
-
-    def samples(self) -> Iterator[Sample]:
-        """Yield all samples without waiting."""
-        return iter(self.script)
-
-    def watch(self, time_s: float, state: FlightState) -> None:
-        """Do nothing: there is no window."""
+#: Stick samples as they come, and a function that shows the time and the state at each sample.
+Device = tuple[Iterator[Sample], Callable[[float, FlightState], None]]
 
 
-class Pilot:
-    """A person with a window, who moves sticks that are read at 60 Hz of the wall clock.
+@contextlib.contextmanager
+def _display(device: str) -> Iterator[None]:
+    """Turn every error in this block into one for a machine that cannot open a window.
+
+    pyglet has several classes of such errors, some of which cannot be imported without a display.
+    """
+    try:
+        yield
+    except Exception as error:
+        raise SettingsError(
+            f"device {device}",
+            expected="a display with OpenGL for the pilot's window",
+            found=f"{error}".partition("\n")[0] or type(error).__name__,
+            remedy="run it on a desktop, or give a file of sticks as --device",
+        ) from error
+
+
+def pyglet_module(name: str, device: str) -> ModuleType:
+    """Import a module of pyglet, such as `input`.
+
+    Raises:
+        SettingsError: pyglet is not installed, or there is no display with OpenGL, which pyglet needs.
+    """
+    try:
+        importlib.import_module("pyglet")
+    except ImportError as error:
+        expected, found = "the package pyglet", "it is not installed"
+        remedy = install_command("control")
+        raise SettingsError(f"device {device}", expected=expected, found=found, remedy=remedy) from error
+    with _display(device):
+        return importlib.import_module(f"pyglet.{name}")
+
+
+class Panel:
+    """A window with the hall seen from above, whose title says where the drone is.
+
+    Attributes:
+        closed: whether the pilot has ended the flight.
+    """
+
+    def __init__(self, device: str, space: Space, words: str) -> None:
+        app, self._shapes, window = (pyglet_module(name, device) for name in ("app", "shapes", "window"))
+        self._space, self._words, self.closed = space, words, False
+        sides_m = (space.upper_m - space.lower_m)[:2]
+        self._px_per_m = _PLAN_PX / sides_m.max()
+        self._plan_px = sides_m * self._px_per_m
+        with _display(device):
+            sides_px = (round(side) + 2 * _MARGIN_PX for side in self._plan_px.tolist())
+            self._window = window.Window(*sides_px, caption=words, vsync=False)
+        self._names, self._keys = window.key, window.key.KeyStateHandler()
+        self._window.push_handlers(self._keys)
+        self._loop = app.platform_event_loop
+        self._loop.start()
+
+    def end(self, *signal_and_frame: object) -> None:
+        """End the flight with the next sample; also the handler of SIGINT."""
+        self.closed = True
+
+    def is_down(self, name: str) -> bool:
+        """Whether the named key is pressed."""
+        return self._keys[getattr(self._names, name)]
+
+    def pump(self) -> None:
+        """Process events of keys, sticks and the window."""
+        self._loop.step(0.0)
+        self._window.switch_to()
+        self._window.dispatch_events()
+        # Esc, or the window was closed.
+        self.closed = self.closed or bool(self._window.has_exit)
+
+    def draw(self, time_s: float, state: FlightState) -> None:
+        """Draw the drone's state."""
+        x, y, z = state.position_m
+        speed = float(np.linalg.norm(state.velocity_m_s))
+        self._window.set_caption(
+            f"{time_s:.1f} s  x {x:+.2f}  y {y:+.2f}  z {z:.2f} m  {speed:.2f} m/s  ({self._words})"
+        )
+        self._window.clear()
+        shapes, corner = self._shapes, np.full(2, float(_MARGIN_PX))
+        shapes.Box(*corner, *self._plan_px, thickness=2, color=_GREY).draw()
+        at = corner + (state.position_m - self._space.lower_m)[:2] * self._px_per_m
+        ahead = at + _AHEAD_PX * np.array([np.cos(state.yaw_rad), np.sin(state.yaw_rad)])
+        shapes.Line(*at, *ahead, thickness=3, color=_WHITE).draw()
+        shapes.Circle(*at, _DRONE_PX, color=_ORANGE).draw()
+        self._window.flip()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._window.close()
+        self._loop.stop()
+
+
+def poll(
+    panel: Panel,
+    sticks: Callable[[], Sticks],
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[Sample]:
+    """Yield stick samples at 60 Hz, or as fast as the machine can; the last sample ends the flight.
 
     Args:
         panel: the pilot's window.
@@ -195,51 +154,30 @@ class Pilot:
         clock: gives the time in seconds.
         sleep: waits for a number of seconds.
     """
-
-    def __init__(
-        self,
-        panel: Panel,
-        sticks: Callable[[], Sticks],
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._panel, self._sticks, self._clock, self._sleep = panel, sticks, clock, sleep
-        self._stopped = False
-
-    def stop(self, *signal_and_frame: object) -> None:
-        """End the flight with the next sample; also the handler of SIGINT."""
-        self._stopped = True
-
-    @contextlib.contextmanager
-    def flying(self) -> Iterator[Pilot]:
-        """Let Ctrl-C end the flight between two samples, as Esc does, so that it is kept; close the window at last."""
-        with contextlib.closing(self._panel):
-            handler = signal.signal(signal.SIGINT, self.stop)
-            try:
-                yield self
-            finally:
-                signal.signal(signal.SIGINT, handler)
-
-    def samples(self) -> Iterator[Sample]:
-        """Yield stick samples at 60 Hz, or as fast as the machine can; the last sample ends the flight."""
-        begin_s = self._clock()
-        polls = 0
-        while True:
-            self._panel.pump()
-            yield Sample(self._clock() - begin_s, self._sticks())
-            if self._stopped or self._panel.closed:
-                return
-            # Time is counted from the beginning of the flight, so that the time of drawing does not accumulate.
-            polls = max(polls + 1, int((self._clock() - begin_s) / _POLL_S))
-            self._sleep(max(0.001, polls * _POLL_S - (self._clock() - begin_s)))
-
-    def watch(self, time_s: float, state: FlightState) -> None:
-        """Show the drone's state to the pilot."""
-        self._panel.draw(time_s, state)
+    begin_s, polls = clock(), 0
+    while True:
+        panel.pump()
+        yield Sample(clock() - begin_s, sticks())
+        if panel.closed:
+            return
+        # Time is counted from the beginning of the flight, so that the time of drawing does not accumulate.
+        polls = max(polls + 1, int((clock() - begin_s) / _POLL_S))
+        sleep(max(0.001, polls * _POLL_S - (clock() - begin_s)))
 
 
 @contextlib.contextmanager
-def open_device(name: str, space: Space) -> Iterator[Script | Pilot]:
+def flying(panel: Panel) -> Iterator[Panel]:
+    """Let Ctrl-C end the flight between two samples, as Esc does, so that it is kept; close the window at last."""
+    with contextlib.closing(panel):
+        handler = signal.signal(signal.SIGINT, panel.end)
+        try:
+            yield panel
+        finally:
+            signal.signal(signal.SIGINT, handler)
+
+
+@contextlib.contextmanager
+def open_device(name: str, space: Space) -> Iterator[Device]:
     """Open the device `gamepad` or `keyboard`, or a file in the format of `read_sticks`, for a `with` block.
 
     Args:
@@ -253,18 +191,14 @@ def open_device(name: str, space: Space) -> Iterator[Script | Pilot]:
     if name == "gamepad":
         controller = _controller()
         controller.open()
-        with contextlib.closing(controller):
-            gamepad = Gamepad(controller)
-            pilot = Pilot(Panel(name, space, GAMEPAD_HELP), gamepad.sticks)
-            gamepad.on_end = pilot.stop
-            with pilot.flying():
-                yield pilot
+        with contextlib.closing(controller), flying(Panel(name, space, GAMEPAD_HELP)) as panel:
+            gamepad = Gamepad(controller, panel.end)
+            yield poll(panel, lambda: gamepad.sticks), panel.draw
     elif name == "keyboard":
-        panel = Panel(name, space, KEYBOARD_HELP)
-        with Pilot(panel, lambda: key_sticks(panel.is_down)).flying() as pilot:
-            yield pilot
+        with flying(Panel(name, space, KEYBOARD_HELP)) as panel:
+            yield poll(panel, lambda: key_sticks(panel.is_down)), panel.draw
     elif Path(name).suffix:
-        yield Script(read_sticks(Path(name)))
+        yield iter(read_sticks(Path(name))), lambda time_s, state: None
     else:
         raise SettingsError("device", expected="gamepad, keyboard, or a file of sticks (.csv)", found=name)
 
@@ -278,30 +212,29 @@ def key_sticks(is_down: Callable[[str], bool]) -> Sticks:
 class Gamepad:
     """Sticks of a game controller with a layout that pyglet knows.
 
+    Args:
+        controller: the controller.
+        end: called when the pilot presses start or back.
+
     Attributes:
-        on_end: called when the pilot presses start or back.
+        sticks: positions of both sticks, without their dead zones.
     """
 
-    def __init__(self, controller: Any) -> None:
-        self._now = Sticks()
-        self.on_end: Callable[[], None] = lambda: None
+    def __init__(self, controller: Any, end: Callable[[], None]) -> None:
+        self.sticks, self._end = Sticks(), end
         # Events are used, because the sign of pyglet's polled values depends on the operating system.
         controller.push_handlers(on_stick_motion=self._move, on_button_press=self._press)
-
-    def sticks(self) -> Sticks:
-        """Positions of both sticks, without their dead zones."""
-        return self._now
 
     def _move(self, controller: Any, stick: str, vector: tuple[float, float]) -> None:
         right, up = (_without_dead_zone(value) for value in vector)
         if stick == "leftstick":
-            self._now = self._now._replace(up=up, turn=0.0 - right)
+            self.sticks = self.sticks._replace(up=up, turn=0.0 - right)
         elif stick == "rightstick":
-            self._now = self._now._replace(forward=up, left=0.0 - right)
+            self.sticks = self.sticks._replace(forward=up, left=0.0 - right)
 
     def _press(self, controller: Any, button: str) -> None:
         if button in ("start", "back"):
-            self.on_end()
+            self._end()
 
 
 def _without_dead_zone(value: float) -> float:

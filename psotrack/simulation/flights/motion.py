@@ -83,6 +83,10 @@ class Flight(ABC):
         thrust_m_s2 = self.acceleration_m_s2(time_s) + np.array([0.0, 0.0, GRAVITY_M_S2])
         return attitude(thrust_m_s2, self.heading.at(time_s))
 
+    def tilt_deg(self, time_s: Times) -> Float[np.ndarray, "times"]:
+        """(times,), angle between the body's z axis and the vertical, degrees."""
+        return np.degrees(np.arccos(np.clip(self.rotation(time_s)[:, 2, 2], -1, 1)))
+
     def orientation_wxyz(self, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times 4"]:
         """(times, 4), unit quaternions, body to world; their signs do not change from one time to the next."""
         return quaternions_wxyz(self.rotation(time_s))

@@ -5,7 +5,7 @@ The flight depends only on the samples and their times, so the same samples give
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -184,19 +184,6 @@ class Sample(NamedTuple):
     sticks: Sticks
 
 
-@dataclass(frozen=True)
-class Flown:
-    """A flight by hand and the stick samples that made it.
-
-    Attributes:
-        recorded: samples of the flight.
-        samples: samples of the sticks.
-    """
-
-    recorded: Recorded
-    samples: tuple[Sample, ...]
-
-
 def fly(
     samples: Iterable[Sample],
     start_m: Vector,
@@ -204,8 +191,9 @@ def fly(
     *,
     dynamics: Dynamics = DYNAMICS,
     rate_hz: float = 25.0,
+    max_s: float = np.inf,
     watch: Callable[[float, FlightState], None] = lambda time_s, state: None,
-) -> Flown:
+) -> tuple[Recorded, tuple[Sample, ...]]:
     """Simulate a flight that stick samples control, from hovering until the time of the last sample.
 
     Args:
@@ -214,13 +202,22 @@ def fly(
         space: space that the drone stays in.
         dynamics: dynamics of the drone.
         rate_hz: rate of the recorded flight; its times are exactly k / rate_hz.
+        max_s: longest duration of the flight.
         watch: function that is called with the time of each sample and the state at that time.
+
+    Returns:
+        The recorded flight, and the samples of the sticks that made it.
 
     Raises:
         SettingsError: the start is outside the space, the rate is not above 0, the samples' times do not increase, or
             the flight is too short to be replayed.
     """
-    check(start_m, space, rate_hz)
+    check_positive("rate", rate_hz)
+    if not np.all((start_m >= space.lower_m) & (start_m <= space.upper_m)):
+        lower, upper, start = (
+            ", ".join(f"{value:g}" for value in point) for point in (space.lower_m, space.upper_m, start_m)
+        )
+        raise SettingsError("start", expected=f"a point from ({lower}) to ({upper})", found=f"({start})")
     per_record = int(np.ceil(_MIN_STEPS_HZ / rate_hz))
     step_s = 1 / (rate_hz * per_record)
     state, sticks, done = FlightState.hovering(start_m), Sticks(), 0
@@ -231,6 +228,8 @@ def fly(
             raise SettingsError(
                 "sticks", expected=f"a time after {used[-1].time_s:g} s", found=f"{sample.time_s:g} s"
             )
+        if sample.time_s >= max_s:
+            sample = Sample(max_s, sticks)
         used.append(sample)
         due = int(sample.time_s / step_s + _ROUNDING)
         while done < due:
@@ -240,28 +239,9 @@ def fly(
                 records.append(state)
         sticks = sample.sticks
         watch(sample.time_s, state)
-    return Flown(_recorded(records, rate_hz), tuple(used))
-
-
-def check(start_m: Vector, space: Space, rate_hz: float) -> None:
-    """Check start and rate before the flight; raises the same `SettingsError` as `fly`."""
-    check_positive("rate", rate_hz)
-    if not np.all((start_m >= space.lower_m) & (start_m <= space.upper_m)):
-        lower, upper, start = (
-            ", ".join(f"{value:g}" for value in point) for point in (space.lower_m, space.upper_m, start_m)
-        )
-        raise SettingsError("start", expected=f"a point from ({lower}) to ({upper})", found=f"({start})")
-
-
-def until(samples: Iterable[Sample], end_s: float) -> Iterator[Sample]:
-    """Yield the samples before a time, and one last sample at this time if there are later samples."""
-    sticks = Sticks()
-    for sample in samples:
-        if sample.time_s >= end_s:
-            yield Sample(end_s, sticks)
-            return
-        sticks = sample.sticks
-        yield sample
+        if sample.time_s == max_s:
+            break
+    return _recorded(records, rate_hz), tuple(used)
 
 
 def _recorded(states: list[FlightState], rate_hz: float) -> Recorded:

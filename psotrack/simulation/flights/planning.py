@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy.linalg import norm
 
 from psotrack.errors import SettingsError
 from psotrack.simulation.flights.motion import Flight
@@ -22,15 +25,13 @@ from psotrack.simulation.flights.varying import (
 )
 from psotrack.simulation.scenarios import (
     FlightFromFile,
-    Limits,
     NearPass,
     Scenario,
     scenario_error,
 )
 
 
-@dataclass(frozen=True)
-class Excess:
+class Excess(NamedTuple):
     """The largest violation of a limit by a flight.
 
     Attributes:
@@ -54,66 +55,46 @@ def excess(
     The limits are checked in the order bounds, speed, acceleration, tilt, distance. The distance of two drones in a
     near pass is not checked, because it follows from the formula of the near pass.
     """
-    limits = scenario.limits
-    position_m = np.stack([flight.position_m(time_s) for flight in flights])
-    outside_m = np.maximum(limits.lower_m - position_m, position_m - limits.upper_m).max(axis=-1)
-    # The comparison is negated, because a position that overflows is NaN, and NaN is not above any limit.
-    if not outside_m.max() <= 0:
-        drone, at = _worst(outside_m)
-        x, y, z = position_m[drone, at]
-        lower, upper = list(limits.lower_m), list(limits.upper_m)
-        limit = f"positions from {lower} (limits.lower_m) to {upper} (limits.upper_m)"
-        return _excess(drone, limit, f"[{x:.3f}, {y:.3f}, {z:.3f}]", time_s[at])
-    return _excess_of_motion(flights, limits, time_s) or _excess_of_distance(position_m, scenario, time_s)
-
-
-def _excess_of_motion(
-    flights: tuple[Flight, ...], limits: Limits, time_s: Float[np.ndarray, "times"]
-) -> Excess | None:
-    for name, unit, measure in (
-        ("max_speed_m_s", "m/s", lambda flight: np.linalg.norm(flight.velocity_m_s(time_s), axis=-1)),
-        ("max_acceleration_m_s2", "m/s2", lambda one: np.linalg.norm(one.acceleration_m_s2(time_s), axis=-1)),
-        ("max_tilt_deg", "degrees of tilt", lambda flight: _tilt_deg(flight, time_s)),
-    ):
-        value = np.stack([measure(flight) for flight in flights])
-        most = getattr(limits, name)
-        if not value.max() <= most:
-            drone, at = _worst(value)
-            limit = f"at most {most:g} {unit} (limits.{name})"
-            return _excess(drone, limit, f"{value[drone, at]:.4g} {unit}", time_s[at])
+    for first, over, limit, values, unit in _measured(flights, scenario, time_s):
+        # The comparison is negated, because a position that overflows is NaN, and NaN is not above any limit.
+        if not over.max() <= 0:
+            row, at = (int(index) for index in np.unravel_index(np.argmax(over), over.shape))
+            value = values[row, at]
+            shown = f"{value:.4g} {unit}" if unit else f"[{', '.join(f'{each:.3f}' for each in value)}]"
+            found = f"{shown} at {time_s[at]:.2f} s"
+            return Excess(f"drones[{first + row}].flight", limit, found, float(time_s[at]))
     return None
 
 
-def _tilt_deg(flight: Flight, time_s: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:
-    return np.degrees(np.arccos(np.clip(flight.rotation(time_s)[:, 2, 2], -1, 1)))
-
-
-def _excess_of_distance(
-    position_m: Float[np.ndarray, "drones times 3"], scenario: Scenario, time_s: Float[np.ndarray, "times"]
-) -> Excess | None:
-    least_m = scenario.limits.min_distance_m
+def _measured(
+    flights: tuple[Flight, ...], scenario: Scenario, time_s: Float[np.ndarray, "times"]
+) -> Iterator[
+    tuple[int, Float[np.ndarray, "drones times"], str, Float[np.ndarray, "drones times *values"], str]
+]:
+    """Yield for each limit the number of the first drone, the excess, the limit in words, the values and their unit."""
+    limits = scenario.limits
+    position_m = np.stack([flight.position_m(time_s) for flight in flights])
+    outside_m = np.maximum(limits.lower_m - position_m, position_m - limits.upper_m).max(axis=-1)
+    bounds = f"{list(limits.lower_m)} (limits.lower_m) to {list(limits.upper_m)} (limits.upper_m)"
+    yield 0, outside_m, f"positions from {bounds}", position_m, ""
+    measures: dict[str, tuple[str, Callable[[Flight], Float[np.ndarray, "times"]]]] = {
+        "max_speed_m_s": ("m/s", lambda flight: norm(flight.velocity_m_s(time_s), axis=-1)),
+        "max_acceleration_m_s2": ("m/s2", lambda flight: norm(flight.acceleration_m_s2(time_s), axis=-1)),
+        "max_tilt_deg": ("degrees of tilt", lambda flight: flight.tilt_deg(time_s)),
+    }
+    for name, (unit, measure) in measures.items():
+        values, most = np.stack([measure(flight) for flight in flights]), getattr(limits, name)
+        yield 0, values - most, f"at most {most:g} {unit} (limits.{name})", values, unit
     passing = {
         frozenset((index, drone.flight.other - 1))
         for index, drone in enumerate(scenario.drones)
         if isinstance(drone.flight, NearPass)
     }
-    for drone in range(1, len(position_m)):
-        others = [other for other in range(drone) if frozenset((drone, other)) not in passing]
-        apart_m = np.linalg.norm(position_m[others] - position_m[drone], axis=-1)
-        if apart_m.size and apart_m.min() < least_m:
-            nearest, at = _worst(-apart_m)
-            limit = f"at least {least_m:g} m from drones[{others[nearest]}] (limits.min_distance_m)"
-            return _excess(drone, limit, f"{apart_m[nearest, at]:.4g} m", time_s[at])
-    return None
-
-
-def _worst(value: Float[np.ndarray, "drones times"]) -> tuple[int, int]:
-    row, column = np.unravel_index(np.argmax(value), value.shape)
-    return int(row), int(column)
-
-
-def _excess(drone: int, limit: str, found: str, time_s: float) -> Excess:
-    return Excess(f"drones[{drone}].flight", limit, f"{found} at {time_s:.2f} s", float(time_s))
+    for one, other in itertools.combinations(range(len(flights)), 2):
+        if frozenset((one, other)) not in passing:
+            apart_m = norm(position_m[one] - position_m[other], axis=-1)[None]
+            limit = f"at least {limits.min_distance_m:g} m from drones[{one}] (limits.min_distance_m)"
+            yield other, limits.min_distance_m - apart_m, limit, apart_m, "m"
 
 
 #: Largest number of random variations that are tried until one keeps the limits.

@@ -25,21 +25,18 @@ class Backdrop:
         light: (height, width, 3), linear BGR light.
         depth_m: (height, width), depth along the optical axis at pixel centres.
         floor: (height, width), True at the pixels that show the floor.
-        shell: (height, width), True at the pixels that show walls, ceiling, what hangs there, or no surface.
     """
 
     light: Float[np.ndarray, "height width 3"]
     depth_m: Float[np.ndarray, "height width"]
     floor: Bool[np.ndarray, "height width"]
-    shell: Bool[np.ndarray, "height width"]
 
 
 def render(room: Room, cam: Pinhole, imaging: Imaging) -> Backdrop:
     """Draw the empty room for one camera."""
     number, depth = numbers_and_depth(room.surfaces, full_view(cam))
     light = lens_blur(render_light(room.surfaces, cam, imaging.antialiasing), imaging.lens_blur_px)
-    shell = np.less(number, 0) | np.array(room.in_shell)[number]
-    return Backdrop(light, depth, np.equal(number, 0), shell)
+    return Backdrop(light, depth, np.equal(number, 0))
 
 
 def render_light(

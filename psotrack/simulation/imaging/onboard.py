@@ -161,7 +161,7 @@ class OnboardRenderer:
         self, total: Float[np.ndarray, "height width 4"], num_samples: int, time_s: float, row_px: float
     ) -> None:
         """Darken the floor in a sum of samples by the shadows in the middle of the exposure."""
-        if not (self._imaging.shadows or self._imaging.contact_shadows):
+        if not self._imaging.shadows:
             return
         lost = cv2.convertScaleAbs(self._floor.floor_gain(time_s), alpha=-255, beta=255)
 

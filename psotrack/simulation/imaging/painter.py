@@ -1,13 +1,13 @@
 """Fast drawing of the empty room for moving cameras, which see a different image in each frame.
 
 Surfaces are painted from far to near, each by a homography of its texture into the window where it is visible. Distant
-parts use coarser textures (Williams, "Pyramidal parametrics", 1983). Edges of pieces and limits between levels of a
-texture are half planes of the image: a pixel shows a piece if its ray is inside the cone of the eye and the piece.
+parts use coarser textures (Williams, "Pyramidal parametrics", 1983). Edges of surfaces and limits between levels of a
+texture are half planes of the image: a pixel shows a surface if its ray is inside the cone of the eye and the surface.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -23,118 +23,53 @@ _ON_PLANE_M = 1e-6
 
 
 @dataclass(frozen=True)
-class Piece:
-    """A part of a surface that no plane of the tree cuts.
+class _Tree:
+    """Surfaces in an order from far to near for every viewpoint: a plane, and the surfaces in it and on both sides.
 
-    Attributes:
-        surface: index of the surface.
-        corners_m: (corners, 3), convex polygon, in the order of the surface's corners.
-    """
-
-    surface: int
-    corners_m: Float[np.ndarray, "corners 3"]
-
-
-@dataclass(frozen=True)
-class _Node:
-    """A node of the tree: a plane with the pieces in it.
+    Each surface is wholly on one side, because the planes are those of surfaces that cut no other surface, as there are
+    between walls and boxes.
 
     Attributes:
         normal: (3,), normal of the plane; its points x satisfy normal @ x = offset_m.
         offset_m: offset of the plane.
-        pieces: indices of the pieces in the plane.
-        before: subtree on the side of the normal.
-        behind: subtree on the other side.
+        inside: indices of the surfaces in the plane.
+        before: surfaces on the side of the normal; None for none.
+        behind: surfaces on the other side; None for none.
     """
 
     normal: Float[np.ndarray, "3"]
     offset_m: float
-    pieces: tuple[int, ...]
-    before: _Node | None
-    behind: _Node | None
+    inside: list[int]
+    before: _Tree | None
+    behind: _Tree | None
 
-
-class Order:
-    """Pieces of surfaces that have an order from far to near for every viewpoint.
-
-    Attributes:
-        pieces: pieces of all surfaces.
-    """
-
-    def __init__(self, surfaces: Sequence[Surface]) -> None:
-        self._normals = np.array([surface.normal for surface in surfaces]).reshape(-1, 3)
-        self.pieces: list[Piece] = []
-        self._root = self._node([Piece(index, surface.corners_m) for index, surface in enumerate(surfaces)])
-
-    def far_to_near(self, eye_m: Float[np.ndarray, "3"]) -> list[int]:
-        """Indices of all pieces in an order in which no piece is hidden by an earlier one, seen from a point."""
-        found: list[int] = []
-
-        def visit(node: _Node | None) -> None:
-            if node is None:
-                return
-            in_front = node.normal @ eye_m > node.offset_m
-            visit(node.behind if in_front else node.before)
-            found.extend(node.pieces)
-            visit(node.before if in_front else node.behind)
-
-        visit(self._root)
-        return found
-
-    def _node(self, pieces: list[Piece]) -> _Node | None:
-        if not pieces:
+    @classmethod
+    def of(
+        cls,
+        corners_m: Float[np.ndarray, "surfaces 4 3"],
+        normals: Float[np.ndarray, "surfaces 3"],
+        chosen: Int[np.ndarray, "chosen"],
+    ) -> _Tree | None:
+        """The tree of some surfaces; of the planes that cut the fewest, it takes the one with the most equal halves."""
+        if not len(chosen):
             return None
-        normal, offset_m = _best_plane(pieces, self._normals)
-        first = len(self.pieces)
-        before: list[Piece] = []
-        behind: list[Piece] = []
-        for piece in pieces:
-            height_m = piece.corners_m @ normal - offset_m
-            if np.abs(height_m).max() <= _ON_PLANE_M:
-                self.pieces.append(piece)
-                continue
-            for side, sign in ((before, 1.0), (behind, -1.0)):
-                part = _cut(piece.corners_m, sign * height_m)
-                if part is not None:
-                    side.append(Piece(piece.surface, part))
-        inside = tuple(range(first, len(self.pieces)))
-        return _Node(normal, offset_m, inside, self._node(before), self._node(behind))
+        offset_m = (corners_m[chosen, 0] * normals[chosen]).sum(axis=-1)
+        height_m = np.einsum("pi,sci->psc", normals[chosen], corners_m[chosen]) - offset_m[:, None, None]
+        above, below = (height_m > _ON_PLANE_M).any(axis=-1), (height_m < -_ON_PLANE_M).any(axis=-1)
+        uneven = np.abs(above.sum(axis=1) - below.sum(axis=1))
+        best = int(np.lexsort((uneven, (above & below).sum(axis=1)))[0])
+        above, below = above[best], below[best]
+        sides = (cls.of(corners_m, normals, chosen[side]) for side in (above, below & ~above))
+        inside = chosen[~(above | below)].tolist()
+        return cls(normals[chosen[best]], float(offset_m[best]), inside, *sides)
 
-
-def _best_plane(
-    pieces: list[Piece], normals: Float[np.ndarray, "surfaces 3"]
-) -> tuple[Float[np.ndarray, "3"], float]:
-    """Plane of a piece that cuts the fewest other pieces; among equal planes, the one with the most equal halves."""
-    planes = normals[[piece.surface for piece in pieces]]
-    offset_m = np.array([plane @ piece.corners_m[0] for plane, piece in zip(planes, pieces, strict=True)])
-    starts = np.cumsum([0, *(len(piece.corners_m) for piece in pieces[:-1])])
-    corners = np.concatenate([piece.corners_m for piece in pieces])
-    height_m = planes @ corners.T - offset_m[:, None]
-    above = np.maximum.reduceat(height_m, starts, axis=1) > _ON_PLANE_M
-    below = np.minimum.reduceat(height_m, starts, axis=1) < -_ON_PLANE_M
-    cuts = (above & below).sum(axis=1)
-    uneven = np.abs(above.sum(axis=1) - below.sum(axis=1))
-    best = int(np.lexsort((uneven, cuts))[0])
-    return planes[best], float(offset_m[best])
-
-
-def _cut(
-    corners_m: Float[np.ndarray, "corners 3"], height_m: Float[np.ndarray, "corners"]
-) -> Float[np.ndarray, "kept 3"] | None:
-    """Part of a convex polygon with positive heights, or None if it is empty (Sutherland and Hodgman, 1974)."""
-    if height_m.max() <= _ON_PLANE_M:
-        return None
-    if height_m.min() >= -_ON_PLANE_M:
-        return corners_m
-    kept = []
-    for i in range(len(corners_m)):
-        j = (i + 1) % len(corners_m)
-        if height_m[i] >= 0:
-            kept.append(corners_m[i])
-        if (height_m[i] >= 0) != (height_m[j] >= 0):
-            share = height_m[i] / (height_m[i] - height_m[j])
-            kept.append(corners_m[i] + share * (corners_m[j] - corners_m[i]))
-    return np.array(kept)
+    def far_to_near(self, eye_m: Float[np.ndarray, "3"]) -> Iterator[int]:
+        """Yield all surfaces in an order in which none is hidden by an earlier one, seen from a point."""
+        sides = [self.behind, self.before]
+        far, near = sides if self.normal @ eye_m > self.offset_m else sides[::-1]
+        yield from far.far_to_near(eye_m) if far else ()
+        yield from self.inside
+        yield from near.far_to_near(eye_m) if near else ()
 
 
 #: Integer value of light 1. Lamps have light 3, which still fits into 16 bits.
@@ -153,7 +88,7 @@ _TEXEL_PX = 0.6
 #: Largest number of texels within `_TEXEL_PX` in the direction of foreshortening. If more texels fall there, a
 #: coarser level is used, although it blurs the other direction.
 _FORESHORTENED = 2.0
-#: Pixels by which pieces are widened, so that no ray passes between two pieces with a common edge.
+#: Pixels by which surfaces are widened, so that no ray passes between two surfaces with a common edge.
 _OVERLAP_PX = 1e-6
 
 
@@ -177,21 +112,15 @@ class RoomPainter:
 
     def __init__(self, surfaces: tuple[Surface, ...]) -> None:
         self.surfaces = surfaces
-        self._order = Order(surfaces)
-        pieces = self._order.pieces
-        self._surface_of = [piece.surface for piece in pieces]
-        self._surface_normals = np.array([surface.normal for surface in surfaces])
-        self._surface_corners_m = np.array([surface.corner_m for surface in surfaces])
-        self._normals = self._surface_normals[self._surface_of]
-        # Repeated corners change nothing, and give all pieces the same number of corners.
-        most = max(len(piece.corners_m) for piece in pieces)
-        self._corners_m = np.stack(
-            [np.pad(p.corners_m, ((0, most - len(p.corners_m)), (0, 0)), mode="edge") for p in pieces]
-        )
+        self._normals = np.array([surface.normal for surface in surfaces])
+        self._corners_m = np.array([surface.corners_m for surface in surfaces])
         # The first surface of a room is its floor.
         self._levels = [_levels(surface, is_floor=not index) for index, surface in enumerate(surfaces)]
         self._texel_m = [_texel_m(surface) for surface in surfaces]
         self._buffer = np.empty(0, np.uint16)
+        tree = _Tree.of(self._corners_m, self._normals, np.arange(len(surfaces)))
+        assert tree is not None, "a room has surfaces"
+        self._tree = tree
 
     def paint(self, view: RasterView, image: Light) -> None:
         """Paint the room in a view, one sample per pixel.
@@ -200,16 +129,20 @@ class RoomPainter:
             view: view of magnification 1.
             image: (rows, columns, 4), overwritten: BGR light, and 1 at pixels of the floor, in units of `LIGHT_UNIT`.
         """
-        cam, K = view.cam, view.K
-        eye_m = -cam.R.T @ cam.t_m
-        height_m = ((eye_m - self._corners_m[:, 0]) * self._normals).sum(axis=-1)
+        cam = view.cam
         corners = self._corners_m @ cam.R.T + cam.t_m
-        seen = (height_m > 0) & may_be_seen(corners, K, view.shape)
+        height_m = self._heights_m(view)
         image[...] = 0
-        for index in self._order.far_to_near(eye_m):
+        seen = (height_m > 0) & may_be_seen(corners, view.K, view.shape)
+        for index in self._tree.far_to_near(-cam.R.T @ cam.t_m):
             if seen[index]:
                 normal = cam.R @ self._normals[index]
-                self._paint_piece(image, view, index, corners[index], normal / height_m[index])
+                self._paint_surface(image, view, index, corners[index], normal / height_m[index])
+
+    def _heights_m(self, view: RasterView) -> Float[np.ndarray, "surfaces"]:
+        """(surfaces,), height of the eye over the plane of each surface."""
+        eye_m = -view.cam.R.T @ view.cam.t_m
+        return ((eye_m - self._corners_m[:, 0]) * self._normals).sum(axis=-1)
 
     def hiding_depth_m(
         self, view: RasterView, faces_m: Float[np.ndarray, "faces 3 3"]
@@ -218,14 +151,12 @@ class RoomPainter:
         points = faces_m.reshape(-1, 3)
         lower, upper = points.min(axis=0), points.max(axis=0)
         # For each plane, the corner of the faces' bounding box that is farthest behind the plane.
-        farthest = np.where(self._surface_normals > 0, lower, upper)
-        beyond = ((farthest - self._surface_corners_m) * self._surface_normals).sum(axis=-1) < 0
-        eye_m = -view.cam.R.T @ view.cam.t_m
-        faced = ((eye_m - self._surface_corners_m) * self._surface_normals).sum(axis=-1) > 0
-        hiding = [self.surfaces[index] for index in np.flatnonzero(beyond & faced)]
+        farthest = np.where(self._normals > 0, lower, upper)
+        beyond = ((farthest - self._corners_m[:, 0]) * self._normals).sum(axis=-1) < 0
+        hiding = [self.surfaces[index] for index in np.flatnonzero(beyond & (self._heights_m(view) > 0))]
         return numbers_and_depth(hiding, view)[1] if hiding else empty_buffers(view)[1]
 
-    def _paint_piece(
+    def _paint_surface(
         self,
         image: Light,
         view: RasterView,
@@ -233,14 +164,14 @@ class RoomPainter:
         corners: Float[np.ndarray, "corners 3"],
         normal_per_height: Float[np.ndarray, "3"],
     ) -> None:
-        K, surface = view.K, self._surface_of[index]
+        K = view.K
         to_rays = np.linalg.inv(K)
         edges = np.cross(corners, np.roll(corners, -1, axis=0)) @ to_rays
         # Along a ray (x, y, 1) to the plane, 1 / depth is linear in x and y.
         nearness = -normal_per_height @ to_rays
         height_m = 1 / float(np.linalg.norm(normal_per_height))
-        to_image = K @ texel_to_camera(self.surfaces[surface], view.cam)
-        for level, nearest, farthest in self._by_level(surface, corners[:, 2], height_m, K[0, 0]):
+        to_image = K @ texel_to_camera(self.surfaces[index], view.cam)
+        for level, nearest, farthest in self._by_level(index, corners[:, 2], height_m, K[0, 0]):
             limits = [nearness - [0, 0, 1 / farthest]] if np.isfinite(farthest) else []
             limits += [[0, 0, 1 / nearest] - nearness] if nearest > 0 else []
             spans = _spans(np.vstack([edges, *limits]), view.shape)
@@ -251,7 +182,7 @@ class RoomPainter:
     def _by_level(
         self, surface: int, depth_m: Float[np.ndarray, "corners"], height_m: float, focal_px: float
     ) -> Iterator[tuple[Level, float, float]]:
-        """Yield the levels of a texture that a piece needs, each with its smallest and largest depth."""
+        """Yield the levels of a texture that a surface needs, each with its smallest and largest depth."""
         levels = self._levels[surface]
         texel_px_m = focal_px * self._texel_m[surface]
         nearest = 0.0
@@ -278,7 +209,7 @@ class RoomPainter:
         window = image[spans.y : spans.y + len(spans.left), x1:x2]
         if self._buffer.size < window.size:
             self._buffer = np.empty(window.size, np.uint16)
-        # The buffer is reused, because allocating memory for each piece takes as long as painting it.
+        # The buffer is reused, because allocating memory for each surface takes as long as painting it.
         painted = self._buffer[: window.size].reshape(window.shape)
         H = np.array([[1, 0, -x1], [0, 1, -spans.y], [0, 0, 1.0]]) @ H
         cv2.warpPerspective(level, H, window.shape[1::-1], dst=painted, flags=cv2.INTER_LINEAR)
@@ -313,9 +244,9 @@ def _levels(surface: Surface, is_floor: bool) -> list[Level]:
 
 
 def may_be_seen(
-    corners: Float[np.ndarray, "pieces corners 3"], K: Float[np.ndarray, "3 3"], shape: tuple[int, int]
-) -> Bool[np.ndarray, "pieces"]:
-    """(pieces,), False if all corners of a piece are beyond one side of the image or behind the camera."""
+    corners: Float[np.ndarray, "surfaces corners 3"], K: Float[np.ndarray, "3 3"], shape: tuple[int, int]
+) -> Bool[np.ndarray, "surfaces"]:
+    """(surfaces,), False if all corners of a surface are beyond one side of the image or behind the camera."""
     x, y, depth = np.moveaxis(corners @ K.T, -1, 0)
     rows, columns = shape
     beyond = [

@@ -19,7 +19,6 @@ from psotrack.simulation.imaging.raster import Pinhole, RasterView, full_view, p
 from psotrack.simulation.imaging.reflections import Mirror
 from psotrack.simulation.imaging.scenery import Scenery
 from psotrack.simulation.imaging.shadows import FloorShadows
-from psotrack.simulation.imaging.sky import Sky
 from psotrack.simulation.scene import Scene
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -110,16 +109,12 @@ class View:
         self._clean: Image = sensor.develop(self.backdrop.light)
         self._samples = pass_samples(imaging)
         self._behind, self._shows_px = behind, shows_px
-        clouds = scene.scenario.surroundings.clouds
-        self._sky = Sky(clouds, scene.seed, cam, self.backdrop, imaging.lens_blur_px) if clouds else None
 
     def clean_frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame without the effects of the sensor."""
         image = self._clean.copy()
         imaging = self.scene.scenario.imaging
         time_s = self.scene.time_s(frame)
-        if self._sky is not None:
-            self._sky.draw(image, time_s)
         self.shadows.cast(image, time_s)
         during_s = time_s + self._samples[:, 2] * imaging.shutter_s
         posed = [pose(self.scene, drone, during_s) for drone in range(len(self.scene.flights))]

@@ -1,16 +1,14 @@
-"""Shadows of drones on the floor: a soft shadow for each lamp, and a contact shadow in the ambient light.
+"""Shadows of drones on the floor, a soft shadow for each lamp.
 
 The lamps have the same height and the floor is flat, so a drone's shadow has the same shape under each lamp: the
-drone's outline from above, magnified, blurred by the panel's size, and shifted. In the ambient light, a flat object's
-shadow is its outline with a blur that grows with the height. The shadows are drawn on a map of the floor.
+drone's outline from above, magnified, blurred by the panel's size, and shifted. The shadows are drawn on a map of the
+floor.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-import scipy.fft
-import scipy.special
 from jaxtyping import Float, UInt8
 
 from psotrack.simulation.imaging.backdrop import Backdrop
@@ -25,8 +23,6 @@ from psotrack.simulation.world.lighting import AMBIENT
 _CELL_M, _FINE_M = 0.02, 0.01
 #: Share of light that a rotor disc blocks.
 _DISC_SHARE = 0.25
-#: Share of lost light that is not visible, because it is less than half a grey level.
-_INVISIBLE = 0.01
 
 #: Factor of a pixel's grey levels, in 1/255, by the share of lost light, in 1/255.
 _DARKER = (255 * (1 - np.arange(256) / 255) ** (1 / GAMMA)).round().astype(np.uint8)
@@ -40,7 +36,6 @@ class FloorLight:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._outlines = [_outline(shape) for shape in scene.models]
-        self._undersides_m = [_underside_m(shape) for shape in scene.models]
         ground = scene.room.surfaces[0]
         self._corner_m = ground.corner_m
         extent = [float(np.linalg.norm(ground.along_m)), float(np.linalg.norm(ground.down_m))]
@@ -56,19 +51,12 @@ class FloorLight:
     def floor_gain(self, time_s: float) -> Float[np.ndarray, "rows columns"]:
         """(rows, columns), share of light that reaches each cell of the floor at a time."""
         gain = np.ones(self._shape, np.float32)
-        imaging = self._scene.scenario.imaging
         time = np.array([time_s])
-        for flight, outline, underside_m in zip(
-            self._scene.flights, self._outlines, self._undersides_m, strict=True
-        ):
-            position, turn = flight.position_m(time)[0], flight.rotation(time)[0, :2, :2]
-            if imaging.shadows:
-                self._cast_lamp_shadows(gain, outline, position, turn)
-            if imaging.contact_shadows:
-                self._cast_ambient_shadow(gain, outline, underside_m, position, turn)
+        for flight, outline in zip(self._scene.flights, self._outlines, strict=True):
+            self._cast(gain, outline, flight.position_m(time)[0], flight.rotation(time)[0, :2, :2])
         return gain
 
-    def _cast_lamp_shadows(
+    def _cast(
         self,
         gain: Float[np.ndarray, "rows columns"],
         outline: Float[np.ndarray, "side side"],
@@ -81,49 +69,29 @@ class FloorLight:
         # The edge of a shadow from a panel of length s is s (m - 1) wide; the standard deviation of a uniform
         # distribution is its width divided by sqrt(12).
         sigmas_m = [max(side * (magnified - 1) / np.sqrt(12), _CELL_M / 2) for side in panels.size_m]
-        patch = _turn_outline(outline, turn, magnified, _CELL_M, 3 * max(sigmas_m))
+        patch = _turn_outline(outline, turn, magnified, 3 * max(sigmas_m))
         patch = cv2.GaussianBlur(patch, (0, 0), sigmas_m[0] / _CELL_M, sigmaY=sigmas_m[1] / _CELL_M)
         falls = panels.centres_m + (position - panels.centres_m) * magnified
         ups = np.broadcast_to(_UP, falls.shape)
         # (lamps, shadows), light of each lamp at the centre of each lamp's shadow.
         direct = np.stack([panels.direct(falls, ups, lamp) for lamp in panels.centres_m])
         for fall, weight in zip(falls, direct.diagonal() / (direct.sum(axis=0) + AMBIENT), strict=True):
-            self._stamp(gain, float(weight) * patch, _CELL_M, fall)
-
-    def _cast_ambient_shadow(
-        self,
-        gain: Float[np.ndarray, "rows columns"],
-        outline: Float[np.ndarray, "side side"],
-        underside_m: float,
-        position: Float[np.ndarray, "3"],
-        turn: Float[np.ndarray, "2 2"],
-    ) -> None:
-        height_m = max(float(position[2]) + underside_m, _FINE_M)
-        foot = position * [1, 1, 0]
-        weight = AMBIENT / self._scene.room.panels.on_faces(foot, _UP)[0]
-        if weight * outline.sum() * _FINE_M**2 < _INVISIBLE * np.pi * height_m**2:
-            return
-        # Shadows of high drones have no details, so larger cells are enough.
-        cell_m = max(_CELL_M, height_m / 8)
-        patch = _turn_outline(outline, turn, 1.0, cell_m, 3 * height_m)
-        self._stamp(gain, weight * ambient_blocked(patch, cell_m, height_m), cell_m, foot)
+            self._stamp(gain, float(weight) * patch, fall)
 
     def _stamp(
         self,
         gain: Float[np.ndarray, "rows columns"],
         patch: Float[np.ndarray, "side side"],
-        cell_m: float,
         at_m: Float[np.ndarray, "3"],
     ) -> None:
         """Remove the share of light that a patch gives, centred at a point of the floor."""
         centre = np.array([at_m[0] - self._corner_m[0], self._corner_m[1] - at_m[1]]) / _CELL_M - 0.5
-        magnified = cell_m / _CELL_M
-        half = int(magnified * (len(patch) // 2)) + 1
+        half = len(patch) // 2 + 1
         first = np.floor(centre).astype(int) - half
         # Transformation from the patch's cells to the floor's cells, which moves the patch's middle to `centre`.
-        offset = centre - first - magnified * (len(patch) // 2)
+        offset = centre - first - len(patch) // 2
         side = 2 * half + 2
-        A = np.array([[magnified, 0, offset[0]], [0, magnified, offset[1]]])
+        A = np.array([[1, 0, offset[0]], [0, 1, offset[1]]])
         moved = cv2.warpAffine(patch.astype(np.float32), A, (side, side))
         low, high = np.maximum(first, 0), np.minimum(first + side, gain.shape[::-1])
         if np.all(high > low):
@@ -145,9 +113,8 @@ class FloorShadows(FloorLight):
 
     def cast(self, image: UInt8[np.ndarray, "height width 3"], time_s: float) -> None:
         """Darken the floor in an image by the shadows at a time."""
-        imaging = self._scene.scenario.imaging
         part = image[self._window]
-        if not part.size or not (imaging.shadows or imaging.contact_shadows):
+        if not part.size or not self._scene.scenario.imaging.shadows:
             return
         on_floor = cv2.convertScaleAbs(self.floor_gain(time_s), alpha=-255, beta=255)
         seen = cv2.warpPerspective(on_floor, self._H, part.shape[1::-1], flags=cv2.INTER_LINEAR)
@@ -157,27 +124,6 @@ class FloorShadows(FloorLight):
             part = part[y : y + height, x : x + width]
             darker = cv2.LUT(lost[y : y + height, x : x + width], _DARKER)
             cv2.multiply(part, cv2.merge([darker, darker, darker]), dst=part, scale=1 / 255)
-
-
-def ambient_blocked(
-    outline: Float[np.ndarray, "side side"], cell_m: float, height_m: float
-) -> Float[np.ndarray, "side side"]:
-    """(side, side), share of ambient light that a flat object blocks from each cell of the floor below it.
-
-    For a point of the floor, an element dA of a horizontal plane at height h and horizontal distance r blocks the form
-    factor h^2 dA / (pi (h^2 + r^2)^2) of the ambient light. The sum over the object is a convolution; the Fourier
-    transform of its kernel is k h K1(k h), with the modified Bessel function K1.
-
-    Args:
-        outline: (side, side), share of light that each cell of the object blocks, seen from above; 0 near the border.
-        cell_m: size of the cells.
-        height_m: height of the object above the floor.
-    """
-    side = scipy.fft.next_fast_len(len(outline), real=True)
-    kh = 2 * np.pi * height_m / cell_m * np.hypot(scipy.fft.rfftfreq(side), scipy.fft.fftfreq(side)[:, None])
-    kh[0, 0] = 1e-9
-    spectrum = scipy.fft.rfft2(outline, (side, side)) * (kh * scipy.special.k1(kh)).astype(np.float32)
-    return np.clip(scipy.fft.irfft2(spectrum, (side, side))[: len(outline), : len(outline)], 0, 1)
 
 
 def _outline(shape: DroneModel) -> Float[np.ndarray, "side side"]:
@@ -191,27 +137,16 @@ def _outline(shape: DroneModel) -> Float[np.ndarray, "side side"]:
     return outline
 
 
-def _underside_m(shape: DroneModel) -> float:
-    """Mean height of the faces that point down, in the body frame; rotor discs have the weight `_DISC_SHARE`."""
-    weight, height = [], []
-    for triangles, share in ((disc_fans(shape), -_DISC_SHARE), (shape.triangles_m, 1.0)):
-        a, b, c = triangles.swapaxes(0, 1)
-        weight.append(np.clip(-share * np.cross(b - a, c - a)[:, 2], 0, None))
-        height.append(triangles[..., 2].mean(axis=-1))
-    return float(np.average(np.concatenate(height), weights=np.concatenate(weight)))
-
-
 def _turn_outline(
     outline: Float[np.ndarray, "side side"],
     turn: Float[np.ndarray, "2 2"],
     magnified: float,
-    cell_m: float,
     margin_m: float,
 ) -> Float[np.ndarray, "cells cells"]:
-    """(cells, cells), outline turned, magnified and resampled to cells of `cell_m`, centred."""
-    half = int((len(outline) * _FINE_M * magnified / 2 + margin_m) / cell_m) + 2
+    """(cells, cells), outline turned, magnified and resampled to the floor's cells, centred."""
+    half = int((len(outline) * _FINE_M * magnified / 2 + margin_m) / _CELL_M) + 2
     # Rows increase downwards and y upwards, so a rotation in the plane is the transposed rotation in the image.
-    A = magnified * _FINE_M / cell_m * np.array([[turn[0, 0], -turn[0, 1]], [-turn[1, 0], turn[1, 1]]])
+    A = magnified * _FINE_M / _CELL_M * np.array([[turn[0, 0], -turn[0, 1]], [-turn[1, 0], turn[1, 1]]])
     offset = half - A @ np.full(2, len(outline) // 2)
-    small = cv2.GaussianBlur(outline, (0, 0), cell_m / _FINE_M / 2 / magnified)
+    small = cv2.GaussianBlur(outline, (0, 0), _CELL_M / _FINE_M / 2 / magnified)
     return cv2.warpAffine(small, np.column_stack([A, offset]), (2 * half + 1, 2 * half + 1))

@@ -1,4 +1,4 @@
-"""Drone models: solids of triangles, rotors, and the cross of mocap markers on top.
+"""Drone models: solids of triangles, and rotors.
 
 The corners of a triangle are counter-clockwise seen from outside, metres.
 """
@@ -41,10 +41,10 @@ def beam(start: Point, end: Point, width: float, height: float) -> Triangles:
     return bar @ np.stack([ahead, left, np.cross(ahead, left)]) + (a + b) / 2
 
 
-def turn(triangles: Triangles, angle_rad: float) -> Triangles:
-    """Triangles turned about the z axis, from x towards y."""
+def turn(corners: Float[np.ndarray, "*corners 3"], angle_rad: float) -> Float[np.ndarray, "*corners 3"]:
+    """Points turned about the z axis, from x towards y."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return corners @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def pitch(triangles: Triangles, angle_rad: float, about: Point) -> Triangles:
@@ -73,8 +73,6 @@ def _prism(ring: Float[np.ndarray, "sides 2"], bottom: float, top: float, taper:
 
 #: Number of corners of a rotor disc.
 _DISC_SIDES = 20
-#: Height of the markers above the highest point of the drone, so that the drone does not hide them from above.
-_MAST_M = 0.03
 
 
 @dataclass(frozen=True)
@@ -115,39 +113,3 @@ def disc_fans(model: DroneModel) -> Float[np.ndarray, "slices 3 3"]:
     fan = np.stack([np.zeros_like(rim[:-1]), rim[:-1], rim[1:]], axis=1)
     discs = model.rotor_centres_m[:, None, None] + model.rotor_radii_m[:, None, None, None] * fan
     return discs.reshape(-1, 3, 3)
-
-
-#: Lengths of the crosses' arms: ahead, left, back, right. The six distances between the markers of one cross differ
-#: from each other by at least 12 mm. For any two crosses, the sorted distances differ in at least one place by at least
-#: 20 mm. The lengths were found by a search.
-_CROSS_ARMS_M = (
-    (0.055, 0.085, 0.115, 0.105),
-    (0.115, 0.120, 0.095, 0.060),
-    (0.085, 0.140, 0.040, 0.050),
-    (0.070, 0.050, 0.090, 0.095),
-    (0.135, 0.110, 0.060, 0.045),
-    (0.130, 0.120, 0.110, 0.075),
-    (0.075, 0.095, 0.125, 0.120),
-    (0.095, 0.115, 0.040, 0.050),
-    (0.045, 0.095, 0.135, 0.140),
-    (0.135, 0.120, 0.085, 0.140),
-    (0.075, 0.140, 0.135, 0.040),
-    (0.135, 0.050, 0.085, 0.080),
-    (0.045, 0.125, 0.075, 0.040),
-    (0.135, 0.130, 0.085, 0.110),
-)
-
-
-def marker_cross(model: DroneModel, number: int) -> Float[np.ndarray, "4 3"]:
-    """(4, 3), mocap markers A, B, C and D of a drone in its body frame: ahead, left, back, right.
-
-    The markers form an asymmetric cross above the highest point of the model. The arms depend on the drone's number, so
-    that a motion capture system can distinguish the drones by the distances between their markers.
-
-    Args:
-        model: shape of the drone.
-        number: number of the drone in its sequence, from 1; after the last cross, the first cross is used again.
-    """
-    ahead, left, back, right = _CROSS_ARMS_M[(number - 1) % len(_CROSS_ARMS_M)]
-    height = float(model.triangles_m[..., 2].max()) + _MAST_M
-    return np.array([(ahead, 0.0, height), (0.0, left, height), (-back, 0.0, height), (0.0, -right, height)])

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.errors import SettingsError
 from psotrack.simulation.scenarios import Vector
 from psotrack.simulation.world import textures
 from psotrack.simulation.world.halls import HALLS, Box, Hall
@@ -60,13 +59,11 @@ class Room:
 
     Attributes:
         surfaces: all surfaces; the first is the floor.
-        in_shell: whether each surface is a wall, the ceiling, or hangs there: a marker or a lamp.
         panels: lamp panels.
         marker_corners_m: (4, 3) by marker id: top left, top right, bottom right, bottom left of the black square.
     """
 
     surfaces: tuple[Surface, ...]
-    in_shell: tuple[bool, ...]
     panels: Lamps
     marker_corners_m: Mapping[int, Float[np.ndarray, "4 3"]]
 
@@ -79,12 +76,7 @@ def room(name: str, with_markers: bool, scale: float) -> Room:
         name: name of a hall in `HALLS`.
         with_markers: whether ArUco markers hang on the walls.
         scale: scale of the image size, 1 is full size; it decides the resolution of the textures.
-
-    Raises:
-        SettingsError: no hall has this name; the message lists the names.
     """
-    if name not in HALLS:
-        raise SettingsError("room", expected=f"one of {', '.join(HALLS)}", found=name)
     hall = HALLS[name]
     texel_m = hall.texel_m * min(max(1.0, 1 / scale), _COARSEST)
     return _build(hall, with_markers, round(texel_m, 3))
@@ -95,38 +87,30 @@ def _build(hall: Hall, with_markers: bool, texel_m: float) -> Room:
     x, y = length / 2, width / 2
     rng = np.random.default_rng(hall.seed)
     panels = lamps(np.array([(*at, height) for at in hall.lamps_xy_m]), hall.lamp_size_m)
-    walls = [
-        ((-x, y, height), (length, 0.0, 0.0), (0.0, 0.0, -height)),
-        ((x, y, height), (0.0, -width, 0.0), (0.0, 0.0, -height)),
-        ((x, -y, height), (-length, 0.0, 0.0), (0.0, 0.0, -height)),
-        ((-x, -y, height), (0.0, width, 0.0), (0.0, 0.0, -height)),
+    shell = [
+        (hall.floor, (-x, y, 0.0), (length, 0.0, 0.0), (0.0, -width, 0.0)),
+        (hall.ceiling, (-x, -y, height), (length, 0.0, 0.0), (0.0, width, 0.0)),
+        (hall.walls, (-x, y, height), (length, 0.0, 0.0), (0.0, 0.0, -height)),
+        (hall.walls, (x, y, height), (0.0, -width, 0.0), (0.0, 0.0, -height)),
+        (hall.walls, (x, -y, height), (-length, 0.0, 0.0), (0.0, 0.0, -height)),
+        (hall.walls, (-x, -y, height), (0.0, width, 0.0), (0.0, 0.0, -height)),
     ]
-    surfaces = [
-        _surface(
-            (-x, y, 0.0), (length, 0.0, 0.0), (0.0, -width, 0.0), hall.floor(length, width, texel_m, rng)
-        ),
-        _surface(
-            (-x, -y, height),
-            (length, 0.0, 0.0),
-            (0.0, width, 0.0),
-            hall.ceiling(length, width, texel_m, rng),
-        ),
-        *(_surface(*wall, hall.walls(abs(sum(wall[1])), height, texel_m, rng)) for wall in walls),
-        *(side for box in hall.boxes for side in _sides(box, 2 * texel_m, rng)),
-        *(_underside(box, 2 * texel_m, rng) for box in hall.boxes if box.lower_m[2] > 0),
-    ]
-    in_shell = [1 <= index <= 1 + len(walls) for index in range(len(surfaces))]
+    surfaces = []
+    for name, corner, along, down in shell:
+        drawn = getattr(textures, name)(abs(sum(along)), abs(sum(down)), texel_m, rng)
+        surfaces.append(_surface(corner, along, down, drawn))
+    for box in hall.boxes:
+        surfaces += _sides(box, 2 * texel_m, rng)
+    surfaces += [_underside(box, 2 * texel_m, rng) for box in hall.boxes if box.lower_m[2] > 0]
     marker_corners: dict[int, Float[np.ndarray, "4 3"]] = {}
     if with_markers:
-        for marker, (corner, along) in enumerate(_marker_places(surfaces[2:6], hall), start=1):
-            surface, marker_corners[marker] = _marker(marker, hall.marker_size_m, corner, along)
+        for marker, place_m in enumerate(_marker_places(surfaces[2:6], hall), start=1):
+            surface, marker_corners[marker] = _marker(marker, hall.marker_size_m, *place_m)
             surfaces.append(surface)
     boxes_m = np.array([(box.lower_m, box.upper_m) for box in hall.boxes])
     lit = [_add_light(surface, hall.light_step_m, panels, boxes_m) for surface in surfaces]
     lamp_surfaces = [_lamp(centre, panels.size_m) for centre in panels.centres_m]
-    every = (*lit, *lamp_surfaces)
-    in_shell += [True] * (len(every) - len(in_shell))
-    return Room(every, tuple(in_shell), panels, marker_corners)
+    return Room((*lit, *lamp_surfaces), panels, marker_corners)
 
 
 def _surface(corner: Vector, along: Vector, down: Vector, texture: textures.Texture) -> Surface:
