@@ -309,35 +309,6 @@ def test_the_advice_for_a_video_that_ends_early_needs_no_option_of_other_command
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("inverted", [False, True])
-def test_a_board_with_markers_is_no_chessboard(tmp_path, inverted):
-    """Also where corners of its squares and markers look like those of a small chessboard."""
-    for number in range(4):
-        image = draw_board(BOARD, K, pose(number), SIZE_WH)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), 255 - image if inverted else image)
-    images = open_images([tmp_path])
-    for size in ((4, 6), (9, 7)):
-        with pytest.raises(
-            InputError, match=r"found a board with markers of the dictionary 4x4_50 in 4 of the first 4 "
-        ):
-            find_views(Board(size, 0.04, kind="chessboard"), images, instants_of_numbers(images))
-
-
-@pytest.mark.slow
-def test_markers_beside_a_chessboard_are_not_on_it(tmp_path):
-    """Markers that a person carries beside the board."""
-    sheet = np.kron(np.indices((8, 6)).sum(axis=0) % 2, np.ones((40, 40), int)).astype(np.uint8) * 255
-    for number in range(4):
-        image = np.full((480, 1280), 255, np.uint8)
-        image[50 + 9 * number : 370 + 9 * number, 60:300] = sheet
-        image[:, 640:] = draw_board(BOARD, K, pose(number), SIZE_WH)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
-    images = open_images([tmp_path])
-    found = find_views(Board((6, 8), 0.04, kind="chessboard"), images, instants_of_numbers(images))
-    assert len(found.views.number) == 4
-
-
-@pytest.mark.slow
 def test_any_frame_of_a_long_video_may_be_the_floor(tmp_path):
     """More than 300 frames are not all searched, which a line says; the frame of --floor always is."""
     for name, x_m in (("left", 0.0), ("right", 0.1)):

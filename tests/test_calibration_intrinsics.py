@@ -10,7 +10,6 @@ from psotrack.calibration import (
     LensModel,
     choose_lens_model,
     lens_of_board,
-    lens_of_sensor,
     lens_of_view,
     open_images,
     parse_lens_model,
@@ -22,19 +21,15 @@ from psotrack.recordings import VideoWriter
 
 
 def test_lenses_of_a_data_sheet():
-    """The dataset's action camera, 92.45 x 60.83 degrees, and a sensor whose edge is seen at 45 degrees."""
+    """The dataset's action camera, 92.45 x 60.83 degrees."""
     lens = lens_of_view(92.45, 60.83, (3840, 2160))
     edges = project(
         lens, np.array([[np.tan(np.deg2rad(92.45 / 2)), 0, 1], [0, -np.tan(np.deg2rad(60.83 / 2)), 1]])
     )[0]
     # Pixel centres are at whole numbers: the image ends half a pixel after the last pixel's centre.
     np.testing.assert_allclose(edges, [[3839.5, 1079.5], [1919.5, -0.5]], atol=1e-9)
-    lens = lens_of_sensor(8.0, (16.0, 12.0), (640, 480))
-    np.testing.assert_allclose(project(lens, np.array([1.0, 0, 1.0]))[0], [639.5, 239.5], atol=1e-9)
     with pytest.raises(SettingsError, match="between 0 and 180"):
         lens_of_view(180.0, 60.0, (640, 480))
-    with pytest.raises(SettingsError, match="sensor_mm"):
-        lens_of_sensor(8.0, (16.0, 0.0), (640, 480))
 
 
 BOARD = Board((7, 5), 0.04, 0.03)

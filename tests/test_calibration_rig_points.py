@@ -25,7 +25,7 @@ from psotrack.calibration import (
     views_of_detections,
     world_of_camera,
 )
-from psotrack.calibration.rig.point_adjustment import adjust
+from psotrack.calibration.rig.moving_point import adjust
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.recordings import Detections, FrameTimes

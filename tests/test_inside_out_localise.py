@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from psotrack.calibration import lens_of_sensor, lens_of_view
+from psotrack.calibration import lens_of_view
 from psotrack.cli.onboard.localise import localise as command
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.foreground.markers import marker_dictionary
@@ -572,7 +572,7 @@ def test_lenses_are_not_scaled_to_other_aspect_ratios(tmp_path):
 
 def test_a_csv_without_sizes_is_refused_where_its_axis_is_far_off_the_middle(tmp_path):
     lens = tmp_path / "cameras_calibration.csv"
-    write_calibration(lens, make_rig({"cam1i": lens_of_sensor(4.0, (6.4, 4.8), SIZE_WH)}))
+    write_calibration(lens, make_rig({"cam1i": lens_of_view(77.32, 61.93, SIZE_WH)}))
     assert read_lens(lens, SIZE_WH).K[0, 2] == 319.5
     with pytest.raises(
         InputError, match=r"expected intrinsics for 1920 x 1080.*found an optical axis at \(320, 240\)"

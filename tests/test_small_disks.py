@@ -163,10 +163,6 @@ COMMANDS = {
         "markers.csv",
     ): "onboard detect {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
     ("fused.csv",): "onboard fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
-    (
-        "offset.png",
-    ): "doctor {inputs}/clocks/Real_Data/R12_D2 --tracks {inputs}/clocks/tracks.csv --max-offset 1 "
-    "--plot offset.png --force",
     ("doctor.json",): "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
 }
 

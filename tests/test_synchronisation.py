@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration.clocks import camera_offsets
 from psotrack.cli.doctor import doctor
-from psotrack.errors import InputError, OutputError, SettingsError
+from psotrack.errors import InputError, SettingsError
 from psotrack.evaluation import find_offset
 from psotrack.geometry import look_at, make_camera
 from psotrack.geometry.rig_files import write_calibration
@@ -489,13 +489,6 @@ class TestCommand:
             ("dron2", "1"),
         ]
         assert len(content["curve"]["offset_s"]) == len(content["curve"]["mean_distance_m"]) == 51
-
-    def test_plot(self, recording, tmp_path):
-        picture = tmp_path / "offset.png"
-        assert self.run(recording, "--plot", picture, "--quiet").stdout == ""
-        assert cv2.imread(str(picture)).shape[0] > 300
-        with pytest.raises(OutputError, match="--force"):
-            self.run(recording, "--plot", picture)
 
     def test_without_a_reference(self, recording, tmp_path):
         folder, tracks = recording

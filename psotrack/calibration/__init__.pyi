@@ -3,26 +3,23 @@ from .board_page import save_board
 from .board_recognition import describe_board, detect_board
 from .boards import Board
 from .bundle import Bundle, BundleProblem, BundleState, summed
-from .derivatives import reproject
 from .extrinsics import Located, locate_camera
 from .image_points import (
     ImagePoints,
     find_markers,
     read_image_points,
 )
-from .intrinsics import Lens, lens_of_board, lens_of_sensor, lens_of_view
+from .intrinsics import Lens, lens_of_board, lens_of_view
 from .lens_models import LensModel, known_lenses, parse_lens_model
-from .pnp import Solver, ray_distances, refine_pnp, solve_pnp, solve_pnp_ransac
+from .pnp import Solver, ray_distances, solve_pnp, solve_pnp_ransac
 from .residuals import GATE, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
 from .rig.by_board import calibrate_by_board
 from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
-    CameraFigures,
     advise,
     coverage,
     figures_of,
-    find_shifts,
     say_print,
     say_searched,
     worst_views,
@@ -40,9 +37,9 @@ from .rig.point_files import (
     stick_length,
     views_of_detections,
 )
-from .rig.point_shifts import PointShift, find_point_shifts
 from .rig.result import RigCalibration
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
+from .rig.shifts import Shift, find_board_shifts, find_point_shifts
 from .rig.views import BoardViews, FoundBoards, find_views
 from .rig.world import Similarity, align, world_of_camera
 
@@ -57,7 +54,6 @@ __all__ = [
     "BundleProblem",
     "BundleState",
     "CalibratedRig",
-    "CameraFigures",
     "CameraImages",
     "FoundBoards",
     "GivenWorld",
@@ -70,10 +66,10 @@ __all__ = [
     "ModelComparison",
     "PointRig",
     "PointSettings",
-    "PointShift",
     "PointViews",
     "RigCalibration",
     "RigSettings",
+    "Shift",
     "Similarity",
     "Solver",
     "advise",
@@ -90,16 +86,15 @@ __all__ = [
     "detect_board",
     "distance_between",
     "figures_of",
+    "find_board_shifts",
     "find_markers",
     "find_point_shifts",
-    "find_shifts",
     "find_views",
     "fit_world",
     "inflation",
     "instants_of_numbers",
     "known_lenses",
     "lens_of_board",
-    "lens_of_sensor",
     "lens_of_view",
     "locate_camera",
     "open_images",
@@ -109,8 +104,6 @@ __all__ = [
     "read_image_points",
     "read_point_views",
     "read_world",
-    "refine_pnp",
-    "reproject",
     "save_board",
     "save_coverage",
     "say_not_compared",

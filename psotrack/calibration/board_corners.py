@@ -100,28 +100,6 @@ class BoardFinder:
         return _in_order(pixels.reshape(rows - 1, columns - 1, 2), image).reshape(-1, 2)
 
 
-def outline_of(board: Board, corners_px: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "8"] | None:
-    """(8,), pixels of the corners of the board's outline, also where they are not seen; None for corners on a line."""
-    seen = np.isfinite(corners_px[:, 0])
-    if seen.sum() < board.least_corners or np.linalg.matrix_rank(np.cov(corners_px[seen].T), tol=1.0) < 2:
-        return None
-    homography, _ = cv2.findHomography(board.corners_m[seen, :2], corners_px[seen])
-    if homography is None:
-        return None
-    return cv2.perspectiveTransform(board.outline_m[:, None], homography).ravel()
-
-
-def choose_spread(outlines: Float[np.ndarray, "views numbers"], count: int) -> list[int]:
-    """Choose views that differ most: each next view is the farthest from the views chosen before."""
-    # The first view is the farthest from the median of all views.
-    chosen = [int(np.linalg.norm(outlines - np.median(outlines, axis=0), axis=1).argmax())]
-    distance = np.linalg.norm(outlines - outlines[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(outlines)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(outlines - outlines[chosen[-1]], axis=1))
-    return chosen
-
-
 def _half_window(grid: Float[np.ndarray, "rows columns 2"]) -> int:
     """Half the side of a window around a corner that contains no other corner."""
     steps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])

@@ -28,20 +28,18 @@ _FAMILIES = {
 }
 #: Smallest number of different markers in an image, and of images that show a marker, that are not there by chance.
 _LEAST_MARKERS, _LEAST_IMAGES = 3, 3
-#: Number of markers that determine the plane of a board well, and number of images in which their size is measured.
-_MARKERS_OF_PLANE, _IMAGES_OF_SIZE = 6, 40
+#: Number of markers that determine the plane of a board, and number of images in which their size is measured.
+_MARKERS_OF_PLANE, _IMAGES_OF_SIZE = 5, 40
 #: A marker that is nearer than this to its place in another image stands still, pixels.
 _STILL_PX = 2.0
 #: Smallest number of images that show a marker of the board, as a fraction of those that show its most frequent marker.
 _OFTEN = 0.25
-#: Number of images in which markers are looked for before a chessboard is, and side of these images, pixels.
-_FIRST_IMAGES, _FIRST_SIDE_PX = 6, 1000
+#: Side of the images in which a board is recognised, pixels.
+_FIRST_SIDE_PX = 1000
 #: Largest number of squares along a side of a board that is recognised by its markers.
 _MOST_SQUARES = 20
-#: Largest distance, in sides of a marker, up to which markers fit a board.
-_FITS = 0.2
-#: Sides of a marker in sides of a square that are tried: one of them is near enough to any that is printed.
-_MARKERS_IN_SQUARES = (0.75, 0.5)
+#: Largest distance, in sides of a square, up to which middles of markers fit a board, and a marker's side by default.
+_FITS, _USUAL_MARKER = 0.15, 0.75
 
 _Images = Sequence[UInt8[np.ndarray, "_ _"]]
 #: Markers of one family in an image: number of each and its corners, (4, 2), pixels.
@@ -84,18 +82,16 @@ def detect_board(square_m: float, images: _Images) -> Board:
     family, seen = _family_of_board(_small(images))
     if not family:
         return Board(_size_of_chessboard(images), square_m, None, kind="chessboard")
-    clearest = sorted(filter(None, _without_chance(seen)), key=len, reverse=True)[:_IMAGES]
+    clearest = sorted(_without_chance(seen), key=len, reverse=True)[:_IMAGES]
+    clearest = [found for found in clearest if len(found) >= _MARKERS_OF_PLANE] or clearest[:1]
     lowest, highest = min(map(min, clearest)), max(map(max, clearest))
     fits: list[tuple[float, Board]] = []
-    sides = range(3, _MOST_SQUARES + 1)
-    for part, columns, rows in product(_MARKERS_IN_SQUARES, sides, sides):
+    for columns, rows in product(range(3, _MOST_SQUARES + 1), repeat=2):
         # A board has a marker on every second square, and at most a row of its markers was never seen.
         if highest < columns * rows // 2 <= highest + 1 + columns // 2:
-            board = Board(
-                (columns, rows), square_m, part * square_m, _smallest(family, columns * rows // 2 - 1)
-            )
-            model = np.asarray(board.opencv().getObjPoints(), np.float64)[..., :2]
-            fits.append((float(np.median([_misfit(model, one) for one in clearest])), board))
+            dictionary = _smallest(family, columns * rows // 2 - 1)
+            board = Board((columns, rows), square_m, _USUAL_MARKER * square_m, dictionary)
+            fits.append((float(np.median([_flattened(board, one)[1] for one in clearest])), board))
     misfit, fitting = min(fits, key=lambda one: one[0], default=(np.inf, None))
     if fitting is None or misfit > _FITS:
         raise InputError(
@@ -104,8 +100,8 @@ def detect_board(square_m: float, images: _Images) -> Board:
             found=f"markers {lowest} to {highest} of the dictionary {_smallest(family, highest)} in another order",
             remedy="say with --board, --squares, --marker, --dictionary and --first-marker what the board is",
         )
-    part = measure_markers(fitting, images) or 0.75
-    return replace(fitting, marker_m=round(part, 2) * square_m)
+    side = measure_markers(fitting, images) or _USUAL_MARKER
+    return replace(fitting, marker_m=round(side, 2) * square_m)
 
 
 def describe_board(board: Board) -> str:
@@ -118,72 +114,45 @@ def describe_board(board: Board) -> str:
 
 
 def measure_markers(board: Board, images: Iterable[UInt8[np.ndarray, "_ _"]]) -> float | None:
-    """The side of a ChArUco board's marker in sides of a square, as images show it; None where they do not show enough.
-
-    The middles of the markers, which are whole squares apart whatever their size, give the homography from the image to
-    the board; it maps the markers' corners to the board.
-    """
+    """The side of a ChArUco board's marker in sides of a square, as images show it; None if they do not show enough."""
     if board.kind != "charuco" or board.num_markers < _MARKERS_OF_PLANE:
         return None
-    middles = np.asarray(board.opencv().getObjPoints(), np.float64)[..., :2].mean(axis=1) / board.square_m
     finder, sides = BoardFinder(board), []
     for grey in islice(images, _IMAGES_OF_SIZE):
-        found = finder.markers(grey)
-        if len(found) < _MARKERS_OF_PLANE:
-            continue
-        middles_px = found.corners_px.mean(axis=1)
-        to_board, _ = cv2.findHomography(middles_px, middles[found.ids], cv2.RANSAC, 0.2)
-        if to_board is not None:
-            flat = cv2.perspectiveTransform(found.corners_px.reshape(-1, 1, 2), to_board).reshape(-1, 4, 2)
+        markers = finder.markers(grey)
+        flat, misfit = _flattened(board, dict(zip(markers.ids.tolist(), markers.corners_px, strict=True)))
+        if misfit < _FITS:
             sides.append(float(np.median(np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=-1))))
     return float(np.median(sides)) if len(sides) >= _LEAST_IMAGES else None
 
 
-def number_of_first_images(cameras: int) -> int:
-    """Number of images, of all cameras in turn, that `markers_on_chessboard` needs: two of each camera at least."""
-    return max(_FIRST_IMAGES, 2 * cameras)
+def _flattened(board: Board, found: _Markers) -> tuple[Float[np.ndarray, "markers 4 2"], float]:
+    """Corners of markers on a ChArUco board, in squares, and the median distance of their middles from the board's.
 
-
-def markers_on_chessboard(board: Board, images: _Images) -> InputError | None:
-    """The error for a board with markers that is stated as a chessboard, from a few images; None if there are none.
-
-    OpenCV takes seconds to find no chessboard in many images of a ChArUco board, and in some images it takes corners of
-    squares and markers for a smaller board's. The markers count where they move, and are inside of the corners that are
-    found, if any.
+    The middles, which are whole squares apart whatever the size of the markers, give the homography from the image to
+    the board. The distance is infinite for too few markers, or for markers that are not on a plane.
     """
-    small, finder = _small(images), BoardFinder(board)
-    for family, of_images in _seen_markers(small).items():
-        shown: list[_Markers] = []
-        for grey, found in zip(small, _moved(of_images), strict=True):
-            if len(found) >= _LEAST_MARKERS:
-                corners_px = finder.find(grey).astype(np.float32)
-                hull = (
-                    cv2.convexHull(corners_px[np.isfinite(corners_px[:, 0])])
-                    if np.isfinite(corners_px).any()
-                    else None
-                )
-                middles = [quad.mean(axis=0) for quad in found.values()]
-                if hull is None or any(
-                    cv2.pointPolygonTest(hull, (float(u), float(v)), False) > 0 for u, v in middles
-                ):
-                    shown.append(found)
-        if len(shown) > 1:
-            dictionary = _smallest(family, max(max(found) for found in shown))
-            number = f"in {len(shown)} of the first {len(images)} images"
-            return InputError(
-                "board",
-                expected=f"a {board}",
-                found=f"a board with markers of the dictionary {dictionary} {number}",
-                remedy=f"pass --marker, the side of a marker, and --dictionary {dictionary}",
-            )
-    return None
+    quads = np.array(list(found.values())).reshape(-1, 1, 2)
+    places = np.asarray(board.opencv().getObjPoints(), np.float64)[..., :2].mean(axis=1) / board.square_m
+    if len(found) < _MARKERS_OF_PLANE:
+        return quads.reshape(-1, 4, 2), np.inf
+    places = places[list(found)]
+    to_board, _ = cv2.findHomography(quads.reshape(-1, 4, 2).mean(axis=1), places)
+    if to_board is None:
+        return quads.reshape(-1, 4, 2), np.inf
+    flat = cv2.perspectiveTransform(quads, to_board).reshape(-1, 4, 2)
+    return flat, float(np.median(np.linalg.norm(flat.mean(axis=1) - places, axis=-1)))
 
 
 def missing_board(board: Board, images: _Images) -> InputError:
     """The error for a board that is not found in any image: it says what is seen instead."""
     if board.num_markers == 1:
-        found, remedy = _other_marker(images)
-        return InputError("board", expected=f"a {board}", found=found, remedy=remedy)
+        return InputError(
+            "board",
+            expected=f"a {board}",
+            found=f"no such marker in {len(images)} images",
+            remedy="check --dictionary and --first-marker; is it large and sharp, with a white border?",
+        )
     try:
         seen = detect_board(board.square_m, images)
     except InputError as error:
@@ -203,40 +172,14 @@ def _family(board: Board) -> str:
     return "" if board.marker_m is None else board.dictionary.lower().removeprefix("dict_").rpartition("_")[0]
 
 
-def _other_marker(images: _Images) -> tuple[str, str]:
-    """The marker that most images show, in words, and what to do."""
-    counts = Counter(
-        (family, marker)
-        for sides in (images, _mirrored(images))
-        for family, of_images in _seen_markers(sides).items()
-        for found in of_images
-        for marker in found
-    )
-    ((family, marker), count), *_ = [*counts.most_common(1), (("", 0), 0)]
-    if count < _LEAST_IMAGES:
-        return (
-            f"no such marker in {len(images)} images",
-            "check that the marker is large and sharp enough in the images, and has a white border",
-        )
-    dictionary = _smallest(family, marker)
-    return (
-        f"marker {marker} of the dictionary {dictionary} in {count} of {len(images)} images",
-        f"pass --dictionary {dictionary} --first-marker {marker}",
-    )
-
-
 def _family_of_board(images: _Images) -> tuple[str, list[_Markers]]:
     """The family of a board's markers, and the markers in each image; no family if there are too few.
 
     Markers that stand still, such as those on the walls of a laboratory, are not those of a board that is moved: they
-    count only if no others are found, in the images or in mirrored ones.
+    count only if no others are found.
     """
-    searched: dict[bool, dict[str, list[_Markers]]] = {}
-    for only_moved, mirrored in product((True, False), (False, True)):
-        if mirrored not in searched:
-            searched[mirrored] = _seen_markers(_mirrored(images) if mirrored else images)
-        seen = searched[mirrored]
-        chosen = {family: _moved(found) if only_moved else found for family, found in seen.items()}
+    seen = _seen_markers(images)
+    for chosen in ({family: _moved(found) for family, found in seen.items()}, seen):
         family, of_images = max(chosen.items(), key=lambda one: max(map(len, one[1]), default=0))
         if max(map(len, of_images), default=0) >= _LEAST_MARKERS:
             return family, of_images
@@ -292,10 +235,6 @@ def _small(images: _Images) -> _Images:
     ]
 
 
-def _mirrored(images: _Images) -> _Images:
-    return [np.ascontiguousarray(grey[:, ::-1]) for grey in images]
-
-
 def _size_of_chessboard(images: _Images) -> tuple[int, int]:
     """Columns and rows of the squares of the chessboard that most images show.
 
@@ -318,17 +257,6 @@ def _size_of_chessboard(images: _Images) -> tuple[int, int]:
             remedy="is the board large and sharp, with a white border? --squares states another kind",
         )
     return size
-
-
-def _misfit(model: Float[np.ndarray, "markers 4 2"], found: _Markers) -> float:
-    """Median distance of markers in an image from the markers of a plane, in sides of a marker."""
-    quads, flat = np.array(list(found.values())), model[list(found)].reshape(-1, 2)
-    homography, _ = cv2.findHomography(flat, quads.reshape(-1, 2))
-    if homography is None:
-        return np.inf
-    ends = cv2.perspectiveTransform(flat[:, None], homography).reshape(quads.shape)
-    side = np.linalg.norm(np.diff(quads, axis=1), axis=-1).mean()
-    return float(np.median(np.linalg.norm(ends - quads, axis=-1)) / side)
 
 
 def _smallest(family: str, highest: int) -> str:

@@ -152,12 +152,6 @@ class Board:
             flat = _steps(np.arange(1, columns), np.arange(1, rows)) * self.square_m
         return np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
 
-    @property
-    def outline_m(self) -> Float[np.ndarray, "4 2"]:
-        """(4, 2), corners of the rectangle around the board's points, metres."""
-        low, high = self.corners_m[:, :2].min(axis=0), self.corners_m[:, :2].max(axis=0)
-        return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-
     @cached_property
     def labellings(self) -> Int[np.ndarray, "labellings corners"]:
         """(labellings, corners), orders of the corners that look alike: turns of a chessboard that keep its colours.

@@ -190,6 +190,42 @@ class Bundle:
     is_robust: bool = False
     slip_std: Float[np.ndarray, "sightings 2"] | None = None
 
+    @staticmethod
+    def of_views(
+        models: tuple[Projection, ...],
+        state: BundleState,
+        corners_m: Float[np.ndarray, "corners 3"],
+        views_px: Float[np.ndarray, "cameras targets corners 2"],
+        *,
+        free: tuple[Bool[np.ndarray, " cameras"], Bool[np.ndarray, " targets"]],
+        noise_px: float = 1.0,
+    ) -> Bundle:
+        """The adjustment, with a robust loss, of cameras and targets whose lenses are known as yet.
+
+        Args:
+            models: model of each camera's lens.
+            state: first values of the unknowns.
+            corners_m: positions on a target.
+            views_px: pixels; NaN where a corner is not seen.
+            free: True for the cameras, and for the targets, that are adjusted.
+            noise_px: standard deviation of a corner along x and along y.
+        """
+        camera, target = np.nonzero(np.isfinite(views_px[..., 0]).any(axis=-1))
+        problem = BundleProblem(
+            models=models,
+            priors=tuple((lens, np.zeros((len(lens), len(lens)))) for lens in state.lenses),
+            corners_m=corners_m,
+            lens=camera,
+            camera=camera,
+            target=target,
+            corners_px=views_px[camera, target],
+            noise_px=np.full(len(camera), noise_px),
+            free_lens=tuple(np.zeros(len(lens), bool) for lens in state.lenses),
+            free_camera=free[0],
+            free_target=np.tile(free[1], (7, 1)).T,
+        )
+        return Bundle(problem, state, np.isfinite(problem.corners_px).all(axis=-1), is_robust=True)
+
     @cached_property
     def slopes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals, measured less projected, infinite behind the camera; derivatives by shared and block unknowns."""
@@ -209,7 +245,7 @@ class Bundle:
         for index, (model, lens) in enumerate(zip(problem.models, state.lenses, strict=True)):
             rows = problem.lens == index
             if rows.any():
-                shape = (int(rows.sum()), -1, 2)
+                shape = off[rows].shape
                 pixels, slope, of_lens = model.project(lens, in_camera[rows].reshape(-1, 3))
                 off[rows] = problem.corners_px[rows] - pixels.reshape(shape)
                 by_point[rows] = slope.reshape(*shape, 3)

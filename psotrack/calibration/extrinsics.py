@@ -12,26 +12,18 @@ with the stated σ, or with the residuals' σ if the residuals are larger than t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import log
+from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.calibration.derivatives import centre_by_pose, reproject
+from psotrack.calibration.bundle import Bundle, BundleState
 from psotrack.calibration.pnp import MIN_POINTS, Solver, solve_pnp, solve_pnp_ransac
-from psotrack.calibration.residuals import GATE, inflation, spread_px
+from psotrack.calibration.residuals import GATE, centre_by_pose, inflation, spread_px
 from psotrack.errors import InputError, check_positive
-from psotrack.geometry import NEAR_M, Camera, undistort
-from psotrack.geometry.estimation import (
-    NormalEquations,
-    Step,
-    cauchy_loss,
-    cauchy_weight,
-    covariance_from_information,
-    levenberg_marquardt,
-)
+from psotrack.geometry import Camera, to_pixels_with_jacobian, undistort
+from psotrack.geometry.estimation import covariance_from_information
 
 #: Largest median residual of a usable pose, in units of the stated σ; points within it may be inliers.
 _MAX_MEDIAN_SIGMAS = 10.0
@@ -41,8 +33,6 @@ _FLAT = 1e-3
 _ODDS = 100.0
 #: Poses are the same if the camera's orientations differ by less than this, radians.
 _SAME_RAD = np.deg2rad(2.0)
-#: Step that ends the search, in standard deviations.
-_SETTLED = 1e-6
 #: Largest ratio of an unknown's variance to its variance if the others were known: 1e5 standard deviations of rounding.
 _MAX_INFLATION = 1e12
 
@@ -97,19 +87,20 @@ def locate_camera(
     extent_m = _check_points(points_m, points_px, name)
     lens = Camera(np.eye(4), K, dist, np.zeros(2), np.array(True) if fisheye else None)
     fits = _likely_poses(points_m, points_px, lens, noise_px)
-    typical_px = float(np.median(fits[0].distance_px)) if fits else np.inf
+    typical_px = _typical_px(fits[0]) if fits else np.inf
     if typical_px > _MAX_MEDIAN_SIGMAS * noise_px:
         mirrored_m = points_m * np.array([1.0, 1.0, -1.0])
         is_flat = extent_m[2] <= _FLAT * extent_m[0]
         twins = [] if is_flat else _likely_poses(mirrored_m, points_px, lens, noise_px)
-        is_mirrored = any(np.median(twin.distance_px) < 0.2 * typical_px for twin in twins[:1])
+        is_mirrored = any(_typical_px(twin) < 0.2 * typical_px for twin in twins[:1])
         raise _no_pose(typical_px, noise_px, name, is_mirrored=is_mirrored)
     _check_unique(fits, name)
     fit = fits[0]
     # The gate depends on the fit and the fit on the gate. The number of rounds is limited in case they oscillate.
     for _ in range(10):
-        within = fit.distance_px <= GATE * max(noise_px, spread_px(fit.distance_px[fit.used], 6))
-        before, used = fit.used, within if within.sum() >= MIN_POINTS else fit.used
+        distance_px, before = fit.distance_px, fit.used
+        within = distance_px <= GATE * max(noise_px, spread_px(distance_px[before], 6))
+        used = within if within.sum() >= MIN_POINTS else before
         fit = replace(fit, used=used, is_robust=False).solved()
         if (used == before).all():
             break
@@ -119,74 +110,20 @@ def locate_camera(
         expected, found = "points that determine the camera's pose", "points that leave it undetermined"
         raise InputError(name, expected=expected, found=found) from None
     covariance = covariance * inflation(fit.cost, 2 * int(fit.used.sum()) - 6)
-    by_pose = centre_by_pose(fit.T[:3, :3], fit.T[:3, 3])
-    return Located(fit.T, covariance, by_pose @ covariance @ by_pose.T, fit.distance_px, fit.used)
+    T = fit.state.T_cam_world[0]
+    by_pose = centre_by_pose(T[:3, :3], T[:3, 3])
+    return Located(T, covariance, by_pose @ covariance @ by_pose.T, fit.distance_px[0], fit.used[0])
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """A pose with its residuals, `estimation.least_squares.Linearised`.
+class _KnownLens:
+    """A lens without unknowns, `bundle.Projection`."""
 
-    Attributes:
-        points_m, points_px, lens, noise_px: see `locate_camera`.
-        T: (4, 4), the pose, from world to camera.
-        used: (points,), False for outliers.
-        is_robust: whether the loss is Cauchy's instead of the squared residual.
-    """
+    camera: Camera
 
-    points_m: Float[np.ndarray, "points 3"]
-    points_px: Float[np.ndarray, "points 2"]
-    lens: Camera
-    noise_px: float
-    T: Float[np.ndarray, "4 4"]
-    used: Bool[np.ndarray, " points"]
-    is_robust: bool = True
-
-    @cached_property
-    def _linear(self) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points 2 6"]]:
-        """Residuals, measured minus projected, and derivatives by turn and shift, in standard deviations."""
-        pixels, by_turn, by_shift = reproject(self.points_m, self.T[:3, :3], self.T[:3, 3], self.lens)
-        slopes = np.concatenate([by_turn, by_shift], axis=-1)
-        return (self.points_px - pixels) / self.noise_px, slopes / self.noise_px
-
-    @cached_property
-    def squares(self) -> Float[np.ndarray, " points"]:
-        """Squared residuals in variances; 0 of outliers."""
-        return np.where(self.used, np.sum(self._linear[0] ** 2, axis=-1), 0.0)
-
-    @cached_property
-    def depth_m(self) -> Float[np.ndarray, " points"]:
-        """Depths of the points along the optical axis."""
-        return self.points_m @ self.T[2, :3] + self.T[2, 3]
-
-    @cached_property
-    def distance_px(self) -> Float[np.ndarray, " points"]:
-        """Distances of points from their projections, pixels; infinite for points behind the camera."""
-        distance = self.noise_px * np.linalg.norm(self._linear[0], axis=-1)
-        return np.where(self.depth_m > NEAR_M, distance, np.inf)
-
-    @cached_property
-    def cost(self) -> float:
-        """Sum of the losses: minus twice the logarithm of the likelihood."""
-        return float(np.sum(cauchy_loss(self.squares) if self.is_robust else self.squares))
-
-    def equations(self) -> NormalEquations:
-        """Normal equations of a small turn about the camera's axes (rad) and of the translation (m)."""
-        weight = self.used * (cauchy_weight(self.squares) if self.is_robust else 1.0)
-        residuals, slopes = self._linear
-        weighted = (weight[:, None, None] * slopes).reshape(-1, 6)
-        return NormalEquations(weighted.T @ slopes.reshape(-1, 6), weighted.T @ residuals.ravel())
-
-    def moved(self, step: Step) -> _Fit:
-        """Turn and shift the camera."""
-        T = np.eye(4)
-        T[:3, :3] = cv2.Rodrigues(step.shared[:3])[0] @ self.T[:3, :3]
-        T[:3, 3] = self.T[:3, 3] + step.shared[3:]
-        return replace(self, T=T)
-
-    def solved(self) -> _Fit:
-        """Lower the cost from this pose."""
-        return levenberg_marquardt(self, max_steps=100, least_length=_SETTLED)
+    def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixels of points, and their derivatives."""
+        return *to_pixels_with_jacobian(self.camera, points_m), np.zeros((len(points_m), 2, 0))
 
 
 def _likely_poses(
@@ -194,30 +131,37 @@ def _likely_poses(
     points_px: Float[np.ndarray, "points 2"],
     lens: Camera,
     noise_px: float,
-) -> list[_Fit]:
+) -> list[Bundle]:
     """Local minima of the robust cost, the most likely pose first."""
     # A pixel at which the lens shows nothing starts no pose, and counts as an outlier.
     rays = undistort(lens, points_px)
     gate = _MAX_MEDIAN_SIGMAS * noise_px / float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
     sampled = solve_pnp_ransac(points_m, rays, gate)
-    everything = np.ones(len(rays), bool)
-    near = everything if sampled is None else sampled[1]
+    near = np.ones(len(rays), bool) if sampled is None else sampled[1]
     # Points that are nearly in a plane may fit a second pose, which IPPE finds; four points may fit four.
     solvers: list[Solver] = ["sqpnp", "ippe"]
     if len(rays) == MIN_POINTS:
         solvers.append("ap3p")
+    poses = [T for solver in solvers for T in solve_pnp(points_m[near], rays[near], solver)]
+    states = [BundleState((np.zeros(0),), T[None], np.eye(4)[None], np.ones(1)) for T in poses]
+    # The points are the corners of one target that stands still.
+    free, seen_px = (np.ones(1, bool), np.zeros(1, bool)), points_px[None, None]
     fits = [
-        _Fit(points_m, points_px, lens, noise_px, T, everything).solved()
-        for solver in solvers
-        for T in solve_pnp(points_m[near], rays[near], solver)
+        Bundle.of_views((_KnownLens(lens),), state, points_m, seen_px, free=free, noise_px=noise_px).solved()
+        for state in states
     ]
-    found: list[_Fit] = []
+    found: list[Bundle] = []
     for fit in sorted(fits, key=lambda fit: fit.cost):
         # The trace of a rotation by an angle is 1 + 2 cos(angle).
-        is_new = all(np.sum(fit.T[:3, :3] * one.T[:3, :3]) <= 1 + 2 * np.cos(_SAME_RAD) for one in found)
-        if is_new and np.median(fit.depth_m) > NEAR_M:
+        traces = [np.sum((fit.state.T_cam_world * one.state.T_cam_world)[0, :3, :3]) for one in found]
+        if all(trace <= 1 + 2 * np.cos(_SAME_RAD) for trace in traces) and np.isfinite(_typical_px(fit)):
             found.append(fit)
     return found
+
+
+def _typical_px(fit: Bundle) -> float:
+    """Median distance of the points from their projections."""
+    return float(np.median(fit.distance_px))
 
 
 def _check_points(
@@ -241,11 +185,11 @@ def _check_points(
     return extent_m
 
 
-def _check_unique(fits: list[_Fit], name: str) -> None:
+def _check_unique(fits: list[Bundle], name: str) -> None:
     """Raise an error if another pose, far from the best one, is about as likely."""
     for other in fits[1:]:
         if other.cost - fits[0].cost < 2 * log(_ODDS):
-            first, second = (-fit.T[:3, :3].T @ fit.T[:3, 3] for fit in (fits[0], other))
+            first, second = (np.linalg.inv(fit.state.T_cam_world[0])[:3, 3] for fit in (fits[0], other))
             raise InputError(
                 name,
                 expected="points that only one pose fits",

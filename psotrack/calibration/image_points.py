@@ -6,7 +6,7 @@ point. The position of a point in the world is in any of its rows, or in another
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,23 +99,12 @@ def find_markers(
         InputError: the video cannot be read.
         SettingsError: the dictionary does not exist.
     """
-    step = max(1, video.num_frames // _FRAMES)
-    greys = (cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in read_frames(video, step))
-    return find_markers_in(greys, corners_m, dictionary)
-
-
-def find_markers_in(
-    images: Iterable[np.ndarray],
-    corners_m: Mapping[int, Float[np.ndarray, "4 3"]],
-    dictionary: str = "4x4_1000",
-) -> ImagePoints:
-    """Find the corners of markers of known positions in grey images of a static camera; see `find_markers`."""
     detector = MarkerDetector(dictionary, ids=corners_m)
     found: dict[int, list[Float[np.ndarray, "4 2"]]] = {}
     frames = 0
-    for grey in images:
+    for frame in read_frames(video, max(1, video.num_frames // _FRAMES)):
         frames += 1
-        markers = detector.detect(grey).of_single_ids()
+        markers = detector.detect(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)).of_single_ids()
         for quad, marker in zip(markers.corners_px, markers.ids.tolist(), strict=True):
             found.setdefault(marker, []).append(quad)
     kept = sorted(marker for marker, quads in found.items() if len(quads) >= _SEEN * frames)

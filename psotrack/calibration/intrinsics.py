@@ -16,7 +16,7 @@ from psotrack.calibration.rig.adjustment import LensChoice, calibrate_rig
 from psotrack.calibration.rig.images import CameraImages, instants_of_numbers
 from psotrack.calibration.rig.lens_choice import MOST_FITS, choose_lens_model
 from psotrack.calibration.rig.views import find_views
-from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Camera, make_camera
 from psotrack.support import Report, no_progress
 
@@ -67,26 +67,11 @@ def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tupl
         raise SettingsError(
             "field of view", expected="angles between 0 and 180 degrees", found=f"{angles_deg.tolist()}"
         )
-    return _undistorted_camera(
-        np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2), image_size_wh
-    )
-
-
-def lens_of_sensor(
-    focal_length_mm: float, sensor_mm: tuple[float, float], image_size_wh: tuple[int, int]
-) -> Camera:
-    """Make a lens without distortion from its focal length and the sensor's width and height.
-
-    The pose of the camera is the world's origin.
-
-    Raises:
-        SettingsError: a length is not above 0.
-    """
-    for name, length_mm in zip(
-        ("focal_length_mm", "sensor_mm", "sensor_mm"), (focal_length_mm, *sensor_mm), strict=True
-    ):
-        check_positive(name, length_mm)
-    return _undistorted_camera(focal_length_mm * np.array(image_size_wh) / np.array(sensor_mm), image_size_wh)
+    focal_length_px = np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2)
+    # Pixel centres are at whole numbers, so the middle of the image is (size - 1) / 2.
+    cx, cy = (np.array(image_size_wh) - 1) / 2
+    K = np.array([[focal_length_px[0], 0.0, cx], [0.0, focal_length_px[1], cy], [0.0, 0.0, 1.0]])
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)
 
 
 def lens_of_board(
@@ -142,10 +127,3 @@ def lens_of_board(
     squares = np.where(used, calibrated.residual_px[0], 0.0) ** 2
     rms_px = np.sqrt(squares.sum(axis=1)[is_good] / used.sum(axis=1)[is_good])
     return Lens(camera, model, compared_px, std, views.number[is_good], rms_px, int(found.searched[0]))
-
-
-def _undistorted_camera(focal_length_px: Float[np.ndarray, "2"], image_size_wh: tuple[int, int]) -> Camera:
-    # Pixel centres are at whole numbers, so the middle of the image is (size - 1) / 2.
-    cx, cy = (np.array(image_size_wh) - 1) / 2
-    K = np.array([[focal_length_px[0], 0.0, cx], [0.0, focal_length_px[1], cy], [0.0, 0.0, 1.0]])
-    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import SettingsError
-from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, Rig, make_camera, undistort
+from psotrack.geometry import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, Camera, Rig, make_camera, undistort
 from psotrack.support import whole_number
 
 #: Number of unknowns of a lens before the distortion: fx, fy, cx, cy.
@@ -79,20 +79,29 @@ class LensModel:
         slopes = np.asarray(slopes, np.float64).reshape(-1, 2, slopes.shape[-1])
         return np.asarray(pixels).reshape(-1, 2), slopes[..., by_shift], slopes[..., by_lens]
 
+    def camera(
+        self,
+        lens: Float[np.ndarray, " unknowns"],
+        T_cam_world: Float[np.ndarray, "4 4"],
+        image_size_wh: tuple[int, int] = (1, 1),
+    ) -> Camera:
+        """The camera with this lens at a pose, whose rotation may have rounding errors."""
+        U, _, V = np.linalg.svd(T_cam_world[:3, :3])
+        return make_camera(
+            R=U @ V,
+            t_m=T_cam_world[:3, 3],
+            K=camera_matrix(lens),
+            image_size_wh=image_size_wh,
+            dist=lens[PINHOLE:].tolist(),
+            fisheye=self.fisheye,
+        )
+
     def normalise(
         self, lens: Float[np.ndarray, " unknowns"], points_px: Float[np.ndarray, "points 2"]
     ) -> Float[np.ndarray, "points 2"]:
         """Directions (x / z, y / z) in which pixels are seen; NaN where the lens cannot be inverted."""
         # The lens alone counts: the camera's place and the size of its images do not.
-        camera = make_camera(
-            R=np.eye(3),
-            t_m=np.zeros(3),
-            K=camera_matrix(lens),
-            image_size_wh=(1, 1),
-            dist=lens[PINHOLE:].tolist(),
-            fisheye=self.fisheye,
-        )
-        return undistort(camera, points_px)
+        return undistort(self.camera(lens, np.eye(4)), points_px)
 
     def prior(
         self, image_size_wh: tuple[int, int]

@@ -118,23 +118,6 @@ def solve_pnp_ransac(
     return (poses[0], used) if len(poses) else None
 
 
-def refine_pnp(
-    points_m: Float[np.ndarray, "points 3"],
-    rays: Float[np.ndarray, "points 2"],
-    T_cam_world: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "4 4"]:
-    """Minimise the squared reprojection error, at a focal length of 1, from a first pose (Levenberg-Marquardt).
-
-    Args:
-        points_m: (points, 3), positions in the world, metres; at least four.
-        rays: (points, 2), directions in which they are seen.
-        T_cam_world: the first pose.
-    """
-    points_m, rays, _ = _seen(points_m, rays)
-    turn, shift = cv2.Rodrigues(T_cam_world[:3, :3])[0], T_cam_world[:3, 3:].copy()
-    return _pose(*cv2.solvePnPRefineLM(points_m, rays, np.eye(3), None, turn, shift))
-
-
 def _seen(
     points_m: Float[np.ndarray, "points 3"], rays: Float[np.ndarray, "points 2"]
 ) -> tuple[Float[np.ndarray, "seen 3"], Float[np.ndarray, "seen 2"], Bool[np.ndarray, " points"]]:

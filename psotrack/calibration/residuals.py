@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
+from psotrack.geometry import cross_matrices
+
 #: A point is an outlier beyond this number of standard deviations: 4 in a million good points are.
 GATE = 5.0
 #: σ is larger than stated if the residuals' sum of squares has a smaller probability than this.
@@ -38,3 +40,8 @@ def inflation(sum_of_squares: float, freedom: int) -> float:
     if freedom < 1 or sum_of_squares <= chi2.ppf(1 - UNLIKELY, freedom):
         return 1.0
     return sum_of_squares / freedom
+
+
+def centre_by_pose(R: Float[np.ndarray, "3 3"], t_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 6"]:
+    """(3, 6), derivative of a camera's centre, -Rᵀ t, by a small turn about its axes and by its translation."""
+    return np.hstack([-R.T @ cross_matrices(t_m), -R.T])

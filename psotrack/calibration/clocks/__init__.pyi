@@ -1,5 +1,5 @@
 from .camera_clocks import camera_offsets
-from .reference_clock import ReferenceOffset, own_reference, reference_for, reference_offset, save_curve
+from .reference_clock import ReferenceOffset, own_reference, reference_for, reference_offset
 from .track_clocks import CameraClocks, clocks_of_tracks, estimate_clocks, fit_clocks
 from .track_places import places_of_tracks
 
@@ -14,5 +14,4 @@ __all__ = [
     "places_of_tracks",
     "reference_for",
     "reference_offset",
-    "save_curve",
 ]

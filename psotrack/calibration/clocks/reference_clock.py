@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from psotrack.errors import InputError
 from psotrack.evaluation import Offset, find_offset
 from psotrack.recordings import Recording
-from psotrack.support import COLOURS, save_figure
 from psotrack.trajectories import UNASSIGNED, Trajectories, resample
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Largest offset that is tried where nobody says one, seconds.
 USUAL_OFFSET_S = 2.0
@@ -145,27 +140,3 @@ def own_reference(recording: Recording) -> Trajectories:
         if not turned[reference.seen].all():
             return replace(reference, orientation_wxyz=None)
     return reference
-
-
-def save_curve(path: str | Path, offset: Offset, *, force: bool = False) -> None:
-    """Save a PNG with the mean distance at each offset, and a mark at the offset that was found.
-
-    Raises:
-        OutputError: the file exists and `force` is not set, or the file cannot be written.
-    """
-
-    def draw(figure: Figure) -> None:
-        axes = figure.add_subplot()
-        axes.plot(offset.curve_s, 1e3 * offset.curve_m, color=COLOURS[0], linewidth=1.2)
-        axes.plot(offset.offset_s, 1e3 * offset.mean_distance_m, "o", color=COLOURS[1], markersize=5)
-        axes.annotate(
-            f"{offset.offset_s:+.4f} s, {1e3 * offset.mean_distance_m:.1f} mm",
-            (offset.offset_s, 1e3 * offset.mean_distance_m),
-            (14, 12),
-            textcoords="offset points",
-        )
-        axes.set_xlabel("offset of the reference (s)")
-        axes.set_ylabel("mean distance (mm)")
-        axes.set_ylim(bottom=0)
-
-    save_figure(Path(path), (8.0, 4.0), draw, force)

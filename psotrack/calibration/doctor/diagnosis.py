@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.calibration.doctor.findings import Finding
-from psotrack.calibration.doctor.reference_fit import ReferenceFit
 from psotrack.support import finite_or_none, html_block, html_table, text_table
 
 _HEADINGS = ("camera", "detections/frame", "explained", "median (px)", "(noise)", "late (ms)")
@@ -36,7 +35,7 @@ class Diagnosis:
         late_std_frames: (cameras,), standard deviations of `late_frames`.
         epipolar_px: (cameras, cameras), median distances of sightings from each other's epipolar lines, pixels; NaN for
             pairs of cameras without common points.
-        reference: fit of the reference; None without a reference.
+        reference_m: median distance of the points from the reference, metres; NaN without one.
     """
 
     cameras: tuple[str, ...]
@@ -50,7 +49,7 @@ class Diagnosis:
     late_frames: Float[np.ndarray, "cameras"]
     late_std_frames: Float[np.ndarray, "cameras"]
     epipolar_px: Float[np.ndarray, "cameras cameras"]
-    reference: ReferenceFit | None
+    reference_m: float
 
     def to_dict(self) -> dict[str, Any]:
         """The findings and measurements, with None for missing numbers."""
@@ -67,7 +66,7 @@ class Diagnosis:
             "explained": float(self.num_explained.sum() / max(self.num_sightings.sum(), 1)),
             "cameras": self._measured(),
             "epipolar_px": [[finite_or_none(value) for value in row] for row in self.epipolar_px],
-            "reference_m": None if self.reference is None else self.reference.before_m,
+            "reference_m": finite_or_none(self.reference_m),
         }
 
     def __str__(self) -> str:

@@ -1,9 +1,9 @@
 """Examination of a rig with its own data before tracking: what disagrees, by how much, and what to do.
 
 Sightings of a few runs of frames are matched over the cameras and triangulated. If they do not agree, other
-interpretations of the whole rig are tried (`rig_interpretations`), then large faults of each camera (`camera_faults`).
+interpretations of the whole rig are tried (`rig_interpretations`). A camera that agrees with no other one is named.
 Small faults, of cameras and of clocks, are found by comparing all hypotheses on sightings that are matched loosely
-(`fault_search`). Last, the reference is compared (`reference_fit`).
+(`fault_search`). Last, the reference is compared.
 """
 
 from __future__ import annotations
@@ -14,20 +14,18 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.calibration.doctor.camera_faults import MIN_POINTS_OF_CAMERA, SuspectViews, explain_camera
 from psotrack.calibration.doctor.common_points import CommonPoints, ExaminedFrames, least_viewpoints
 from psotrack.calibration.doctor.corrections import Corrected, WeightedPoints, medians, misfit_px, weigh
 from psotrack.calibration.doctor.diagnosis import Diagnosis
 from psotrack.calibration.doctor.fault_search import find_fault, find_lags
 from psotrack.calibration.doctor.findings import (
     Finding,
-    describe_camera_fault,
     describe_fault,
+    describe_gross_fault,
     describe_reference,
 )
-from psotrack.calibration.doctor.reference_fit import fit_reference
 from psotrack.calibration.doctor.rig_interpretations import find_best_interpretation
-from psotrack.geometry import Rig
+from psotrack.geometry import Rig, project_visible
 from psotrack.tracking.matching import (
     NOISE_PX,
     NOISE_SHARE,
@@ -44,18 +42,17 @@ FEWEST_RUNS, MOST_RUNS, RUN_FRAMES, APART_S = 4, 14, 12, 1.2
 INTERPRETATION_FRAMES = 8
 #: Smallest and largest plausible median distance of two cameras in a room, metres.
 PLAUSIBLE_M = (0.05, 200.0)
-#: Largest plausible difference of a principal point from the image's middle, as a fraction of it: real lenses have a
-#: few per cent.
-FROM_MIDDLE = 0.3
 #: Fraction of sightings that a correct rig explains. False detections, and drones that only two cameras see, are the
 #: rest.
 SOUND_SHARE = 0.85
 #: Smallest fraction of explained sightings with which single cameras can be checked.
 MIN_SHARE = 0.3
 #: A camera may be grossly wrong if the loose matching uses less of its sightings than this fraction of the median
-#: camera's. It is wrong if a correction explains more of what the others see by this fraction, or if it explains less
-#: of this than the last number without a correction that helps.
-SUSPECT_SHARE, GROSS_GAIN, NOTHING_EXPLAINED = 0.5, 0.3, 0.1
+#: camera's. It is if it has sightings near less than this fraction of the points that the others see, within this
+#: number of standard deviations: 1 in 1000 right sightings is farther (χ² distribution, two degrees of freedom).
+SUSPECT_SHARE, NOTHING_EXPLAINED, NEAR_STD = 0.5, 0.15, 3.7
+#: Smallest number of points of the other cameras with which a camera is checked.
+MIN_POINTS_OF_CAMERA = 30
 #: Smallest number of points with which a rig can be checked.
 MIN_POINTS = 12
 #: Smallest fraction of matched sightings that go on from frame to frame: of boxes of bodies nine in ten do, of matches
@@ -108,7 +105,7 @@ def examine(
             findings.append(Finding(better.kind, better.cameras, message, better.remedy))
             rig, explained, points = better.rig, again, seen.common_points(better.rig)
     as_read = Corrected(rig, np.zeros(len(rig)))
-    data, lags, fit = weigh(as_read, points), np.full((2, len(rig)), np.nan), None
+    data, lags, reference_m = weigh(as_read, points), np.full((2, len(rig)), np.nan), np.nan
     unknown = _why_unknown(rig, seen, explained, points, data)
     if unknown is not None:
         findings.append(unknown)
@@ -119,8 +116,10 @@ def examine(
             findings.append(_nothing_agrees(rig, seen, explained))
         if reference is not None:
             inside = points.frame < reference.num_frames
-            fit = fit_reference(points.frame[inside], points.start_m[inside], reference, fps)
-            findings += describe_reference(fit, fps)
+            reference_m, contradiction = describe_reference(
+                points.start_m[inside], reference.position_m[points.frame[inside]]
+            )
+            findings += contradiction
     misfit = misfit_px(as_read, data)
     return Diagnosis(
         cameras=rig.names,
@@ -134,7 +133,7 @@ def examine(
         late_frames=lags[0],
         late_std_frames=lags[1],
         epipolar_px=_median_epipolar_distances(rig, points),
-        reference=fit,
+        reference_m=reference_m,
     )
 
 
@@ -184,36 +183,30 @@ def _find_faults(
 
 
 def _gross_fault(rig: Rig, seen: ExaminedFrames, points: CommonPoints) -> Finding | None:
-    """The largest fault of a camera whose sightings take no part in the loose matching."""
-    wrong = []
+    """A camera whose sightings take no part in the loose matching, and are not where the others see the bodies."""
+    wrong: list[tuple[float, str]] = []
     for index in np.flatnonzero(points.share < SUSPECT_SHARE * np.median(points.share)).tolist():
         others = [number for number in range(len(rig)) if number != index]
         rest = rig.select([rig.names[number] for number in others])
         if least_viewpoints(rest) < 3:
             continue
         known, boxes = seen.by(others).common_points(rest), seen.sightings
-        views = SuspectViews(
-            known.start_m,
-            known.velocity_m,
-            boxes.centre_px[known.frame, index],
-            boxes.noise_px[known.frame, index],
-        )
+        noise_px = boxes.noise_px[known.frame, index]
         # A camera that seldom has a detection is not known to be wrong.
-        if len(known.frame) < MIN_POINTS_OF_CAMERA:
+        if len(known.frame) < MIN_POINTS_OF_CAMERA or np.isfinite(noise_px).any(axis=1).mean() < 0.5:
             continue
-        explained = explain_camera(rig.cameras[index], views)
-        gain = max(fault.explained for fault in explained) - explained[0].explained
-        often = np.isfinite(views.noise_px).any(axis=1).mean() >= 0.5
-        if gain > GROSS_GAIN or (often and explained[0].explained < NOTHING_EXPLAINED):
-            wrong.append((gain, index, explained))
-    if not wrong:
-        return None
-    _, index, explained = max(wrong, key=lambda each: each[0])
-    return describe_camera_fault(rig, index, explained, seen.fps)
+        off_px = (
+            boxes.centre_px[known.frame, index]
+            - project_visible(rig.cameras[index], known.start_m)[0][:, None]
+        )
+        explained = float((np.linalg.norm(off_px, axis=-1) < NEAR_STD * noise_px).any(axis=1).mean())
+        if explained < NOTHING_EXPLAINED:
+            wrong.append((explained, rig.names[index]))
+    return describe_gross_fault(*min(wrong)) if wrong else None
 
 
 def _check_numbers(rig: Rig, seen: ExaminedFrames) -> tuple[list[Finding], Rig]:
-    """Find implausible lengths and principal points, and correct both: findings, and the corrected rig."""
+    """Find implausible lengths, and correct them: findings, and the corrected rig."""
     findings = []
     cameras = rig.cameras
     distances_m = [np.linalg.norm(a - b) for a, b in combinations(cameras.centre_world, 2)]
@@ -231,8 +224,7 @@ def _check_numbers(rig: Rig, seen: ExaminedFrames) -> tuple[list[Finding], Rig]:
             T = cameras.T_cam_world.copy()
             T[:, :3, 3] *= factor
             cameras = replace(cameras, T_cam_world=T)
-    of_lenses, K = _check_principal_points(rig)
-    return findings + of_lenses, Rig(rig.names, replace(cameras, K=K))
+    return findings, Rig(rig.names, cameras)
 
 
 def _body_size_m(rig: Rig, seen: ExaminedFrames) -> float | None:
@@ -243,30 +235,6 @@ def _body_size_m(rig: Rig, seen: ExaminedFrames) -> float | None:
         return None
     distance_m = np.linalg.norm(points.start_m[:, None] - rig.cameras.centre_world, axis=-1)
     return float(np.nanmedian(points.side_px / rig.cameras.K[:, 0, 0] * distance_m))
-
-
-def _check_principal_points(rig: Rig) -> tuple[list[Finding], np.ndarray]:
-    """Find principal points of another image size, one finding per ratio; return the findings and the corrected K."""
-    cameras, K = rig.cameras, np.array(rig.cameras.K)
-    ratio = K[:, :2, 2] / ((cameras.image_size_wh - 1) / 2)
-    same_ratio: dict[tuple[str, ...], list[int]] = {}
-    for index in np.flatnonzero(np.abs(ratio - 1).max(axis=-1) > FROM_MIDDLE).tolist():
-        same_ratio.setdefault(tuple(f"{each:.2f}" for each in ratio[index]), []).append(index)
-    findings = []
-    for indices in same_ratio.values():
-        first, names = indices[0], tuple(rig.names[index] for index in indices)
-        (x, y), (width, height) = K[first, :2, 2], cameras.image_size_wh[first]
-        remedy = "check cx and cy"
-        if (ratio[first] > 0).all() and 0.95 < ratio[first, 0] / ratio[first, 1] < 1.05:
-            scale = 1 / float(ratio[first].mean())
-            remedy = f"it is of an image {1 / scale:.2f} times as large: multiply focal length, cx, cy by {scale:.3f}"
-            K[indices, :2] *= scale
-        message = (
-            f"camera{'s' * (len(names) > 1)} {', '.join(names)}: the principal point ({x:.0f}, {y:.0f}) is far from "
-            f"the middle of the {width:.0f} x {height:.0f} image"
-        )
-        findings.append(Finding("image size", names, message, remedy))
-    return findings, K
 
 
 def _why_unknown(

@@ -5,23 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.calibration.doctor.camera_faults import CameraFault
 from psotrack.calibration.doctor.corrections import Corrected
 from psotrack.calibration.doctor.evidence import Judged
 from psotrack.calibration.doctor.fault_search import FoundFault
-from psotrack.calibration.doctor.reference_fit import NEAR_M, ReferenceFit
 from psotrack.geometry import Camera, Rig
 
-#: Smallest gain of a fault, as a fraction of the camera's points: six parameters fitted to 30 points of a correct
-#: camera gain 0.015 by chance.
-_CLEARLY = 0.05
-#: The simpler of two explanations is taken if its gain is at least this fraction of the larger gain.
-_ALMOST = 0.9
-#: Smallest relative difference between the scales of rig and reference that is reported: focal lengths are known to a
-#: few per cent.
-_SAME_SCALE = 0.03
+#: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to
+#: 0.15 m.
+_NEAR_M = 0.3
 #: What to do about a camera's place, and about its lens.
 _PLACE_ANEW = (
     "place it anew with `psotrack calibrate rig --pairs`, or all cameras with `psotrack calibrate rig`"
@@ -51,19 +45,14 @@ class Finding:
         return f"{self.message}; {self.remedy}"
 
 
-def describe_camera_fault(rig: Rig, index: int, explained: list[CameraFault], fps: float) -> Finding:
-    """Describe the simplest explanation whose gain is almost as large as the largest gain."""
-    name, sound = rig.names[index], explained[0].explained
-    best = max(each.explained for each in explained)
-    if best - sound <= _CLEARLY:
-        message = (
-            f"camera {name}: it explains {sound:.0%} of the drones that the others see; no correction helps"
-        )
-        return Finding("disagrees", (name,), message, f"leave {name} out with --cameras, or {_PLACE_ANEW}")
-    fault = next(each for each in explained if each.explained - sound >= _ALMOST * (best - sound))
-    words, remedy = _in_words(fault.kind, rig.cameras[index], fault.camera, fault.lag_frames / fps)
-    numbers = f"(explains {fault.explained:.0%} of the drones that the others see, not {sound:.0%})"
-    return Finding(_named(fault.kind), (name,), f"camera {name}: {words} {numbers}", remedy)
+def describe_gross_fault(explained: float, name: str) -> Finding:
+    """Describe a camera that explains hardly any of the points that the others see."""
+    message = (
+        f"camera {name}: it has detections near {explained:.0%} of the drones that the others see: it was turned or "
+        "moved far, has another lens, or its video is of another time"
+    )
+    remedy = f"look at its video beside the others; leave {name} out with --cameras, or {_PLACE_ANEW}"
+    return Finding("disagrees", (name,), message, remedy)
 
 
 def describe_fault(rig: Rig, fault: FoundFault, fps: float) -> Finding:
@@ -133,44 +122,27 @@ def _in_words(
     return f"it is {' and '.join(parts)}", f"{_PLACE_ANEW}; the boxes put it at ({centre}) m"
 
 
-def describe_reference(fit: ReferenceFit, fps: float) -> list[Finding]:
-    """Describe how the reference disagrees with the rig; an empty list if they agree."""
-    if fit.agrees and fit.before_m < NEAR_M:
-        return []
-    numbers = f"(median distance to the detections' points {fit.after_m:.2f} m, not {fit.before_m:.2f} m)"
-    if fit.agrees:
-        message = f"the reference: it is {fit.before_m:.2f} m from what the cameras see, at the median"
-        remedy = "no clock, unit or motion explains it: check that it is of this flight"
-        return [Finding("reference", (), message, remedy)]
-    if fit.offset_frames:
-        frames, seconds = abs(fit.offset_frames), abs(fit.offset_frames) / fps
-        where = "ahead of" if fit.offset_frames > 0 else "behind"
-        message = (
-            f"the reference: its clock is {frames} frames ({seconds:.2f} s) {where} the videos' {numbers}"
-        )
-        remedy = "find it to a fraction of a frame with `psotrack doctor --tracks`"
-        return [Finding("reference clock", (), message, remedy)]
-    kind, how = _motion_of(fit)
-    remedy = "bring both into one world"
-    if kind == "reference unit" and abs(abs(np.log10(fit.scale)) - 3) < 0.05:
-        remedy = "one of them is in millimetres and was read as metres: name the right unit"
-    return [Finding(kind, (), f"the reference: against the rig it is {how} {numbers}", remedy)]
+def describe_reference(
+    point_m: Float[np.ndarray, "points 3"], reference_m: Float[np.ndarray, "points drones 3"]
+) -> tuple[float, list[Finding]]:
+    """Median distance of points from the nearest drone of the reference, metres, and whether it contradicts the rig.
 
-
-def _motion_of(fit: ReferenceFit) -> tuple[str, str]:
-    """The kind of the largest difference between reference and rig, and a description of all differences."""
-    parts, kind = [], "reference moved"
-    diagonal = np.diag(fit.R)
-    turn_deg = np.rad2deg(np.arccos(np.clip((np.trace(fit.R) - 1) / 2, -1, 1)))
-    if abs(fit.scale - 1) > _SAME_SCALE:
-        kind = "reference unit"
-        parts.append(f"{fit.scale:.4g} times as large")
-    if np.linalg.det(fit.R) < 0:
-        kind = "reference mirrored"
-        axes = ", ".join(axis for axis, value in zip("xyz", diagonal, strict=True) if value < 0)
-        parts.append("mirrored" + (f" in {axes}" if np.abs(diagonal).min() > 0.95 else ""))
-    elif turn_deg > 2:
-        parts.append(f"turned by {turn_deg:.0f} degrees")
-    if np.linalg.norm(fit.shift_m) / fit.scale > NEAR_M / 3 or not parts:
-        parts.append("shifted by ({:.2f}, {:.2f}, {:.2f}) m".format(*fit.shift_m))
-    return kind, ", ".join(parts)
+    Args:
+        point_m: (points, 3), triangulated points of unknown drones.
+        reference_m: (points, drones, 3), the reference in each point's frame; NaN where it is missing.
+    """
+    distance_m = np.linalg.norm(reference_m - point_m[:, None], axis=-1)
+    known = np.isfinite(distance_m).any(axis=1)
+    median_m = float(np.median(np.nanmin(distance_m[known], axis=1))) if known.any() else np.nan
+    if not median_m >= _NEAR_M:
+        return median_m, []
+    extents_m = [np.nanstd(each, axis=0).max() for each in (reference_m.reshape(-1, 3), point_m)]
+    message = (
+        f"the reference: it is {median_m:.2f} m from what the cameras see, at the median; its extent is "
+        f"{extents_m[0] / extents_m[1]:.3g} times theirs"
+    )
+    remedy = (
+        "find the offset of its clock with `psotrack doctor --tracks`; else check its unit and its axes, and that it "
+        "is of this flight"
+    )
+    return median_m, [Finding("reference", (), message, remedy)]

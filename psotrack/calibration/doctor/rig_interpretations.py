@@ -73,22 +73,25 @@ def _conventions(rig: Rig) -> Iterator[RigInterpretation]:
 def _convention(
     rig: Rig, cameras: Camera, centred: bool, turned: bool, flip: Float[np.ndarray, "3"]
 ) -> RigInterpretation:
-    words, remedies = [], []
-    if centred:
-        words.append("its translation is the camera's centre C, which was read as t of x_cam = R X + t")
-        remedies.append("write t = -R C for each camera")
-    if turned:
-        words.append("its rotation is from camera to world, which was read as world to camera")
-        remedies.append("write the transposed rotation")
-    if (flip < 0).any():
-        axes = ", ".join(axis for axis, sign in zip("xyz", flip, strict=True) if sign < 0)
-        hand = "" if np.prod(flip) > 0 else " in a left-handed world"
-        opengl = " as in OpenGL" if flip.tolist() == [1.0, -1.0, -1.0] else ""
-        words.append(f"camera axes {axes} are mirrored{opengl}{hand}")
-        also = ", and mirror an axis of the world" if hand else ""
-        remedies.append(
+    axes = ", ".join(axis for axis, sign in zip("xyz", flip, strict=True) if sign < 0)
+    hand = " in a left-handed world" if np.prod(flip) < 0 else ""
+    opengl = " as in OpenGL" if flip.tolist() == [1.0, -1.0, -1.0] else ""
+    also = ", and mirror an axis of the world" if hand else ""
+    confused = {
+        "its translation is the camera's centre C, which was read as t of x_cam = R X + t": (
+            "write t = -R C for each camera" if centred else ""
+        ),
+        "its rotation is from camera to world, which was read as world to camera": (
+            "write the transposed rotation" if turned else ""
+        ),
+        f"camera axes {axes} are mirrored{opengl}{hand}": (
             f"change the sign of rows {axes} of R and t: cameras have x right, y down, z ahead{also}"
-        )
+            if axes
+            else ""
+        ),
+    }
+    words = [said for said, remedy in confused.items() if remedy]
+    remedies = [remedy for remedy in confused.values() if remedy]
     kind = (
         "mirrored axes" if (flip < 0).any() else "translation or centre" if centred else "rotation inverted"
     )

@@ -17,14 +17,12 @@ from psotrack.calibration.boards import Board
 from psotrack.calibration.bundle import (
     LEAST_NOISE_PX,
     Bundle,
-    BundleProblem,
     BundleState,
     median_by_camera,
     solve_robustly,
 )
-from psotrack.calibration.derivatives import centre_by_pose
-from psotrack.calibration.lens_models import PINHOLE, LensModel, camera_matrix
-from psotrack.calibration.residuals import GATE
+from psotrack.calibration.lens_models import LensModel
+from psotrack.calibration.residuals import GATE, centre_by_pose
 from psotrack.calibration.rig.board_poses import find_lens
 from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
 from psotrack.calibration.rig.covariance import covariance_over_instants
@@ -33,7 +31,7 @@ from psotrack.calibration.rig.slips import Slips
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
-from psotrack.geometry import Camera, Rig, make_camera, make_rig
+from psotrack.geometry import Camera, Rig, make_rig
 from psotrack.support import Advance, Report, no_progress
 
 #: Largest number of adjustments, and relative change of the slips' widths that ends them.
@@ -84,12 +82,10 @@ class LensChoice:
     Attributes:
         model: model of the lenses that are not known; None to choose it for each camera by views left out.
         known: lenses by camera name, which are kept.
-        is_shared: whether all cameras have the same lens.
     """
 
     model: LensModel | None = field(default_factory=LensModel)
     known: Mapping[str, tuple[LensModel, np.ndarray]] | None = None
-    is_shared: bool = False
 
 
 def calibrate_rig(
@@ -116,17 +112,17 @@ def calibrate_rig(
     """
     _check_views(board, views, lenses)
     fixed = None if floor is None else _instant(views, floor)
-    models, vectors, lens_of = _start_lenses(board, views, lenses, report)
-    chain = join_cameras(board, views, tuple(models[k] for k in lens_of), tuple(vectors[k] for k in lens_of))
+    models, vectors = _start_lenses(board, views, lenses, report)
+    chain = join_cameras(board, views, models, vectors)
     views = _relabelled(board, views, chain)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
-        bundle = _adjust(board, views, chain, (models, vectors, lens_of), lenses, fixed, advance)
+        bundle = _adjust(board, views, chain, (models, vectors), lenses, fixed, advance)
     return replace(_result(board, views, chain, models, bundle), not_compared=_not_compared(views, lenses))
 
 
 def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
     for name, count in zip(views.names, views.seen.sum(axis=1).tolist(), strict=True):
-        least = _LEAST_VIEWS_KNOWN if name in (lenses.known or {}) or lenses.is_shared else _LEAST_VIEWS
+        least = _LEAST_VIEWS_KNOWN if name in (lenses.known or {}) else _LEAST_VIEWS
         if count < least:
             raise InputError(
                 f"camera {name}",
@@ -139,8 +135,8 @@ def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
 
 def _start_lenses(
     board: Board, views: BoardViews, lenses: LensChoice, report: Report
-) -> tuple[tuple[LensModel, ...], tuple[np.ndarray, ...], Int[np.ndarray, " cameras"]]:
-    """Models and first vectors of the lenses, and the index of each camera's lens."""
+) -> tuple[tuple[LensModel, ...], tuple[np.ndarray, ...]]:
+    """Models and first vectors of the lenses."""
     known = lenses.known or {}
     models, vectors = [], []
     steps = (0 if lenses.model else MOST_FITS) + 1
@@ -153,17 +149,7 @@ def _start_lenses(
                 advance(1)
             models.append(model)
             vectors.append(vector)
-    if not lenses.is_shared:
-        return tuple(models), tuple(vectors), np.arange(len(models))
-    if len(np.unique(views.image_size_wh, axis=0)) > 1:
-        raise InputError("cameras", expected="images of one size for one shared lens", found="several sizes")
-    best = _camera_of_shared_lens(views)
-    return (models[best],), (vectors[best],), np.zeros(len(models), np.int64)
-
-
-def _camera_of_shared_lens(views: BoardViews) -> int:
-    """The camera whose first lens is that of all cameras: the one with most views has the best."""
-    return int(views.seen.sum(axis=1).argmax())
+    return tuple(models), tuple(vectors)
 
 
 def _not_compared(views: BoardViews, lenses: LensChoice) -> dict[str, int]:
@@ -171,9 +157,10 @@ def _not_compared(views: BoardViews, lenses: LensChoice) -> dict[str, int]:
     if lenses.model is not None:
         return {}
     counts = dict(zip(views.names, views.seen.sum(axis=1).tolist(), strict=True))
-    used = [views.names[_camera_of_shared_lens(views)]] if lenses.is_shared else views.names
     return {
-        name: counts[name] for name in used if name not in (lenses.known or {}) and counts[name] < LEAST_VIEWS
+        name: count
+        for name, count in counts.items()
+        if name not in (lenses.known or {}) and count < LEAST_VIEWS
     }
 
 
@@ -224,15 +211,14 @@ def _adjust(
     board: Board,
     views: BoardViews,
     chain: Chain,
-    start: tuple[tuple[LensModel, ...], tuple[np.ndarray, ...], Int[np.ndarray, " cameras"]],
+    start: tuple[tuple[LensModel, ...], tuple[np.ndarray, ...]],
     lenses: LensChoice,
     fixed: int | None,
     advance: Advance,
 ) -> Bundle:
     """Adjust everything, with the world fixed to the first camera or to the board at an instant."""
-    models, vectors, lens_of = start
+    models, vectors = start
     known = lenses.known or {}
-    sizes = np.array([views.image_size_wh[np.flatnonzero(lens_of == k)[0]] for k in range(len(models))])
     free_camera = np.ones(len(views.names), bool)
     free_board = np.ones(len(views.number), bool)
     T_cam_world, T_world_board = chain.T_cam_world, chain.T_world_board
@@ -245,33 +231,23 @@ def _adjust(
     # Turns about the board's middle and shifts of the middle are nearly independent.
     middle = np.eye(4)
     middle[:3, 3] = board.corners_m.mean(axis=0)
-    camera, instant = np.nonzero(np.isfinite(views.corners_px[..., 0]).any(axis=-1))
-    problem = BundleProblem(
-        models=models,
-        priors=tuple(model.prior(tuple(size)) for model, size in zip(models, sizes.tolist(), strict=True)),
-        corners_m=board.corners_m - middle[:3, 3],
-        lens=lens_of[camera],
-        camera=camera,
-        target=instant,
-        corners_px=views.corners_px[camera, instant],
-        noise_px=np.ones(len(camera)),
-        free_lens=tuple(np.zeros(model.size, bool) for model in models),
-        free_camera=free_camera,
-        free_target=np.tile(free_board, (7, 1)).T,
-    )
     state = BundleState(vectors, T_cam_world, T_world_board @ middle, np.ones(len(T_world_board)))
-    bundle = Bundle(problem, state, np.isfinite(problem.corners_px).all(axis=-1), is_robust=True)
+    corners_m, free = board.corners_m - middle[:3, 3], (free_camera, free_board)
+    bundle = Bundle.of_views(models, state, corners_m, views.corners_px, free=free)
+    sizes = [tuple(size) for size in views.image_size_wh.tolist()]
+    priors = tuple(model.prior(size) for model, size in zip(models, sizes, strict=True))
+    problem = replace(bundle.problem, priors=priors)
+    bundle = replace(bundle, problem=problem)
     if problem.size:
         bundle = solve_robustly(bundle)
     advance(1)
     free_lens = tuple(
-        np.full(model.size, lenses.is_shared or views.names[index] not in known)
-        for index, model in enumerate(models)
+        np.full(model.size, name not in known) for name, model in zip(views.names, models, strict=True)
     )
     bundle = replace(bundle, problem=replace(problem, free_lens=free_lens))
     bundle = _adjust_with_slips(bundle, board, advance)
     for index, name in enumerate(views.names):
-        if not bundle.used[camera == index].any():
+        if not bundle.used[problem.camera == index].any():
             raise InputError(f"camera {name}", expected="views that fit the other cameras", found="none")
     boards = bundle.state.T_world_target @ np.linalg.inv(middle)
     problem = replace(bundle.problem, corners_m=board.corners_m)
@@ -318,19 +294,18 @@ def _result(
     used = np.zeros(views.corners_px.shape[:3], bool)
     at = problem.camera, problem.target
     residual_px[at], own_px[at], used[at] = bundle.distance_px, bundle.own_distance_px, bundle.used
-    lens_of = np.zeros(len(views.names), np.int64)
-    lens_of[problem.camera] = problem.lens
     padded = np.pad(covariance, ((0, 1), (0, 1)))
     for index, (name, T) in enumerate(zip(views.names, state.T_cam_world, strict=True)):
-        lens = int(lens_of[index])
         # Unknowns that were not adjusted have the index -1, the padding.
-        lens_std.append(np.sqrt(np.diag(padded)[problem.lens_columns[lens]]))
+        lens_std.append(np.sqrt(np.diag(padded)[problem.lens_columns[index]]))
         columns = problem.pose_columns[index]
         block = padded[np.ix_(columns, columns)]
         by_pose = centre_by_pose(T[:3, :3], T[:3, 3])
         by_camera.append(block)
         centres.append(by_pose @ block @ by_pose.T)
-        cameras[name] = camera_of(models[lens], state.lenses[lens], T, views.image_size_wh[index])
+        cameras[name] = models[index].camera(
+            state.lenses[index], T, (int(views.image_size_wh[index, 0]), int(views.image_size_wh[index, 1]))
+        )
     return CalibratedRig(
         board,
         make_rig(cameras),
@@ -339,30 +314,11 @@ def _result(
         residual_px,
         own_px,
         used,
-        tuple(models[lens] for lens in lens_of.tolist()),
+        models,
         tuple(lens_std),
         np.stack(by_camera),
         np.stack(centres),
         chain.shared,
-    )
-
-
-def camera_of(
-    model: LensModel,
-    lens: Float[np.ndarray, " unknowns"],
-    T_cam_world: Float[np.ndarray, "4 4"],
-    image_size_wh: Int[np.ndarray, "2"],
-) -> Camera:
-    """Make a camera of a lens's vector."""
-    kind = {"fisheye": True} if model.fisheye else {}
-    U, _, V = np.linalg.svd(T_cam_world[:3, :3])
-    return make_camera(
-        R=U @ V,
-        t_m=T_cam_world[:3, 3],
-        K=camera_matrix(lens),
-        dist=lens[PINHOLE:].tolist(),
-        image_size_wh=(int(image_size_wh[0]), int(image_size_wh[1])),
-        **kind,
     )
 
 

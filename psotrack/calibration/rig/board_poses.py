@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.calibration.board_corners import choose_spread, outline_of
 from psotrack.calibration.boards import Board
-from psotrack.calibration.bundle import Bundle, BundleProblem, BundleState, solve_robustly
+from psotrack.calibration.bundle import Bundle, BundleState, solve_robustly
 from psotrack.calibration.lens_models import PINHOLE, LensModel
 from psotrack.calibration.pnp import ray_distances, solve_pnp
 
 #: Focal lengths from which the search for a lens starts, in image widths: 90 to 14 degrees; a fisheye's, to 200.
 _FOCAL_WIDTHS, _FOCAL_WIDTHS_FISHEYE = (0.5, 0.8, 1.2, 2.0, 4.0), (0.25, 0.35, 0.5, 0.8)
-#: Largest number of views for a first lens: more views add little, because the chosen views differ most.
+#: Largest number of views for a first lens, evenly spread.
 _MOST_VIEWS = 30
 
 
@@ -60,12 +59,8 @@ def find_lens(
     Returns:
         Vector of the lens, or None if no view fits.
     """
-    outlines = [(index, outline_of(board, corners_px)) for index, corners_px in enumerate(views_px)]
-    usable = [(index, outline) for index, outline in outlines if outline is not None]
-    if not usable:
-        return None
-    spread = choose_spread(np.array([outline for _, outline in usable]) / image_size_wh[0], _MOST_VIEWS)
-    chosen = views_px[sorted(usable[index][0] for index in spread)]
+    usable = views_px[np.isfinite(views_px[..., 0]).sum(axis=1) >= board.least_corners]
+    chosen = usable[:: max(1, -(-len(usable) // _MOST_VIEWS))]
     found: list[tuple[float, np.ndarray]] = []
     starts_px = [
         widths * image_size_wh[0] for widths in (_FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS)
@@ -94,8 +89,7 @@ def fit_boards(
     if prepared is None:
         return None
     bundle, fits = prepared
-    none = (np.zeros(model.size, bool),)
-    bundle = solve_robustly(replace(bundle, problem=replace(bundle.problem, free_lens=none)))
+    bundle = solve_robustly(bundle)
     distance_px = np.full(views_px.shape[:2], np.nan)
     distance_px[fits] = bundle.distance_px
     return distance_px
@@ -139,20 +133,9 @@ def _problem(
     fits = np.array([len(candidates) > 0 for candidates in poses])
     if not fits.any():
         return None
-    count = int(fits.sum())
-    problem = BundleProblem(
-        models=(model,),
-        priors=(model.prior(image_size_wh),),
-        corners_m=board.corners_m,
-        lens=np.zeros(count, np.int64),
-        camera=np.zeros(count, np.int64),
-        target=np.arange(count),
-        corners_px=views_px[fits],
-        noise_px=np.ones(count),
-        free_lens=(np.ones(model.size, bool),),
-        free_camera=np.zeros(1, bool),
-        free_target=np.ones((count, 7), bool),
-    )
     boards = np.array([candidates[0] for candidates in poses if len(candidates)])
-    state = BundleState((lens,), np.eye(4)[None], boards, np.ones(count))
-    return Bundle(problem, state, np.isfinite(problem.corners_px).all(axis=-1), is_robust=True), fits
+    state = BundleState((lens,), np.eye(4)[None], boards, np.ones(len(boards)))
+    free = np.zeros(1, bool), np.ones(len(boards), bool)
+    bundle = Bundle.of_views((model,), state, board.corners_m, views_px[None, fits], free=free)
+    problem = replace(bundle.problem, priors=(model.prior(image_size_wh),))
+    return replace(bundle, problem=problem), fits

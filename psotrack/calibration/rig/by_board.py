@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from psotrack.calibration.board_recognition import describe_board, detect_board
@@ -86,15 +85,15 @@ def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], worl
     rows = [
         (
             name,
-            f"{row.views}",
-            f"{row.rms_px:.2f}",
-            f"{row.focal_px[0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row.focal_std_px[0]:.1f}",
-            format_numbers(row.centre_m, 3),
-            f"{1e3 * math.hypot(*row.centre_std_m):.1f}",
+            f"{row['views']}",
+            f"{row['rms_px']:.2f}",
+            f"{row['focal_px'][0]:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{row['focal_std_px'][0]:.1f}",
+            format_numbers(row["centre_m"], 3),
+            f"{1e3 * math.hypot(*row['centre_std_m']):.1f}",
         )
         for name, row in figures.items()
     ]
-    models = ", ".join(f"{name} {row.lens}" for name, row in figures.items())
+    models = ", ".join(f"{name} {row['lens']}" for name, row in figures.items())
     more = {
         "print": printed,
         "worst_views": [dict(zip(("camera", "frame", "residual_px"), view, strict=True)) for view in worst],
@@ -107,11 +106,11 @@ def _result(calibrated: CalibratedRig, said: list[str], printed: list[str], worl
         *advice,
         f"the world is {world}",
     ]
-    cameras = {name: asdict(row) for name, row in figures.items()}
-    table = _HEADINGS, rows
-    return RigCalibration(calibrated.rig, cameras, table, [*said, *printed], after, more, calibrated)
+    return RigCalibration(
+        calibrated.rig, figures, (_HEADINGS, rows), [*said, *printed], after, more, calibrated
+    )
 
 
 def _lens_choice(settings: RigSettings) -> LensChoice:
     known = None if settings.lenses is None else known_lenses(read_lenses(settings.lenses))
-    return LensChoice(parse_lens_model(settings.lens), known, settings.same_lens)
+    return LensChoice(parse_lens_model(settings.lens), known)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.image_points import find_markers, read_image_points
-from psotrack.calibration.intrinsics import lens_of_sensor, lens_of_view
+from psotrack.calibration.intrinsics import lens_of_view
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
@@ -30,18 +31,38 @@ from psotrack.calibration.rig.point_files import (
     views_of_detections,
     world_in_words,
 )
-from psotrack.calibration.rig.point_shifts import find_point_shifts
-from psotrack.calibration.rig.result import PointFit, RigCalibration, calibration_by_points
+from psotrack.calibration.rig.result import RigCalibration
 from psotrack.calibration.rig.settings import RigSettings
+from psotrack.calibration.rig.shifts import find_point_shifts
 from psotrack.calibration.rig.world import Similarity, world_of_camera
 from psotrack.errors import InputError, SettingsError, errors_name
 from psotrack.geometry import Rig, chosen_camera, make_rig
 from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings import read_detections
 from psotrack.recordings.datasets import is_recording, open_recording
+from psotrack.support import POSITION, finite_or_none, format_numbers
 
 #: Fraction of the sightings below which the user is told how few are used.
 _FEW_USED = 0.5
+#: Number of points that are shown by name for each camera, those that fit worst.
+_WORST = 5
+
+
+@dataclass(frozen=True)
+class PointFit:
+    """How points fit one camera.
+
+    Attributes:
+        points: names of the points.
+        covariance_m2: (3, 3), covariance of the camera's centre, m².
+        residual_px: (points,), distances of the points from their projections, pixels; infinite behind the camera.
+        used: (points,), False for points that were left out.
+    """
+
+    points: Sequence[Any]
+    covariance_m2: Float[np.ndarray, "3 3"]
+    residual_px: Float[np.ndarray, " points"]
+    used: Bool[np.ndarray, " points"]
 
 
 def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) -> RigCalibration:
@@ -98,7 +119,7 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
         fits[name] = PointFit(found.views.number[seen].tolist(), covariance_m2[index], residual_px, used)
     shifts = map(str, find_point_shifts(adjusted.rig, views))
     notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
-    return calibration_by_points(rig, fits, notes)
+    return _calibration(rig, fits, notes)
 
 
 def calibrate_by_known_points(
@@ -149,7 +170,7 @@ def calibrate_by_known_points(
         cameras[name] = replace(lens, T_cam_world=located.T_cam_world)
         covariance_m2 = located.centre_covariance_m2
         fits[name] = PointFit(mark.points, covariance_m2, located.residual_px, located.used)
-    return calibration_by_points(make_rig(cameras), fits, [f"the world is that of {world}"])
+    return _calibration(make_rig(cameras), fits, [f"the world is that of {world}"])
 
 
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
@@ -194,23 +215,19 @@ def _weak(found: PointRig, rig: Rig, covariance_m2: Float[np.ndarray, "cameras 3
 
 def _lenses_of(names: Sequence[str], settings: RigSettings) -> Rig:
     """Lenses of the cameras, from a calibration or a data sheet; a file with one camera has the lens of all."""
-    path, fov_deg, focal_mm = settings.lenses, settings.fov_deg, settings.focal_length_mm
-    ways = sum(value is not None for value in (path, fov_deg, focal_mm))
-    if ways != 1 or (focal_mm is None) != (settings.sensor_mm is None):
+    path, fov_deg = settings.lenses, settings.fov_deg
+    if (path is None) == (fov_deg is None):
         raise SettingsError(
             "--lenses",
-            expected="a calibration with the lens of each camera, or --fov H,V, or --focal-length with --sensor",
-            found="another combination" if ways else "none",
+            expected="a calibration with the lens of each camera, or --fov H,V",
+            found="none" if path is None else "both",
         )
     if path is not None:
         lenses = read_lenses(path, settings.size)
     elif settings.size is None:
         raise SettingsError("--size", expected="width and height of the images", found="none")
-    elif fov_deg is not None:
-        lenses = make_rig({"all": lens_of_view(*fov_deg, settings.size)})
     else:
-        sensor_mm = settings.sensor_mm or (0.0, 0.0)
-        lenses = make_rig({"all": lens_of_sensor(focal_mm or 0.0, sensor_mm, settings.size)})
+        lenses = make_rig({"all": lens_of_view(*(fov_deg or (0.0, 0.0)), settings.size)})
     if len(lenses) == 1:
         return Rig(tuple(names), lenses.cameras[np.zeros(len(names), np.int64)])
     chosen = [chosen_camera(name, lenses.names) for name in names]
@@ -238,3 +255,52 @@ def _read_views(sources: Sequence[Path]) -> PointViews:
     line_time_s = {each.name: each.line_time_s for each in recording.cameras}
     with errors_name(sources[0]):
         return views_of_detections(boxes, times, line_time_s)
+
+
+def _calibration(rig: Rig, fits: Mapping[str, PointFit], notes: Sequence[str]) -> RigCalibration:
+    """The result of a calibration by points: positions, standard deviations, and the points that fit worst.
+
+    Args:
+        rig: the cameras.
+        fits: how the points fit each camera.
+        notes: sentences on the world, and on what the points do not determine.
+    """
+    cameras, rows, worst = {}, [], []
+    for name, centre_m in zip(rig.names, np.asarray(rig.cameras.centre_world), strict=True):
+        fit = fits[name]
+        std_m = np.sqrt(np.diag(fit.covariance_m2))
+        rms_px = float(np.sqrt(np.mean(fit.residual_px[fit.used] ** 2))) if fit.used.any() else None
+        points = [
+            {
+                "point": str(fit.points[index]),
+                "residual_px": finite_or_none(fit.residual_px[index]),
+                "used": bool(fit.used[index]),
+            }
+            for index in np.argsort(-fit.residual_px)[:_WORST]
+        ]
+        cameras[name] = {
+            "centre_m": centre_m.tolist(),
+            "centre_std_m": std_m.tolist(),
+            "points": len(fit.used),
+            "used": int(fit.used.sum()),
+            "rms_px": rms_px,
+            "worst": points,
+        }
+        rows.append(
+            (
+                name,
+                f"{fit.used.sum()} of {len(fit.used)}",
+                "" if rms_px is None else f"{rms_px:.2f}",
+                format_numbers(centre_m.tolist(), 3),
+                format_numbers((1e3 * std_m).tolist(), 1),
+            )
+        )
+        # Names of points may be too long for a column.
+        worst.append(f"{name}, worst points (px): {', '.join(map(_in_words, points))}")
+    table = ("camera", "points", "rms (px)", POSITION, "std (mm)"), rows
+    return RigCalibration(rig, cameras, table, after=[*worst, *notes], more={"notes": list(notes)})
+
+
+def _in_words(one: dict[str, Any]) -> str:
+    distance = "behind" if one["residual_px"] is None else f"{one['residual_px']:.1f}"
+    return f"{one['point']} {distance}{'' if one['used'] else ' left out'}"

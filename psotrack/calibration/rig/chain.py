@@ -51,13 +51,15 @@ class _Seen:
         board: the board.
         rays: (cameras, instants, corners, 2), directions x / z, y / z; NaN where a corner is not seen.
         focal_widths: (cameras,), focal lengths in image widths.
-        poses: by camera and instant, (candidates, 4, 4), board to camera.
+        count: (cameras, instants), number of candidates.
+        poses: (cameras, instants, candidates, 4, 4), board to camera; the last one is repeated.
     """
 
     board: Board
     rays: Float[np.ndarray, "cameras instants corners 2"]
     focal_widths: Float[np.ndarray, " cameras"]
-    poses: list[list[np.ndarray]]
+    count: Int[np.ndarray, "cameras instants"]
+    poses: Float[np.ndarray, "cameras instants candidates 4 4"]
 
     def errors(
         self, camera: int, instants: np.ndarray, T: Float[np.ndarray, "*batch 4 4"]
@@ -102,7 +104,7 @@ def join_cameras(
     """
     seen = _find_poses(board, views, models, lenses)
     count = len(views.names)
-    there = np.array([[len(candidates) > 0 for candidates in of_camera] for of_camera in seen.poses])
+    there = seen.count > 0
     shared = there.astype(np.int64) @ there.T.astype(np.int64)
     cost, steps = np.zeros((count, count)), {}
     for first, second in combinations(range(count), 2):
@@ -113,7 +115,7 @@ def join_cameras(
             # The error, which is below 1, decides between pairs of which equally many instants agree.
             cost[first, second] = 1 + shared.max() - agreeing + error
     order, before = breadth_first_order(minimum_spanning_tree(cost), 0, directed=False)
-    _check_joined(views, shared)
+    check_joined(views, shared)
     T_cam_world = np.tile(np.eye(4), (count, 1, 1))
     for camera in order[1:]:
         T_cam_world[camera] = steps[before[camera], camera] @ T_cam_world[before[camera]]
@@ -128,9 +130,14 @@ def _find_poses(
         there = views.seen[camera]
         pixels = views.corners_px[camera, there]
         rays[camera, there] = model.normalise(lens, pixels.reshape(-1, 2)).reshape(pixels.shape)
-    poses = [[find_board_poses(board, of_view) for of_view in of_camera] for of_camera in rays]
-    widths = views.image_size_wh.max(axis=1)
-    return _Seen(board, rays, np.array([lens[0] for lens in lenses]) / widths, poses)
+    found = [[find_board_poses(board, of_view) for of_view in of_camera] for of_camera in rays]
+    count = np.array([list(map(len, of_camera)) for of_camera in found])
+    poses = np.tile(np.eye(4), (*count.shape, max(int(count.max()), 1), 1, 1))
+    for camera, instant in np.argwhere(count > 0).tolist():
+        number = np.minimum(np.arange(poses.shape[2]), count[camera, instant] - 1)
+        poses[camera, instant] = found[camera][instant][number]
+    focal_widths = np.array([lens[0] for lens in lenses]) / views.image_size_wh.max(axis=1)
+    return _Seen(board, rays, focal_widths, count, poses)
 
 
 def _transform(
@@ -138,23 +145,9 @@ def _transform(
 ) -> tuple[Float[np.ndarray, "4 4"], int, float]:
     """Transform from a camera to another, the number of instants that it fits, and its mean error in image widths."""
     some = shared[np.linspace(0, len(shared) - 1, min(len(shared), _MOST_INSTANTS)).round().astype(np.int64)]
-    candidates = np.array(
-        [
-            there @ np.linalg.inv(here)
-            for instant in some
-            for here in seen.poses[first][instant]
-            for there in seen.poses[second][instant]
-        ]
-    )
-    most = max(len(seen.poses[first][instant]) for instant in some)
-    # All poses of each instant; instants with fewer poses repeat their last one.
-    here = np.array(
-        [
-            [seen.poses[first][instant][min(rank, len(seen.poses[first][instant]) - 1)] for instant in some]
-            for rank in range(most)
-        ]
-    )
-    errors = seen.errors(second, some, candidates[:, None, None] @ here)[0].min(axis=1)
+    here, there = seen.poses[first, some], seen.poses[second, some]
+    candidates = (there[:, :, None] @ np.linalg.inv(here)[:, None]).reshape(-1, 4, 4)
+    errors = seen.errors(second, some, candidates[:, None, None] @ here.swapaxes(0, 1))[0].min(axis=1)
     total = np.minimum(errors, 5 * _FITS).mean(axis=1)
     best = int(total.argmin())
     # All shared instants count, not only those that gave candidates.
@@ -170,12 +163,11 @@ def _place_boards(
     boards = np.tile(np.eye(4), (instants, 1, 1))
     labelling = np.zeros((cameras, instants), np.int64)
     for instant in range(instants):
-        there = [camera for camera in range(cameras) if len(seen.poses[camera][instant])]
-        if not there:
+        there = np.flatnonzero(seen.count[:, instant])
+        if not len(there):
             continue
-        candidates = np.concatenate(
-            [np.linalg.inv(T_cam_world[camera]) @ seen.poses[camera][instant] for camera in there]
-        )
+        candidates = np.linalg.inv(T_cam_world[there])[:, None] @ seen.poses[there, instant]
+        candidates = candidates.reshape(-1, 4, 4)
         found = [
             seen.errors(camera, np.array([instant]), (T_cam_world[camera] @ candidates)[:, None])
             for camera in there
@@ -187,19 +179,18 @@ def _place_boards(
     return boards, labelling
 
 
-def check_joined(views: BoardViews) -> None:
-    """Check that instants at which two cameras see the board join all cameras: before lenses are looked for.
+def check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"] | None = None) -> None:
+    """Check that instants at which two cameras see the board join all cameras.
+
+    Args:
+        views: the views.
+        shared: number of instants that two cameras share; None: those at which both see enough corners.
 
     Raises:
         InputError: the cameras are not all joined.
     """
     seen = views.seen.astype(np.int64)
-    _check_joined(views, seen @ seen.T)
-
-
-def _check_joined(views: BoardViews, shared: Int[np.ndarray, "cameras cameras"]) -> None:
-    """Raise `InputError` for cameras that no shared view joins to the others."""
-    count, group = connected_components(shared, directed=False)
+    count, group = connected_components(seen @ seen.T if shared is None else shared, directed=False)
     if count > 1:
         first, second = ([views.names[index] for index in np.flatnonzero(group == one)] for one in (0, 1))
         parts = f"one of {', '.join(first)} and one of {', '.join(second)}"

@@ -16,13 +16,12 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, triangulate_linearly
 from psotrack.recordings import Detections, FrameTimes, make_timeline
 from psotrack.support import read_table
+from psotrack.trajectories.resampling import interpolated
 
 _SEPARATOR = ","
 #: Longest time between two frames between which a point is interpolated, in intervals of the camera: one frame in which
 #: the point was missed lies between them.
 _LONGEST_GAP = 2.5
-#: Fractions of an interval below this are rounding.
-_SAME = 1e-6
 #: Largest number of a frame.
 _LARGEST_FRAME = 2**31
 
@@ -80,8 +79,7 @@ def views_of_detections(
     Args:
         detections: boxes by camera name.
         frame_times: when the frames were exposed, by camera name. Instants are those of `make_timeline`, and a camera's
-            pixel at an instant is interpolated between its frames before and after, which errs by at most an
-            eighth of the change of the point's speed, in pixels per frame, from frame to frame.
+            pixel at an instant is interpolated by a cubic spline through its frames.
         line_time_s: times from the exposure of one row to that of the next row by camera name, seconds.
 
     Raises:
@@ -101,7 +99,9 @@ def views_of_detections(
         times = frame_times[name]
         frame, middle_px = _middles(detections[name], times.num_frames)
         time_s = times.time_s[frame] + (line_time_s or {}).get(name, 0.0) * middle_px[:, 1]
-        points_px[:, index] = _at_times(timeline.time_s, time_s, middle_px, _LONGEST_GAP / times.fps)
+        order = np.argsort(time_s, kind="stable")
+        path = interpolated(time_s[order], middle_px[order, None], _LONGEST_GAP / times.fps)
+        points_px[:, index] = path(timeline.time_s)[:, 0]
     numbers = np.arange(timeline.num_instants)
     return PointViews(names, np.zeros(len(numbers), np.int64), numbers, points_px)
 
@@ -119,27 +119,6 @@ def _middles(
     # Pixel centres are at whole numbers, and edges of boxes are half a pixel away from pixel centres.
     middle_px = (boxes.xyxy[chosen, :2] + boxes.xyxy[chosen, 2:]) / 2 - 0.5
     return boxes.frame[chosen].astype(np.int64), middle_px
-
-
-def _at_times(
-    wanted_s: Float[np.ndarray, " wanted"],
-    time_s: Float[np.ndarray, " frames"],
-    point_px: Float[np.ndarray, "frames 2"],
-    longest_s: float,
-) -> Float[np.ndarray, "wanted 2"]:
-    """(wanted, 2), pixels at the wanted times, interpolated linearly; NaN in gaps longer than `longest_s`."""
-    if len(time_s) < 2:
-        return np.full((len(wanted_s), 2), np.nan)
-    order = np.argsort(time_s, kind="stable")
-    time_s, point_px = time_s[order], point_px[order]
-    after = np.clip(np.searchsorted(time_s, wanted_s), 1, len(time_s) - 1)
-    gap_s = time_s[after] - time_s[after - 1]
-    fraction = (wanted_s - time_s[after - 1]) / np.maximum(gap_s, 1e-9)
-    # Where the wanted time is that of a frame, the gap beside the frame does not matter.
-    is_exact = np.minimum(np.abs(fraction), np.abs(fraction - 1)) < _SAME
-    usable = is_exact | ((np.abs(fraction - 0.5) < 0.5) & (gap_s <= longest_s))
-    pixel = point_px[after - 1] + fraction[:, None] * (point_px[after] - point_px[after - 1])
-    return np.where(usable[:, None], pixel, np.nan)
 
 
 def stick_length(point_rig: PointRig) -> float:

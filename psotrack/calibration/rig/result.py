@@ -7,15 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import Bool, Float
-
 from psotrack.calibration.rig.adjustment import CalibratedRig
 from psotrack.geometry import Rig
-from psotrack.support import POSITION, finite_or_none, format_numbers, html_block, html_table, text_table
-
-#: Number of points that are shown by name for each camera, those that fit worst.
-_WORST = 5
+from psotrack.support import html_block, html_table, text_table
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,69 +51,3 @@ class RigCalibration:
     def _repr_html_(self) -> str:
         """What a notebook shows: the table of the cameras, and the sentences."""
         return html_block("; ".join(self.after), html_table(*self.table))
-
-
-@dataclass(frozen=True)
-class PointFit:
-    """How points fit one camera.
-
-    Attributes:
-        points: names of the points.
-        covariance_m2: (3, 3), covariance of the camera's centre, m².
-        residual_px: (points,), distances of the points from their projections, pixels; infinite behind the camera.
-        used: (points,), False for points that were left out.
-    """
-
-    points: Sequence[Any]
-    covariance_m2: Float[np.ndarray, "3 3"]
-    residual_px: Float[np.ndarray, " points"]
-    used: Bool[np.ndarray, " points"]
-
-
-def calibration_by_points(rig: Rig, fits: Mapping[str, PointFit], notes: Sequence[str]) -> RigCalibration:
-    """The result of a calibration by points: positions, standard deviations, and the points that fit worst.
-
-    Args:
-        rig: the cameras.
-        fits: how the points fit each camera.
-        notes: sentences on the world, and on what the points do not determine.
-    """
-    cameras, rows, worst = {}, [], []
-    for name, centre_m in zip(rig.names, np.asarray(rig.cameras.centre_world), strict=True):
-        fit = fits[name]
-        std_m = np.sqrt(np.diag(fit.covariance_m2))
-        rms_px = float(np.sqrt(np.mean(fit.residual_px[fit.used] ** 2))) if fit.used.any() else None
-        points = [
-            {
-                "point": str(fit.points[index]),
-                "residual_px": finite_or_none(fit.residual_px[index]),
-                "used": bool(fit.used[index]),
-            }
-            for index in np.argsort(-fit.residual_px)[:_WORST]
-        ]
-        cameras[name] = {
-            "centre_m": centre_m.tolist(),
-            "centre_std_m": std_m.tolist(),
-            "points": len(fit.used),
-            "used": int(fit.used.sum()),
-            "rms_px": rms_px,
-            "worst": points,
-        }
-        rows.append(
-            (
-                name,
-                f"{fit.used.sum()} of {len(fit.used)}",
-                "" if rms_px is None else f"{rms_px:.2f}",
-                format_numbers(centre_m.tolist(), 3),
-                format_numbers((1e3 * std_m).tolist(), 1),
-            )
-        )
-        # Names of points may be too long for a column.
-        worst.append(f"{name}, worst points (px): {', '.join(map(_in_words, points))}")
-    table = ("camera", "points", "rms (px)", POSITION, "std (mm)"), rows
-    return RigCalibration(rig, cameras, table, after=[*worst, *notes], more={"notes": list(notes)})
-
-
-def _in_words(one: dict[str, Any]) -> str:
-    distance = "behind" if one["residual_px"] is None else f"{one['residual_px']:.1f}"
-    return f"{one['point']} {distance}{'' if one['used'] else ' left out'}"

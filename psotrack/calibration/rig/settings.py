@@ -46,12 +46,10 @@ class LensSettings:
     Attributes:
         lens: number of distortion coefficients of OpenCV's lens model, or its fisheye model; auto chooses by views that
             are left out.
-        same_lens: all cameras have one lens, as equal cameras at equal zoom nearly do.
         lenses: calibration whose lenses are kept; a camera that is not in the file gets a lens from the board.
     """
 
     lens: Annotated[str, Meta(extra={"metavar": "auto|0|4|5|8|12|14|fisheye"})] = "auto"
-    same_lens: bool = False
     lenses: Path | None = None
 
 
@@ -61,20 +59,11 @@ class SheetSettings:
 
     Attributes:
         fov_deg: horizontal and vertical field of view in degrees, with `size`, instead of `lenses`.
-        focal_length_mm: focal length in millimetres, with `sensor_mm` and `size`, instead of `lenses`.
-        sensor_mm: size of the sensor in millimetres.
         size: size of the images in pixels, if no file states it.
     """
 
     fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
-    focal_length_mm: float | None = None
-    sensor_mm: Annotated[tuple[float, float], Meta(extra={"metavar": "W,H"})] | None = None
     size: tuple[int, int] | None = None
-
-    @property
-    def is_stated(self) -> bool:
-        """Whether the lens is known by the data sheet."""
-        return self.fov_deg is not None or self.focal_length_mm is not None
 
 
 @dataclass(frozen=True)
@@ -141,7 +130,7 @@ class RigSettings(WorldSettings, PointSettings, SheetSettings, LensSettings, Boa
             raise SettingsError("rig", expected=f"one of --square, {', '.join(chosen)}", found=found)
         if (self.distance or self.stick_m is not None) and not self.points:
             raise SettingsError("rig", expected="--distance and --stick with --points", found=used[0])
-        if self.is_stated and self.by_board:
+        if self.fov_deg is not None and self.by_board:
             raise SettingsError("--fov", expected="points or markers, not a board", found=used[0])
         if self.floor is not None and not self.by_board:
             raise SettingsError("rig", expected="--floor with --squares", found=used[0])

@@ -11,10 +11,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.calibration.board_corners import BoardFinder
 from psotrack.calibration.board_recognition import (
-    markers_on_chessboard,
     measure_markers,
     missing_board,
-    number_of_first_images,
     recognise_board,
 )
 from psotrack.calibration.boards import LEAST_CORNERS, Board
@@ -91,10 +89,6 @@ def find_views(
         InputError: an image cannot be read, or a camera never sees the board; the message says what is seen instead.
     """
     number, frames = instants
-    if board.kind == "chessboard":
-        first = list(islice(_samples(cameras, frames), number_of_first_images(len(cameras))))
-        if error := markers_on_chessboard(board, first):
-            raise error
     board, seen_times = recognise_board(board, _samples(cameras, frames))
     if not seen_times:
         raise missing_board(board, list(islice(_samples(cameras, frames), _MOST_SAMPLES)))

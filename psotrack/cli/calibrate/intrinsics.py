@@ -22,7 +22,7 @@ _FISHEYE = ("k1", "k2", "k3", "k4")
 @click.command(cls=HelpfulCommand)
 @click.argument("video", type=click.Path(path_type=Path))
 @options_of(BoardSettings, "board", names=BOARD_NAMES)
-@options_of(LensSettings, "lenses", names={"same_lens": "", "lenses": ""})
+@options_of(LensSettings, "lenses", names={"lenses": ""})
 @click.option("--name", help="Name of the camera.  [default: the video's name]")
 @OUT
 @running()

@@ -25,10 +25,8 @@ from psotrack.cli.records import HelpfulCommand, options_of
 @options_of(
     BoardSettings, "board", names=BOARD_NAMES, heading="Board", rare=("kind", "separation_m", "first_marker")
 )
-@options_of(LensSettings, "lens", heading="Lenses", rare=("same_lens",))
-@options_of(
-    SheetSettings, "sheet", heading="Lenses", rare=("fov_deg", "focal_length_mm", "sensor_mm", "size")
-)
+@options_of(LensSettings, "lens", heading="Lenses")
+@options_of(SheetSettings, "sheet", heading="Lenses", rare=("fov_deg", "size"))
 @options_of(WorldSettings, "world")
 @options_of(PointSettings, "points", heading="Instead of a board", rare=("stick_m", "noise_px"))
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
