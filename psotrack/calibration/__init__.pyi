@@ -20,6 +20,7 @@ from .rig.findings import (
     advise,
     coverage,
     figures_of,
+    save_coverage,
     say_print,
     say_searched,
     worst_views,
@@ -27,7 +28,6 @@ from .rig.findings import (
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
 from .rig.lens_choice import ModelComparison, choose_lens_model, say_not_compared
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
-from .rig.plots import save_coverage
 from .rig.point_files import (
     GivenWorld,
     distance_between,

@@ -61,12 +61,9 @@ class Board:
                 raise SettingsError(
                     "board.marker_m", expected="none on a chessboard", found=f"{self.marker_m:g}"
                 )
-        elif self.kind == "grid" and self.squares_wh == (1, 1):
-            if self.marker_m != self.square_m:
-                raise SettingsError(
-                    "board.marker_m", expected=f"{self.square_m:g} as square_m", found=f"{self.marker_m}"
-                )
-        elif self.marker_m is None or not 0 < self.marker_m < self.square_m:
+        elif self.marker_m is None or not (
+            0 < self.marker_m < self.square_m or (self.kind == "grid" and self.marker_m == self.square_m)
+        ):
             found = "none" if self.marker_m is None else f"{self.marker_m:g}"
             raise SettingsError(
                 "board.marker_m", expected="a side above 0 and below the square's", found=found

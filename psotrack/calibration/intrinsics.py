@@ -6,6 +6,7 @@ The calibration is the adjustment of a rig (`rig.adjustment`) with one camera, s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,6 +21,9 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Camera, make_camera
 from psotrack.support import Report, no_progress
 
+#: Names of the distortion coefficients in OpenCV's order.
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+_FISHEYE = ("k1", "k2", "k3", "k4")
 #: Smallest number of views: fewer views determine k1, k2, p1, p2 badly.
 _MIN_VIEWS = 8
 #: Largest standard deviation of the focal length, as a fraction of the focal length.
@@ -52,6 +56,21 @@ class Lens:
     frame: Int[np.ndarray, " views"]
     residual_px: Float[np.ndarray, " views"]
     searched: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """The values of the lens by name, their standard deviations, and the residuals."""
+        K, dist = self.camera.K, np.asarray(self.camera.dist)[: self.model.coefficients]
+        known = _FISHEYE if self.model.fisheye else _COEFFICIENTS
+        names = ("fx_px", "fy_px", "cx_px", "cy_px", *known[: self.model.coefficients])
+        values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist]
+        return {
+            "model": str(self.model),
+            "compared_px": self.compared_px,
+            "values": dict(zip(names, map(float, values), strict=True)),
+            "std": dict(zip(names, map(float, self.std), strict=True)),
+            "frames": self.frame.tolist(),
+            "residual_px": self.residual_px.tolist(),
+        }
 
 
 def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tuple[int, int]) -> Camera:

@@ -1,7 +1,6 @@
 from .camera_clocks import camera_offsets
 from .reference_clock import ReferenceOffset, own_reference, reference_for, reference_offset
-from .track_clocks import CameraClocks, clocks_of_tracks, estimate_clocks, fit_clocks
-from .track_places import places_of_tracks
+from .track_clocks import CameraClocks, clocks_of_tracks, estimate_clocks, fit_clocks, places_of_tracks
 
 __all__ = [
     "CameraClocks",

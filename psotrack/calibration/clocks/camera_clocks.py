@@ -27,7 +27,7 @@ from psotrack.geometry import (
     to_camera,
     triangulate_linearly,
 )
-from psotrack.geometry.estimation import cauchy_weight, gauss_newton
+from psotrack.geometry.estimation import cauchy_weight
 from psotrack.support import block_jackknife, time_blocks, widening
 
 #: Number of rounds without a step until the weights have settled, and largest number of steps.
@@ -105,40 +105,27 @@ def camera_offsets(
     check_positive("max_offset_frames", max_offset_frames)
     if points_px.shape[2] != len(rig):
         raise SettingsError("points_px", expected=f"{len(rig)} cameras", found=f"{points_px.shape[2]}")
-    problem = _Problem(rig.cameras, points_px, max(1, round(_REACH_S * fps)), max_offset_frames)
+    reach, zero_frames = max(1, round(_REACH_S * fps)), np.zeros(len(rig))
     weights = np.ones(points_px.shape[:-1])
     # Offsets are not changed before the weights have excluded the outliers.
     for _ in range(_WEIGHT_ROUNDS):
-        before = _linearise(problem, np.zeros(len(rig)), weights)
+        before = _linearise(rig.cameras, points_px, reach, zero_frames, weights)
         weights = before.weights
-    after = gauss_newton(_linearise(problem, np.zeros(len(rig)), weights), max_steps=_MAX_STEPS)
+    after = _linearise(rig.cameras, points_px, reach, zero_frames, weights)
+    for _ in range(_MAX_STEPS):
+        last_frames, moved_frames = after.offset_frames, after.moved_frames(max_offset_frames)
+        after = _linearise(rig.cameras, points_px, reach, moved_frames, after.weights)
+        if np.abs(moved_frames - last_frames).max() < _SETTLED:
+            break
     stds_frames = _standard_deviations(after, max_offset_frames)
     return CameraOffsets(after.offset_frames, *stds_frames, before.rms_px, after.rms_px)
 
 
 @dataclass(frozen=True)
-class _Problem:
-    """Data of the estimate.
-
-    Attributes:
-        cameras: the calibrated cameras.
-        points_px: (frames, drones, cameras, 2), detections, pixels.
-        reach: number of frames before and after a frame through which a velocity is fitted.
-        max_offset_frames: standard deviation of the offsets' prior distribution, and largest offset, frames.
-    """
-
-    cameras: Camera
-    points_px: Float[np.ndarray, "frames drones cameras 2"]
-    reach: int
-    max_offset_frames: float
-
-
-@dataclass(frozen=True)
 class _System:
-    """Normal equations at given offsets with the points eliminated, `estimation.least_squares.Reweighted`.
+    """Normal equations at given offsets with the points eliminated.
 
     Attributes:
-        problem: data of the estimate.
         offset_frames: (cameras,), offsets at which the problem was linearised, frames.
         normal: (frames, drones, cameras, cameras), left side of each drone, squared pixels per squared frame.
         gradient: (frames, drones, cameras), right side of each drone, squared pixels per frame.
@@ -147,7 +134,6 @@ class _System:
         rms_px: weighted root mean square distance of the detections from the projections, pixels.
     """
 
-    problem: _Problem
     offset_frames: Float[np.ndarray, "cameras"]
     normal: Float[np.ndarray, "frames drones cameras cameras"]
     gradient: Float[np.ndarray, "frames drones cameras"]
@@ -155,22 +141,20 @@ class _System:
     variance_px2: float
     rms_px: float
 
-    def moved(self) -> _System:
-        """Take a step with the prior, keep the offsets within their limit, and keep their mean at 0."""
-        limit = self.problem.max_offset_frames
-        stiffness = self.variance_px2 / limit**2
+    def moved_frames(self, limit_frames: float) -> Float[np.ndarray, "cameras"]:
+        """Offsets after a step with the prior, within their limit, and with a mean of 0."""
+        stiffness = self.variance_px2 / limit_frames**2
         normal = self.normal.sum(axis=(0, 1)) + stiffness * np.eye(len(self.offset_frames))
         right = self.gradient.sum(axis=(0, 1)) - stiffness * self.offset_frames
         offset_frames = self.offset_frames + np.linalg.solve(normal, right)
-        offset_frames = np.clip(offset_frames, -limit, limit)
-        return _linearise(self.problem, offset_frames - offset_frames.mean(), self.weights)
-
-    def is_settled(self, before: _System) -> bool:
-        return bool(np.abs(self.offset_frames - before.offset_frames).max() < _SETTLED)
+        offset_frames = np.clip(offset_frames, -limit_frames, limit_frames)
+        return offset_frames - offset_frames.mean()
 
 
 def _linearise(
-    problem: _Problem,
+    cameras: Camera,
+    points_px: Float[np.ndarray, "frames drones cameras 2"],
+    reach: int,
     offset_frames: Float[np.ndarray, "cameras"],
     weights: Float[np.ndarray, "frames drones cameras"],
 ) -> _System:
@@ -179,7 +163,7 @@ def _linearise(
     V are the velocities of the points, and e the detections minus the projections. `weights` are those of the previous
     round, for the triangulation.
     """
-    cameras, seen_px = problem.cameras, _interpolate_at_common_times(problem.points_px, offset_frames)
+    seen_px = _interpolate_at_common_times(points_px, offset_frames)
     point_m = triangulate_linearly(cameras, seen_px, np.maximum(weights, 1e-9))
     places_m = np.nan_to_num(point_m)[:, :, None]
     pixels, _, J = project_with_jacobian(cameras, places_m)
@@ -202,7 +186,7 @@ def _linearise(
 
     inverse = np.linalg.inv(point_normal)
     spread_m2 = np.where(known, variance_px2 * np.trace(inverse, axis1=-2, axis2=-1), np.inf)
-    velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, problem.reach)
+    velocity_m, noise_m2 = _fit_velocities(point_m, spread_m2, reach)
     moving = known & ((velocity_m**2).sum(axis=-1) > _CLEARLY**2 * noise_m2)
     u = np.einsum("fdcij,fdj->fdci", J, np.where(moving[..., None], velocity_m, 0.0))
     coupling = np.einsum("fdc,fdcik,fdci->fdkc", weights, J, u)
@@ -213,7 +197,7 @@ def _linearise(
     gradient = np.einsum("fdc,fdci,fdci->fdc", weights, u, e)
     gradient -= np.einsum("fdlc,fdl->fdc", gain, np.einsum("fdc,fdcik,fdci->fdk", weights, J, e))
     rms_px = np.sqrt(squares / total) if total else np.nan
-    return _System(problem, offset_frames, normal, gradient, weights, variance_px2, rms_px)
+    return _System(offset_frames, normal, gradient, weights, variance_px2, rms_px)
 
 
 def _robust_weights(

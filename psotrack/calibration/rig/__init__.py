@@ -2,7 +2,6 @@
 
 In: images or videos of all cameras (`images`). Out: a `CalibratedRig` with covariances. `views` finds the corners of
 the board, `board_poses` finds a first lens of each camera, `chain` joins the cameras through the views that they share,
-`adjustment` and `slips` adjust lenses, cameras and boards together with the equations of `bundle`, `covariance` says
-how certain the rig is, and `findings` says what to do. Without a board, `moving_point` places the cameras. `shifts`
-names cameras whose frames are counted wrongly.
+`adjustment` adjusts lenses, cameras and boards together and says how certain the rig is, and `findings` says what to
+do. Without a board, `moving_point` places the cameras. `shifts` names cameras whose frames are counted wrongly.
 """

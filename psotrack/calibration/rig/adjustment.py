@@ -1,7 +1,19 @@
 """Lenses and places of all cameras, and the board's place at each instant, in one adjustment.
 
 First each camera's lens alone (`board_poses`), then the cameras' places through the views that they share (`chain`),
-then all together: with a robust loss to find the places, and with squared residuals without outliers (`slips`).
+then all together: with a robust loss to find the places, and with squared residuals without outliers.
+
+**Slips.** The corners of a view agree with each other far better than with the corners of other cameras, if the board
+moves and the cameras are not exactly synchronous. So each view has its own slip, a turn and a shift of the board, from
+a normal distribution whose width is estimated from the views (D. J. C. MacKay, Bayesian interpolation, 1992, equation
+4.6); a view that slips more than others has a wider one, so that slips follow Student's distribution. Where cameras are
+synchronous the width shrinks to nothing.
+
+**Covariance.** All corners that are seen at one instant share errors: the board is not flat, it moves while the
+shutters are open, the clocks differ. Least squares takes them for independent. The sandwich of P. J. Huber (1967), with
+the instants as groups (Liang & Zeger 1986), does not; with few groups it is too small, because each group pulls the
+estimate towards itself. The correction is that of Bell & McCaffrey (2002), CR3, which is the jackknife over the
+instants: each group's residuals are those of an estimate without the group.
 """
 
 from __future__ import annotations
@@ -20,14 +32,13 @@ from psotrack.calibration.bundle import (
     BundleState,
     median_by_camera,
     solve_robustly,
+    summed,
 )
 from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.residuals import GATE, centre_by_pose
 from psotrack.calibration.rig.board_poses import find_lens
 from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
-from psotrack.calibration.rig.covariance import covariance_over_instants
 from psotrack.calibration.rig.lens_choice import LEAST_VIEWS, MOST_FITS, choose_lens_model
-from psotrack.calibration.rig.slips import Slips
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
@@ -38,6 +49,18 @@ from psotrack.support import Advance, Report, no_progress
 _MOST_ROUNDS, _SETTLED = 15, 0.02
 #: Smallest number of views of a camera whose lens is unknown, and of one whose lens is known.
 _LEAST_VIEWS, _LEAST_VIEWS_KNOWN = 5, 1
+#: Degrees of freedom of Student's distribution: small, because a board moves now fast and now hardly.
+_FREEDOM = 3.0
+#: Unknowns of a slip: three of the turn, three of the shift.
+_SLIP_UNKNOWNS = 6
+#: Widths at the start and smallest widths: a turn, and a shift as a fraction of the board's size.
+_FIRST_SLIP, _LEAST_SLIP = 0.01, 1e-5
+#: Largest factor of a width in one step.
+_LARGEST_STEP = 4.0
+#: Largest condition number of the information, in units of its diagonal.
+_MAX_CONDITION = 1e13
+#: Smallest share of an unknown's information that the other instants must have for an instant to be left out.
+_LEAST_LEFT = 0.02
 
 
 @dataclass(frozen=True)
@@ -50,7 +73,7 @@ class CalibratedRig:
         views: the views, with the corners of a board that looks alike after a turn put into one order.
         T_world_board: (instants, 4, 4), board to world, metres.
         residual_px: (cameras, instants, corners), distances from the projections, pixels; NaN where not seen.
-        own_residual_px: the same where each view has the board at a pose of its own (see `slips`).
+        own_residual_px: the same where each view has the board at a pose of its own, its slip.
         used: (cameras, instants, corners), False for outliers and for what is not seen.
         lens_models: for each camera, the model of its lens.
         lens_std: for each camera, standard deviations of fx, fy, cx, cy and of the distortion; 0 where it was known.
@@ -254,11 +277,53 @@ def _adjust(
     return replace(bundle, state=replace(bundle.state, T_world_target=boards), problem=problem)
 
 
+@dataclass(frozen=True)
+class _Slips:
+    """Widths of the slips' distribution.
+
+    Attributes:
+        std: (2,), standard deviation of the turn, rad, and of the shift, m.
+        scale: (sightings,), variance of a sighting's slip against that of others.
+        board_m: size of the board.
+    """
+
+    std: Float[np.ndarray, "2"]
+    scale: Float[np.ndarray, " sightings"]
+    board_m: float
+
+    @staticmethod
+    def start(board_m: float, sightings: int) -> _Slips:
+        """Wide slips of all sightings."""
+        return _Slips(_FIRST_SLIP * np.array([1.0, board_m]), np.ones(sightings), board_m)
+
+    def each(self) -> Float[np.ndarray, "sightings 2"]:
+        """(sightings, 2), standard deviations of a sighting's slip, for `Bundle`."""
+        return np.sqrt(self.scale)[:, None] * self.std
+
+    def estimated(self, bundle: Bundle) -> _Slips:
+        """The widths again, from the slips of an adjustment with these widths."""
+        instant, parts = bundle.problem.target, bundle.sightings
+        cameras = np.bincount(instant[bundle.used.any(axis=1)], minlength=instant.max() + 1)[instant]
+        squares = parts.slip**2
+        variance = np.diagonal(parts.slip_covariance, axis1=1, axis2=2)
+        widths = np.repeat(self.std**2, 3)
+        # The board's pose follows the slips of its views: of two views, each shows half of their difference.
+        kept = np.where(cameras > 1, 1 - 1 / np.maximum(cameras, 1), 0.0) / self.scale
+        scaled = self.scale[:, None]
+        shown = (kept > 0) @ (squares / scaled).reshape(-1, 2, 3).sum(axis=-1)
+        expected = kept @ (widths * scaled - variance).clip(0).reshape(-1, 2, 3).sum(axis=-1)
+        surprise = ((squares + variance) / widths).sum(axis=-1)
+        factor = np.clip(shown / np.maximum(expected, 1e-300), _LARGEST_STEP**-2, _LARGEST_STEP**2)
+        least = _LEAST_SLIP * np.array([1.0, self.board_m])
+        scale = (_FREEDOM + surprise) / (_FREEDOM + _SLIP_UNKNOWNS)
+        return _Slips(np.maximum(self.std * np.sqrt(factor), least), scale, self.board_m)
+
+
 def _adjust_with_slips(bundle: Bundle, board: Board, advance: Advance) -> Bundle:
     """Adjust with squared residuals; outliers, noise and slips are estimated anew after each adjustment."""
     extent_m = float(np.linalg.norm(np.ptp(board.corners_m, axis=0)))
     seen = np.isfinite(bundle.problem.corners_px).all(axis=-1)
-    slips = Slips.start(extent_m, len(seen))
+    slips = _Slips.start(extent_m, len(seen))
     bundle = replace(bundle, is_robust=False, slip_std=slips.each())
     for _ in range(_MOST_ROUNDS):
         before, widths = bundle, slips.std
@@ -286,7 +351,7 @@ _UPWARDS = np.diag([1.0, -1.0, -1.0, 1.0])
 def _result(
     board: Board, views: BoardViews, chain: Chain, models: tuple[LensModel, ...], bundle: Bundle
 ) -> CalibratedRig:
-    covariance = covariance_over_instants(bundle)
+    covariance = _covariance(bundle)
     problem, state = bundle.problem, bundle.state
     cameras: dict[str, Camera] = {}
     lens_std, by_camera, centres = [], [], []
@@ -320,6 +385,58 @@ def _result(
         np.stack(centres),
         chain.shared,
     )
+
+
+def _covariance(bundle: Bundle) -> Float[np.ndarray, "unknowns unknowns"]:
+    """Covariance of the shared unknowns of an adjustment, by the jackknife over the instants.
+
+    Raises:
+        InputError: the views do not determine the rig.
+    """
+    equations = bundle.equations()
+    reduced = equations.reduced()
+    # An unknown that no view determines may have an information a little below 0, by rounding.
+    scale = np.sqrt(np.maximum(np.diag(reduced.information), 0.0))
+    if not (scale > 0).all() or np.linalg.cond(reduced.information / np.outer(scale, scale)) > _MAX_CONDITION:
+        raise InputError(
+            "board",
+            expected="views that determine lenses and places of all cameras",
+            found="views that leave some open",
+            remedy="tilt the board, and move it through the whole image of each camera; if it was, check the board's "
+            "stated numbers and sizes with a ruler",
+        )
+    inverse = np.linalg.inv(reduced.information / np.outer(scale, scale)) / np.outer(scale, scale)
+    information, pull = _by_instant(bundle, reduced.gain)
+    # In units in which the information of all instants is 1, an instant's share of it is a matrix between 0 and 1.
+    half = np.linalg.cholesky((inverse + inverse.T) / 2)
+    shares, axes = np.linalg.eigh(half.T @ information @ half)
+    left = np.maximum(1 - shares, _LEAST_LEFT)
+    pulled = np.matvec(axes, np.matvec(axes.swapaxes(-1, -2), pull @ half) / left)
+    groups = max(len(pulled), 2)
+    covariance = half @ (pulled.T @ pulled) @ half.T
+    return covariance * (groups - 1) / groups
+
+
+def _by_instant(
+    bundle: Bundle, gain: Float[np.ndarray, "instants 6 unknowns"]
+) -> tuple[Float[np.ndarray, "used unknowns unknowns"], Float[np.ndarray, "used unknowns"]]:
+    """Information of each used instant about the shared unknowns, and its pull on them."""
+    parts, size, count = bundle.sightings, bundle.problem.size, len(gain)
+    column, instant, own = parts.columns, bundle.problem.block[:, None, None], np.arange(6)
+    information = summed(
+        parts.shared, (instant, column[:, :, None], column[:, None]), (count, size + 1, size + 1)
+    )[:, :-1, :-1]
+    coupling = summed(parts.coupling, (instant, own[:, None], column[:, None]), (count, 6, size + 1))[
+        ..., :-1
+    ]
+    block = summed(parts.block, (instant, own[:, None], own), (count, 6, 6))
+    block_right = summed(parts.block_right, (instant[..., 0], own), (count, 6))
+    pull = summed(parts.shared_right, (instant[..., 0], column), (count, size + 1))[:, :-1]
+    pull -= np.matvec(gain.swapaxes(-1, -2), block_right)
+    crossed = gain.swapaxes(-1, -2) @ coupling
+    information += gain.swapaxes(-1, -2) @ block @ gain - crossed - crossed.swapaxes(-1, -2)
+    is_used = np.trace(information, axis1=1, axis2=2) > 0
+    return information[is_used], pull[is_used]
 
 
 def in_new_world(calibrated: CalibratedRig, change: Similarity) -> CalibratedRig:

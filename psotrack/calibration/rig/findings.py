@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from math import ceil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +14,10 @@ from psotrack.calibration.rig.adjustment import CalibratedRig
 from psotrack.calibration.rig.lens_choice import say_not_compared
 from psotrack.calibration.rig.shifts import find_board_shifts
 from psotrack.calibration.rig.views import FoundBoards
+from psotrack.support import save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Columns and rows of cells of an image; a cell with a corner is covered.
 CELLS = (8, 6)
@@ -23,6 +29,10 @@ _SHARED = 12
 _FOCAL_STD = 0.005
 #: A camera's views slip if the residuals are larger by this factor, and by this many pixels, than within the views.
 _SLIP_FACTOR, _SLIP_PX = 2.0, 0.3
+#: Largest number of pictures in a row.
+_PICTURES = 4
+#: Residuals from this multiple of the median residual on have the brightest colour.
+_BRIGHT = 4.0
 #: Number of views that are named.
 _WORST = 5
 
@@ -149,3 +159,39 @@ def advise(calibrated: CalibratedRig) -> list[str]:
         if cameras:
             sentences.append(words.format(", ".join(f"{name} ({value})" for name, value in cameras.items())))
     return [*sentences, *map(str, find_board_shifts(calibrated))]
+
+
+def save_coverage(path: Path, calibrated: CalibratedRig, *, force: bool) -> None:
+    """Save a PNG with the corners in each camera's image, coloured by their residuals.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    count = len(calibrated.rig)
+    columns = min(count, _PICTURES)
+    rows = ceil(count / columns)
+    brightest_px = _BRIGHT * float(np.nanmedian(calibrated.residual_px))
+
+    def draw(figure: Figure) -> None:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for panel in panels[count:]:
+            panel.axis("off")
+        for index, (panel, name) in enumerate(zip(panels, calibrated.rig.names, strict=False)):
+            residual = calibrated.residual_px[index]
+            seen = np.isfinite(residual)
+            order = np.argsort(residual[seen])
+            pixels = calibrated.views.corners_px[index][seen][order]
+            dots = panel.scatter(
+                pixels[:, 0],
+                pixels[:, 1],
+                c=residual[seen][order],
+                s=3,
+                vmin=0,
+                vmax=brightest_px,
+                cmap="viridis",
+            )
+            width, height = calibrated.views.image_size_wh[index]
+            panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", title=name)
+        figure.colorbar(dots, ax=panels.tolist(), label="residual (px)")
+
+    save_figure(path, (3.2 * columns + 1.0, 2.4 * rows + 0.3), draw, force)

@@ -14,10 +14,6 @@ from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
 from psotrack.errors import errors_name
 
-#: Names of the distortion coefficients in OpenCV's order.
-_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
-_FISHEYE = ("k1", "k2", "k3", "k4")
-
 
 @click.command(cls=HelpfulCommand)
 @click.argument("video", type=click.Path(path_type=Path))
@@ -58,23 +54,11 @@ def intrinsics(
     # A rig.toml can say that the camera's place is not known; the other formats place it at the origin.
     write = write_lenses if out.suffix.lower() == ".toml" else write_rig
     write(out, make_rig({images.name: found.camera}), force=output.force)
-    K, dist = found.camera.K, np.asarray(found.camera.dist)[: found.model.coefficients]
-    values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist]
-    known = _FISHEYE if found.model.fisheye else _COEFFICIENTS
-    names = ("fx_px", "fy_px", "cx_px", "cy_px", *known[: found.model.coefficients])
-    content = {
-        "lens": str(out),
-        "model": str(found.model),
-        "compared_px": found.compared_px,
-        "values": {key: float(value) for key, value in zip(names, values, strict=True)},
-        "std": {key: float(value) for key, value in zip(names, found.std, strict=True)},
-        "frames": found.frame.tolist(),
-        "residual_px": found.residual_px.tolist(),
-    }
+    content = {"lens": str(out), **found.to_dict()}
     output.json(content)
-    rows = zip(names, values, found.std, strict=True)
     output.table(
-        ("", "value", "standard deviation"), ((key, f"{value:.5g}", f"{std:.2g}") for key, value, std in rows)
+        ("", "value", "standard deviation"),
+        ((key, f"{value:.5g}", f"{content['std'][key]:.2g}") for key, value in content["values"].items()),
     )
     if found.compared_px:
         errors = ", ".join(f"{name} {error:.3f}" for name, error in found.compared_px.items())
