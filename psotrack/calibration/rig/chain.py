@@ -163,8 +163,8 @@ def _place_boards(
     boards = np.tile(np.eye(4), (instants, 1, 1))
     labelling = np.zeros((cameras, instants), np.int64)
     for instant in range(instants):
-        there = np.flatnonzero(seen.count[:, instant])
-        if not len(there):
+        there = np.flatnonzero(seen.count[:, instant]).tolist()
+        if not there:
             continue
         candidates = np.linalg.inv(T_cam_world[there])[:, None] @ seen.poses[there, instant]
         candidates = candidates.reshape(-1, 4, 4)
