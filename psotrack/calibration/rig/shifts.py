@@ -19,8 +19,8 @@ from psotrack.geometry import Rig, project, triangulate_linearly, undistort
 #: Largest shift that is looked for, instants: two seconds of 30 per second.
 _MOST_SHIFT = 60
 #: Distance in the image up to which a moving point's sighting fits, pixels: ten times the error of a usual detector;
-#: and that of a board's corner, in medians of the distances within a view, and at least, pixels.
-_FITS_PX, _FITS_MEDIANS, _FITS_LEAST_PX = 5.0, 3.0, 1.0
+#: and that of a board's corner: a camera that is counted wrongly pulls the boards by some pixels.
+_FITS_PX, _CORNER_FITS_PX = 5.0, 3.0
 #: A camera of whose sightings a larger fraction fits is sound.
 _SOUND = 0.6
 #: Least gain of the fraction that fits to tell a shift; clutter fits a few more sightings at any shift.
@@ -88,10 +88,9 @@ def find_board_shifts(calibrated: CalibratedRig) -> list[Shift]:
         known = np.delete(calibrated.used, index, axis=0).any(axis=(0, 2))
         camera = calibrated.rig.cameras[index]
         rays = undistort(camera, views.corners_px[index].reshape(-1, 2))
-        own_px = float(np.nanmedian(calibrated.own_residual_px[index]))
-        gate = max(_FITS_MEDIANS * own_px, _FITS_LEAST_PX) / float(camera.K[0, 0])
-        seen = key.reshape(-1, len(corners))[known].ravel(), points_m[known].reshape(-1, 3)
-        shifts += _shift(name, (key, rays), seen, len(corners), gate)
+        placed = key.reshape(-1, len(corners))[known].ravel(), points_m[known].reshape(-1, 3)
+        gate = _CORNER_FITS_PX / float(camera.K[0, 0])
+        shifts += _shift(name, (key, rays), placed, len(corners), gate)
     return shifts
 
 
