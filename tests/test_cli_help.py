@@ -193,7 +193,7 @@ def completions(shell: str, words: list[str], incomplete: str) -> set[str]:
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_shells_complete_commands_and_options(shell: str) -> None:
     assert completions(shell, ["psotrack"], "s") == {"simulate", "sweep"}
-    assert completions(shell, ["psotrack", "calibrate"], "in") == {"intrinsics"}
+    assert completions(shell, ["psotrack", "calibrate"], "c") == {"convert"}
     assert completions(shell, ["psotrack", "simulate", "sequence"], "--s") == {
         "--scenario",
         "--set",

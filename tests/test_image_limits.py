@@ -256,7 +256,7 @@ def flight(tmp_path_factory):
         ),
         ("onboard", "detect", "{image}", "--out", "{out}.csv"),
         ("onboard", "detect", "{folder}", "--out", "{out}.csv"),
-        ("calibrate", "intrinsics", "{folder}", *BOARD, "--out", "{out}.toml"),
+        ("calibrate", "rig", "{folder}", *BOARD, "--out", "{out}.toml"),
         ("calibrate", "rig", "{folder}", "{flight}/c1.avi", *BOARD, "--out", "{out}.toml"),
         ("detect", "{folder}", "--blobs", "--out", "{out}"),
         ("detect", "{folder}", "--masks", "{out}"),

@@ -66,7 +66,6 @@ def test_a_setting_of_a_config_names_the_file_and_a_typed_one_does_not(files, fl
         (("evaluate", "unseen.csv", "{flight}", "--offset", "auto"), ("unseen.csv", "{flight}")),
         (("doctor", "{flight}", "--tracks", "unseen.csv"), ("unseen.csv", "{flight}")),
         (("doctor", "{flight}", "--tracks", "one.csv"), ("one.csv", "{flight}")),
-        (("calibrate", "intrinsics", "left", *BOARD), ("left, board",)),
         (("calibrate", "rig", "left", "right", *BOARD), ("left and 1 more",)),
         (("calibrate", "rig", "apart.csv", *BY_POINT, "--distance", "c0,c1=1"), ("apart.csv",)),
         (("calibrate", "rig", "alone.csv", *BY_POINT, "--distance", "c0,c1=1"), ("alone.csv",)),

@@ -149,9 +149,7 @@ COMMANDS = {
     (
         "rig.yml",
     ): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.yml --force",
-    (
-        "lens.toml",
-    ): "calibrate intrinsics {inputs}/board.avi --squares 7x5 --square 0.04 --marker 0.03 --lens 4 "
+    ("lens.toml",): "calibrate rig {inputs}/board.avi --squares 7x5 --square 0.04 --marker 0.03 --lens 4 "
     "--out lens.toml --force --quiet",
     (
         "camera.csv",

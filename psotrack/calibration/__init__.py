@@ -1,7 +1,7 @@
 """Calibration: lenses and poses of cameras, and rigs from boards or points.
 
-In: a data sheet or a video of a board (`intrinsics`), points of known position (`image_points`, `extrinsics`), a board
-that is moved before all cameras, or a moving point (`rig`). Out: lenses and rigs with covariances. Other rooms may use
+In: points of known position (`image_points`, `extrinsics`), a board that is moved before one or all cameras, or a
+moving point (`rig`). Out: lenses and rigs with covariances. Other rooms may use
 every name in `__init__.pyi`. The files of rigs are read and written in `psotrack.geometry`.
 """
 

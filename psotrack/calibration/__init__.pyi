@@ -9,8 +9,7 @@ from .image_points import (
     find_markers,
     read_image_points,
 )
-from .intrinsics import Lens, lens_of_board, lens_of_view
-from .lens_models import LensModel, known_lenses, parse_lens_model
+from .lens_models import LensModel, known_lenses, lens_of_view, parse_lens_model
 from .pnp import Solver, ray_distances, solve_pnp, solve_pnp_ransac
 from .residuals import GATE, inflation, spread_px
 from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
@@ -26,7 +25,7 @@ from .rig.findings import (
     worst_views,
 )
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
-from .rig.lens_choice import ModelComparison, choose_lens_model, say_not_compared
+from .rig.lens_choice import choose_lens_model, say_not_compared
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.point_files import (
     GivenWorld,
@@ -58,12 +57,10 @@ __all__ = [
     "FoundBoards",
     "GivenWorld",
     "ImagePoints",
-    "Lens",
     "LensChoice",
     "LensModel",
     "LensSettings",
     "Located",
-    "ModelComparison",
     "PointRig",
     "PointSettings",
     "PointViews",
@@ -94,7 +91,6 @@ __all__ = [
     "inflation",
     "instants_of_numbers",
     "known_lenses",
-    "lens_of_board",
     "lens_of_view",
     "locate_camera",
     "open_images",

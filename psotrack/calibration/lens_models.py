@@ -160,3 +160,23 @@ def known_lenses(rig: Rig) -> dict[str, tuple[LensModel, np.ndarray]]:
         values = np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], padded])
         known[name] = LensModel(size, is_fisheye), values
     return known
+
+
+def lens_of_view(horizontal_deg: float, vertical_deg: float, image_size_wh: tuple[int, int]) -> Camera:
+    """Make a lens without distortion from its field of view, from edge to edge of the image.
+
+    The pose of the camera is the world's origin.
+
+    Raises:
+        SettingsError: an angle is not between 0 and 180 degrees.
+    """
+    angles_deg = np.array([horizontal_deg, vertical_deg])
+    if not ((angles_deg > 0) & (angles_deg < 180)).all():
+        raise SettingsError(
+            "field of view", expected="angles between 0 and 180 degrees", found=f"{angles_deg.tolist()}"
+        )
+    focal_length_px = np.array(image_size_wh) / 2 / np.tan(np.deg2rad(angles_deg) / 2)
+    # Pixel centres are at whole numbers, so the middle of the image is (size - 1) / 2.
+    cx, cy = (np.array(image_size_wh) - 1) / 2
+    K = np.array([[focal_length_px[0], 0.0, cx], [0.0, focal_length_px[1], cy], [0.0, 0.0, 1.0]])
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=image_size_wh)

@@ -20,7 +20,7 @@ _NEAR_M = 0.3
 _PLACE_ANEW = (
     "place it anew with `psotrack calibrate rig --pairs`, or all cameras with `psotrack calibrate rig`"
 )
-_LENS_ANEW = "calibrate its lens anew with `psotrack calibrate intrinsics`"
+_LENS_ANEW = "calibrate its lens anew with `psotrack calibrate rig`"
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def _in_words(
     how = f"{100 * abs(1 / scale - 1):.1f} % too {'short' if scale > 1 else 'long'}{known}"
     if kind == "focal lengths":
         return f"all focal lengths are {how}", (
-            f"multiply them by {scale:.3f}, or calibrate each lens anew with `psotrack calibrate intrinsics`"
+            f"multiply them by {scale:.3f}, or calibrate each lens anew with `psotrack calibrate rig`"
         )
     if kind == "focal length":
         return f"its focal length is {how}", f"try {after.K[0, 0]:.0f} px, or {_LENS_ANEW}"

@@ -121,7 +121,7 @@ def _lenses(rig: Rig, scales: Float[np.ndarray, "scales"]) -> Iterator[RigInterp
         yield RigInterpretation(
             "focal lengths",
             f"all focal lengths are {abs(100 * (1 / scale - 1)):.0f} % too {'short' if scale > 1 else 'long'}",
-            f"multiply them by {scale:.3f}, or calibrate each lens anew with `psotrack calibrate intrinsics`",
+            f"multiply them by {scale:.3f}, or calibrate each lens anew with `psotrack calibrate rig`",
             (),
             Rig(rig.names, replace(rig.cameras, K=K)),
         )

@@ -49,6 +49,10 @@ from psotrack.support import Advance, Report, no_progress
 _MOST_ROUNDS, _SETTLED = 15, 0.02
 #: Smallest number of views of a camera whose lens is unknown, and of one whose lens is known.
 _LEAST_VIEWS, _LEAST_VIEWS_KNOWN = 5, 1
+#: What a single camera's views must determine: largest standard deviation of the focal length, as a fraction of it, and
+#: largest focal length, in image widths (a field of view of 3 degrees); smallest angle between the planes of the board
+#: in the two views that differ most, degrees.
+_MAX_FOCAL_ERROR, _MAX_FOCAL_WIDTHS, _MIN_TILT_DEG = 0.02, 20.0, 10.0
 #: Degrees of freedom of Student's distribution: small, because a board moves now fast and now hardly.
 _FREEDOM = 3.0
 #: Unknowns of a slip: three of the turn, three of the shift.
@@ -140,7 +144,10 @@ def calibrate_rig(
     views = _relabelled(board, views, chain)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors), lenses, fixed, advance)
-    return replace(_result(board, views, chain, models, bundle), not_compared=_not_compared(views, lenses))
+    found = replace(_result(board, views, chain, models, bundle), not_compared=_not_compared(views, lenses))
+    if len(views.names) == 1 and not lenses.known:
+        _check_lens(found)
+    return found
 
 
 def _check_views(board: Board, views: BoardViews, lenses: LensChoice) -> None:
@@ -175,6 +182,24 @@ def _start_lenses(
     return tuple(models), tuple(vectors)
 
 
+def _check_lens(found: CalibratedRig) -> None:
+    """Check that the views of a single camera determine its lens, which no other camera helps to."""
+    camera, width = found.rig.cameras[0], found.views.image_size_wh[0, 0]
+    focal_px, std_px = camera.K[0, 0], found.lens_std[0][0]
+    # Boards that are all parallel to the image fit every focal length, and its stated deviation is then meaningless.
+    normals = found.T_world_board[found.used[0].any(axis=1), :3, 2]
+    tilt_deg = np.rad2deg(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
+    # The estimated tilts are meaningless too if the fit diverged to a very large focal length.
+    diverged = focal_px > _MAX_FOCAL_WIDTHS * width
+    if diverged or tilt_deg < _MIN_TILT_DEG or not std_px < _MAX_FOCAL_ERROR * focal_px:
+        raise InputError(
+            f"camera {found.rig.names[0]}",
+            expected=f"views that determine the focal length to {_MAX_FOCAL_ERROR:.0%}",
+            found=f"boards whose tilts differ by at most {tilt_deg:.0f} degrees, error {std_px / focal_px:.1%}",
+            remedy="tilt the board, and move it into all corners of the image",
+        )
+
+
 def _not_compared(views: BoardViews, lenses: LensChoice) -> dict[str, int]:
     """See `CalibratedRig`."""
     if lenses.model is not None:
@@ -193,7 +218,7 @@ def _first_lens(
     """Model and first vector of a camera's lens from its own views; None for a model that the views choose."""
     size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
     views_px = views.corners_px[camera][views.seen[camera]]
-    model = model or choose_lens_model(board, views_px, size_wh, advance).model
+    model = model or choose_lens_model(board, views_px, size_wh, advance)
     vector = find_lens(board, model, views_px, size_wh)
     if vector is None:
         raise InputError(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.image_points import find_markers, read_image_points
-from psotrack.calibration.intrinsics import lens_of_view
+from psotrack.calibration.lens_models import lens_of_view
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
     LOOSE,

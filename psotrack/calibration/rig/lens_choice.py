@@ -9,7 +9,6 @@ the error: coefficients that nothing is gained by are free to do harm where the 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -31,25 +30,12 @@ _CERTAIN, _VISIBLE = 2.0, 0.02
 _MOST_VIEWS = 45
 
 
-@dataclass(frozen=True)
-class ModelComparison:
-    """Lens models on views that were left out.
-
-    Attributes:
-        model: the chosen model.
-        error_px: median distance of corners left out, pixels, by the model's name; none if there are too few views.
-    """
-
-    model: LensModel
-    error_px: dict[str, float]
-
-
 def choose_lens_model(
     board: Board,
     views_px: Float[np.ndarray, "views corners 2"],
     image_size_wh: tuple[int, int],
     advance: Advance = lambda steps: None,
-) -> ModelComparison:
+) -> LensModel:
     """Choose the model of a lens by views that were left out.
 
     Args:
@@ -60,7 +46,7 @@ def choose_lens_model(
     """
     views_px = views_px[:: -(-len(views_px) // _MOST_VIEWS)] if len(views_px) else views_px
     if len(views_px) < LEAST_VIEWS:
-        return ModelComparison(_MODELS[0], {})
+        return _MODELS[0]
     distances: dict[LensModel, np.ndarray | None] = {}
     focal_px: float | None = None
     for model in _MODELS:
@@ -71,7 +57,7 @@ def choose_lens_model(
             focal_px = found_px
     known = {model: of_model for model, of_model in distances.items() if of_model is not None}
     if not known:
-        return ModelComparison(_MODELS[0], {})
+        return _MODELS[0]
     # The width of the loss is the same for all models.
     width = min(float(np.nanmedian(of_model)) for of_model in known.values())
     losses = {
@@ -85,7 +71,7 @@ def choose_lens_model(
         is_certain = gain.mean() > _CERTAIN * gain.std(ddof=1) / np.sqrt(len(gain))
         if is_certain and error_px[model] < (1 - _VISIBLE) * error_px[chosen]:
             chosen = model
-    return ModelComparison(chosen, {f"{model}": error for model, error in error_px.items()})
+    return chosen
 
 
 def say_not_compared(views: Mapping[str, int]) -> str:

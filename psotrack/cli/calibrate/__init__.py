@@ -10,7 +10,6 @@ COMMANDS = commands_in(
     {
         "Commands": {
             "convert": "Convert the calibration IN, of any program in the list below, to OUT.",
-            "intrinsics": "Estimate a camera's lens from VIDEO, in which a board is moved.",
             "rig": "Calibrate a rig from nothing: lenses and places of all cameras, from a board that is "
             "moved before them.",
         },
@@ -21,7 +20,7 @@ COMMANDS = commands_in(
 @click.group(
     cls=LazyGroup,
     lazy_commands=COMMANDS,
-    renamed={"extrinsics": "calibrate rig --pairs"},
+    renamed={"extrinsics": "calibrate rig --pairs", "intrinsics": "calibrate rig"},
     context_settings=SETTINGS,
 )
 def calibrate() -> None:
@@ -29,7 +28,7 @@ def calibrate() -> None:
 
     \b
     A rig from nothing: psotrack calibrate rig a.mp4 b.mp4 --squares 7x5 --square 0.04 --marker 0.03 --out rig.toml
-    Lenses:             psotrack calibrate intrinsics a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
+    Lenses:             psotrack calibrate rig a.avi --squares 7x5 --square 0.04 --marker 0.03 --out lens.toml
     Poses of cameras:   psotrack calibrate rig --pairs pairs.csv --lenses lens.toml --out rig.toml
     Other programs:     psotrack calibrate convert rig.toml cameras_calibration.csv
     """

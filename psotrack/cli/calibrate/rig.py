@@ -14,8 +14,7 @@ from psotrack.calibration.rig.settings import (
     SheetSettings,
     WorldSettings,
 )
-from psotrack.cli.calibrate.options import BOARD_NAMES, OUT
-from psotrack.cli.options import plot_option, running
+from psotrack.cli.options import out_option, plot_option, running
 from psotrack.cli.output import Output
 from psotrack.cli.records import HelpfulCommand, options_of
 
@@ -23,22 +22,30 @@ from psotrack.cli.records import HelpfulCommand, options_of
 @click.command(cls=HelpfulCommand)
 @click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
 @options_of(
-    BoardSettings, "board", names=BOARD_NAMES, heading="Board", rare=("kind", "separation_m", "first_marker")
+    BoardSettings,
+    "board",
+    names={"kind": "board"},
+    heading="Board",
+    rare=("kind", "separation_m", "first_marker"),
 )
 @options_of(LensSettings, "lens", heading="Lenses")
 @options_of(SheetSettings, "sheet", heading="Lenses", rare=("fov_deg", "size"))
 @options_of(WorldSettings, "world")
 @options_of(PointSettings, "points", heading="Instead of a board", rare=("stick_m", "noise_px"))
 @plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
-@OUT
+@out_option(
+    "Calibration to write: a file that ends in .toml, .yml or .csv.",
+    default=Path("rig.toml"),
+    show_default=True,
+)
 @running()
 def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path, **known: Any) -> None:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
     Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'; a folder of videos
     stands for all of them. Frames of equal number are one instant. A single recording.toml, or its folder, says by
-    itself when each frame was exposed. The board must be seen by two cameras at a time, and the pairs must join all
-    cameras. Of the board only --square must be stated: whether it is a ChArUco board or a chessboard, its squares,
+    itself when each frame was exposed. Of a single camera, the lens is found. Of several, two must see the board at a
+    time, and the pairs must join all cameras. Of the board only --square must be stated: whether it is a ChArUco board or a chessboard, its squares,
     markers and dictionary are found in the images; --squares states them. With --points, VIDEO is a recording with
     detections, or a CSV file; with --pairs there is none.
 
@@ -52,6 +59,7 @@ def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path,
       psotrack calibrate rig left right --squares 10x7 --square 0.025 --floor 0 --out rig.toml
       psotrack calibrate rig a b --squares 6x6 --marker 0.09 --separation 0.03 --dictionary apriltag_36h11 --out r.toml
       psotrack calibrate rig a b --squares 1x1 --marker 0.2 --first-marker 7 --lenses lenses.toml --out rig.toml
+      psotrack calibrate rig board.avi --square 0.04 --lens fisheye --out lens.toml
       psotrack calibrate rig SEQ --points --lenses lenses.toml --distance left,right=4.20 --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --places points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
