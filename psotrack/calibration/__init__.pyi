@@ -25,7 +25,7 @@ from .rig.findings import (
     worst_views,
 )
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
-from .rig.lens_choice import choose_lens_model, say_not_compared
+from .rig.lens_choice import choose_lens_model
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.point_files import (
     GivenWorld,
@@ -102,7 +102,6 @@ __all__ = [
     "read_world",
     "save_board",
     "save_coverage",
-    "say_not_compared",
     "say_print",
     "say_searched",
     "solve_pnp",

@@ -357,17 +357,24 @@ class Bundle:
             known += float(np.sum((self.state.motion / self.problem.motion_std) ** 2))
         return float(self.sightings.cost.sum()) + known
 
-    def equations(self) -> NormalEquations:
-        """Normal equations."""
+    @cached_property
+    def by_block(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For each block, coupling to the shared unknowns, information about its own, and their right-hand side."""
         problem, parts = self.problem, self.sightings
         size, m = problem.size, parts.block.shape[-1]
         count = len(self.state.T_cam_world if problem.cameras_are_blocks else self.state.T_world_target)
-        column, block, own = parts.columns, problem.block[:, None, None], np.arange(m)
+        block, own = problem.block[:, None, None], np.arange(m)
+        coupling = summed(parts.coupling, (block, own[:, None], parts.columns[:, None]), (count, m, size + 1))
+        blocks = summed(parts.block, (block, own[:, None], own), (count, m, m))
+        return coupling[..., :-1], blocks, summed(parts.block_right, (block[..., 0], own), (count, m))
+
+    def equations(self) -> NormalEquations:
+        """Normal equations."""
+        problem, parts, column, size = self.problem, self.sightings, self.sightings.columns, self.problem.size
+        coupling, blocks, block_right = self.by_block
+        blocks, block_right = blocks.copy(), block_right.copy()
         information = summed(parts.shared, (column[:, :, None], column[:, None]), (size + 1, size + 1))
         right = summed(parts.shared_right, (column,), (size + 1,))
-        blocks = summed(parts.block, (block, own[:, None], own), (count, m, m))
-        block_right = summed(parts.block_right, (block[..., 0], own), (count, m))
-        coupling = summed(parts.coupling, (block, own[:, None], column[:, None]), (count, m, size + 1))
         for columns, lens, (value, known) in zip(
             problem.lens_columns, self.state.lenses, problem.priors, strict=True
         ):
@@ -381,7 +388,7 @@ class Bundle:
             diagonal[:, 6:] += problem.motion_std**-2.0
             block_right[:, 6:] -= self.state.motion / problem.motion_std**2
         return NormalEquations(
-            information[:-1, :-1], right[:-1], blocks, block_right, np.ascontiguousarray(coupling[..., :-1])
+            information[:-1, :-1], right[:-1], blocks, block_right, np.ascontiguousarray(coupling)
         )
 
     def moved(self, step: Step) -> Bundle:

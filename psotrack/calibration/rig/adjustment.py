@@ -18,6 +18,7 @@ instants: each group's residuals are those of an estimate without the group.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import log
@@ -45,6 +46,7 @@ from psotrack.errors import InputError
 from psotrack.geometry import Camera, Rig, make_rig
 from psotrack.support import Advance, Report, no_progress
 
+_logger = logging.getLogger(__name__)
 #: Largest number of adjustments, and relative change of the slips' widths that ends them.
 _MOST_ROUNDS, _SETTLED = 15, 0.02
 #: Smallest number of views of a camera whose lens is unknown, and of one whose lens is known.
@@ -84,7 +86,6 @@ class CalibratedRig:
         covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m.
         centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
         shared: (cameras, cameras), number of instants that two cameras share.
-        not_compared: number of views of each camera that has too few of them to choose a lens model by, by its name.
     """
 
     board: Board
@@ -99,7 +100,6 @@ class CalibratedRig:
     covariance: Float[np.ndarray, "cameras 6 6"]
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
     shared: Int[np.ndarray, "cameras cameras"]
-    not_compared: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def calibrate_rig(
     views = _relabelled(board, views, chain)
     with report("adjustment", _MOST_ROUNDS + 1) as advance:
         bundle = _adjust(board, views, chain, (models, vectors), lenses, fixed, advance)
-    found = replace(_result(board, views, chain, models, bundle), not_compared=_not_compared(views, lenses))
+    found = _result(board, views, chain, models, bundle)
     if len(views.names) == 1 and not lenses.known:
         _check_lens(found)
     return found
@@ -200,25 +200,20 @@ def _check_lens(found: CalibratedRig) -> None:
         )
 
 
-def _not_compared(views: BoardViews, lenses: LensChoice) -> dict[str, int]:
-    """See `CalibratedRig`."""
-    if lenses.model is not None:
-        return {}
-    counts = dict(zip(views.names, views.seen.sum(axis=1).tolist(), strict=True))
-    return {
-        name: count
-        for name, count in counts.items()
-        if name not in (lenses.known or {}) and count < LEAST_VIEWS
-    }
-
-
 def _first_lens(
     board: Board, views: BoardViews, camera: int, model: LensModel | None, advance: Advance
 ) -> tuple[LensModel, Float[np.ndarray, " unknowns"]]:
     """Model and first vector of a camera's lens from its own views; None for a model that the views choose."""
     size_wh = (int(views.image_size_wh[camera, 0]), int(views.image_size_wh[camera, 1]))
     views_px = views.corners_px[camera][views.seen[camera]]
-    model = model or choose_lens_model(board, views_px, size_wh, advance)
+    if model is None:
+        if len(views_px) < LEAST_VIEWS:
+            _logger.warning(
+                "camera %s: lens models are compared by at least %d views, found %d: it gets the usual model; film "
+                "more views, or choose a model by --lens",
+                *(views.names[camera], LEAST_VIEWS, len(views_px)),
+            )
+        model = choose_lens_model(board, views_px, size_wh, advance)
     vector = find_lens(board, model, views_px, size_wh)
     if vector is None:
         raise InputError(
@@ -447,15 +442,11 @@ def _by_instant(
 ) -> tuple[Float[np.ndarray, "used unknowns unknowns"], Float[np.ndarray, "used unknowns"]]:
     """Information of each used instant about the shared unknowns, and its pull on them."""
     parts, size, count = bundle.sightings, bundle.problem.size, len(gain)
-    column, instant, own = parts.columns, bundle.problem.block[:, None, None], np.arange(6)
+    column, instant = parts.columns, bundle.problem.block[:, None, None]
     information = summed(
         parts.shared, (instant, column[:, :, None], column[:, None]), (count, size + 1, size + 1)
     )[:, :-1, :-1]
-    coupling = summed(parts.coupling, (instant, own[:, None], column[:, None]), (count, 6, size + 1))[
-        ..., :-1
-    ]
-    block = summed(parts.block, (instant, own[:, None], own), (count, 6, 6))
-    block_right = summed(parts.block_right, (instant[..., 0], own), (count, 6))
+    coupling, block, block_right = bundle.by_block
     pull = summed(parts.shared_right, (instant[..., 0], column), (count, size + 1))[:, :-1]
     pull -= np.matvec(gain.swapaxes(-1, -2), block_right)
     crossed = gain.swapaxes(-1, -2) @ coupling

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.calibration.rig.adjustment import CalibratedRig
-from psotrack.calibration.rig.lens_choice import say_not_compared
 from psotrack.calibration.rig.shifts import find_board_shifts
 from psotrack.calibration.rig.views import FoundBoards
 from psotrack.support import save_figure
@@ -130,8 +129,7 @@ def say_print(found: FoundBoards) -> list[str]:
 def advise(calibrated: CalibratedRig) -> list[str]:
     """Sentences that say what to film again, and why; none where the calibration is sound."""
     rows = figures_of(calibrated)
-    sentences = [say_not_compared(calibrated.not_compared)] if calibrated.not_compared else []
-    sentences += [
+    sentences = [
         f"{name} shares {row['shared']} views with {row['best_partner']} and fewer with the others: "
         f"film more where {name} and {row['best_partner']} both see the board"
         for name, row in rows.items()

@@ -8,8 +8,6 @@ the error: coefficients that nothing is gained by are free to do harm where the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from jaxtyping import Float
 
@@ -72,19 +70,6 @@ def choose_lens_model(
         if is_certain and error_px[model] < (1 - _VISIBLE) * error_px[chosen]:
             chosen = model
     return chosen
-
-
-def say_not_compared(views: Mapping[str, int]) -> str:
-    """A sentence on lenses whose model was not chosen by views left out, because there are too few views.
-
-    Args:
-        views: number of views of each of these cameras, by its name.
-    """
-    few = ", ".join(f"{name} ({count})" for name, count in views.items())
-    return (
-        f"lens models are compared by at least {LEAST_VIEWS} views; fewer were found of {few}: the usual "
-        f"model with {_MODELS[0]} distortion coefficients is taken there; film more views, or choose a model by --lens"
-    )
 
 
 def _left_out(

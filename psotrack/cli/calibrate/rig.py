@@ -42,12 +42,12 @@ from psotrack.cli.records import HelpfulCommand, options_of
 def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path, **known: Any) -> None:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
-    Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'; a folder of videos
-    stands for all of them. Frames of equal number are one instant. A single recording.toml, or its folder, says by
-    itself when each frame was exposed. Of a single camera, the lens is found. Of several, two must see the board at a
-    time, and the pairs must join all cameras. Of the board only --square must be stated: whether it is a ChArUco board or a chessboard, its squares,
-    markers and dictionary are found in the images; --squares states them. With --points, VIDEO is a recording with
-    detections, or a CSV file; with --pairs there is none.
+    Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'; a folder of
+    videos stands for all of them. Frames of equal number are one instant. A single recording.toml, or its folder,
+    says by itself when each frame was exposed. Of a single camera, the lens is found. Of several, two must see the
+    board at a time, and the pairs must join all cameras. Of the board only --square must be stated: whether it is a
+    ChArUco board or a chessboard, its squares, markers and dictionary are found in the images; --squares states
+    them. With --points, VIDEO is a recording with detections, or a CSV file; with --pairs there is none.
 
     Of points of known place, each camera needs at least four that are not on one line. Twelve that are spread over the
     image and in depth are good. Points that disagree with the others are left out, and shown.
