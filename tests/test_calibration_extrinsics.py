@@ -14,7 +14,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 
 K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
-NO_LENS = np.zeros(0)
+LENS = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=(1920, 1080))
 
 
 def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=(), K=K):
@@ -47,7 +47,7 @@ def test_exact_points_give_the_pose_through_a_wide_lens(dist, fisheye):
     points = (rays * np.linspace(2, 6, 12)[:, None] - t_m) @ R
     pixels = project(camera, points)[0]
     pixels[3] = (1e5, 1e5)
-    located = locate_camera(points, pixels, camera.K, camera.dist, fisheye=fisheye)
+    located = locate_camera(points, pixels, camera)
     np.testing.assert_allclose(located.T_cam_world, camera.T_cam_world, atol=1e-7)
     assert located.used.tolist() == [index != 3 for index in range(12)]
 
@@ -56,7 +56,7 @@ def test_exact_points_give_the_pose_through_a_wide_lens(dist, fisheye):
 @pytest.mark.parametrize("count", [6, 12, 29])
 def test_exact_points_give_the_camera(count, coefficients):
     camera, points = view(np.random.default_rng(count), count=count, dist=LENSES[coefficients])
-    located = locate_camera(points, project(camera, points)[0], camera.K, camera.dist)
+    located = locate_camera(points, project(camera, points)[0], camera)
     # The least squares stop at 1e-8 of the cost's scale.
     np.testing.assert_allclose(located.T_cam_world, camera.T_cam_world, atol=1e-6)
     assert located.used.all()
@@ -66,7 +66,7 @@ def test_the_pose_equals_opencvs_least_squares_pose():
     rng = np.random.default_rng(3)
     camera, points = view(rng, dist=LENSES[5])
     pixels = project(camera, points)[0] + rng.normal(0, 1, (12, 2))
-    located = locate_camera(points, pixels, camera.K, camera.dist)
+    located = locate_camera(points, pixels, camera)
     turn, t_m = cv2.Rodrigues(camera.T_cam_world[:3, :3])[0], camera.T_cam_world[:3, 3:].copy()
     turn, t_m = cv2.solvePnPRefineLM(points, pixels, camera.K, camera.dist, turn, t_m)
     np.testing.assert_allclose(located.T_cam_world[:3, :3], cv2.Rodrigues(turn)[0], atol=1e-6)
@@ -83,9 +83,7 @@ def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
     errors_m, distances = [], []
     for _ in range(runs):
         camera, points = view(rng, nearest_m=nearest_m, farthest_m=farthest_m)
-        located = locate_camera(
-            points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS, 1.0
-        )
+        located = locate_camera(points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), LENS, 1.0)
         off = centre(located.T_cam_world) - camera.centre_world
         errors_m.append(np.linalg.norm(off))
         distances.append(off @ np.linalg.solve(located.centre_covariance_m2, off))
@@ -106,9 +104,9 @@ def test_outliers_are_found_and_not_used():
     wrong = np.array([1, 4, 8, 11])
     spoilt = pixels.copy()
     spoilt[wrong] += rng.uniform(60, 400, (4, 2)) * rng.choice([-1, 1], (4, 2))
-    located = locate_camera(points, spoilt, K, NO_LENS)
+    located = locate_camera(points, spoilt, LENS)
     assert np.flatnonzero(~located.used).tolist() == wrong.tolist()
-    without = locate_camera(np.delete(points, wrong, 0), np.delete(pixels, wrong, 0), K, NO_LENS)
+    without = locate_camera(np.delete(points, wrong, 0), np.delete(pixels, wrong, 0), LENS)
     # Both use the same points, but start from different poses.
     np.testing.assert_allclose(located.T_cam_world, without.T_cam_world, atol=1e-6)
     assert (located.residual_px[wrong] > 30).all()
@@ -118,8 +116,8 @@ def test_noise_larger_than_stated_widens_the_covariance():
     rng = np.random.default_rng(6)
     camera, points = view(rng, count=36)
     off = rng.normal(0, 1, (36, 2))
-    small = locate_camera(points, project(camera, points)[0] + off, K, NO_LENS, noise_px=1.0)
-    large = locate_camera(points, project(camera, points)[0] + 4 * off, K, NO_LENS, noise_px=1.0)
+    small = locate_camera(points, project(camera, points)[0] + off, LENS, noise_px=1.0)
+    large = locate_camera(points, project(camera, points)[0] + 4 * off, LENS, noise_px=1.0)
     assert large.used.all()
     ratio = np.sqrt(large.centre_covariance_m2.trace() / small.centre_covariance_m2.trace())
     # 36 points determine the standard deviation to 10 %.
@@ -131,7 +129,7 @@ def test_points_in_a_plane_determine_the_pose():
     R, t_m = look_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
     camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     points = np.concatenate([rng.uniform(-1.5, 1.5, (12, 2)), np.zeros((12, 1))], axis=1)
-    located = locate_camera(points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), K, NO_LENS)
+    located = locate_camera(points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), LENS)
     off = centre(located.T_cam_world) - camera.centre_world
     # The 99.9 % ellipsoid contains the true centre.
     assert off @ np.linalg.solve(located.centre_covariance_m2, off) < chi2.ppf(0.999, 3)
@@ -144,8 +142,8 @@ def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
     camera, points = view(rng)
     pixels = project(camera, points)[0] + rng.normal(0, 1, (12, 2))
     R = Rotation.from_rotvec(turn).as_matrix()
-    here = locate_camera(points, pixels, K, NO_LENS)
-    there = locate_camera(points @ R.T + shift_m, pixels, K, NO_LENS)
+    here = locate_camera(points, pixels, LENS)
+    there = locate_camera(points @ R.T + shift_m, pixels, LENS)
     np.testing.assert_allclose(
         centre(there.T_cam_world), R @ centre(here.T_cam_world) + shift_m, rtol=0, atol=1e-5
     )
@@ -158,7 +156,7 @@ def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
 def error_message(points, pixels, *, noise_px=1.0):
     """Message of the error for these points, which must be one line with the name of the camera."""
     with pytest.raises(InputError) as error:
-        locate_camera(points, pixels, K, NO_LENS, noise_px, name="camera c7")
+        locate_camera(points, pixels, LENS, noise_px, name="camera c7")
     assert str(error.value).startswith("camera c7: ")
     assert "\n" not in str(error.value)
     return str(error.value)
@@ -179,7 +177,7 @@ def test_points_that_determine_no_pose_are_refused():
     assert "mirrored" in mirrored
     assert "mixed up" in error_message(points, pixels[rng.permutation(12)])
     with pytest.raises(SettingsError, match="noise_px"):
-        locate_camera(points, pixels, K, NO_LENS, 0.0)
+        locate_camera(points, pixels, LENS, 0.0)
 
 
 def test_a_small_plane_far_away_has_two_poses():

@@ -54,7 +54,7 @@ def summary(words: str, range_m: tuple[float, float], draws: int) -> dict[str, o
     """Row of the table: errors of the camera's centre over random points and noise."""
     off_m, inside = [], []
     for one, points_m, points_px in scenes(range_m, draws):
-        located = locate_camera(points_m, points_px, K, np.zeros(0), NOISE_PX)
+        located = locate_camera(points_m, points_px, one, NOISE_PX)
         T = located.T_cam_world
         off = -T[:3, :3].T @ T[:3, 3] - one.centre_world
         off_m.append(np.linalg.norm(off))

@@ -106,7 +106,7 @@ def one_camera(
     truth = project(camera, others_m)[0]
     left_out = truth + label_errors(rng, len(truth), correlated_px)
     try:
-        located = locate_camera(points_m, pixels, K, DIST)
+        located = locate_camera(points_m, pixels, camera)
     except InputError as error:
         if "two poses" not in str(error):
             raise

@@ -59,11 +59,9 @@ class Located:
 def locate_camera(
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points 2"],
-    K: Float[np.ndarray, "3 3"],
-    dist: Float[np.ndarray, " coefficients"],
+    lens: Camera,
     noise_px: float = 1.0,
     *,
-    fisheye: bool = False,
     name: str = "camera",
 ) -> Located:
     """Find the pose of a camera with a known lens, from points of known positions.
@@ -72,10 +70,8 @@ def locate_camera(
         points_m: (points, 3), positions in the world, metres; at least four points, not on one line. All points may be
             in a plane.
         points_px: (points, 2), positions in the image, pixels.
-        K: (3, 3), intrinsics in pixels.
-        dist: (coefficients,), distortion coefficients in OpenCV's order.
+        lens: the camera's lens; the pose in it is ignored.
         noise_px: standard deviation of `points_px` along each axis, pixels.
-        fisheye: the lens has OpenCV's fisheye model.
         name: name of the camera in error messages.
 
     Raises:
@@ -85,7 +81,6 @@ def locate_camera(
     """
     check_positive("noise_px", noise_px)
     extent_m = _check_points(points_m, points_px, name)
-    lens = Camera(np.eye(4), K, dist, np.zeros(2), np.array(True) if fisheye else None)
     fits = _likely_poses(points_m, points_px, lens, noise_px)
     typical_px = _typical_px(fits[0]) if fits else np.inf
     if typical_px > _MAX_MEDIAN_SIGMAS * noise_px:

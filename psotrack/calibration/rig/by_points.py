@@ -159,13 +159,7 @@ def calibrate_by_known_points(
         lens = lenses.cameras[index]
         with errors_name(world):
             located = locate_camera(
-                mark.points_m,
-                mark.points_px,
-                np.asarray(lens.K),
-                np.asarray(lens.dist),
-                settings.noise_px,
-                fisheye=bool(lens.fisheye),
-                name=f"camera {name}",
+                mark.points_m, mark.points_px, lens, settings.noise_px, name=f"camera {name}"
             )
         cameras[name] = replace(lens, T_cam_world=located.T_cam_world)
         covariance_m2 = located.centre_covariance_m2
