@@ -1,7 +1,6 @@
 from .block import on_device
 from .fitness import (
     PAPER_SCORE,
-    DroneFitness,
     Score,
     ScoreInputs,
     SoftIoU,
@@ -19,7 +18,6 @@ from .tracker import DISPERSION_FRAMES
 __all__ = [
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
-    "DroneFitness",
     "ParticleSwarm",
     "Places",
     "RunInputs",
