@@ -7,20 +7,20 @@ pixels, lens included (Hartley & Zisserman 2004, section 12.3). All points are f
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from psotrack.geometry.cameras import NEAR_M, Camera, has_image, to_camera
-from psotrack.geometry.estimation import Damping, NormalEquations, Step, levenberg_marquardt
 from psotrack.geometry.lenses import distort, lens_derivative
 
 #: A step shorter than this is not taken, standard deviations of the point.
 _LEAST_LENGTH = 1e-4
-#: Two steps suffice near the solution, so the damping is nearly 0 and returns to that value after each success. A step
-#: that fails must be damped much more.
-_DAMPING = Damping(first=1e-9, least=1e-9, largest=np.inf, increase=1e3, decrease=0.0)
+#: Damping, as a share of the diagonal of the normal equations, to which a small number is added. Two steps suffice near
+#: the solution, so the damping is nearly 0 and returns to that value after each success. A step that fails must be
+#: damped much more: by this factor.
+_LEAST_DAMPING, _MORE_DAMPING, _TINY = 1e-9, 1e3, 1e-12
 #: Added to the variances of a residual. If one view alone determines a direction, its residual there has no variance.
 _RIDGE = 1e-8
 
@@ -63,8 +63,24 @@ def fit_in_image(
         num_steps: largest number of steps; no step makes a point worse. Two suffice near the solution.
     """
     has_start = np.isfinite(start_m).all(axis=-1)
-    start = _linearise(_Views(cameras, points_px, scale), np.where(has_start[:, None], start_m, 0.0))
-    fit = levenberg_marquardt(start, max_steps=num_steps, least_length=_LEAST_LENGTH, damping=_DAMPING)
+    fit = _linearise(cameras, points_px, scale, np.where(has_start[:, None], start_m, 0.0))
+    damping = np.full(len(fit.cost), _LEAST_DAMPING)
+    for _ in range(num_steps):
+        information, right = fit.information, np.matvec(fit.jacobian.swapaxes(-1, -2), fit.residual)
+        stiffness = damping[:, None] * (information.diagonal(axis1=-2, axis2=-1) + _TINY)
+        damped = information + stiffness[..., None] * np.eye(3)
+        step_m = np.linalg.solve(damped, right[..., None])[..., 0]
+        if (np.vecdot(step_m, np.matvec(information, step_m)) < _LEAST_LENGTH**2).all():
+            break
+        tried = _linearise(cameras, points_px, scale, fit.position_m + step_m)
+        better = tried.cost < fit.cost
+        damping = np.where(better, _LEAST_DAMPING, damping * _MORE_DAMPING)
+        fit = _Fit(
+            *(
+                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                for new, old in zip(tried, fit, strict=True)
+            )
+        )
     information = fit.information
     is_fixed = has_start & (np.linalg.cond(information) < 1 / np.finfo(float).eps)
     covariance_m2 = np.linalg.inv(np.where(is_fixed[:, None, None], information, np.eye(3)))
@@ -76,58 +92,43 @@ def fit_in_image(
     )
 
 
-@dataclass(frozen=True)
-class _Views:
-    """Pixels of all points in all cameras; attributes as in `fit_in_image`."""
-
-    cameras: Camera
-    points_px: Float[np.ndarray, "points cameras 2"]
-    scale: Float[np.ndarray, "points cameras"]
-
-
-@dataclass(frozen=True)
-class _Points:
-    """Points with their residuals, `estimation.least_squares.Linearised`.
+class _Fit(NamedTuple):
+    """Points with their residuals.
 
     Attributes:
-        views: the pixels.
         position_m: (points, 3), world, metres.
         residual: (points, equations), measured minus projected in standard deviations, two equations per camera.
         jacobian: (points, equations, 3), derivatives of the projections by the position.
         cost: (points,), sums of squared residuals; infinite where a used camera cannot show a point.
     """
 
-    views: _Views
     position_m: Float[np.ndarray, "points 3"]
     residual: Float[np.ndarray, "points equations"]
     jacobian: Float[np.ndarray, "points equations 3"]
     cost: Float[np.ndarray, "points"]
 
-    @cached_property
+    @property
     def information(self) -> Float[np.ndarray, "points 3 3"]:
         """(points, 3, 3), inverse covariances of the positions, m⁻²."""
         return self.jacobian.swapaxes(-1, -2) @ self.jacobian
 
-    def equations(self) -> NormalEquations:
-        return NormalEquations(self.information, np.matvec(self.jacobian.swapaxes(-1, -2), self.residual))
 
-    def moved(self, step: Step) -> _Points:
-        return _linearise(self.views, self.position_m + step.shared)
-
-
-def _linearise(views: _Views, position_m: Float[np.ndarray, "points 3"]) -> _Points:
-    pixels, depth, jacobian = project_with_jacobian(views.cameras, position_m[:, None, :])
-    scale = views.scale
+def _linearise(
+    cameras: Camera,
+    points_px: Float[np.ndarray, "points cameras 2"],
+    scale: Float[np.ndarray, "points cameras"],
+    position_m: Float[np.ndarray, "points 3"],
+) -> _Fit:
+    pixels, depth, jacobian = project_with_jacobian(cameras, position_m[:, None, :])
     is_used = scale > 0
     is_shown = depth >= NEAR_M
-    if views.cameras.dist.shape[-1]:
-        is_shown = np.asarray(has_image(views.cameras, to_camera(views.cameras, position_m[:, None, :])))
-    residual = np.where(is_used[..., None], (views.points_px - pixels) * scale[..., None], 0.0)
+    if cameras.dist.shape[-1]:
+        is_shown = np.asarray(has_image(cameras, to_camera(cameras, position_m[:, None, :])))
+    residual = np.where(is_used[..., None], (points_px - pixels) * scale[..., None], 0.0)
     residual = residual.reshape(len(scale), 2 * scale.shape[1])
     is_hidden = (is_used & ~is_shown).any(axis=-1)
     cost = np.where(is_hidden, np.inf, np.vecdot(residual, residual))
-    jacobian = (jacobian * scale[..., None, None]).reshape(*residual.shape, 3)
-    return _Points(views, position_m, residual, jacobian, cost)
+    return _Fit(position_m, residual, (jacobian * scale[..., None, None]).reshape(*residual.shape, 3), cost)
 
 
 def project_with_jacobian(

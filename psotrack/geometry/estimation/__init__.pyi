@@ -1,18 +1,15 @@
 from .least_squares import (
-    Damping,
     NormalEquations,
     ReducedEquations,
     Step,
     cauchy_loss,
     cauchy_weight,
     covariance_from_information,
-    gauss_newton,
     levenberg_marquardt,
 )
 from .rauch_tung_striebel import backward_step
 
 __all__ = [
-    "Damping",
     "NormalEquations",
     "ReducedEquations",
     "Step",
@@ -20,6 +17,5 @@ __all__ = [
     "cauchy_loss",
     "cauchy_weight",
     "covariance_from_information",
-    "gauss_newton",
     "levenberg_marquardt",
 ]
