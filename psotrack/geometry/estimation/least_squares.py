@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 #: Added to a diagonal element before damping, so that an unknown without any equation stays where it is.
 _TINY = 1e-12
-#: Damping of the first step and its limits, as shares of the diagonal of the normal equations. A problem that needs more
+#: Damping of the first step and its limits, as shares of the diagonal of the equations. A problem that needs more
 #: than the largest damping has no better state in reach.
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e8
 #: Factor on the damping after a step that lowers the cost, and after one that does not.
