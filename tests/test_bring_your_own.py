@@ -119,7 +119,6 @@ class Hover:
             fitness=np.ones((frames, drones)),
             num_cameras=np.full((frames, drones), len(inputs.rig)),
             status=np.full((frames, drones), Status.TRACKED),
-            measured_size_m=np.full((frames, drones, 3), np.nan),
             size_m=start.size_m,
             size_frames=np.zeros((drones, 3), int),
         )

@@ -50,7 +50,6 @@ def simulate_method(truth_m, std_m, *, seed, hidden=(), offset_m=(0.0, 0.0, 0.0)
         fitness=np.where(status == Status.TRACKED, 0.5, 0.0),
         num_cameras=np.where(status == Status.TRACKED, 4, 0),
         status=status,
-        measured_size_m=np.full(truth_m.shape, np.nan),
         size_m=size_m,
         size_frames=np.zeros(size_m.shape, int),
         arrivals=tuple(arrivals),
@@ -203,7 +202,7 @@ def test_drones_found_only_by_the_lines_come_last():
     # The first arrival of the projection lines is ignored, because the swarm has a track of this drone.
     assert fused.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
     assert fused.size_m.shape == (3, 3)
-    assert fused.measured_size_m.shape == (FRAMES, 3, 3)
+    assert fused.measured_m.shape == (FRAMES, 3, 3)
 
 
 def test_where_the_methods_disagree_the_swarm_is_used():

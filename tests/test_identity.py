@@ -34,7 +34,6 @@ class LabelledTracks:
         covariance_m2: (frames, tracks, 3, 3), covariances of the measurements.
         was_measured: (frames, tracks), False where a measurement is missing.
         truth: (frames, drones), number of the track that follows each drone.
-        size_m: (frames, tracks, 3), measured sizes, metres; None without size measurements.
     """
 
     time_s: np.ndarray
@@ -42,10 +41,9 @@ class LabelledTracks:
     covariance_m2: np.ndarray
     was_measured: np.ndarray
     truth: np.ndarray
-    size_m: np.ndarray | None = None
 
 
-def simulate_tracks(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
+def simulate_tracks(flown_m, std_m=0.01, seed=0, exchanges=()):
     """Measure flights (frames, drones, 3) with white errors; `exchanges` are (first frame, permutation of tracks)."""
     frames, drones, _ = flown_m.shape
     rng = np.random.default_rng(seed)
@@ -59,7 +57,6 @@ def simulate_tracks(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
         covariance_m2=std_m[..., None, None] ** 2 * np.eye(3),
         was_measured=np.ones((frames, drones), bool),
         truth=truth,
-        size_m=size_m,
     )
     return order_by_tracks(by_drones, truth)
 
@@ -67,17 +64,8 @@ def simulate_tracks(flown_m, std_m=0.01, seed=0, exchanges=(), size_m=None):
 def order_by_tracks(by_drones, truth):
     """Move the columns of each drone to the columns of its tracks in `truth`."""
     column = np.argsort(truth, axis=1)
-
-    def reorder(value):
-        return None if value is None else relabelled(value, column)
-
-    return replace(
-        by_drones,
-        measured_m=reorder(by_drones.measured_m),
-        covariance_m2=reorder(by_drones.covariance_m2),
-        was_measured=reorder(by_drones.was_measured),
-        size_m=reorder(by_drones.size_m),
-    )
+    names = ("measured_m", "covariance_m2", "was_measured")
+    return replace(by_drones, **{name: relabelled(getattr(by_drones, name), column) for name in names})
 
 
 def resolve_tracks(given_tracks, model=GENTLE, encounter_m=ENCOUNTER_M):
@@ -85,10 +73,7 @@ def resolve_tracks(given_tracks, model=GENTLE, encounter_m=ENCOUNTER_M):
         given_tracks.time_s, given_tracks.measured_m, given_tracks.covariance_m2, given_tracks.was_measured
     )
     motion = model.params(given_tracks.was_measured.shape[1])
-    unknown_m = np.full(given_tracks.measured_m.shape, np.nan)
-    return resolve(
-        measured, motion, encounter_m, unknown_m if given_tracks.size_m is None else given_tracks.size_m
-    )
+    return resolve(measured, motion, encounter_m)
 
 
 def list_outcomes(found):
@@ -100,16 +85,6 @@ def nearest_distance_m(flown_m):
     distance_m = np.linalg.norm(flown_m[:, :, None] - flown_m[:, None], axis=-1)
     distance_m[:, np.eye(flown_m.shape[1], dtype=bool)] = np.inf
     return distance_m.min(axis=-1)
-
-
-def correlated_errors(rng, shape, time_s=0.4):
-    """(frames, ...), errors of variance 1 with a correlation time, seconds: a first-order autoregression."""
-    left = np.exp(-DT_S / time_s)
-    error = np.empty(shape)
-    error[0] = rng.normal(size=shape[1:])
-    for frame in range(1, shape[0]):
-        error[frame] = left * error[frame - 1] + np.sqrt(1 - left**2) * rng.normal(size=shape[1:])
-    return error
 
 
 #: Times of 100 frames before and after frame 50, seconds.
@@ -183,21 +158,6 @@ class TestTwoDrones:
         # Odds are nearly even; the course of more than a second ago has little influence. Measured 0.41 to 0.62.
         assert (np.abs(found.ambiguity[[50, 60, 70, last], 0] - 0.5) < 0.15).all()
         assert (found.ambiguity[last + 1 :] == 0).all()
-
-    @pytest.mark.parametrize("exchanged", [False, True])
-    def test_sizes_decide_the_identities_of_drones_that_hovered(self, exchanged):
-        """One drone is a fifth larger; because errors are correlated, the decision takes some tenths of a second."""
-        flown_m = np.concatenate([np.repeat(hovering()[:1], 200, axis=0), merge_positions(hovering())])
-        usual_m = np.array([[0.36, 0.36, 0.12], [0.30, 0.30, 0.10]])
-        size_m = usual_m + 0.01 * correlated_errors(np.random.default_rng(1), (360, 2, 3))
-        # The measured size of merged silhouettes is that of both drones together.
-        size_m[nearest_distance_m(flown_m) < 0.3] = 0.5
-        tracks = simulate_tracks(flown_m, exchanges=[(250, (1, 0))] * exchanged, size_m=size_m)
-        found = resolve_tracks(tracks)
-        assert list_outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
-        # The frame of the swap cannot be determined while the silhouettes are merged.
-        separate = nearest_distance_m(flown_m) > 0.3
-        np.testing.assert_array_equal(found.order[separate], tracks.truth[separate])
 
     def test_ambiguity_begins_with_the_encounter_and_ends_with_it(self):
         found = resolve_tracks(simulate_tracks(passing(0.2), 0.02))
@@ -454,39 +414,6 @@ class TestAmbiguity:
                 exchanged = found.ambiguity[9 + number, 0]
                 assert (found.order[9 + number] == [0, 1]).all()
                 assert exchanged == pytest.approx(exact[1], abs=limit)
-
-
-class TestSizes:
-    """Two drones hover together after 10 s of flight; one of them is larger, or has other errors."""
-
-    def resolve_hovering(self, size_m):
-        flown_m = np.concatenate([np.repeat(hovering()[:1], 250, axis=0), merge_positions(hovering())])
-        return resolve_tracks(simulate_tracks(flown_m, size_m=size_m))
-
-    def test_unknown_sizes_decide_nothing(self):
-        size_m = np.full((410, 2, 3), np.nan)
-        without, unknown = (self.resolve_hovering(value) for value in (None, size_m))
-        np.testing.assert_array_equal(unknown.ambiguity, without.ambiguity)
-        # Three seconds are too few to learn sizes from.
-        size_m[200:275] = np.array([[0.3], [0.5]])
-        np.testing.assert_array_equal(self.resolve_hovering(size_m).ambiguity, without.ambiguity)
-
-    def test_outliers_hardly_change_the_decision(self):
-        size_m = np.array([[0.30], [0.36]]) + 0.01 * correlated_errors(np.random.default_rng(1), (410, 2, 3))
-        clean = self.resolve_hovering(size_m)
-        size_m[::20] = 5.0
-        spoilt = self.resolve_hovering(size_m)
-        assert list_outcomes(clean) == list_outcomes(spoilt) == [LabelOutcome.KEPT]
-
-    def test_equal_drones_are_rarely_distinguished(self):
-        """Sizes of equal drones with errors that last move the odds by less than a factor of e in nearly all cases."""
-        without = self.resolve_hovering(None).encounters[0]
-        off = []
-        for seed in range(30):
-            size_m = 0.3 + 0.01 * correlated_errors(np.random.default_rng(seed), (410, 2, 3))
-            (encounter,) = self.resolve_hovering(size_m).encounters
-            off.append(encounter.log_odds - without.log_odds)
-        assert (np.abs(off) < 1).mean() > 0.9
 
 
 def test_measurements_that_are_not_finite():

@@ -167,4 +167,4 @@ def test_close_above_the_floor_nothing_is_learned():
     """Foreground close to the floor may be a drone together with its shadow. The drone is 0.5 m wide."""
     ratio, tracks = learned([1.0] * 10, first=0.9, height_m=0.4)
     np.testing.assert_allclose(ratio, 0.9, rtol=1e-6)
-    assert np.isnan(tracks.measured_size_m).all()
+    assert (tracks.size_frames == 0).all()

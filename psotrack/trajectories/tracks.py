@@ -47,7 +47,6 @@ class Tracks:
         fitness: (frames, drones), how well the frame fits the position, in [0, 1].
         num_cameras: (frames, drones), cameras that see the drone.
         status: (frames, drones), values of `Status`.
-        measured_size_m: (frames, drones, 3), full lengths from each frame alone, metres; NaN where unknown.
         size_m: (drones, 3), full lengths of the drones along the world's axes, metres.
         size_frames: (drones, 3), number of frames from which each length was learned.
         arrivals: drones that came after frame 0, or that came back.
@@ -61,7 +60,6 @@ class Tracks:
     fitness: Float[np.ndarray, "frames drones"]
     num_cameras: Int[np.ndarray, "frames drones"]
     status: Int[np.ndarray, "frames drones"]
-    measured_size_m: Float[np.ndarray, "frames drones 3"]
     size_m: Float[np.ndarray, "drones 3"]
     size_frames: Int[np.ndarray, "drones 3"]
     arrivals: tuple[Arrival, ...] = ()
@@ -99,7 +97,6 @@ ARRAYS = (
     "fitness",
     "num_cameras",
     "status",
-    "measured_size_m",
 )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from numpy.lib.stride_tricks import sliding_window_view
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, viewpoints
@@ -26,55 +26,31 @@ def find_cut_off(tracks: Tracks, volume: FlightVolume, fps: float) -> str | None
         volume: the bounds and the speed limit that were used.
         fps: frames per second.
     """
-    lines = []
+    found = np.asarray(tracks.status == Status.TRACKED)
+    position_m, velocity_m_s = tracks.position_m, tracks.velocity_m_s
+    # (frames, drones, sides, axes): whether a drone that is lost in the next frame flies through the bound.
+    sign = np.array([[-1.0], [1.0]])
+    outward_m_s, ahead_m = velocity_m_s[:, :, None], (position_m + SOON_S * velocity_m_s)[:, :, None]
+    leaves = (sign * outward_m_s > LEAST_SPEED_M_S) & (sign * (ahead_m - volume.bounds_m) > 0)
+    leaves = leaves[:-1] & (found[:-1] & ~found[1:])[..., None, None]
+    speed = np.linalg.norm(np.where(found[..., None], velocity_m_s, 0.0), axis=-1)
+    count = min(max(2, round(AT_LIMIT_S * fps)), len(speed))
+    at_limit = sliding_window_view(speed >= AT_LIMIT * volume.max_speed_m_s, count, axis=0).all(axis=-1)
+    cases = []
     for drone in range(tracks.num_drones):
-        found = np.asarray(tracks.status[:, drone] == Status.TRACKED)
-        state = tracks.position_m[:, drone], tracks.velocity_m_s[:, drone]
-        for line in (
-            _lost_at_bound(*state, found, volume.bounds_m),
-            _at_speed_limit(state[1], found, volume.max_speed_m_s, fps),
-        ):
-            if line is not None:
-                frame, text = line
-                lines.append((frame, f"frame {frame}: drone {drone} {text}"))
-    if not lines:
+        for frame, side, axis in np.argwhere(leaves[:, drone])[:1].tolist():
+            bound = f"{_AXES[axis]} = {volume.bounds_m[side, axis]:.1f} m"
+            cases.append(
+                (frame, drone, f"was lost at the bound {bound}; if it flies on, pass wider --bounds")
+            )
+        for (frame,) in np.argwhere(at_limit[:, drone])[:1].tolist():
+            limit = f"{volume.max_speed_m_s:g} m/s; if it is faster, pass a higher --max-speed"
+            cases.append((frame, drone, f"flies at the speed limit of {limit}"))
+    if not cases:
         return None
-    more = f" ({len(lines) - 1} more such cases)" if len(lines) > 1 else ""
-    return min(lines)[1] + more
-
-
-def _lost_at_bound(
-    position_m: Float[np.ndarray, "frames 3"],
-    velocity_m_s: Float[np.ndarray, "frames 3"],
-    found: Bool[np.ndarray, "frames"],
-    bounds_m: Float[np.ndarray, "2 3"],
-) -> tuple[int, str] | None:
-    """The first frame in which a drone was found last before it was lost on its way through a bound."""
-    for frame in np.flatnonzero(found[:-1] & ~found[1:]).tolist():
-        after_m = position_m[frame] + SOON_S * velocity_m_s[frame]
-        for side, sign in ((0, -1.0), (1, 1.0)):
-            leaves = (sign * velocity_m_s[frame] > LEAST_SPEED_M_S) & (sign * (after_m - bounds_m[side]) > 0)
-            if leaves.any():
-                axis = int(leaves.argmax())
-                bound = f"{_AXES[axis]} = {bounds_m[side, axis]:.1f} m"
-                return frame, f"was lost at the bound {bound}; if it flies on, pass wider --bounds"
-    return None
-
-
-def _at_speed_limit(
-    velocity_m_s: Float[np.ndarray, "frames 3"],
-    found: Bool[np.ndarray, "frames"],
-    max_speed_m_s: float,
-    fps: float,
-) -> tuple[int, str] | None:
-    """The first frame from which a drone flies as fast as the limit allows."""
-    speed = np.linalg.norm(np.where(found[:, None], velocity_m_s, 0.0), axis=-1)
-    count = max(2, round(AT_LIMIT_S * fps))
-    at_limit = np.convolve(speed >= AT_LIMIT * max_speed_m_s, np.ones(count), mode="valid") >= count
-    if len(speed) < count or not at_limit.any():
-        return None
-    text = f"flies at the speed limit of {max_speed_m_s:g} m/s; if it is faster, pass a higher --max-speed"
-    return int(at_limit.argmax()), text
+    more = f" ({len(cases) - 1} more such cases)" if len(cases) > 1 else ""
+    frame, drone, text = min(cases)
+    return f"frame {frame}: drone {drone} {text}{more}"
 
 
 def find_outside(volume: FlightVolume) -> str | None:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import solve_discrete_are
 
 from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors.learning import CameraErrors
@@ -187,12 +188,6 @@ def _mean(values: np.ndarray) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
 
 
-#: Largest number of frames until the filter's covariance has settled.
-_MAX_FRAMES = 2000
-#: The filter has settled when its variance changes by less than this fraction per frame.
-_SETTLED = 1e-6
-
-
 @dataclass(frozen=True)
 class MeasurementErrors:
     """Errors of measured positions along one axis.
@@ -206,6 +201,11 @@ class MeasurementErrors:
     variance_m2: float
     fading_fraction: float
     time_s: float
+
+    @property
+    def fading_m2(self) -> float:
+        """Variance of the fading errors, m²."""
+        return self.fading_fraction * self.variance_m2
 
 
 def filtered_variances(
@@ -225,52 +225,29 @@ def filtered_variances(
         dt_s: time between frames, seconds.
         jerk_density_m2_s5: spectral density of the white jerk.
     """
-    F = np.eye(4)
+    # In units of the standard deviation that is assumed, and seconds.
+    unit_m2 = assumed.variance_m2
+    F, noise = np.eye(5), np.zeros((5, 5))
     F[:3, :3] += np.array([[0, dt_s, dt_s**2 / 2], [0, 0, dt_s], [0, 0, 0]])
-    F[3, 3] = np.exp(-dt_s / assumed.time_s)
-    motion_noise = np.zeros((4, 4))
-    motion_noise[:3, :3] = jerk_density_m2_s5 * white_jerk_noise(float(dt_s))
-    fading_m2 = assumed.fading_fraction * assumed.variance_m2
-    noise = motion_noise + np.diag([0, 0, 0, fading_m2 * (1 - F[3, 3] ** 2)])
+    noise[:3, :3] = jerk_density_m2_s5 * white_jerk_noise(float(dt_s)) / unit_m2
+    # State: position, velocity, acceleration, the filter's fading error; the real fading error.
+    for row, errors in ((3, assumed), (4, found)):
+        F[row, row] = np.exp(-dt_s / errors.time_s)
+        noise[row, row] = errors.fading_m2 / unit_m2 * (1 - F[row, row] ** 2)
     # A measurement is the position plus the fading error plus white noise.
     H = np.array([1.0, 0.0, 0.0, 1.0])
-    white_m2 = (1 - assumed.fading_fraction) * assumed.variance_m2
-    P, gain = np.diag([assumed.variance_m2, 1.0, 1.0, fading_m2]), np.zeros(4)
-    stated_m2 = np.inf
-    for _ in range(_MAX_FRAMES):
-        P = F @ P @ F.T + noise
-        gain = P @ H / (H @ P @ H + white_m2)
-        P = (np.eye(4) - np.outer(gain, H)) @ P
-        P = (P + P.T) / 2
-        if abs(P[0, 0] - stated_m2) < _SETTLED * P[0, 0]:
-            break
-        stated_m2 = P[0, 0]
-    return float(P[0, 0]), _real_variance(F, motion_noise, gain, found, dt_s)
-
-
-def _real_variance(
-    F: Float[np.ndarray, "4 4"],
-    motion_noise: Float[np.ndarray, "4 4"],
-    gain: Float[np.ndarray, "4"],
-    found: MeasurementErrors,
-    dt_s: float,
-) -> float:
-    """Variance of the filtered position's error with a fixed gain."""
-    # State: true minus estimated position, velocity, acceleration; the filter's fading error; the real fading error.
-    decay = np.exp(-dt_s / found.time_s)
-    ahead = np.zeros((5, 5))
-    ahead[:4, :4], ahead[4, 4] = F, decay
-    fading_m2 = found.fading_fraction * found.variance_m2
-    noise = np.zeros((5, 5))
-    noise[:4, :4] = motion_noise
-    noise[4, 4] = fading_m2 * (1 - decay**2)
-    # Innovation: error of the position + real fading error - the filter's fading error + white noise.
-    innovation = np.array([1.0, 0.0, 0.0, -1.0, 1.0])
-    corrects = np.array([-gain[0], -gain[1], -gain[2], gain[3], 0.0])
-    correct = np.eye(5) + np.outer(corrects, innovation)
-    white_m2 = (1 - found.fading_fraction) * found.variance_m2
-    step = correct @ ahead
-    driven = correct @ noise @ correct.T + white_m2 * np.outer(corrects, corrects)
-    # X = step X stepᵀ + driven, as linear equations.
-    solved = np.linalg.solve(np.eye(25) - np.kron(step, step), driven.ravel())
-    return float(solved[0])
+    white = (assumed.variance_m2 - assumed.fading_m2) / unit_m2
+    P = solve_discrete_are(F[:4, :4].T, H[:, None], noise[:4, :4], np.array([[white]]))
+    gain = P @ H / (H @ P @ H + white)
+    stated = P[0, 0] - gain[0] * (P @ H)[0]
+    # With true minus estimated values, the innovation is the error of the position + the real fading error - the
+    # filter's fading error + white noise.
+    corrects = np.append(gain * np.array([-1.0, -1.0, -1.0, 1.0]), 0.0)
+    correct = np.eye(5) + np.outer(corrects, [1.0, 0.0, 0.0, -1.0, 1.0])
+    noise[3, 3] = 0.0
+    white = (found.variance_m2 - found.fading_m2) / unit_m2
+    driven = correct @ noise @ correct.T + white * np.outer(corrects, corrects)
+    # X = (correct F) X (correct F)ᵀ + driven, as linear equations.
+    ahead = correct @ F
+    real = np.linalg.solve(np.eye(25) - np.kron(ahead, ahead), driven.ravel())[0]
+    return float(stated * unit_m2), float(real * unit_m2)

@@ -33,12 +33,8 @@ def postprocess(
             they are.
     """
     time_s = np.arange(tracks.num_frames) / fps
-    identities = resolve(
-        _measurements(tracks, time_s),
-        motion_params(motion, tracks.num_drones),
-        identity.encounter_m,
-        np.asarray(tracks.measured_size_m, np.float64),
-    )
+    measured, params = _measurements(tracks, time_s), motion_params(motion, tracks.num_drones)
+    identities = resolve(measured, params, identity.encounter_m)
     if identity.resolve_swaps:
         tracks = tracks.with_arrays(lambda name, value: relabelled(value, identities.order))
     trajectories = Trajectories(

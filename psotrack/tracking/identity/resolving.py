@@ -7,7 +7,6 @@ from itertools import combinations
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from psotrack.tracking.identity.encounters import (
     Encounter,
@@ -24,12 +23,7 @@ from psotrack.tracking.motion import Measurements, MotionParams
 _AGILITY = 10.0
 
 
-def resolve(
-    measured: Measurements,
-    motion: MotionParams,
-    encounter_m: float,
-    size_m: Float[np.ndarray, "frames drones 3"],
-) -> Identities:
+def resolve(measured: Measurements, motion: MotionParams, encounter_m: float) -> Identities:
     """Find the track of each drone in every frame. Labels are correct until drones meet for the first time.
 
     Where three drones meet, each two of them have an encounter. When one is decided and labels are exchanged, the other
@@ -40,8 +34,6 @@ def resolve(
         motion: motion parameters of the drones, by label.
         encounter_m: drones nearer than this may be taken for each other, metres: about twice a drone's size, because
             their silhouettes then touch in some views.
-        size_m: (frames, tracks, 3), apparent sizes; NaN where not known. How well they distinguish drones is learned
-            from the frames before an encounter in which no other drone is near.
 
     Raises:
         InputError: as `Measurements.check` says.
@@ -53,7 +45,6 @@ def resolve(
     position_m = np.where(measured.was_measured[..., None], measured.position_m, np.nan)
     distance_m = np.linalg.norm(position_m[:, :, None] - position_m[:, None], axis=-1)
     is_near = (distance_m < encounter_m) & ~np.eye(num_drones, dtype=bool)
-    clear_m = np.where(is_near.any(axis=-1, keepdims=True), np.nan, size_m)
     # Tracks that are near each other, and whose encounter is not decided yet.
     undecided = is_near.copy()
 
@@ -62,13 +53,13 @@ def resolve(
         near = undecided[frame, tracks[:, 0], tracks[:, 1]]
         if not near.any():
             return None
-        by_track = (measured.position_m, measured.covariance_m2, measured.was_measured, clear_m)
-        *by_drone, size_of_pair_m = (relabelled(value, tracks) for value in by_track)
+        by_track = (measured.position_m, measured.covariance_m2, measured.was_measured)
+        by_drone = (relabelled(value, tracks) for value in by_track)
         density = _AGILITY * np.asarray(motion.jerk_density_m2_s5)[list(pair)]
         of_pair = replace(motion, jerk_density_m2_s5=density)
         known = Measurements(measured.time_s, *by_drone)
         with jax.enable_x64(True):
-            return follow(pair, int(near.argmax()), known, size_of_pair_m, of_pair, encounter_m)
+            return follow(pair, int(near.argmax()), known, of_pair, encounter_m)
 
     ambiguity = np.zeros((num_frames, len(pairs)))
     encounters: list[Encounter] = []

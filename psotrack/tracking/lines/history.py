@@ -49,7 +49,6 @@ class History:
             "fitness": number,
             "num_cameras": number.astype(int),
             "status": number.astype(int),
-            "measured_size_m": vector,
             "span_m": vector[..., :2],
         }
 

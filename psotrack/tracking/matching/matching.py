@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.geometry import Camera, Rig, triangulate_linearly
+from psotrack.geometry import Camera, Rig
 from psotrack.tracking.matching.assignment import apply_exchanges, assign_groups, propose_exchanges
 from psotrack.tracking.matching.groups import UNEXPLAINED_COST, Groups
 from psotrack.tracking.matching.padded_sightings import BY_PLACE, PaddedSightings, make_priors, pad_sightings
@@ -24,7 +24,7 @@ class Matches:
     """Drones in one frame, and the detections of each drone.
 
     Attributes:
-        position_m: (drones, 3), positions in the world, computed by `triangulate_linearly`, metres.
+        position_m: (drones, 3), positions in the world, metres.
         detection: (drones, cameras), index of the drone's detection in each camera; -1 for no detection. Two drones
             that overlap in an image may share a detection.
         ambiguity: (drones,), from 0 to 1: likelihood, relative to this assignment, of the best other assignment that
@@ -50,8 +50,8 @@ def match(
     """Find the groups of detections that have the smallest total cost (see `psotrack.tracking.matching`).
 
     Two viewpoints are enough for an expected drone. They are also enough if no camera has more than one detection and
-    at most one drone is expected, because then no detections can be confused. The positions are computed from the
-    detections alone: the expected positions only help to find which detections belong to which drone.
+    at most one drone is expected, because then no detections can be confused. The positions are compromises of
+    the detections and the expected positions.
 
     Args:
         cameras: cameras with one leading axis.
@@ -69,22 +69,8 @@ def match(
     least = 2 if unambiguous else BY_PLACE if min_views is None else min_views
     priors = make_priors(bounds_m, *expected, least)
     proposed = propose_groups(padded, priors, bounds_m)
-    return _matches(padded, assign_groups(padded, proposed, priors, bounds_m), proposed)
-
-
-def _matches(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Matches:
-    views = np.arange(len(padded.x)), groups.detection
-    x = np.where(groups.seen[..., None], padded.x[views], np.nan)
-    weights = 1 / (padded.variance[views] * padded.depth(groups.point) ** 2)
-    position = triangulate_linearly(padded.straight, x, weights)
-    # Two rays may be parallel: then the group has no position.
-    there = np.isfinite(position).all(axis=-1)
-    return Matches(
-        position_m=position[there],
-        detection=groups.detection[there],
-        ambiguity=_ambiguity(padded, groups, proposed)[there],
-        expected=groups.prior[there],
-    )
+    groups = assign_groups(padded, proposed, priors, bounds_m)
+    return Matches(groups.point, groups.detection, _ambiguity(padded, groups, proposed), groups.prior)
 
 
 def _ambiguity(padded: PaddedSightings, groups: Groups, proposed: Groups) -> Float[np.ndarray, "groups"]:

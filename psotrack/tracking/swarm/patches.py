@@ -64,37 +64,18 @@ def make_pyramid(coverage: UInt8[Array, "frames cameras height width"]) -> Pyram
     height, width = coverage.shape[-2:]
     step = 2 ** (NUM_LEVELS - 1)
     even = jnp.pad(coverage, [(0, 0), (0, 0), (0, -height % step), (0, -width % step)], mode="edge")
-    # Neighbours are added as parts of one word: XLA on a CPU reads every other number of an array slowly.
-    four = jax.lax.bitcast_convert_type(even.reshape(*even.shape[:-1], -1, 4), jnp.uint32)
-    two = (four & 0x00FF00FF) + ((four >> 8) & 0x00FF00FF)
-    two = two[..., 0::2, :] + two[..., 1::2, :]
-    rows = two[..., 0::2, :] + two[..., 1::2, :]
-    sums = [
-        jax.lax.bitcast_convert_type(two, jnp.uint16).reshape(*two.shape[:-1], -1),
-        (rows & 0xFFFF) + (rows >> 16),
-    ]
-    while len(sums) < NUM_LEVELS - 1:
-        rows = sums[-1][..., 0::2, :] + sums[-1][..., 1::2, :]
-        sums.append(rows[..., 0::2] + rows[..., 1::2])
-    means = [
-        ((total + (1 << 2 * level >> 1)) >> 2 * level).astype(jnp.uint8)
-        for level, total in enumerate(sums, 1)
-    ]
+    total, means = even.astype(jnp.uint16), [coverage]
+    for level in range(1, NUM_LEVELS):
+        *images, rows, columns = total.shape
+        total = total.reshape(*images, rows // 2, 2, columns // 2, 2).sum(axis=(-3, -1), dtype=jnp.uint16)
+        means.append(((total + (1 << 2 * level >> 1)) >> 2 * level).astype(jnp.uint8))
     places = _places((height, width))
     longest = max(rows for _, rows, _ in places)
     levels = [
-        _enlarged(image, longest, columns)
-        for image, (_, _, columns) in zip((coverage, *means), places, strict=True)
+        jnp.pad(mean, [(0, 0), (0, 0), (0, longest - mean.shape[-2]), (0, columns - mean.shape[-1])])
+        for mean, (_, _, columns) in zip(means, places, strict=True)
     ]
     return Pyramid(jnp.concatenate(levels, axis=-1), (height, width))
-
-
-def _enlarged(image: UInt8[Array, "*frames rows columns"], rows: int, columns: int) -> Array:
-    """The image with empty rows and columns up to some numbers."""
-    missing = [
-        max(0, least - length) for least, length in zip((rows, columns), image.shape[-2:], strict=True)
-    ]
-    return jnp.pad(image, [*[(0, 0)] * (image.ndim - 2), *((0, more) for more in missing)])
 
 
 def _places(shape: tuple[int, int]) -> list[tuple[int, int, int]]:

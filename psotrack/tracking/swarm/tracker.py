@@ -203,7 +203,6 @@ class Rows:
     fitness: Float[Array, "*frames drones"]
     num_cameras: Int[Array, "*frames drones"]
     status: Int[Array, "*frames drones"]
-    measured_size_m: Float[Array, "*frames drones 3"]
     box_px: Float[Array, "*frames drones cameras 4"]
     middle_px: Float[Array, "*frames drones cameras 2"]
 
@@ -309,7 +308,6 @@ def step(
         fitness=jnp.nan_to_num(fitness),
         num_cameras=num_cameras,
         status=status.astype(jnp.int32),
-        measured_size_m=measured_size_m,
         box_px=seen.box_px,
         middle_px=jnp.where(was_found[:, None, None], seen.middle_px, jnp.nan),
     )
