@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from psotrack.foreground.silhouettes import pack
-from psotrack.geometry import Boxes, Camera, Extents, project_boxes
+from psotrack.geometry import Boxes, Extents, project_boxes
 from psotrack.support.array_types import Array, Positions, Tables
 from psotrack.tracking.swarm.occlusion import (
     CORE_SCALE,
@@ -248,12 +248,18 @@ def _windows(
     windows_of = jax.vmap(jax.vmap(window), in_axes=(None, 0, 0))
     value = windows_of(jnp.arange(row.shape[1]), row, column + places[..., 0])
     value, row, column, pixel_px = jax.lax.optimization_barrier((value, row, column, pixel_px))
+    # Up to the borders of the silhouettes: those of a small camera fill only a part of the array.
+    covered_px = reduction * jnp.ceil(jnp.asarray(extents.cameras.image_size_wh, jnp.float32) / reduction)
+    height, width = pyramid.shape
     return Windows(
         value=value.astype(jnp.int32),
         x_px=column.astype(jnp.float32) * pixel_px,
         y_px=row.astype(jnp.float32) * pixel_px,
         pixel_px=pixel_px,
-        size_wh_px=_covered_px(extents.cameras, pyramid.shape, reduction),
+        size_wh_px=(
+            jnp.minimum(covered_px[:, 0], reduction * width),
+            jnp.minimum(covered_px[:, 1], reduction * height),
+        ),
     )
 
 
@@ -281,14 +287,3 @@ def _tables(
     # The last line is below the window: each line of the table is the sum of the lines before.
     lines = jnp.pad(lines.reshape(-1, SIDE, SIDE + 1), [(0, 0), (0, 1), (0, 0)]).swapaxes(0, 1)
     return jax.lax.scan(add, jnp.zeros(lines.shape[1:], jnp.int32), lines)[1]
-
-
-def _covered_px(
-    cameras: Camera, shape: tuple[int, int], reduction: int
-) -> tuple[Float[Array, "cameras"], Float[Array, "cameras"]]:
-    """Widths and heights of the images, up to the borders of their silhouettes.
-
-    The silhouettes of a small camera fill only a part of the array, which has the size of the largest ones.
-    """
-    own = reduction * jnp.ceil(jnp.asarray(cameras.image_size_wh, jnp.float32) / reduction)
-    return jnp.minimum(own[:, 0], reduction * shape[1]), jnp.minimum(own[:, 1], reduction * shape[0])

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from psotrack.foreground.silhouettes import Exposures
-from psotrack.geometry import Camera, Extents, make_extents, project_boxes
+from psotrack.geometry import Camera, make_extents, project_boxes
 from psotrack.support.array_types import Array, Key, Positions
 from psotrack.tracking.motion import MotionParams, MotionState, kalman
 from psotrack.tracking.swarm.fitness import (
@@ -243,14 +243,20 @@ def step(
     # The motion of a lost drone is not known: it stays where it was lost.
     predicted = kalman.select_drones(was_lost | ~slots.present, slots.motion, predicted)
     expected = jnp.clip(predicted.apparent_m, region.low, region.high)
-    extents = _extents(cameras, expected, predicted.velocity_m_s, slots.size_m, exposures)
+    # As each camera's frame shows the drones: where they are when the frame is exposed.
+    extents = make_extents(cameras if exposures is None else exposures.seeing(cameras), slots.size_m)
+    if exposures is not None:
+        extents = exposures.moved(extents, expected, predicted.velocity_m_s)
+    known = slots.present & (slots.missed <= MAX_OCCLUDING_FRAMES)
     patches, windows = cut(
         frame.pyramid,
         extents,
         ExpectedDrones(
             position_m=expected,
             reach_m=REACH_SIGMAS * params.spread_m * _frames_since_found(slots, params)[:, 0],
-            occluding=_occluding(slots, expected) if program.occlusion else None,
+            occluding=known & ~_displaced(expected, known, slots.missed, slots.size_m)
+            if program.occlusion
+            else None,
         ),
         reduction=program.reduction,
         ring=program.score.ring,
@@ -272,10 +278,15 @@ def step(
     near = jnp.linalg.norm(found - slots.motion.apparent_m, axis=-1) < slots.size_m.max(axis=-1)
     was_found = slots.present & (fitness >= enough) & (num_cameras >= params.min_cameras)
     was_found &= near | ~was_lost
-    dispersion = _averaged(slots.dispersion, vertex.dispersion, was_found)
+    # Averaged over frames, because the few cameras of one frame determine it only roughly.
+    believed = was_found & jnp.isfinite(vertex.dispersion)
+    change = jnp.where(believed, vertex.dispersion - slots.dispersion, 0.0)
+    dispersion = slots.dispersion + change / DISPERSION_FRAMES
     covariance = COMMON * dispersion[:, None, None] * vertex.inverse_curvature_m2
     if exposures is not None:
-        covariance += _displacement_covariance(predicted, vertex.camera_share, exposures)
+        # The error of the velocity times the cameras' mean offset between instant and exposures.
+        offset_s = (vertex.camera_share * exposures.offset_s).sum(axis=-1)
+        covariance += jnp.square(offset_s)[:, None, None] * predicted.covariance[:, 3:6, 3:6]
 
     plausible = kalman.log_likelihood(predicted, found, covariance, params.motion)
     was_found &= ~_displaced(found, was_found, -plausible, slots.size_m)
@@ -400,30 +411,6 @@ def _without_absent(rows: Rows, present: Bool[Array, "drones"]) -> Rows:
     return replace(jax.tree.map(known, rows), status=jnp.where(present, rows.status, Status.LOST))
 
 
-def _extents(
-    cameras: Camera,
-    expected: Positions,
-    velocity_m_s: Positions,
-    size_m: Positions,
-    exposures: Exposures | None,
-) -> Extents:
-    """The drones' extents as each camera's frame shows them: where the drones are when the frame is exposed."""
-    if exposures is None:
-        return make_extents(cameras, size_m)
-    return exposures.moved(make_extents(exposures.seeing(cameras), size_m), expected, velocity_m_s)
-
-
-def _displacement_covariance(
-    predicted: MotionState, camera_share: Float[Array, "drones cameras"], exposures: Exposures
-) -> Float[Array, "drones 3 3"]:
-    """Covariance of a measured position that comes from the uncertain velocity between instant and exposures.
-
-    The position is off by the error of the velocity times the cameras' mean offset.
-    """
-    offset_s = (camera_share * exposures.offset_s).sum(axis=-1)
-    return jnp.square(offset_s)[:, None, None] * predicted.covariance[:, 3:6, 3:6]
-
-
 def _reachable(slots: Slots, elapsed_s: Float[Array, ""], params: TrackerParams) -> SearchRegion:
     """Bounds of the search for each drone: what it can have reached since it was last found, within the room."""
     longest = params.max_speed_m_s * elapsed_s
@@ -487,12 +474,6 @@ def _search(
     return best.reshape(drones, 3)
 
 
-def _occluding(slots: Slots, expected: Positions) -> Bool[Array, "drones"]:
-    """Which drones' expected positions are certain enough to occlude other drones."""
-    known = slots.present & (slots.missed <= MAX_OCCLUDING_FRAMES)
-    return known & ~_displaced(expected, known, slots.missed, slots.size_m)
-
-
 def _displaced(
     position_m: Positions,
     there: Bool[Array, "drones"],
@@ -513,11 +494,3 @@ def _displaced(
     equal = (doubt[:, None] == doubt) & (number[:, None] > number)
     more = (doubt[:, None] > doubt) | equal
     return (conflict & more).any(axis=1)
-
-
-def _averaged(
-    dispersion: Float[Array, "drones"], latest: Float[Array, "drones"], was_found: Bool[Array, "drones"]
-) -> Float[Array, "drones"]:
-    """Dispersion, averaged over frames, because the few cameras of one frame determine it only roughly."""
-    believed = was_found & jnp.isfinite(latest)
-    return dispersion + jnp.where(believed, latest - dispersion, 0.0) / DISPERSION_FRAMES
