@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
+from scipy.special import logsumexp
 
 from psotrack.tracking.births.births import SPANS_M, SPEED_SHARE, FlightLimits, TrackCandidate
 
@@ -40,10 +41,6 @@ SAME_PLACE = 0.5
 #: Longest time for which a lost drone may be tracked while the candidate is there, seconds; after a longer time they
 #: are two drones, after a shorter time the track was failing.
 MAX_OVERLAP_S = 0.4
-#: Time constant of the velocity, seconds: after this time the last velocity says little about the position.
-VELOCITY_TIME_S = 1.0
-#: Standard deviations of measured positions and velocities along each axis.
-POSITION_STD_M, VELOCITY_STD_M_S = 0.1, 0.3
 #: A candidate is out of reach if it is farther than a drone can fly plus this number of standard deviations.
 REACH_SIGMAS = 5.0
 
@@ -180,10 +177,9 @@ def reidentify(
 ) -> Int[np.ndarray, "candidates"]:
     """Assign candidates to lost drones with the largest total likelihood.
 
-    A drone's velocity is an Ornstein-Uhlenbeck process, which returns to 0 on average (G. E. Uhlenbeck, L. S. Ornstein,
-    On the theory of the Brownian motion, Physical Review 36, 1930): after a short gap a drone is expected on its
-    course, after a long gap anywhere within reach. A drone that stood still most probably stayed. The alternative is a
-    new drone anywhere in the room.
+    A drone's velocity is an Ornstein-Uhlenbeck process (see `log_transition`): after a short gap a drone is
+    expected on its course, after a long gap anywhere within reach. A drone that stood still most probably stayed. The
+    alternative is a new drone anywhere in the room.
 
     Args:
         candidates: the candidates.
@@ -251,31 +247,11 @@ def _log_likelihood(
     distance = float(np.linalg.norm(candidate.position_m - place))
     if distance > limits.max_speed_m_s * gap_s + REACH_SIGMAS * POSITION_STD_M:
         return _UNREACHABLE - distance
-    log_flown = log_normal(
-        candidate.position_m - place - _way_s(gap_s) * velocity, _spread_m2(gap_s, variance)
-    )
-    log_flown = max(log_flown + log_normal(candidate.velocity_m_s, variance), log_anywhere)
+    before = np.stack([place, velocity])
+    after = np.stack([candidate.position_m, candidate.velocity_m_s])
+    log_flown = max(log_transition(before, after, gap_s, variance, limits.bounds_m), log_anywhere)
     log_flown += np.log(1 - STAYED_PROBABILITY) if _stands(lost, row, limits) else 0.0
     return max(log_stayed, log_flown) + log_span
-
-
-def _way_s(gap_s: float) -> float:
-    """Expected way after a gap, as a multiple of the last velocity, seconds."""
-    return VELOCITY_TIME_S * -float(np.expm1(-gap_s / VELOCITY_TIME_S))
-
-
-def _spread_m2(gap_s: float, variance: float) -> float:
-    """Variance of a measured position about the expected one after a gap, along each axis, for this stationary variance
-    of the velocity.
-    """
-    way_s = _way_s(gap_s)
-    flown_m2 = variance * (2 * VELOCITY_TIME_S * (gap_s - way_s) - way_s**2)
-    return 2 * POSITION_STD_M**2 + (way_s * VELOCITY_STD_M_S) ** 2 + flown_m2
-
-
-def log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
-    """Log density of a Gaussian with mean 0 and the same variance along each axis."""
-    return float(-(value @ value / variance + len(value) * np.log(2 * np.pi * variance)) / 2)
 
 
 def _stands(lost: LostTracks, row: int, limits: FlightLimits) -> bool:
@@ -322,3 +298,59 @@ def _smallest_distance(candidate: TrackCandidate, place_m: Float[np.ndarray, "3"
     offset = candidate.position_m - place_m
     ago_s = np.clip(offset @ candidate.velocity_m_s / max(speed2, 1e-9), 0.0, DEPARTURE_S)
     return float(np.linalg.norm(offset - ago_s * candidate.velocity_m_s))
+
+
+#: Time constant of the velocity, seconds: after this time the last velocity says little about the position.
+VELOCITY_TIME_S = 1.0
+#: Standard deviations of measured positions and velocities along each axis.
+POSITION_STD_M, VELOCITY_STD_M_S = 0.1, 0.3
+#: Number of reflected images of the room on either side; a drone that is reflected more often may be anywhere.
+NUM_WALLS = 3
+
+#: Position (metres) and velocity (metres per second).
+Motion = Float[np.ndarray, "2 3"]
+
+
+def log_transition(
+    before: Motion, after: Motion, gap_s: float, variance: float, bounds_m: Float[np.ndarray, "2 3"]
+) -> float:
+    """Log density of a measured state after a gap, over position and velocity: an Ornstein-Uhlenbeck process.
+
+    The velocity returns to 0 on average (G. E. Uhlenbeck, L. S. Ornstein, On the theory of the Brownian motion,
+    Physical Review 36, 1930). After a short gap the drone is expected on its course, after a long gap anywhere in the
+    room. The walls of the room reflect the drone.
+
+    Args:
+        before, after: (2, 3), measured positions and velocities, in the room.
+        gap_s: time between them, at least 0.
+        variance: stationary variance of the velocity along each axis, m2/s2.
+        bounds_m: (2, 3), corners of the room.
+    """
+    time = VELOCITY_TIME_S
+    decay = np.exp(-gap_s / time)
+    transition = np.array([[1.0, time * (1 - decay)], [0.0, decay]])
+    process = variance * np.array(
+        [
+            [time**2 * (2 * gap_s / time - 3 + 4 * decay - decay**2), time * (1 - decay) ** 2],
+            [time * (1 - decay) ** 2, 1 - decay**2],
+        ]
+    )
+    measured = np.diag([POSITION_STD_M**2, VELOCITY_STD_M_S**2])
+    covariance = transition @ measured @ transition.T + process + measured
+    error = _reflect(after, bounds_m) - (transition @ before)[:, None]
+    distance2 = np.einsum("iwa,ij,jwa->wa", error, np.linalg.inv(covariance), error)
+    per_axis = logsumexp(-distance2 / 2, axis=0)
+    return float(per_axis.sum() - 3 * np.log(np.linalg.det(2 * np.pi * covariance)) / 2)
+
+
+def log_normal(value: Float[np.ndarray, "dims"], variance: float) -> float:
+    """Log density of a Gaussian with mean 0 and the same variance along each axis."""
+    return float(-(value @ value / variance + len(value) * np.log(2 * np.pi * variance)) / 2)
+
+
+def _reflect(motion: Motion, bounds_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "2 images 3"]:
+    """Position and velocity along each axis, and their images after reflections at the walls."""
+    (place, velocity), (low, high) = motion, bounds_m
+    away = 2 * (high - low) * np.arange(-NUM_WALLS, NUM_WALLS + 1)[:, None]
+    places = np.concatenate([place + away, 2 * low - place + away])
+    return np.stack([places, np.repeat([velocity, -velocity], len(away), axis=0)])
