@@ -32,7 +32,7 @@ def find_cut_off(tracks: Tracks, volume: FlightVolume, fps: float) -> str | None
     sign = np.array([[-1.0], [1.0]])
     outward_m_s, ahead_m = velocity_m_s[:, :, None], (position_m + SOON_S * velocity_m_s)[:, :, None]
     leaves = (sign * outward_m_s > LEAST_SPEED_M_S) & (sign * (ahead_m - volume.bounds_m) > 0)
-    leaves = leaves[:-1] & (found[:-1] & ~found[1:])[..., None, None]
+    leaves = np.asarray(leaves)[:-1] & (found[:-1] & ~found[1:])[..., None, None]
     speed = np.linalg.norm(np.where(found[..., None], velocity_m_s, 0.0), axis=-1)
     count = min(max(2, round(AT_LIMIT_S * fps)), len(speed))
     at_limit = sliding_window_view(speed >= AT_LIMIT * volume.max_speed_m_s, count, axis=0).all(axis=-1)
