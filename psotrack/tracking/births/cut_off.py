@@ -31,8 +31,9 @@ def find_cut_off(tracks: Tracks, volume: FlightVolume, fps: float) -> str | None
     # (frames, drones, sides, axes): whether a drone that is lost in the next frame flies through the bound.
     sign = np.array([[-1.0], [1.0]])
     outward_m_s, ahead_m = velocity_m_s[:, :, None], (position_m + SOON_S * velocity_m_s)[:, :, None]
-    leaves = (sign * outward_m_s > LEAST_SPEED_M_S) & (sign * (ahead_m - volume.bounds_m) > 0)
-    leaves = np.asarray(leaves)[:-1] & (found[:-1] & ~found[1:])[..., None, None]
+    is_fast, is_beyond = sign * outward_m_s > LEAST_SPEED_M_S, sign * (ahead_m - volume.bounds_m) > 0
+    is_lost = (found[:-1] & ~found[1:])[..., None, None]
+    leaves = np.asarray((is_fast & is_beyond)[:-1] & is_lost)
     speed = np.linalg.norm(np.where(found[..., None], velocity_m_s, 0.0), axis=-1)
     count = min(max(2, round(AT_LIMIT_S * fps)), len(speed))
     at_limit = sliding_window_view(speed >= AT_LIMIT * volume.max_speed_m_s, count, axis=0).all(axis=-1)
