@@ -36,7 +36,8 @@ def find_cut_off(tracks: Tracks, volume: FlightVolume, fps: float) -> str | None
     leaves = np.asarray((is_fast & is_beyond)[:-1] & is_lost)
     speed = np.linalg.norm(np.where(found[..., None], velocity_m_s, 0.0), axis=-1)
     count = min(max(2, round(AT_LIMIT_S * fps)), len(speed))
-    at_limit = sliding_window_view(speed >= AT_LIMIT * volume.max_speed_m_s, count, axis=0).all(axis=-1)
+    is_fastest = sliding_window_view(speed >= AT_LIMIT * volume.max_speed_m_s, count, axis=0)
+    at_limit = np.asarray(is_fastest.all(axis=-1))
     cases = []
     for drone in range(tracks.num_drones):
         for frame, side, axis in np.argwhere(leaves[:, drone])[:1].tolist():
