@@ -111,10 +111,7 @@ def unpack(
         temporary.mkdir()
         with report("unpack", len(zipped.infolist())) as advance:
             for entry in zipped.infolist():
-                target = temporary / entry.filename
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with zipped.open(entry) as packed, target.open("xb") as file:
-                    shutil.copyfileobj(packed, file)
+                zipped.extract(entry, temporary)
                 advance(1)
         manifest = _manifest_of(archive, temporary, zipped)
     return manifest

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import Silhouettes
-from psotrack.geometry import Rig, looking_depths_m, project_visible, sizes_m, to_camera
+from psotrack.geometry import Rig, looking_depths_m
 from psotrack.recordings import Recording
 from psotrack.settings import DroneSettings
 from psotrack.tracking.births.births import (
@@ -21,12 +21,14 @@ from psotrack.tracking.births.births import (
     FlightLimits,
     state_at,
 )
-from psotrack.tracking.matching import from_silhouettes
+from psotrack.tracking.matching import Expected, crossings, from_silhouettes, wide_bounds
 from psotrack.trajectories import Tracks, Trajectories, read_trajectories
 
 #: Number of first frames from which the sizes of drones at given positions are taken, and in which drones are found
 #: for a method that is plugged in.
 _START_FRAMES, _FRAMES = 10, 40
+#: Standard deviation of a given position, metres: it may be that of the body's origin, and the drone may turn away.
+_GIVEN_STD_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -224,24 +226,18 @@ def _sizes_at(
     position_m: Float[np.ndarray, "drones 3"],
     step_m: Float[np.ndarray, "drones 3"],
 ) -> tuple[Float[np.ndarray, "drones 3"], Float[np.ndarray, "drones"]]:
-    """Sizes of drones from the blobs that hold one of them alone in the first frames; and mean numbers of cameras."""
-    count = min(_START_FRAMES, silhouettes.num_frames)
-    seen = from_silhouettes(silhouettes, stop=count)
-    spans, numbers = [], []
+    """Sizes of drones from their blobs in the first frames; and mean numbers of cameras."""
+    count, num_drones = min(_START_FRAMES, silhouettes.num_frames), len(position_m)
+    seen, room_m = from_silhouettes(silhouettes, stop=count), wide_bounds(rig)
+    spans, numbers = np.full((count, num_drones, 2), np.nan), np.zeros((count, num_drones))
+    std_m2 = np.tile(_GIVEN_STD_M**2 * np.eye(3), (num_drones, 1, 1))
     for frame in range(count):
-        at_m = position_m + frame * step_m
-        pixels, depth = project_visible(rig.cameras, at_m[:, None])
-        off = np.abs(pixels[:, :, None] - seen.centre_px[frame]) < seen.size_px[frame] / 2
-        holds = off.all(axis=-1) & (depth > 0)[..., None]
-        numbers.append(holds.any(axis=-1).sum(axis=-1))
-        alone = holds & (holds.sum(axis=0) == 1)
-        box = alone.argmax(axis=-1)
-        size_px = seen.size_px[frame][np.arange(len(rig)), box]
-        span_m = sizes_m(rig.cameras, np.asarray(to_camera(rig.cameras, at_m[:, None])), size_px)
-        spans.append(np.where(alone.any(axis=-1)[..., None], span_m, np.nan))
-    flat = np.concatenate(spans, axis=1)
-    known = np.isfinite(flat).all(axis=-1)
-    size_m = np.full((len(position_m), 3), np.nan)
-    for drone in np.flatnonzero(known.any(axis=1)).tolist():
-        size_m[drone] = np.median(flat[drone, known[drone]], axis=0)[[0, 0, 1]]
-    return size_m, np.mean(numbers, axis=0)
+        expected = Expected(position_m + frame * step_m, std_m2, np.ones(num_drones))
+        crossed = crossings(rig.cameras, seen[frame], room_m, expected)
+        own = crossed.expected >= 0
+        spans[frame, crossed.expected[own]] = crossed.span_m[own]
+        numbers[frame, crossed.expected[own]] = crossed.seen[own].sum(axis=-1)
+    shown = np.isfinite(spans).any(axis=(0, 2))
+    size_m = np.full((num_drones, 3), np.nan)
+    size_m[shown] = np.nanmedian(spans[:, shown], axis=0)[:, [0, 0, 1]]
+    return size_m, numbers.mean(axis=0)

@@ -62,14 +62,6 @@ class ConstantErrors:
     clock_std_s: float
     covariance: Float[np.ndarray, "all all"]
 
-    @classmethod
-    def none(cls, num_cameras: int) -> ConstantErrors:
-        """No errors."""
-        unknowns = 4 * num_cameras
-        return cls(
-            np.zeros((num_cameras, 3)), np.zeros(num_cameras), 0.0, 0.0, np.zeros((unknowns, unknowns))
-        )
-
 
 def fit_constant_errors(
     places: FittedPlaces,

@@ -20,11 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
-from psotrack.tracking.camera_errors.constant_errors import (
-    ConstantErrors,
-    fit_constant_errors,
-    student_inflation,
-)
+from psotrack.tracking.camera_errors.constant_errors import fit_constant_errors, student_inflation
 from psotrack.tracking.camera_errors.variance_components import (
     FittedPlaces,
     camera_variances,
@@ -175,17 +171,18 @@ def learn_camera_errors(views: CameraViews, fps: float, usual: tuple[float, floa
         sample.flow_px_s.reshape(-1, num_cameras, 2)[which],
     )
     # The first fit has no turns: noise that is learned from what many turns leave would be too small to doubt them.
-    constant = ConstantErrors.none(num_cameras)
+    turn_rad, clock_s = np.zeros((num_cameras, 3)), np.zeros(num_cameras)
     correlation = Autocorrelation(1 - usual[0], *(np.array([value]) for value in usual))
     total_px2 = None
     for _ in range(_ROUNDS):
-        rest = _without(views, constant)
+        rest = _without(views, turn_rad, clock_s)
         inflation, before_px2 = correlation.inflation(step * dt_s, duration_s), total_px2
         total_px2 = camera_variances(_rows(rest[::step]), inflation, before_px2)
         total_px2 = np.where(np.isnan(total_px2), np.nanmean(total_px2), total_px2)
         correlation = autocorrelation_of(rest.residual_px / np.sqrt(total_px2), rest.shown, dt_s, correlation)
         inflation = correlation.inflation(step * dt_s, duration_s)
         constant = fit_constant_errors(*linear, np.sqrt(total_px2), inflation)
+        turn_rad, clock_s = constant.turn_rad, constant.clock_s
         if before_px2 is not None and np.allclose(total_px2, before_px2, rtol=_SETTLED):
             break
     # Few independent residuals: the variance is itself uncertain.
@@ -212,12 +209,14 @@ def _rows(views: CameraViews) -> FittedPlaces:
     )
 
 
-def _without(views: CameraViews, constant: ConstantErrors) -> CameraViews:
+def _without(
+    views: CameraViews, turn_rad: Float[np.ndarray, "cameras 3"], clock_s: Float[np.ndarray, "cameras"]
+) -> CameraViews:
     """The views without the fitted turns and clocks, with residuals of positions that are fitted anew."""
     residuals_px = []
     for part in views.parts():
-        turned_px = np.einsum("fdcip,cp->fdci", part.turn_px, constant.turn_rad)
-        late_px = -part.flow_px_s * constant.clock_s[:, None]
+        turned_px = np.einsum("fdcip,cp->fdci", part.turn_px, turn_rad)
+        late_px = -part.flow_px_s * clock_s[:, None]
         rows = _rows(replace(part, residual_px=part.residual_px - turned_px - late_px))
         determined = rows.determined
         fitted_px = np.where(rows.shown[..., None], rows.residual_px, np.nan)

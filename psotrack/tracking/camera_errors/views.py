@@ -58,15 +58,9 @@ class CameraViews:
 
     def __getitem__(self, frames: slice) -> CameraViews:
         """The views of some frames."""
-        return CameraViews(
-            self.cameras,
-            _at(self.exposures, frames),
-            self.position_m[frames],
-            self.velocity_m_s[frames],
-            self.residual_px[frames],
-            self.jacobian[frames],
-            self.weight[frames],
-        )
+        names = ("position_m", "velocity_m_s", "residual_px", "jacobian", "weight")
+        parts = {name: getattr(self, name)[frames] for name in names}
+        return CameraViews(self.cameras, _at(self.exposures, frames), **parts)
 
     def parts(self) -> Iterator[CameraViews]:
         """The views of some frames after the other."""

@@ -22,11 +22,9 @@ from psotrack.support.array_types import Array
 from psotrack.tracking.motion import kalman
 from psotrack.tracking.motion.kalman import MotionParams, MotionState
 
-#: Grid of log10 jerk densities, m²/s⁵: from a drone that hovers to one in violent manoeuvres.
-_JERK_DECADES = np.arange(-4.0, 7.0)
-
-#: Step of the second, finer grid, decades. Over this step the log likelihood is close to a parabola.
-_FINER_STEP = 0.2
+#: Grid of log10 jerk densities, m²/s⁵: from a drone that hovers to one in violent manoeuvres. Over a step of it the log
+#: likelihood is close to a parabola.
+_JERK_DECADES = np.linspace(-4.0, 6.0, 31)
 
 #: Standard deviation of the prior on log10 of the density, decades. The data of a few dozen frames outweigh the prior.
 _JERK_PRIOR_DECADES = 1.0
@@ -65,24 +63,14 @@ class Measurements:
         """
         if not (np.diff(self.time_s) > 0).all() or not np.isfinite(self.time_s).all():
             raise InputError("time_s", expected="increasing times", found="repeats, steps back or no numbers")
-        for name in ("position_m", "covariance_m2"):
-            value = getattr(self, name)
-            wrong = self.was_measured & ~np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
-            if wrong.any():
-                row, drone = np.argwhere(wrong)[0]
-                where = f"{name}, row {row}, drone {drone}"
-                raise InputError(
-                    where, expected="numbers where it was measured", found=f"{value[row, drone]}"
-                )
-        known_m2 = np.where(self.was_measured[..., None, None], self.covariance_m2, np.eye(3))
-        smallest_m2 = np.linalg.eigvalsh(known_m2)[..., 0]
-        if not (smallest_m2 > 0).all():
-            row, drone = np.unravel_index(smallest_m2.argmin(), smallest_m2.shape)
-            raise InputError(
-                f"covariance_m2, row {row}, drone {drone}",
-                expected="a positive definite covariance",
-                found=f"one whose least eigenvalue is {smallest_m2.min():.3g} m2",
-            )
+        known = np.isfinite(self.position_m).all(axis=-1) & np.isfinite(self.covariance_m2).all(axis=(-2, -1))
+        smallest_m2 = np.linalg.eigvalsh(np.where(known[..., None, None], self.covariance_m2, -np.eye(3)))
+        wrong = self.was_measured & (smallest_m2[..., 0] <= 0)
+        if wrong.any():
+            row, drone = np.argwhere(wrong)[0]
+            expected = "a position and a positive definite covariance where it was measured"
+            found = f"{self.position_m[row, drone]} m, {self.covariance_m2[row, drone].tolist()} m2"
+            raise InputError(f"measurements, row {row}, drone {drone}", expected=expected, found=found)
 
 
 @dataclass(frozen=True)
@@ -142,10 +130,10 @@ def _estimated(program: Callable, measured: Measurements, params: MotionParams) 
 def estimate_jerk_density(measured: Measurements, params: MotionParams) -> Float[np.ndarray, "drones"]:
     """(drones,), jerk density of the highest posterior probability given the measurements, m²/s⁵.
 
-    The likelihood is that of all innovations (Bar-Shalom et al. 2001, section 11.4). The search tries decades, then a
-    finer grid around the best decade, then the vertex of a parabola. The prior is centred on
-    `params.jerk_density_m2_s5`, so a drone with few measurements keeps that value. Outliers do not raise the density,
-    because `kalman.log_likelihood` has long tails. Measurement covariances that are too small do raise the density.
+    The likelihood is that of all innovations (Bar-Shalom et al. 2001, section 11.4). The search tries a grid, then the
+    vertex of a parabola. The prior is centred on `params.jerk_density_m2_s5`, so a drone with few measurements keeps
+    that value. Outliers do not raise the density, because `kalman.log_likelihood` has long tails. Measurement
+    covariances that are too small do raise the density.
 
     Raises:
         InputError: as `Measurements.check` says.
@@ -154,20 +142,15 @@ def estimate_jerk_density(measured: Measurements, params: MotionParams) -> Float
     expected = np.log10(np.asarray(params.jerk_density_m2_s5, np.float64))
     drones = np.arange(len(expected))
 
-    def scores(decades: Float[np.ndarray, "tried drones"]) -> Float[np.ndarray, "tried drones"]:
-        with jax.enable_x64(True):
-            found = _log_likelihoods(*_in_float64(measured, params), 10.0**decades)
-        return np.asarray(found) - ((decades - expected) / _JERK_PRIOR_DECADES) ** 2 / 2
-
     decades = np.tile(_JERK_DECADES[:, None], len(drones))
-    best = decades[scores(decades).argmax(axis=0), drones]
-    decades = best + _FINER_STEP * (_JERK_DECADES - _JERK_DECADES.mean())[:, None]
-    score = scores(decades)
+    with jax.enable_x64(True):
+        found = np.asarray(_log_likelihoods(*_in_float64(measured, params), 10.0**decades))
+    score = found - ((decades - expected) / _JERK_PRIOR_DECADES) ** 2 / 2
     best = np.clip(score.argmax(axis=0), 1, len(decades) - 2)
     below, at, above = (score[best + shift, drones] for shift in (-1, 0, 1))
     # The prior makes the score concave, so a vertex exists. The search stays within one grid step.
     vertex = np.clip((above - below) / 2 / (2 * at - above - below), -1, 1)
-    return 10.0 ** (decades[best, drones] + vertex * _FINER_STEP)
+    return 10.0 ** (_JERK_DECADES[best] + vertex * (_JERK_DECADES[1] - _JERK_DECADES[0]))
 
 
 def _in_float64(measured: Measurements, params: MotionParams) -> tuple[_Measured, MotionParams]:

@@ -6,7 +6,7 @@ about this drone, except in the core of this drone's own ellipse, which this dro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -32,14 +32,11 @@ class Occluders:
     """Ellipses of other drones that may cover each drone in each camera, nearest first.
 
     Attributes:
-        x_middle, y_middle, x_half, y_half: middles and half lengths of the ellipses, image pixels.
-        exists: whether there is an ellipse of this rank.
+        boxes: (ranks, drones, cameras), the boxes about the ellipses.
+        exists: (ranks, drones, cameras), whether there is an ellipse of this rank.
     """
 
-    x_middle: Float[Array, "ranks drones cameras"]
-    y_middle: Float[Array, "ranks drones cameras"]
-    x_half: Float[Array, "ranks drones cameras"]
-    y_half: Float[Array, "ranks drones cameras"]
+    boxes: Boxes
     exists: Bool[Array, "ranks drones cameras"]
 
     def cover(
@@ -47,14 +44,12 @@ class Occluders:
     ) -> Bool[Array, "drones cameras *points"]:
         """Which image points, several per drone and camera, lie in one of the ellipses."""
         inner = (slice(None),) * 2 + (None,) * (x_px.ndim - 2)
+        boxes = self.boxes
         covered: Array = jnp.zeros(np.broadcast_shapes(x_px.shape, y_px.shape), bool)
         # One rank after the other: XLA on a CPU computes a reduction over ranks number by number.
         for rank in range(len(self.exists)):
-            ellipse = (
-                of[rank][inner]
-                for of in (self.x_middle, self.y_middle, 1 / self.x_half, 1 / self.y_half, self.exists)
-            )
-            x_middle, y_middle, x_per_half, y_per_half, exists = ellipse
+            ellipse = boxes.x_middle, boxes.y_middle, 1 / boxes.x_half, 1 / boxes.y_half, self.exists
+            x_middle, y_middle, x_per_half, y_per_half, exists = (of[rank][inner] for of in ellipse)
             across, along = (x_px - x_middle) * x_per_half, (y_px - y_middle) * y_per_half
             covered |= exists & (jnp.square(across) + jnp.square(along) < 1)
         return covered
@@ -83,13 +78,9 @@ def find_occluders(
     def of_order(of: Array) -> Array:
         return jnp.take_along_axis(of[:, None], order, axis=0)
 
-    return Occluders(
-        x_middle=of_order(boxes.x_middle),
-        y_middle=of_order(boxes.y_middle),
-        x_half=of_order(OCCLUDER_SCALE * boxes.x_half) + pixel_px / 2,
-        y_half=of_order(OCCLUDER_SCALE * boxes.y_half) + pixel_px / 2,
-        exists=exists,
-    )
+    near: Boxes = jax.tree.map(of_order, boxes)
+    x_half, y_half = (OCCLUDER_SCALE * half + pixel_px / 2 for half in (near.x_half, near.y_half))
+    return Occluders(replace(near, x_half=x_half, y_half=y_half), exists)
 
 
 def unoccluded_share(occluders: Occluders, boxes: Boxes) -> Float[Array, "drones cameras"]:
