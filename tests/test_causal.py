@@ -174,9 +174,7 @@ def test_a_recording_is_tracked_as_it_is_frame_by_frame(
 ) -> None:
     """Both find the same drones. Tracks begin at different instants, with other random numbers."""
     runs = [RunInputs(ROOM_M, tracker_settings(track_settings(**EFFORT)))]
-    (((tracks, _),), _) = track_silhouettes(
-        RIG, silhouettes_in_memory(RIG, coverage, REDUCTION), runs, fps=FPS
-    )
+    ((tracks, _),) = track_silhouettes(RIG, silhouettes_in_memory(RIG, coverage, REDUCTION), runs, fps=FPS)
     apart_m = []
     for frame, rows in enumerate(tracked):
         drones = np.array(rows.drones, int)

@@ -28,7 +28,7 @@ def track(num_drones, *, seed=0, fps=25.0, **settings):
     inputs = RunInputs(
         ROOM_M * (1 + 0.1 * seed), tracker_settings(track_settings(**(effort | settings))), given
     )
-    ((tracks, _),), _ = track_silhouettes(
+    ((tracks, _),) = track_silhouettes(
         RIG, silhouettes_in_memory(RIG, coverage, REDUCTION), [inputs], fps=fps
     )
     assert tracks.num_drones == num_drones

@@ -140,9 +140,7 @@ def learned(size_of_frame, *, first=1.0, height_m=HOVER_M[2]):
     bounds_m = np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]])
     settings = tracker_settings(track_settings(particles=20, iterations=15, drones=1))
     silhouettes = silhouettes_in_memory(RIG, coverage, REDUCTION)
-    (((tracks, _),), _) = track_silhouettes(
-        RIG, silhouettes, [RunInputs(bounds_m, settings, given)], fps=25.0
-    )
+    ((tracks, _),) = track_silhouettes(RIG, silhouettes, [RunInputs(bounds_m, settings, given)], fps=25.0)
     return tracks.size_m[0] / SIZE_M, tracks
 
 

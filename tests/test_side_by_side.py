@@ -69,8 +69,7 @@ RUNS = [
 
 
 def tracked(silhouettes, runs, *, side_by_side):
-    results, _ = track_silhouettes(RIG, silhouettes, runs, fps=FPS, side_by_side=side_by_side)
-    return results
+    return track_silhouettes(RIG, silhouettes, runs, fps=FPS, side_by_side=side_by_side)
 
 
 @pytest.fixture(scope="module")

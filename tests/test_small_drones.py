@@ -50,7 +50,7 @@ def track(coverage, rig=SMALL, reduction=REDUCTION):
     """The tracks of drones that the tracker finds itself."""
     runs = [RunInputs(ROOM_M, tracker_settings(track_settings(particles=20, iterations=15)))]
     silhouettes = silhouettes_in_memory(rig, coverage, reduction)
-    (((tracks, _),), _) = track_silhouettes(rig, silhouettes, runs, fps=FPS)
+    ((tracks, _),) = track_silhouettes(rig, silhouettes, runs, fps=FPS)
     return tracks
 
 

@@ -46,7 +46,7 @@ def figures(frame_times, given=None):
     velocity = (positions(step_s) - positions(0.0)) / step_s
     initial = InitialState(positions(0.0), velocity, SIZE_M, np.array([5.0]))
     inputs = RunInputs(ROOM_M, tracker_settings(SETTINGS), initial)
-    (((tracks, _),), _) = track_silhouettes(RIG, silhouettes, [inputs], fps=timeline.rate_hz)
+    ((tracks, _),) = track_silhouettes(RIG, silhouettes, [inputs], fps=timeline.rate_hz)
     settled = slice(15, None)
     error_m = (tracks.position_m[:, :1] - positions(timeline.time_s))[settled]
     inverse = np.linalg.inv(tracks.covariance_m2[settled, :1])

@@ -52,7 +52,7 @@ def track(coverage, position_m=TRUTH_M[0], velocity_m_s=VELOCITY_M_S[0], *, size
     given = InitialState(np.asarray(position_m), np.asarray(velocity_m_s), size_m, np.full(2, 5.0))
     runs = [RunInputs(ROOM_M, tracker_settings(chosen), given)]
     silhouettes = silhouettes_in_memory(RIG, coverage, REDUCTION)
-    (((tracks, _),), _) = track_silhouettes(RIG, silhouettes, runs, fps=FPS)
+    ((tracks, _),) = track_silhouettes(RIG, silhouettes, runs, fps=FPS)
     return tracks
 
 

@@ -54,7 +54,7 @@ def silhouettes(optimised):
 
 def track(silhouettes, given=None, **settings):
     runs = [RunInputs(ROOM_M, tracker_settings(track_settings(**(EFFORT | settings))), given)]
-    (((tracks, _),), _) = track_silhouettes(RIG, silhouettes, runs, fps=FPS)
+    ((tracks, _),) = track_silhouettes(RIG, silhouettes, runs, fps=FPS)
     return tracks, trajectories_of(tracks)
 
 

@@ -57,7 +57,7 @@ def test_a_drone_is_tracked_through_the_lens(name):
     start = InitialState(truth_m[0], velocity_m_s, SIZE_M, np.array([5.0]))
     settings = track_settings(particles=20, iterations=15)
     run = RunInputs(ROOM_M, tracker_settings(settings), start)
-    (((tracks, _),), _) = track_silhouettes(rig, silhouettes, [run], fps=FPS)
+    ((tracks, _),) = track_silhouettes(rig, silhouettes, [run], fps=FPS)
     found = postprocess(tracks, settings.motion, settings.identity, fps=FPS, smoothing=None)[0]
     error_m = found.position_m[:, 0] - truth_m[:, 0]
     # A cell of the silhouettes is 2 px: at 3.5 m and focal length of 200 to 300 px, 23 to 35 mm. Cells that are covered

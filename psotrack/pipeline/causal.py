@@ -20,7 +20,7 @@ from psotrack.geometry import Rig
 from psotrack.pipeline.results import centre_of_ellipsoids, environment, warn_of_missing_drones
 from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, measured_compiling, no_progress
 from psotrack.tracking.births import flight_volume
 from psotrack.tracking.swarm import StepwiseTracker, tracker_settings
 from psotrack.trajectories import Status, Trajectories
@@ -136,7 +136,7 @@ def track_causally(
         exposures = exposures_of(timeline) if silhouettes.exposures is None else silhouettes.exposures
         drones: set[str] = set()
         seen, began = 0, time.perf_counter()
-        with report("track", timeline.num_instants) as advance:
+        with measured_compiling() as compiling_s, report("track", timeline.num_instants) as advance:
             for first in range(0, timeline.num_instants, _READ_FRAMES):
                 stop = min(first + _READ_FRAMES, timeline.num_instants)
                 for frame, coverage in enumerate(silhouettes.read(first, stop), first):
@@ -146,13 +146,10 @@ def track_causally(
                     yield rows
                     tracker.look_ahead()
                 advance(stop - first)
+            compile_s = compiling_s()
         warn_of_missing_drones(settings, len(drones))
-        compile_s = tracker.compile_s
-        seconds = {
-            **made.seconds,
-            "compile": compile_s,
-            "track": time.perf_counter() - began - compile_s,
-        }
+        track_s = time.perf_counter() - began - compile_s
+        seconds = {**made.seconds, "compile": compile_s, "track": track_s}
         record.update(
             drones=len(drones),
             tracked_rows=seen,

@@ -213,15 +213,8 @@ def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResu
         for run in runs
     ]
     with _timed() as seconds:
-        tracked, compile_s = track_silhouettes(
-            recording.rig, silhouettes, inputs, fps=recording.fps, report=report
-        )
-    # What compiles besides the tracker, or for a device of its own, is not part of `compile_s`.
-    more_s = max(0.0, compile_s - seconds["compile"])
-    shares = {
-        "compile": (seconds["compile"] + more_s) / len(runs),
-        "track": (seconds["track"] - more_s) / len(runs),
-    }
+        tracked = track_silhouettes(recording.rig, silhouettes, inputs, fps=recording.fps, report=report)
+    shares = {stage: value / len(runs) for stage, value in seconds.items()}
 
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found

@@ -8,7 +8,6 @@ bits.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -141,16 +140,11 @@ class Engine:
     Args:
         setting: what all runs share.
         side_by_side: whether runs are computed side by side, not one after the other; None: on accelerators only.
-
-    Attributes:
-        compile_s: seconds in which programs were compiled, so far.
     """
 
     def __init__(self, setting: Setting, *, side_by_side: bool | None = None) -> None:
         self._cameras = setting.cameras
         self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
-        self.compile_s = 0.0
-        self._compiled: set[Any] = set()
         self._threads = ThreadPoolExecutor(processors())
 
     def track(self, jobs: Sequence[Job], block: Block) -> list[tuple[Slots, Rows]]:
@@ -160,20 +154,9 @@ class Engine:
             shape = job.program, len(job.slots), jax.tree.structure(job.params)
             groups.setdefault(shape, []).append(number)
         done: dict[int, tuple[Slots, Rows]] = {}
-        for shape, numbers in groups.items():
-            of_group = [jobs[number] for number in numbers]
-            key = (*shape, jax.tree.structure(block.frames), block.frames.elapsed.shape)
-            if self.side_by_side:
-                key = (*key, len(numbers))
-            if key not in self._compiled:
-                began = time.perf_counter()
-                # Without iterations, a block takes next to no time to track; the rest is the time of compiling.
-                none = jnp.int32(0)
-                idle = [replace(job, params=replace(job.params, num_iterations=none)) for job in of_group]
-                self._run(idle if self.side_by_side else idle[:1], block)
-                self._compiled.add(key)
-                self.compile_s += time.perf_counter() - began
-            done |= dict(zip(numbers, self._run(of_group, block), strict=True))
+        for numbers in groups.values():
+            found = self._run([jobs[number] for number in numbers], block)
+            done |= dict(zip(numbers, found, strict=True))
         return [
             (slots, jax.tree.map(lambda leaf: np.asarray(leaf)[: len(block)], rows))
             for slots, rows in (done[number] for number in range(len(jobs)))

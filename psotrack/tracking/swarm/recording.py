@@ -58,7 +58,7 @@ def track_silhouettes(
     fps: float,
     side_by_side: bool | None = None,
     report: Report = no_progress,
-) -> tuple[list[tuple[Tracks, Places]], float]:
+) -> list[tuple[Tracks, Places]]:
     """Track the drones of one or more runs through all frames.
 
     Args:
@@ -70,7 +70,7 @@ def track_silhouettes(
         report: shows the progress in frames; all runs go through the frames together.
 
     Returns:
-        For each run its tracks, and where the cameras show the drones; and the seconds of compiling.
+        For each run its tracks, and where the cameras show the drones.
     """
     setting = Setting(rig, silhouettes.reduction, silhouettes.borders, fps)
     engine = Engine(setting, side_by_side=side_by_side)
@@ -110,7 +110,7 @@ def track_silhouettes(
                 each.starts = [start for start in each.starts if start.instant >= block.instant[0]]
             last = block
             advance(len(block))
-    return [_results(each) for each in progress], engine.compile_s
+    return [_results(each) for each in progress]
 
 
 def _planned(

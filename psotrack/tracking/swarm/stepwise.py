@@ -68,11 +68,6 @@ class StepwiseTracker:
         self._was_full = False
         self._latest: tuple[Block, Rows] | None = None
 
-    @property
-    def compile_s(self) -> float:
-        """Seconds in which programs were compiled, so far."""
-        return self._engine.compile_s
-
     def compile(self) -> None:
         """Compile the program for all numbers of drones that may come, so that no frame has to wait for it."""
         coverage = np.zeros((1, len(self._setting.rig), *self._shape), np.uint8)
