@@ -29,9 +29,7 @@ from psotrack.tracking.camera_errors import (
     noise_ratios,
     systematic_covariances,
     views_of_places,
-    views_of_sightings,
 )
-from psotrack.tracking.matching import Sightings
 from psotrack.tracking.motion import Measurements, MotionParams, filter_measurements
 from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
 
@@ -133,22 +131,6 @@ class TestViews:
             np.testing.assert_allclose(
                 views.turn_px[..., axis], (after - before) / 1e-6, rtol=1e-3, atol=1e-2
             )
-
-    @pytest.mark.parametrize("frames", [4, 2100])
-    def test_sightings_belong_to_the_drone_that_is_nearest_to_them(self, frames):
-        rig = ring_rig(3)
-        position_m = np.array([[[0.0, 0.0, 1.0], [0.8, 0.5, 1.4]]] * frames)
-        pixels, _ = project(rig.cameras, position_m[:, :, None])
-        # Boxes in the reverse order of the drones, a box of no drone, and one drone that camera 0 does not see.
-        centre_px = np.concatenate([pixels[:, ::-1], np.full_like(pixels[:, :1], 3.0)], axis=1)
-        centre_px = centre_px.swapaxes(1, 2) + 0.5
-        noise_px = np.full(centre_px.shape[:-1], 1.0)
-        centre_px[:, 0, 1], noise_px[:, 0, 1] = np.nan, np.nan
-        sightings = Sightings(centre_px, np.full(centre_px.shape, 8.0), noise_px)
-        views = views_of_sightings(rig.cameras, sightings, position_m, np.zeros_like(position_m))
-        assert (views.shown == [[False, True, True], [True, True, True]]).all()
-        np.testing.assert_allclose(views.residual_px[views.shown], 0.5)
-        assert (views.weight[~views.shown] == 0).all()
 
     def test_one_camera_alone_has_no_gain(self):
         rig = ring_rig(1)

@@ -191,7 +191,7 @@ def lines_errors(times, given=None, **options):
     known = positions(timeline.time_s[0]), np.zeros((2, 3))
     tracks = track_detections(
         RIG.cameras, shown, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M, known=known
-    )
+    )[0]
     settled = slice(20, timeline.num_instants - 5)
     error_m = (tracks.position_m[:, :2] - positions(timeline.time_s))[settled]
     covariance_m2 = tracks.covariance_m2[:, :2][settled]
@@ -227,7 +227,7 @@ def test_a_drone_that_comes_later_is_found_by_cameras_with_times_of_their_own():
     noise_px[:20, :, 1] = np.nan
     timeline = make_timeline(times)
     given = replace(shown, noise_px=noise_px).at_instants(timeline)
-    tracks = track_detections(RIG.cameras, given, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M)
+    tracks = track_detections(RIG.cameras, given, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M)[0]
     (new,) = tracks.arrivals
     assert abs(timeline.time_s[new.frame] - 20 / FPS) <= 2 / FPS
     # At the last instant, only some of the cameras are there.

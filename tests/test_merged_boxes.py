@@ -160,7 +160,7 @@ def test_drones_whose_boxes_merge_keep_their_tracks():
         fps=FPS,
         bounds_m=ROOM_M,
         known=(truth_m[0], (truth_m[1] - truth_m[0]) * FPS),
-    )
+    )[0]
     frame = np.arange(len(truth_m))
     names = ("0", "1", "2")
     estimate = Trajectories(

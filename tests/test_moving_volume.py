@@ -74,7 +74,7 @@ def tracked(rig, sightings, volume, size_m=None, **status):
     motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
     settings = TrackSettings(motion=motion, status=StatusSettings(**status))
     settings = settings.changed({"drones.size_m": size_m})
-    return track_detections(rig.cameras, sightings, settings, fps=FPS, bounds_m=volume.bounds_m)
+    return track_detections(rig.cameras, sightings, settings, fps=FPS, bounds_m=volume.bounds_m)[0]
 
 
 def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():

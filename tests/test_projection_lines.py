@@ -66,7 +66,7 @@ def track(truth_m, count=None, known=None, **noise):
     sightings = from_detections(simulate_detections(truth_m, **noise), RIG, len(truth_m))
     return track_detections(
         RIG.cameras, sightings, line_settings(count), fps=FPS, bounds_m=ROOM_M, known=known
-    )
+    )[0]
 
 
 def evaluate_tracks(tracked, truth_m):
@@ -203,7 +203,7 @@ def test_a_given_drone_that_is_seen_late_keeps_its_number(max_coasting_std_m):
         fps=FPS,
         bounds_m=ROOM_M,
         known=(truth_m[0], velocity_m_s),
-    )
+    )[0]
     (again,) = tracked.arrivals
     assert (again.frame, again.drone, again.again) == (30, 0, True)
     assert (tracked.status[20:30, 0] == Status.LOST).all()
@@ -222,7 +222,7 @@ def test_fitness_is_the_share_of_the_cameras_that_agree():
     some = {name: boxes for name, boxes in detections_of_all.items() if name in RIG.names[:6]}
     tracked = track_detections(
         RIG.cameras, from_detections(some, RIG, FRAMES), line_settings(), fps=FPS, bounds_m=ROOM_M
-    )
+    )[0]
     assert (tracked.num_cameras[:, 0] == 6).all()
     np.testing.assert_allclose(tracked.fitness[:, 0], 6 / 8)
 
@@ -244,7 +244,7 @@ def test_one_camera_keeps_a_track_on_its_line_of_sight():
     pair, truth_m, detections = seen_by_two_then_one()
     tracks = track_detections(
         pair.cameras, from_detections(detections, pair, FRAMES), line_settings(), fps=FPS, bounds_m=ROOM_M
-    )
+    )[0]
     assert tracks.num_drones == 1
     alone = slice(30, 55)
     assert (tracks.status[alone, 0] != Status.TRACKED).all()
@@ -267,7 +267,7 @@ def test_one_camera_keeps_a_track_on_its_line_of_sight():
     settings = line_settings(max_coasting_std_m=0.1)
     sure = track_detections(
         pair.cameras, from_detections(detections, pair, FRAMES), settings, fps=FPS, bounds_m=ROOM_M
-    )
+    )[0]
     stated = np.isfinite(sure.position_m[alone, 0]).all(axis=-1)
     assert stated[0]
     assert not stated[-1]
@@ -317,7 +317,7 @@ def test_a_part_of_a_drone_that_two_cameras_see_once_is_no_second_drone(seed, be
             boxes.insert(0, (part[name].frame, part[name].xyxy, part[name].confidence))
         whole[name] = Detections(*(np.concatenate(values) for values in zip(*boxes, strict=True)))
     sightings = from_detections(whole, RIG, len(truth_m))
-    tracked = track_detections(RIG.cameras, sightings, line_settings(), fps=FPS, bounds_m=ROOM_M)
+    tracked = track_detections(RIG.cameras, sightings, line_settings(), fps=FPS, bounds_m=ROOM_M)[0]
     assert tracked.num_drones == 1
     assert (tracked.status == Status.TRACKED).all()
 

@@ -38,7 +38,7 @@ from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.simulation import build, scenario
 from psotrack.sweeps import Perturbation, perturb
-from psotrack.tracking.camera_errors import views_of_sightings, with_camera_errors
+from psotrack.tracking.camera_errors import views_of_places, with_camera_errors
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings
 from psotrack.trajectories import Status, Trajectories
@@ -181,7 +181,7 @@ def labelled(rig: Rig, case: str, seed: int, num_frames: int) -> dict[str, Any]:
     )
     stated = turned(rig, turn_deg, rng)
     settings = TrackSettings()
-    tracks = track_detections(
+    tracks, places = track_detections(
         stated.cameras,
         sightings,
         settings,
@@ -190,7 +190,7 @@ def labelled(rig: Rig, case: str, seed: int, num_frames: int) -> dict[str, Any]:
     )
     found = (tracks.status == Status.TRACKED)[..., None]
     position_m = np.where(found, tracks.position_m, np.nan)
-    views = views_of_sightings(stated.cameras, sightings, position_m, tracks.velocity_m_s)
+    views = views_of_places(stated.cameras, places.middle_px, places.weight, position_m, tracks.velocity_m_s)
     corrected, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, FPS)
     partner = np.nanmedian(np.linalg.norm(position_m[:, :, None] - truth_m[:, None], axis=-1), axis=0).argmin(
         axis=1

@@ -43,7 +43,7 @@ from psotrack.pipeline.inputs import read_sightings
 from psotrack.recordings import Detections, write_detections
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
-from psotrack.tracking.camera_errors import views_of_places, views_of_sightings, with_camera_errors
+from psotrack.tracking.camera_errors import views_of_places, with_camera_errors
 from psotrack.tracking.lines import track_detections
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
@@ -207,21 +207,22 @@ def tracked(folder: Path, name: str, without: str, num_frames: int) -> dict[str,
         recording = recording.usable(chosen, num_frames, videos=False)
         run = prepare(recording, None, {}, TrackSettings(method="projection-lines"), Parts())
         assert run.sightings is not None
-        tracks = track_detections(
+        tracks, places = track_detections(
             recording.rig.cameras,
             run.sightings,
             run.settings,
             fps=recording.fps,
             bounds_m=run.volume.bounds_m,
         )
-        found = {"tracks": tracks, "sightings": run.sightings, "cameras": recording.rig.cameras}
+        found = {"tracks": tracks, "places": places, "cameras": recording.rig.cameras}
         found |= {"names": recording.rig.names, "fps": recording.fps, "time_s": recording.timeline().time_s}
         kept.write_bytes(pickle.dumps(found | {"settings": run.settings}))
     found = pickle.loads(kept.read_bytes())
     at = np.asarray(found["tracks"].status)[..., None] == Status.TRACKED
     states = (np.asarray(getattr(found["tracks"], each), float) for each in ("position_m", "velocity_m_s"))
     place_m, velocity_m_s = (np.where(at, state, np.nan) for state in states)
-    views = views_of_sightings(found["cameras"], found["sightings"], place_m, velocity_m_s)
+    middle_px, weight = found["places"].middle_px, found["places"].weight
+    views = views_of_places(found["cameras"], middle_px, weight, place_m, velocity_m_s)
     motion, given = found["settings"].motion, found["settings"].errors
     corrected, errors = with_camera_errors(found["tracks"], views, motion, given, found["fps"])
     covariances_m2 = [corrected.covariance_m2 + each for each in vars(errors.systematic).values()]

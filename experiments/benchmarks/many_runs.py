@@ -64,7 +64,7 @@ CORES = 2
 HOST = (
     ("births", SwarmRun, "search"),
     ("births", SwarmRun, "plan"),
-    ("camera errors", running, "views_of_middles"),
+    ("camera errors", running, "views_of_places"),
     ("camera errors", running, "with_camera_errors"),
     ("identities", results, "postprocess"),
 )

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Unpack
 
@@ -23,7 +23,14 @@ import numpy as np
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.foreground.detection import stored_detections
-from psotrack.foreground.silhouettes import Living, Silhouettes, compute, find_background, scaled_settings
+from psotrack.foreground.silhouettes import (
+    Exposures,
+    Living,
+    Silhouettes,
+    compute,
+    find_background,
+    scaled_settings,
+)
 from psotrack.pipeline.clocks import advise_on_clocks, estimate_clocks, with_clocks
 from psotrack.pipeline.inputs import Run, prepare, usable_for
 from psotrack.pipeline.parts import (
@@ -43,12 +50,7 @@ from psotrack.recordings import Recording
 from psotrack.settings import BLOBS, TrackSettings
 from psotrack.support import Report, measured_compiling, no_progress, processors
 from psotrack.tracking.births import MovingPoints, first_drones, given_state, known_motion, start_source
-from psotrack.tracking.camera_errors import (
-    CameraViews,
-    views_of_middles,
-    views_of_sightings,
-    with_camera_errors,
-)
+from psotrack.tracking.camera_errors import views_of_places, with_camera_errors
 from psotrack.tracking.fusion import fuse_tracks
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.swarm import Places, RunInputs, track_silhouettes, tracker_settings
@@ -218,9 +220,8 @@ def _track_by_swarm(runs: Sequence[Run], report: Report) -> dict[Run, MethodResu
 
     def with_errors(run: Run, found: tuple[Tracks, Places]) -> MethodResult:
         tracks, places = found
-        views = partial(views_of_middles, recording.rig.cameras, silhouettes.exposures, places)
         result = MethodResult(tracks, _points(tracks, "silhouette"), silhouettes.keys, shares)
-        return _with_camera_errors(run, result, views)
+        return _with_camera_errors(run, result, places, silhouettes.exposures)
 
     # NumPy computes most of it without Python's lock.
     with ThreadPoolExecutor(processors()) as threads:
@@ -232,7 +233,7 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
     assert run.sightings is not None
     rig, settings = run.recording.rig, run.settings
     with _timed() as seconds:
-        tracks = track_detections(
+        tracks, places = track_detections(
             rig.cameras,
             run.sightings,
             settings,
@@ -243,11 +244,11 @@ def _track_by_lines(run: Run, report: Report) -> MethodResult:
         )
     seconds["track"] += run.read_s
     result = MethodResult(tracks, _points(tracks, "box"), run.detection_keys, seconds)
-    return _with_camera_errors(run, result, partial(views_of_sightings, rig.cameras, run.sightings))
+    return _with_camera_errors(run, result, places)
 
 
 def _with_camera_errors(
-    run: Run, result: MethodResult, views_at: Callable[[np.ndarray, np.ndarray], CameraViews]
+    run: Run, result: MethodResult, places: Places, exposures: Exposures | None = None
 ) -> MethodResult:
     """The result with covariances that hold for the errors that the cameras show at the drones' places."""
     tracks, settings = result.tracks, run.settings
@@ -256,7 +257,9 @@ def _with_camera_errors(
     began = time.perf_counter()
     found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
     states = (np.asarray(value, np.float64) for value in (tracks.position_m, tracks.velocity_m_s))
-    views = views_at(*(np.where(found, state, np.nan) for state in states))
+    states = (np.where(found, state, np.nan) for state in states)
+    cameras = run.recording.rig.cameras
+    views = views_of_places(cameras, places.middle_px, places.weight, *states, exposures)
     tracks, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, run.recording.fps)
     seconds = {**result.seconds, "finish": time.perf_counter() - began}
     return replace(result, tracks=tracks, errors=errors, seconds=seconds)

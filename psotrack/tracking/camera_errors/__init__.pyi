@@ -10,7 +10,7 @@ from .covariances import (
 from .learning import Autocorrelation, CameraErrors, autocorrelation_of, learn_camera_errors
 from .tracks import TrackErrors, with_camera_errors
 from .variance_components import FittedPlaces, camera_variances
-from .views import CameraViews, views_of_middles, views_of_places, views_of_sightings
+from .views import CameraViews, views_of_places
 
 __all__ = [
     "Autocorrelation",
@@ -29,8 +29,6 @@ __all__ = [
     "noise_covariance",
     "noise_ratios",
     "systematic_covariances",
-    "views_of_middles",
     "views_of_places",
-    "views_of_sightings",
     "with_camera_errors",
 ]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from psotrack.foreground.silhouettes import Exposures, moved_by
 from psotrack.geometry import (
@@ -18,15 +18,9 @@ from psotrack.geometry import (
     project_with_jacobian,
     to_camera,
 )
-from psotrack.tracking.matching import Sightings
-from psotrack.tracking.swarm import Places
 
-#: A detection is of a drone if it is at most this many standard deviations from the drone's projection.
-_GATE = 5.0
 #: Number of frames that are computed at once: those of all frames would take gigabytes for a long recording.
 _FRAMES_AT_ONCE = 1000
-#: The standard deviation of a normal distribution over its median absolute deviation.
-_MAD_STD = 1.4826
 
 
 @dataclass(frozen=True)
@@ -136,56 +130,6 @@ def views_of_places(
     return CameraViews(cameras, exposures, position_m, velocity_m_s, *linear)
 
 
-def views_of_sightings(
-    cameras: Camera,
-    sightings: Sightings,
-    position_m: Float[np.ndarray, "frames drones 3"],
-    velocity_m_s: Float[np.ndarray, "frames drones 3"],
-) -> CameraViews:
-    """The views, from detections: the detection nearest to a drone's projection, if no other drone is nearer to it.
-
-    Args:
-        cameras: cameras with one leading axis.
-        sightings: detections of all cameras.
-        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where they are not known.
-    """
-    parts = []
-    for frames in _blocks(sightings.num_frames):
-        view = sightings[frames]
-        seen_m = _seen(position_m[frames], velocity_m_s[frames], view.exposures)
-        box, distance = _nearest(view, _visible(cameras, position_m[frames], seen_m))
-        frame, camera = np.ogrid[: len(box), : box.shape[2]]
-        at = (frame[:, None], camera[:, None], box)
-        parts.append((view.centre_px[at], view.noise_px[at], distance))
-    place_px, noise_px, distance = map(np.concatenate, zip(*parts, strict=True))
-    # Most detections are of the drones: their median distance shows the real noise, which may exceed the stated noise.
-    # Both axes together have a Rayleigh distribution, whose median is 1.18 standard deviations.
-    of_drone = np.isfinite(distance)
-    usual = np.median(distance[of_drone]) / 1.18 if of_drone.any() else 1.0
-    of_drone &= distance <= _GATE * max(1.0, float(usual))
-    place_px = np.where(of_drone[..., None], place_px, np.nan)
-    weight = np.where(of_drone, np.nan_to_num(noise_px, nan=np.inf) ** -2.0, 0.0)
-    weight = np.repeat(weight[..., None], 2, axis=-1)
-    views = views_of_places(cameras, place_px, weight, position_m, velocity_m_s, sightings.exposures)
-    return _without_outliers(views)
-
-
-def _nearest(
-    view: Sightings, pixels: Float[np.ndarray, "frames drones cameras 2"]
-) -> tuple[Int[np.ndarray, "frames drones cameras"], Float[np.ndarray, "frames drones cameras"]]:
-    """Number of the detection that is nearest to each drone, and its distance in standard deviations.
-
-    The distance is infinite where another drone is nearer to the detection, or where the camera has none.
-    """
-    off_px = view.centre_px[:, None] - pixels[..., None, :]
-    distance = np.linalg.norm(off_px, axis=-1) / view.noise_px[:, None]
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    box = distance.argmin(axis=-1)
-    nearest = np.take_along_axis(distance, box[..., None], axis=-1)[..., 0]
-    own_drone = np.take_along_axis(distance.argmin(axis=1), box.swapaxes(1, 2), axis=-1).swapaxes(1, 2)
-    return box, np.where(own_drone == np.arange(pixels.shape[1])[:, None], nearest, np.inf)
-
-
 def _blocks(num_frames: int) -> Iterator[slice]:
     """Blocks of frames that are computed at once."""
     return (slice(first, first + _FRAMES_AT_ONCE) for first in range(0, num_frames, _FRAMES_AT_ONCE))
@@ -215,36 +159,3 @@ def _visible(
     known = np.isfinite(position_m).all(axis=-1)[..., None]
     ahead = known & (depth > NEAR_M) & np.isfinite(pixels).all(axis=-1)
     return np.where(ahead[..., None], pixels, np.nan)
-
-
-def _without_outliers(views: CameraViews) -> CameraViews:
-    """The views without detections that are far from what is usual for their camera."""
-    off_px = views.residual_px - np.nanmedian(views.residual_px, axis=(0, 1)) if views.shown.any() else 0.0
-    spread_px = _MAD_STD * np.nanmedian(np.abs(off_px), axis=(0, 1)) if views.shown.any() else 1.0
-    far = (np.abs(off_px) > _GATE * np.maximum(spread_px, 1e-6)).any(axis=-1)
-    return replace(
-        views,
-        residual_px=np.where(far[..., None], np.nan, views.residual_px),
-        weight=np.where(far[..., None], 0.0, views.weight),
-    )
-
-
-def views_of_middles(
-    cameras: Camera,
-    exposures: Exposures | None,
-    middles: Places,
-    position_m: Float[np.ndarray, "frames drones 3"],
-    velocity_m_s: Float[np.ndarray, "frames drones 3"],
-) -> CameraViews:
-    """The views, from the middles of the foreground.
-
-    Args:
-        cameras: cameras with one leading axis.
-        exposures: exposures of the silhouettes; None where all cameras' frames were exposed at the instant.
-        middles: where the cameras show the drones.
-        position_m, velocity_m_s: (frames, drones, 3), the tracks, metres and m/s; NaN where a drone is not found.
-    """
-    # The score changes with a shift relative to the box, so a view counts by the square of this share.
-    weight = np.nan_to_num(np.square(1 / np.asarray(middles.half_px, np.float64)))
-    middle_px = np.asarray(middles.middle_px, np.float64)
-    return views_of_places(cameras, middle_px, weight, position_m, velocity_m_s, exposures)

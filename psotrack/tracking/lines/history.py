@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from psotrack.tracking.births import LostTracks, find_lost_tracks
 from psotrack.tracking.matching import Measurement
+from psotrack.tracking.swarm import Places
 from psotrack.trajectories import ARRAYS, Arrival, Status, Tracks, padded
 
 #: Number of last frames from which a drone's present width is taken: a drone looks wider or narrower as it turns.
@@ -34,10 +35,10 @@ class History:
     """The drones in all frames so far.
 
     Args:
-        num_frames: number of frames of the recording.
+        num_frames, num_cameras: numbers of frames and of cameras of the recording.
     """
 
-    def __init__(self, num_frames: int) -> None:
+    def __init__(self, num_frames: int, num_cameras: int) -> None:
         self._arrivals: list[Arrival] = []
         vector, matrix, number = (np.empty((num_frames, 0, *shape)) for shape in ((3,), (3, 3), ()))
         self._arrays = {
@@ -50,6 +51,8 @@ class History:
             "num_cameras": number.astype(int),
             "status": number.astype(int),
             "span_m": vector[..., :2],
+            "place_px": np.empty((num_frames, 0, num_cameras, 2)),
+            "noise_px": np.empty((num_frames, 0, num_cameras)),
         }
 
     def grow(self, num_drones: int) -> None:
@@ -92,6 +95,8 @@ class History:
                 "num_cameras": measured.num_cameras,
                 "fitness": measured.num_cameras / max(measured.num_cameras, num_in_view),
                 "span_m": measured.span_m,
+                "place_px": measured.place_px,
+                "noise_px": measured.noise_px,
             }
         for name, value in values.items():
             self._arrays[name][at] = value
@@ -119,12 +124,15 @@ class History:
             fps,
         )
 
-    def tracks(self, num_drones: int) -> Tracks:
-        """The tracks of all drones; the sizes are those of the boxes."""
+    def tracks(self, num_drones: int) -> tuple[Tracks, Places]:
+        """The tracks of all drones, and where the cameras show the drones; the sizes are those of the boxes."""
+        arrays = {name: array[:, :num_drones] for name, array in self._arrays.items()}
         size_m = self.sizes_m(num_drones).astype(np.float32)
-        return Tracks(
-            **{name: self._arrays[name][:, :num_drones] for name in ARRAYS},
+        noise_px = np.repeat(arrays["noise_px"][..., None], 2, axis=-1)
+        tracks = Tracks(
+            **{name: arrays[name] for name in ARRAYS},
             size_m=size_m,
             size_frames=np.zeros(size_m.shape, int),
             arrivals=tuple(sorted(self._arrivals, key=lambda arrival: arrival.frame)),
         )
+        return tracks, Places(arrays["place_px"], noise_px)

@@ -37,7 +37,7 @@ from psotrack.tracking.matching import (
     moved_to_instant,
 )
 from psotrack.tracking.motion import GATE_999
-from psotrack.tracking.swarm import DISPERSION_FRAMES
+from psotrack.tracking.swarm import DISPERSION_FRAMES, Places
 from psotrack.trajectories import Tracks
 
 #: Squared distance from the expected position, normalised by covariance, from which on a drone is elsewhere if trusted
@@ -54,11 +54,11 @@ def track_detections(
     bounds_m: Float[np.ndarray, "2 3"],
     known: tuple[Float[np.ndarray, "known 3"], Float[np.ndarray, "known 3"]] | None = None,
     report: Report = no_progress,
-) -> Tracks:
-    """Track the drones through all frames by their detections.
+) -> tuple[Tracks, Places]:
+    """Track the drones through all frames by their detections; returns tracks, and the drones' places in the images.
 
     The fitness is the share of the cameras with the drone in view whose detections agree on the drone. Sizes are those
-    of the boxes, as wide along x as along y.
+    of the boxes, as wide along x as along y. Places are those that the cameras would show at the instants.
 
     Args:
         cameras: cameras with one leading axis.
@@ -113,7 +113,7 @@ class _Tracker:
             ),
         )
         self._max_coasting_frames = round(settings.status.max_coasting_s * fps)
-        self._history = History(sightings.num_frames)
+        self._history = History(sightings.num_frames, len(cameras.K))
         self._drones: list[TrackedDrone] = []
 
     def start_known(
@@ -136,8 +136,8 @@ class _Tracker:
             self._note(frame, number, self._motion, number, measured.get(number))
         self._begin(frame)
 
-    def tracks(self) -> Tracks:
-        """The tracks of all drones."""
+    def tracks(self) -> tuple[Tracks, Places]:
+        """The tracks of all drones, and their places in the images."""
         return self._history.tracks(len(self._drones))
 
     def _followed(self) -> list[int]:

@@ -31,6 +31,8 @@ class Measurement:
         disagreement: squared reprojection errors over the noise, per degree of freedom.
         num_cameras, num_viewpoints: cameras whose sightings count, and their viewpoints.
         span_m: (2,), width and height of the sightings at the drone's distance, metres.
+        place_px, noise_px: (cameras, 2) and (cameras,), middles of the sightings that count and their standard
+            deviations along each axis, pixels; NaN for other cameras.
         surprising: whether the position is too far from the expected one to be an error of measurement.
     """
 
@@ -40,6 +42,8 @@ class Measurement:
     num_cameras: int
     num_viewpoints: int
     span_m: Float[np.ndarray, "2"]
+    place_px: Float[np.ndarray, "cameras 2"]
+    noise_px: Float[np.ndarray, "cameras"]
     surprising: bool = False
 
 
@@ -57,6 +61,8 @@ class Crossings:
         disagreement: (crossings,), squared reprojection errors over the noise, per degree of freedom: about 1 where the
             noise is right.
         span_m: (crossings, 2), width and height of the detections at that distance, median of the cameras, metres.
+        place_px, noise_px: (crossings, cameras, 2) and (crossings, cameras), middles of the detections that count and
+            their standard deviations, pixels; NaN for other cameras.
         ambiguity: (crossings,), likelihood of another assignment of the detections (see `Matches`).
     """
 
@@ -68,6 +74,8 @@ class Crossings:
     box: Int[np.ndarray, "crossings cameras"]
     disagreement: Float[np.ndarray, "crossings"]
     span_m: Float[np.ndarray, "crossings 2"]
+    place_px: Float[np.ndarray, "crossings cameras 2"]
+    noise_px: Float[np.ndarray, "crossings cameras"]
     ambiguity: Float[np.ndarray, "crossings"]
 
     def measurement(self, row: int) -> Measurement:
@@ -79,6 +87,8 @@ class Crossings:
             int(self.seen[row].sum()),
             int(self.num_viewpoints[row]),
             self.span_m[row],
+            self.place_px[row],
+            self.noise_px[row],
         )
 
     def numbered(self, drones: Int[np.ndarray, "expected"]) -> Crossings:
@@ -170,6 +180,8 @@ def crossings(
         box=groups.detection[kept],
         disagreement=squared.sum(axis=-1) / (2 * seen.sum(axis=-1) - 3),
         span_m=np.nanmedian(span_m, axis=1),
+        place_px=np.where(seen[..., None], centre_px[kept], np.nan),
+        noise_px=np.where(seen, noise_px[kept], np.nan),
         ambiguity=groups.ambiguity[kept],
     )
 

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+from jaxtyping import Float
 
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig
@@ -27,16 +28,22 @@ _MOST_SEARCHES = 3
 
 @dataclass(frozen=True)
 class Places:
-    """Where each camera shows the drones of a run; NumPy arrays with axes (frames, drones, cameras).
+    """Where each camera shows the drones of a run, and how much the camera counts in the drones' positions.
 
     Attributes:
-        middle_px: (frames, drones, cameras, 2), middles of the drones' foreground, pixels; pixel centres are at whole
-            numbers. NaN where the camera does not show the drone whole and clear of other drones.
-        half_px: (frames, drones, cameras, 2), half lengths of the drone's box; NaN where the drone is not in the image.
+        middle_px: (frames, drones, cameras, 2), middles of the drones' foreground or detections, pixels; pixel centres
+            are at whole numbers. NaN where the camera does not show the drone whole and clear of other drones.
+        scale_px: (frames, drones, cameras, 2), lengths in which the method measures errors along columns and rows: half
+            lengths of the drone's box, or standard deviations; NaN where the camera does not count.
     """
 
-    middle_px: np.ndarray
-    half_px: np.ndarray
+    middle_px: Float[np.ndarray, "frames drones cameras 2"]
+    scale_px: Float[np.ndarray, "frames drones cameras 2"]
+
+    @property
+    def weight(self) -> Float[np.ndarray, "frames drones cameras 2"]:
+        """(frames, drones, cameras, 2), weights of the views in the estimate; 0 where a camera does not count."""
+        return np.nan_to_num(np.square(1 / np.asarray(self.scale_px, np.float64)))
 
 
 @dataclass
