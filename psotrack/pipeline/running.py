@@ -256,10 +256,13 @@ def _with_camera_errors(
         return result
     began = time.perf_counter()
     found = (np.asarray(tracks.status) == Status.TRACKED)[..., None]
-    states = (np.asarray(value, np.float64) for value in (tracks.position_m, tracks.velocity_m_s))
-    states = (np.where(found, state, np.nan) for state in states)
+    position_m, velocity_m_s = (
+        np.where(found, np.asarray(value, np.float64), np.nan)
+        for value in (tracks.position_m, tracks.velocity_m_s)
+    )
     cameras = run.recording.rig.cameras
-    views = views_of_places(cameras, places.middle_px, places.weight, *states, exposures)
+    middle_px, weight = places.middle_px, places.weight
+    views = views_of_places(cameras, middle_px, weight, position_m, velocity_m_s, exposures)
     tracks, errors = with_camera_errors(tracks, views, settings.motion, settings.errors, run.recording.fps)
     seconds = {**result.seconds, "finish": time.perf_counter() - began}
     return replace(result, tracks=tracks, errors=errors, seconds=seconds)
