@@ -146,6 +146,7 @@ class Engine:
         self._cameras = setting.cameras
         self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
         self._threads = ThreadPoolExecutor(processors())
+        self._compiled: set[tuple[Program, int]] = set()
 
     def track(self, jobs: Sequence[Job], block: Block) -> list[tuple[Slots, Rows]]:
         """The drones after the block, and the rows of its frames in NumPy, for each job."""
@@ -182,7 +183,11 @@ class Engine:
             arguments = job.slots, block.frames, job.starts, self._cameras, job.params
             return jax.block_until_ready(_one_run(*arguments, job.program))
 
-        return [one(jobs[0])] if len(jobs) == 1 else list(self._threads.map(one, jobs))
+        # The first run compiles a new program, which threads would do each for itself.
+        new = (jobs[0].program, len(jobs[0].slots)) not in self._compiled
+        self._compiled.add((jobs[0].program, len(jobs[0].slots)))
+        first = [one(jobs[0])] if new or len(jobs) == 1 else []
+        return [*first, *self._threads.map(one, jobs[len(first) :])]
 
 
 _one_run = jax.jit(tracker.track, static_argnames="program")
