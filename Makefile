@@ -20,7 +20,57 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow fuzz kills lint format size bench bench-batch bench-end-to-end bench-live bench-gpu bench-scaling notebooks table4 table5 table5-quick table7 docs results results-check clean
+.PHONY: help demo test test-slow fuzz kills lint format size bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(VENV)/.package: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	  || { echo "psotrack: set-up failed: '$(PYTHON)' is not Python 3.11 or newer; name one, e.g. make PYTHON=python3.12" >&2; exit 1; }
+	@echo "psotrack: making a Python environment in $(VENV)"
+	@{ if command -v uv >/dev/null 2>&1; then \
+	    test -d $(VENV) || uv venv --quiet --python $(PYTHON) $(VENV); \
+	  else \
+	    test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV); \
+	  fi \
+	  && echo "psotrack: installing psotrack, its libraries (JAX, OpenCV, SciPy, pandas and more) and its viewer: 1.7 GB on the disk, some minutes" \
+	  && $(call install,view); } || { $(failed); exit 1; }
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.package
+	@echo "psotrack: installing what tests and lint need (Hypothesis, Jupyter, Playwright, ruff, mypy and more): 0.6 GB more, a minute or two"
+	@{ $(call install,test$(comma)lint) && $(oracle); } || { $(failed); exit 1; }
+	@touch $@
+
+demo: $(VENV)/.package  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
+	@$(BIN)/psotrack demo --out demo --force
+
+test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/test_video.py ..." for some files
+	@$(pytest) -m 'not slow' $(NAMES)
+
+test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and experiments at small sizes
+	@PSOTRACK_TYPE_CHECKS=off $(pytest) -m slow $(NAMES)
+
+fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINUTES=60 for more, SEED=7 for others
+	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
+
+kills: $(VENV)/.installed  ## kill commands at random moments and run them again; COUNT=1000 for more, SEED=7 for others
+	@$(BIN)/python experiments/kills.py --count $(or $(COUNT),300) --seed $(or $(SEED),0) --out build/kills-$(or $(SEED),0)
+
+lint: $(VENV)/.installed  ## ruff, its format check, mypy
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+format: $(VENV)/.installed  ## let ruff mend and format
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+size:  ## lines of code per room, and their budgets
+	@$(PYTHON) experiments/size.py
+
+bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -74,23 +124,8 @@ bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
 	@$(call install,bench)
 	@$(BIN)/python experiments/benchmarks/track_stage.py
 
-bench-end-to-end: $(VENV)/.installed  ## from videos to tracks, stage by stage: as fast as the cameras? twenty minutes
-	@$(BIN)/python experiments/benchmarks/end_to_end.py $(if $(DATA),--data $(DATA))
-
-bench-live: $(VENV)/.installed  ## live: delay of the rows, memory over an hour, cameras that stop; three quarters of an hour
-	@$(call install,bench)
-	@$(BIN)/python experiments/benchmarks/live.py delay $(if $(DATA),--data $(DATA))
-	@$(BIN)/python experiments/benchmarks/live.py memory $(if $(DATA),--data $(DATA))
-	@$(BIN)/python experiments/benchmarks/live.py stops $(if $(DATA),--data $(DATA))
-
-bench-batch: $(VENV)/.installed  ## 64 runs of 250 frames beside one run: seconds of the swarm, and of all that is not the swarm
-	@$(BIN)/python experiments/benchmarks/many_runs.py batch $(if $(DATA),--data $(DATA))
-
-bench-gpu: $(VENV)/.installed  ## a GPU against two cores: Table 5's grid, 64 runs at once, equal tracks; JAX for it: pip install -e '.[cuda]'
-	@$(BIN)/python experiments/benchmarks/many_runs.py gpu $(if $(DATA),--data $(DATA))
-
-bench-scaling: $(VENV)/.installed  ## cost per frame against cameras, drones, particles, image size; what breaks first; ten minutes
-	@$(BIN)/python experiments/benchmarks/scaling.py
+bench-videos bench-live bench-batch: $(VENV)/.installed  ## from videos to tracks; live; many runs at once: some minutes each
+	@$(BIN)/python experiments/benchmarks/benchmark.py $(@:bench-%=%) $(if $(DATA),--data $(DATA))
 
 notebooks: $(VENV)/.installed  ## run the notebooks and write them with their output; commit the changed files
 	@cd notebooks && ../$(BIN)/python _refresh.py
@@ -113,13 +148,10 @@ docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
-results: $(VENV)/.installed  ## make the results again that are older than their code, hours; ONLY=table4 for one, FORCE=1 for all
+results: $(VENV)/.installed  ## make the results again, hours; ONLY=table4 for one
 	@$(call install,bench)
-	@$(BIN)/python experiments/_results.py make $(ONLY) $(if $(FORCE),--force)
+	@$(BIN)/python experiments/_results.py make $(ONLY)
 	@$(BIN)/python docs/readme.py
-
-results-check:  ## name each result that is older than the code that it depends on
-	@$(if $(wildcard $(BIN)/python),$(BIN)/python,$(PYTHON)) experiments/_results.py check $(ONLY)
 
 clean:  ## remove what was built, the environment too
 	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .compiled

@@ -38,12 +38,16 @@ class MissingFigureError(Exception):
     """A result file does not hold the figure that a page shows."""
 
 
+def folder(name: str) -> Path:
+    """Folder of the files of a result: as declared, or that of the experiments that exist no more."""
+    declared = _results.registry()
+    return declared[name].record.parent if name in declared else ROOT / "experiments" / "history"
+
+
 @cache
 def record(name: str) -> dict[str, Any]:
     """The record of a result."""
-    if name not in _results.registry():
-        raise MissingFigureError(f"expected a result of experiments/results.toml, found {name!r}")
-    path = _results.registry()[name].record
+    path = folder(name) / f"{name}.json"
     if not path.exists():
         raise MissingFigureError(f"{path}: expected a record, found none; run `make results ONLY={name}`")
     return json.loads(path.read_text(encoding="utf-8"))
@@ -52,11 +56,10 @@ def record(name: str) -> dict[str, Any]:
 @cache
 def all_rows(name: str) -> pd.DataFrame:
     """All rows of a result, from its first CSV file."""
-    folder = _results.registry()[name].record.parent
     tables = [file for file in record(name)["files"] if file.endswith(".csv")]
     if not tables:
         raise MissingFigureError(f"{name}: expected a CSV file in the record, found none")
-    return pd.read_csv(folder / tables[0])
+    return pd.read_csv(folder(name) / tables[0])
 
 
 def rows(name: str, /, **where: Any) -> pd.DataFrame:
@@ -130,7 +133,7 @@ def result_table(name: str) -> str:
 
 def part(name: str, file: str, title: str) -> str:
     """The section below a title of a Markdown file of a result."""
-    path = _results.registry()[name].record.parent / file
+    path = folder(name) / file
     sections = path.read_text(encoding="utf-8").split("## ")
     found = [section.partition("\n")[2].strip() for section in sections if section.startswith(title)]
     if len(found) != 1:

@@ -1,21 +1,17 @@
-"""Result files of the experiments: how they are written, checked against the code, and made again.
+"""Result files of the experiments: how they are written, and made again.
 
-    python experiments/_results.py list               # the results, and the command that makes each of them
-    python experiments/_results.py check [NAME ...]   # each result that is older than its code (`make results-check`)
-    python experiments/_results.py make [NAME ...]    # makes the older results again (`make results`)
+    python experiments/_results.py list               # the results, when each was made, and the command that makes it
+    python experiments/_results.py make [NAME ...]    # makes the results again (`make results`)
 
-`results.toml` declares every result: its folder, its command, and the code that it depends on. An experiment writes its
-result with `Run.save`: rows as NAME.csv, and NAME.json, the record, with commit, machine, date, versions, command,
-digests of the files, and figures that are no rows. The pages in docs/ read these files when they are built.
-
-`make` skips results that are as new as their code, so an interrupted call goes on with the next result. `--force` makes
-the named results again in any case.
+`results.toml` declares every result: its folder and its commands. An experiment writes its result with `Run.save`: rows
+as NAME.csv, and NAME.json, the record, with commit, machine, date, versions, command, digests of the files, and figures
+that are no rows. The pages in docs/ read these files when they are built. Records in `history` are of experiments that
+exist no more.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
 import hashlib
 import json
 import os
@@ -25,12 +21,10 @@ import shlex
 import shutil
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from fnmatch import fnmatch
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -53,11 +47,7 @@ PACKAGES = (
     "zarr",
     "ezc3d",
 )
-PACKAGES += ("evosax", "pyswarms", "stonesoup")
-#: Keys that every record has.
-KEYS = ("result", "command", "commit", "dirty", "date", "machine", "versions", "files", "figures")
-#: Longest list of changed files that `check` prints for one result.
-MOST_FILES_SHOWN = 3
+PACKAGES += ("stonesoup",)
 
 
 @dataclass(frozen=True)
@@ -69,7 +59,6 @@ class Result:
         says: what the result shows, one line.
         folder: folder of the committed files, relative to the repository's root.
         commands: commands that make the result, in order, relative to the repository's root.
-        code: Git path patterns of the code that the result depends on.
         minutes: time that the commands take on two cores, roughly, minutes.
     """
 
@@ -77,7 +66,6 @@ class Result:
     says: str
     folder: Path
     commands: tuple[str, ...]
-    code: tuple[str, ...]
     minutes: float
 
     @property
@@ -90,17 +78,15 @@ class Result:
 def registry() -> dict[str, Result]:
     """All declared results by name, in the order of the file."""
     declared = tomllib.loads(REGISTRY.read_text(encoding="utf-8"))
-    groups = declared["code"]
     return {
         name: Result(
             name,
             entry["says"],
             Path(entry["folder"]),
             tuple(entry["commands"]),
-            tuple(path for one in entry["code"] for path in groups.get(one, [one])),
             entry["minutes"],
         )
-        for name, entry in declared["results"].items()
+        for name, entry in declared.items()
     }
 
 
@@ -117,7 +103,9 @@ class Run:
             "result": name,
             "command": " ".join(["python", *_portable(sys.argv, self._result.commands)]),
             "commit": _git("rev-parse", "HEAD") or None,
-            "dirty": dirty(self._result.code),
+            "dirty": [
+                line[3:] for line in _git("status", "--porcelain", "--untracked-files=no").splitlines()
+            ],
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         }
 
@@ -217,147 +205,24 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def dirty(code: Sequence[str]) -> list[str]:
-    """Files of the code that differ from the commit, or that Git does not know."""
-    status = _git("status", "--porcelain", "--untracked-files=all", "--", *code)
-    return sorted(line[3:] for line in status.splitlines())
-
-
-def reasons(result: Result) -> list[str]:
-    """Why a result is older than its code, one sentence each; empty if the result is as new as its code."""
-    if not result.record.exists():
-        return ["there is no record; the result was never made"]
-    record = json.loads(result.record.read_text(encoding="utf-8"))
-    missing = [key for key in KEYS if key not in record]
-    if missing:
-        return [f"the record lacks {', '.join(missing)}"]
-    found = []
-    if record.get("note"):
-        found.append(record["note"])
-    if record["dirty"]:
-        found.append(f"made from a working tree with changes in {_listed(record['dirty'])}")
-    for name, expected in record["files"].items():
-        path = result.record.parent / name
-        if not path.exists():
-            found.append(f"{name} is missing")
-        elif digest(path) != expected:
-            found.append(f"{name} is not the file that the record describes")
-    changed = dirty(result.code)
-    if changed:
-        found.append(f"the working tree has changes in {_listed(changed)}")
-    commit = record["commit"]
-    if not commit or _git("cat-file", "-t", commit) != "commit":
-        found.append(f"its commit {commit} is not in this clone")
-        return found
-    newer = newer_files(commit, result.code)
-    if newer:
-        found.append(f"code changed since {commit[:7]}: {_listed(newer)}")
-    return found
-
-
-def newer_files(commit: str, code: Sequence[str]) -> list[str]:
-    """Files of the code whose content changed between a commit and HEAD.
-
-    Docstrings, comments, the messages of errors and declared new names do not count.
-    """
-    names = _git("diff", "--name-only", "--no-renames", commit, "HEAD", "--", *code).splitlines()
-    return [name for name in names if not _same_code(commit, name)]
-
-
-def _same_code(commit: str, name: str) -> bool:
-    """Whether a Python file differs from that of the commit in docstrings, comments, messages, layout and names only.
-
-    Only names count that `results.toml` declares as renamed.
-    """
-    if not name.endswith((".py", ".pyi")):
-        return False
-    old, new = (_content(at, name) for at in (commit, "HEAD"))
-    if old is None or new is None:
-        return False
-    renamed = old
-    for before, after in _new_names().items():
-        renamed = re.sub(rf"\b{before}\b", after, renamed)
-    try:
-        return _stripped(new) in (_stripped(old), _stripped(renamed))
-    except SyntaxError:
-        return False
-
-
-@cache
-def _new_names() -> dict[str, str]:
-    """Declared renames: the name before -> the name today."""
-    return tomllib.loads(REGISTRY.read_text(encoding="utf-8")).get("renamed", {})
-
-
-@cache
-def _content(commit: str, name: str) -> str | None:
-    """Content of a file at a commit; None where the commit has no such file."""
-    return _git("show", f"{commit}:{name}", default=None)
-
-
-@cache
-def _stripped(source: str) -> str:
-    """The syntax tree of a source without docstrings and without the arguments of errors, which hold messages only."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            node.exc = node.exc.func
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
-            body = node.body
-            if body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
-                node.body = body[1:]
-    return ast.dump(tree)
-
-
-def check(names: Sequence[str]) -> int:
-    """Print each result that is older than its code, with the reasons; the exit code is 1 if there is one."""
-    tracked = _git("ls-files").splitlines()
-    older = 0
-    for result in _chosen(names):
-        why = reasons(result)
-        unmatched = [
-            path
-            for path in result.code
-            if not any(fnmatch(name, path) or name.startswith(f"{path}/") for name in tracked)
-        ]
-        why += [f"results.toml names {path}, which matches no file" for path in unmatched]
-        if why:
-            older += 1
-            print(f"{result.name}: {'; '.join(why)}")
-    total = len(_chosen(names))
-    print(f"{total - older} of {total} results are as new as their code")
-    return int(older > 0)
-
-
-def make(names: Sequence[str], *, force: bool) -> int:
-    """Make the older of these results again, one after the other; the exit code is 1 if a command failed."""
+def make(names: Sequence[str]) -> int:
+    """Make these results again, one after the other; the exit code is 1 if a command failed."""
     failed = []
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     for result in _chosen(names):
-        if not force and not reasons(result):
-            print(f"{result.name}: as new as its code", flush=True)
-            continue
         print(f"{result.name}: about {result.minutes:g} minutes on two cores", flush=True)
         missing = [name for name in _variables(result.commands) if not os.environ.get(name)]
         if missing:
-            print(
-                f"{result.name}: expected a value of {', '.join(missing)} in the environment, found none",
-                file=sys.stderr,
-            )
+            found = f"expected a value of {', '.join(missing)} in the environment, found none"
+            print(f"{result.name}: {found}", file=sys.stderr)
             failed.append(result.name)
-            continue
-        began = time.monotonic()
-        for command in result.commands:
+        for command in result.commands if not missing else ():
             print(f"$ {command}", flush=True)
-            words = [
-                sys.executable if word == "python" else os.path.expandvars(word)
-                for word in shlex.split(command)
-            ]
+            words = [os.path.expandvars(word) for word in shlex.split(command)]
+            words[0] = sys.executable
             if subprocess.run(words, cwd=ROOT, env=environment, check=False).returncode:
                 failed.append(result.name)
                 break
-        else:
-            print(f"{result.name}: made in {(time.monotonic() - began) / 60:.1f} minutes", flush=True)
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return int(bool(failed))
@@ -370,14 +235,6 @@ def _chosen(names: Sequence[str]) -> list[Result]:
             f"results: expected names of results.toml ({', '.join(registry())}), found {', '.join(sorted(unknown))}"
         )
     return [result for name, result in registry().items() if not names or name in names]
-
-
-def _listed(names: Sequence[str]) -> str:
-    """The first names of a list, and how many more there are."""
-    shown = ", ".join(names[:MOST_FILES_SHOWN])
-    return (
-        shown if len(names) <= MOST_FILES_SHOWN else f"{shown} and {len(names) - MOST_FILES_SHOWN} more files"
-    )
 
 
 def _portable(words: Sequence[str], commands: Iterable[str]) -> list[str]:
@@ -416,12 +273,12 @@ def _processor() -> str:
     return models[0] if models else platform.machine()
 
 
-def _git(*words: str, default: Any = "") -> Any:
-    """Output of a Git command, or `default` where the command fails or Git is missing."""
+def _git(*words: str) -> str:
+    """Output of a Git command; empty where the command fails or Git is missing."""
     try:
         done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
-        return default
+        return ""
     return done.stdout.rstrip("\n")
 
 
@@ -430,20 +287,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("action", choices=["list", "check", "make"])
+    parser.add_argument("action", choices=["list", "make"])
     parser.add_argument("names", nargs="*", metavar="NAME", help="results [default: all of results.toml]")
-    parser.add_argument(
-        "--force", action="store_true", help="make results again that are as new as their code"
-    )
     options = parser.parse_args()
-    if options.action == "list":
-        for result in _chosen(options.names):
-            print(f"{result.name:20} {result.minutes:4g} min  {result.says}")
-            print("".join(f"{'':30}{command}\n" for command in result.commands), end="")
-    elif options.action == "check":
-        sys.exit(check(options.names))
-    else:
-        sys.exit(make(options.names, force=options.force))
+    if options.action == "make":
+        sys.exit(make(options.names))
+    for result in _chosen(options.names):
+        made = "never"
+        if result.record.exists():
+            record = json.loads(result.record.read_text(encoding="utf-8"))
+            made = f"{record['date'][:10]}, commit {record['commit'][:7]}"
+        print(f"{result.name:20} {result.minutes:4g} min  {result.says}; made {made}")
+        print("".join(f"{'':30}{command}\n" for command in result.commands), end="")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,6 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from psotrack.foreground.silhouettes import SilhouetteSettings, compute, summed_area_table
 from psotrack.recordings.datasets import read_sequence
 from psotrack.settings import TrackSettings
-from psotrack.show.reports import PointCloud, Scene3D
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import keep_compiled
 from psotrack.tracking.births import first_drones, room_bounds
@@ -175,26 +174,6 @@ Image(filename=DATA / "swarm.gif")
 # begin as a wide cloud around the prediction, are pulled over the hill, swing to its other side, and settle on
 # the top. Right: the score of every particle and the best score so far. The best score is nearly final after a few
 # iterations; the remaining iterations improve the position by millimetres.*
-#
-# The same swarm in 3D, to turn with the mouse and to step through, iteration by iteration:
-
-# %%
-Scene3D(
-    time_s=np.arange(SHOWN_ITERATIONS) / 3,
-    clouds=(
-        PointCloud("particles", position_m[:SHOWN_ITERATIONS]),
-        PointCloud("best position", best_m[:, None], colour="#d55e00", size_px=11.0),
-        PointCloud(
-            "true position", np.tile(truth_m, (SHOWN_ITERATIONS, 1, 1)), colour="#009e73", size_px=9.0
-        ),
-    ),
-    step_name="iteration",
-)
-
-# %% [markdown]
-# *What to see: the particles (yellow), the best position so far (red) and the true position (green). The cloud is as wide
-# in height as it is from above, and it becomes flat first where the cameras determine the position best. The slider, and
-# the arrow keys after a click into the view, step through the iterations.*
 #
 # ## One swarm for each drone, or one swarm for all drones?
 #

@@ -17,17 +17,15 @@
 # `experiments/table5/results`; it tracks nothing itself.
 
 # %%
-import json
 import tomllib
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pandas as pd
-from IPython.display import Markdown
+from IPython.display import Image, Markdown
 
 from psotrack.support import COLOURS
 from psotrack.sweeps import pivot, render_table
-from psotrack.sweeps.figures import error_against_work
 
 # %%
 TABLE_5 = Path("../experiments/table5")
@@ -88,9 +86,7 @@ pd.DataFrame(published_m, index=["lowest mean error (mm)", "highest mean error (
 # ## The Pareto front
 
 # %%
-figure = error_against_work(rows, published=published_m)
-figure.set_dpi(DPI)
-figure
+Image(RESULTS / "error_against_work.png", width=900)
 
 # %% [markdown]
 # *What to see: a point is one number of particles and iterations with one method; to the right is more time per frame,
@@ -98,15 +94,7 @@ figure
 # is the Pareto front: no other point is both faster and more accurate than a point on it. Where the front is flat,
 # more work does not lower the error. The band is the range that the paper published.*
 
-# %%
-figure = error_against_work(rows, error="offset_removed_mean_error_m")
-figure.set_dpi(DPI)
-figure
-
 # %% [markdown]
-# *What to see: the same without the constant offsets, which hide the contribution of the swarm. The slope of a method
-# shows whether more particles or iterations still lower the error.*
-#
 # ## Run by run
 
 # %%
@@ -165,6 +153,4 @@ plt.show()
 # ## Origin of the results
 
 # %%
-manifest = json.loads((RESULTS / "_manifest.json").read_text())
-origin = pd.json_normalize(manifest["runs"])
-origin.drop(columns=[name for name in origin if name.startswith("grid")]).T
+rows["commit"].unique()

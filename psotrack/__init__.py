@@ -14,7 +14,7 @@ Own cameras, step by step or in one call
     RigSettings: what is known of the board and the lenses, and where the world is
     doctor: what disagrees in a calibration, before tracking; returns a `Diagnosis`
     track, track_runs: the drones of a recording, once or with several seeds; return a `TrackedRecording` per run
-    report: one HTML page about tracks, a sweep or a calibration
+    report: one HTML page about tracks
     overlay: videos with the tracks drawn into them
     save_picture: the middle moment of a flight in its cameras, with a map
     view_3d: the flight in 3D, in a notebook

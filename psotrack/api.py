@@ -251,11 +251,10 @@ def report(
     force: bool = False,
     progress: bool | Report = False,
 ) -> reports.WrittenPage:
-    """Write one HTML page about tracks, the results of a sweep, or a calibration.
+    """Write one HTML page about tracks.
 
     Args:
-        source: the result of `track`, or trajectories; or files of tracks of one flight; or the folder of a sweep's
-            results, or the JSON file of `psotrack calibrate rig --json`.
+        source: the result of `track`, or trajectories; or files of tracks of one flight.
         out: file that ends in .html; None: beside the source, with the same name.
         recording: the recording of the tracks; None: the one that their record names.
         pictures: whether events are shown with a picture, where there are videos.
@@ -267,14 +266,12 @@ def report(
         InputError: a file cannot be used.
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    return reports.write_report(
-        _flight(source, recording) if isinstance(source, Tracks) else _paths(source),
-        None if out is None else Path(out),
-        recording=recording,
-        pictures=pictures,
-        jobs=jobs,
-        force=force,
-        report=report_of(progress),
+    if out is None and isinstance(source, Tracks):
+        raise SettingsError("report, out", expected="a file that ends in .html", found="none")
+    flight = _flight(source, recording)
+    page = flight.tracks[0].path.with_suffix(".html") if out is None else Path(out)
+    return reports.write_flight_report(
+        page, flight, pictures=pictures, jobs=jobs, force=force, report=report_of(progress)
     )
 
 

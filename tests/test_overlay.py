@@ -174,7 +174,7 @@ def test_a_video_of_other_inputs_is_not_kept(folder, tmp_path, change):
         flight = replace(flight, recording=with_cameras(recording, times=late))
     else:
         video.write_bytes((folder / "flight" / "c1.avi").read_bytes())
-    with pytest.raises(OutputError, match=r"one of other inputs.*--force"):
+    with pytest.raises(OutputError, match=r"c0\.mp4: .*--force"):
         write_overlays(tmp_path / "out", flight, jobs=1)
 
 

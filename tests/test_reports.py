@@ -13,26 +13,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from evaluation_flights import on_x_axis
-from helpers import make_once, ring_rig
+from helpers import make_once
 
 import psotrack as pt
 from psotrack.cli import cli
-from psotrack.errors import OutputError, SettingsError
-from psotrack.geometry.rig_files import write_rig
+from psotrack.errors import OutputError
 from psotrack.recordings import Reference
 from psotrack.recordings.datasets import open_recording
 from psotrack.show.flights import flight_of, read_flight
-from psotrack.show.reports import (
-    MOST_BYTES,
-    MOST_ROWS,
-    PointCloud,
-    Scene3D,
-    view_3d,
-    write_flight_report,
-    write_page,
-)
+from psotrack.show.reports import MOST_BYTES, MOST_ROWS, view_3d, write_flight_report, write_page
+from psotrack.show.reports.scene import scene_data
 from psotrack.simulation import SimulationSettings, simulate
-from psotrack.sweeps import Store
 from psotrack.trajectories import Status, write_trajectories
 
 FRAMES = 24
@@ -230,8 +221,7 @@ class TestFlight:
 
 class TestScene:
     def test_positions_are_those_of_the_tracks(self):
-        tracks = on_x_axis([0, 1, None, 3], [5, 6, 7, 8])
-        (first, second) = Scene3D(tracks.time_s, flight_of(tracks).tracks, rig=ring_rig(3)).data()["drones"]
+        (first, second) = scene_data(flight_of(on_x_axis([0, 1, None, 3], [5, 6, 7, 8])))["drones"]
         np.testing.assert_array_equal(decoded(first["position_m"])[::3], [0, 1, np.nan, 3])
         np.testing.assert_array_equal(decoded(second["position_m"])[::3], [5, 6, 7, 8])
         np.testing.assert_array_equal(decoded(first["status"]), [0, 0, 2, 0])
@@ -240,133 +230,33 @@ class TestScene:
         """In float32, 500 km are known to 3 cm."""
         tracks = on_x_axis([0, 0.001, 0.002])
         far = replace(tracks, position_m=tracks.position_m + np.array([500_000.0, 5_000_000.0, 120.0]))
-        data = view_3d(far).data()
+        data = scene_data(flight_of(far))
         shown = decoded(data["drones"][0]["position_m"])[::3].astype(float) + data["origin_m"][0]
         np.testing.assert_allclose(shown - 500_000, [0, 0.001, 0.002], atol=1e-4)
 
-    def test_pyramids_of_cameras_open_along_their_view(self):
-        rig = ring_rig(3, coefficients=5)
-        for index, camera in enumerate(Scene3D(np.arange(2.0), rig=rig).data()["cameras"]):
+    def test_pyramids_of_cameras_open_along_their_view(self, flight):
+        read = read_flight([], flight / "Simulated_Data" / "S01_D2_A")
+        rig = read.recording.rig
+        for index, camera in enumerate(scene_data(read)["cameras"]):
             centre_m, corners_m = np.array(camera["centre_m"]), np.array(camera["corners_m"])
             forward = np.asarray(rig.cameras.T_cam_world[index])[2, :3]
             np.testing.assert_allclose(centre_m, rig.cameras.centre_world[index], atol=1e-12)
             depth_m = (corners_m - centre_m) @ forward
             np.testing.assert_allclose(depth_m, depth_m[0], rtol=1e-9)
             assert depth_m[0] > 0
+            # The corners are those of the image, without its distortion.
+            width, height = np.asarray(rig.cameras[index].image_size_wh)
+            seen = (corners_m - centre_m) @ np.asarray(rig.cameras.T_cam_world[index])[:3, :3].T
+            seen_px = seen @ np.asarray(rig.cameras[index].K).T / seen[:, 2:]
+            np.testing.assert_allclose(seen_px[2, :2], [width - 0.5, height - 0.5])
 
     def test_long_flights_show_every_nth_row(self):
-        count = 3 * MOST_ROWS
-        scene = view_3d(on_x_axis(list(range(count))))
-        assert len(decoded(scene.data()["time_s"])) == MOST_ROWS
-
-    def test_clouds_must_have_the_rows_of_the_scene(self):
-        with pytest.raises(SettingsError, match="particles: expected 3 rows, found 2"):
-            Scene3D(np.arange(3.0), clouds=(PointCloud("particles", np.zeros((2, 5, 3))),))
+        data = scene_data(flight_of(on_x_axis(list(range(3 * MOST_ROWS)))))
+        assert len(decoded(data["time_s"])) == MOST_ROWS
 
     def test_names_cannot_leave_the_script(self):
         tracks = replace(on_x_axis([0, 1]), drones=("</script><script>alert(1)</script>",))
         assert "</script><script>alert" not in view_3d(tracks)._repr_html_()
-
-
-class TestSweep:
-    def test_cells_are_listed_with_means_over_runs(self, tmp_path):
-        folder = fake_sweep(tmp_path / "results")
-        run("report", folder, "--out", tmp_path / "sweep.html")
-        text = (tmp_path / "sweep.html").read_text(encoding="utf-8")
-        rows = re.findall(r"<tr>(<td.*?)</tr>", text)
-        cells = [re.findall(r">([^<]*)</td>", row) for row in rows]
-        assert [cell[2] for cell in cells] == ["50", "10"]
-        assert [cell[3] for cell in cells] == ["10.0", "20.0"]
-        assert [cell[-1] for cell in cells] == ["yes", "yes"]
-        assert "<svg" in text
-        assert "no further files" in refused("report", folder, tmp_path, "--out", tmp_path / "other.html")
-
-
-def fake_sweep(folder):
-    """Results of two cells with two runs each."""
-    import pandas as pd
-
-    store = Store(folder)
-    for particles, error_m, work in ((10, 0.02, 1.0), (50, 0.01, 5.0)):
-        rows = pd.DataFrame(
-            {
-                "cell": f"cell{particles}",
-                "sequence": "S01",
-                "method": "psotrack",
-                "seed": [0, 1],
-                "settings.swarm.particles": particles,
-                "settings.swarm.iterations": 20,
-                "mean_error_m": [error_m - 0.001, error_m + 0.001],
-                "p95_error_m": 2 * error_m,
-                "offset_removed_mean_error_m": error_m / 2,
-                "hota": 0.99,
-                "missed_rate": 0.0,
-                "track_ms_per_frame": work,
-            }
-        )
-        errors = pd.DataFrame(
-            {
-                "frame": [0, 1],
-                "time_s": [0.0, 0.1],
-                "drone": pd.Categorical(["d0", "d0"]),
-                "error_m": np.float32(error_m),
-                "switch": False,
-                "seed": [0, 1],
-            }
-        )
-        store.add(f"cell{particles}", rows, errors)
-    return folder
-
-
-def fake_calibration(folder):
-    """What `calibrate rig --json` writes for two cameras, and the rig."""
-    folder.mkdir(exist_ok=True)
-    write_rig(folder / "rig.toml", ring_rig(2))
-    camera = {
-        "lens": "5",
-        "views": 12,
-        "corners": 300,
-        "found": 310,
-        "rms_px": 0.31,
-        "median_px": 0.2,
-        "own_median_px": 0.15,
-        "covered": 0.6,
-        "coverage": [[0, 3, 9], [1, 0, 4]],
-        "image_size_wh": [320, 240],
-        "focal_px": [250.0, 251.0],
-        "focal_std_px": [0.5, None],
-        "centre_m": [0.0, 1.0, 2.0],
-        "centre_std_m": [0.001, 0.002, 0.002],
-        "best_partner": "c1",
-        "shared": 8,
-    }
-    record = {
-        "rig": "rig.toml",
-        "cameras": {"c0": camera, "c1": {**camera, "rms_px": 0.52}},
-        "print": [],
-        "worst_views": [{"camera": "c1", "frame": 7, "residual_px": 1.25}],
-        "advice": ["camera c1 sees little of its border"],
-        "world": "that of camera c0",
-    }
-    path = folder / "calibration.json"
-    path.write_text(json.dumps(record), encoding="utf-8")
-    return path
-
-
-class TestCalibration:
-    def test_cameras_coverage_and_advice(self, tmp_path):
-        path = fake_calibration(tmp_path)
-        run("report", path, "--out", tmp_path / "calibration.html")
-        text = (tmp_path / "calibration.html").read_text(encoding="utf-8")
-        assert "camera c1 sees little of its border" in text
-        assert "c1 frame 7: 1.25 px" in text
-        assert text.count("<title>9 corners</title>") == 2
-        assert text.count("<rect") == 2 * 4  # empty parts are not drawn
-
-    def test_a_rig_that_is_gone(self, tmp_path):
-        path = fake_calibration(tmp_path)
-        (tmp_path / "rig.toml").unlink()
-        assert "expected the rig rig.toml" in refused("report", path, "--out", tmp_path / "calibration.html")
 
 
 @pytest.mark.slow
@@ -422,25 +312,14 @@ class TestInABrowser:
             shown.evaluate("document.querySelector('.scene').scene.show(9)")
             assert shown.evaluate(visible) == 1
 
-    def test_pages_of_a_sweep_and_of_a_calibration(self, chromium, tmp_path):
-        run("report", fake_sweep(tmp_path / "results"), "--out", tmp_path / "sweep.html")
-        run("report", fake_calibration(tmp_path), "--out", tmp_path / "calibration.html")
-        with browser.open_page(chromium, tmp_path / "sweep.html", width=400) as shown:
-            assert shown.evaluate("document.documentElement.scrollWidth") <= 400
-            assert shown.locator("figure svg").count() == 2
-        with browser.open_page(chromium, tmp_path / "calibration.html", width=400) as shown:
-            shown.wait_for_selector(".scene canvas")
-            assert shown.evaluate("document.documentElement.scrollWidth") <= 400
-
     def test_a_view_of_a_notebook(self, chromium, tmp_path):
-        cloud = PointCloud("particles", np.random.default_rng(0).normal(size=(4, 30, 3)))
-        scene = Scene3D(np.arange(4.0), clouds=(cloud,), step_name="iteration")
         path = tmp_path / "cell.html"
-        path.write_text(f"<!doctype html><title>cell</title>{scene._repr_html_()}", encoding="utf-8")
+        cell = view_3d(on_x_axis([0, 1, 2, 3]))._repr_html_()
+        path.write_text(f"<!doctype html><title>cell</title>{cell}", encoding="utf-8")
         with browser.open_page(chromium, path) as shown:
             cell = shown.frame_locator("iframe")
             cell.locator(".scene canvas").wait_for()
-            assert cell.locator(".scene-clock").inner_text() == "iteration 0"
+            assert cell.locator(".scene-clock").inner_text() == "0.00 s"
 
     def test_without_webgl_the_rest_of_the_page_works(self, page):
         with browser.open_browser(["--disable-gpu", "--disable-3d-apis", "--no-sandbox"]) as blind:

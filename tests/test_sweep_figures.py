@@ -1,17 +1,20 @@
-"""Figures of sweeps, whose lines and bars must equal the results, and the errors over time in two of the figures."""
+"""The figure of Table 5, whose lines and bars must equal the results; and errors over time."""
 
-import cv2
-import matplotlib.colors
+import sys
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.errors import OutputError, SettingsError
+from psotrack.errors import SettingsError
 from psotrack.evaluation import errors_over_time, evaluate
-from psotrack.sweeps import figures
 from psotrack.trajectories import Status, Trajectories
+
+sys.path.append(str(Path(__file__).parents[1] / "experiments" / "table5"))
+import _pareto
 
 NUM_FRAMES = 50
 
@@ -77,7 +80,7 @@ def test_no_cell_dominates_a_cell_of_the_front(cells):
         )
 
     expected = [one for one in range(len(cells)) if np.isfinite(cells[one]).all() and not dominated(one)]
-    front = figures.pareto_front(work, error)
+    front = _pareto.pareto_front(work, error)
     assert sorted(front) == expected
     assert (np.diff(work[front]) > 0).all()
     assert (np.diff(error[front]) < 0).all()
@@ -108,7 +111,7 @@ def lines_of(axes):
 
 class TestErrorAgainstWork:
     def test_points_front_and_published(self):
-        figure = figures.error_against_work(rows(), published={"S02": (0.068, 0.068)})
+        figure = _pareto.error_against_work(rows(), published={"S02": (0.068, 0.068)})
         first, second = figure.axes
         assert [axes.get_title(loc="left") for axes in (first, second)] == ["S01", "S02"]
         # The paper's method with 20 x 50 has the smallest work, ours with 30 x 50 the smallest error.
@@ -124,58 +127,11 @@ class TestErrorAgainstWork:
 
     def test_a_missing_column_is_an_error(self):
         with pytest.raises(SettingsError, match="track_ms_per_frame"):
-            figures.error_against_work(rows().drop(columns="track_ms_per_frame"))
+            _pareto.error_against_work(rows().drop(columns="track_ms_per_frame"))
 
 
-def errors():
-    """Errors of three runs; in the last run they are twice as large, without identity switches."""
-    parts = [errors_over_time(*flights()).assign(seed=seed) for seed in (3, 4, 5)]
-    parts[2] = parts[2].assign(error_m=2 * parts[2]["error_m"], switch=False)
-    parts[1] = parts[1].assign(error_m=1.5 * parts[1]["error_m"])
-    return pd.concat(parts, ignore_index=True)
-
-
-def test_error_over_time():
-    (axes,) = figures.error_over_time({"paper": errors()}, "S02").axes
-    assert axes.get_title(loc="left") == "paper: run 4, the median of 3"
-    drawn = lines_of(axes)
-    np.testing.assert_allclose(drawn["dron1"][:40, 1], 30.0)
-    np.testing.assert_allclose(drawn["dron1"][:, 0], np.arange(NUM_FRAMES) / 25)
-    (switches,) = axes.collections
-    np.testing.assert_allclose([line[:, 0] for line in switches.get_segments()], 1.6)
-    np.testing.assert_allclose(drawn["switch in another run"][:, 0], 1.6)
-    assert "missed" in drawn
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "error (mm)")
-
-
-def test_error_per_drone():
-    one = errors()
-    (axes,) = figures.error_per_drone({"S02": {"paper": one, "ours": one.assign(error_m=0.01)}}).axes
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["dron1", "dron2"]
-    medians = sorted(line.get_ydata()[0] for line in axes.lines if line.get_color() == "white")
-    # The drone dron1 has 40 frames of 20, 30 and 40 mm, and ten frames of metres in each run.
-    np.testing.assert_allclose(medians[:2], 10.0)
-    assert medians[2] == pytest.approx(30.0)
-
-
-def test_a_method_has_one_colour_in_all_figures():
-    """Whatever the order of the rows, which was that of digests, and with some methods missing in a figure."""
-    (first, _), (second, _) = (figures.error_against_work(each).axes for each in (rows(), rows().iloc[::-1]))
+def test_a_method_has_one_colour_whatever_the_order_of_the_rows():
+    """The order was that of digests."""
+    (first, _), (second, _) = (_pareto.error_against_work(each).axes for each in (rows(), rows().iloc[::-1]))
     bars = [{of.get_label(): of.lines[0].get_color() for of in axes.containers} for axes in (first, second)]
     assert bars[0] == bars[1]
-    (boxes,) = figures.error_per_drone({"S02": {"paper": errors()}}, rows()["method"]).axes
-    (handle,) = boxes.get_legend_handles_labels()[0]
-    assert matplotlib.colors.same_color(handle.get_facecolor(), bars[0]["paper"])
-
-
-def test_a_saved_figure_is_only_replaced_with_force(tmp_path):
-    path = tmp_path / "figures" / "work.png"
-    figures.save(path, figures.error_against_work(rows()))
-    drawn = cv2.imread(str(path))[..., ::-1].reshape(-1, 3)
-    for colour in figures.method_colours(["paper", "ours"]).values():
-        rgb = np.multiply(255, matplotlib.colors.to_rgb(colour)).round()
-        assert (drawn == rgb).all(axis=1).sum() > 20
-    with pytest.raises(OutputError, match=r"work\.png"):
-        figures.save(path, figures.error_against_work(rows()))
-    figures.save(path, figures.error_against_work(rows()), force=True)
-    assert [child.name for child in path.parent.iterdir()] == ["work.png"]

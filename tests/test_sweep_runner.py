@@ -1,4 +1,4 @@
-"""Sweeps on a very small sequence: cells, rows, resuming, failures, tables and estimates.
+"""Sweeps on a very small sequence: cells, rows, resuming, failures and tables.
 
 Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
 """
@@ -27,7 +27,7 @@ from psotrack.cli import main
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
 from psotrack.support import compiled, register_plugin
-from psotrack.sweeps import Inputs, Store, cell_key, estimate, machine, runner, sweep
+from psotrack.sweeps import Inputs, Store, cell_key, machine, plan, runner, sweep
 from psotrack.sweeps import grid as grid_of
 from psotrack.sweeps import inputs as inputs_of_cells
 from psotrack.sweeps.locks import Locks
@@ -138,7 +138,7 @@ def test_one_row_per_cell_and_run(swept: Path) -> None:
     share_s = rows["seconds.batch"] / rows["runs_in_batch"]
     np.testing.assert_allclose(rows["real_time_factor"], 6 / 25 / share_s, rtol=0.006)
     assert (rows["real_time_factor_running"] > rows["real_time_factor"]).all()
-    # The folder is one Parquet data set, with failures, errors and a manifest in it.
+    # The folder is one Parquet data set, with failures and the grids that were run in it.
     data_set = pd.read_parquet(swept / "results")
     pd.testing.assert_frame_equal(data_set, Store(swept / "results").rows(), check_dtype=False)
 
@@ -161,19 +161,15 @@ def test_finished_cells_are_not_run_again(root: Path, swept: Path) -> None:
     assert again.returncode == 0, again.stderr
     assert "0 cells finished now, 4 before" in again.stdout
     assert stamps(swept / "results") == before
-    # The manifest has both grids, and the same origin as the rows.
-    manifest = json.loads((swept / "results" / "_manifest.json").read_text())
-    assert [run["cells"] for run in manifest["runs"]] == [8, 4]
-    assert manifest["runs"][1]["grid"]["methods"] == {"usual": {}, "calm": {"swarm.inertia": 0.4}}
+    # Both grids are noted, with the same origin as the rows.
+    runs = [json.loads(path.read_text()) for path in (swept / "results" / "_runs").glob("*.json")]
+    assert sorted(run["cells"] for run in runs) == [4, 8]
+    assert all(run["grid"]["methods"] == {"usual": {}, "calm": {"swarm.inertia": 0.4}} for run in runs)
     rows = all_rows(swept / "results")
-    assert list(manifest["inputs"]) == rows["input"].unique().tolist()
-    assert {run["device"]["processor"] for run in manifest["runs"]} == set(rows["device.processor"])
-    assert {run["commit"] for run in manifest["runs"]} == set(rows["commit"])
+    assert {run["device"]["processor"] for run in runs} == set(rows["device.processor"])
+    assert {run["commit"] for run in runs} == set(rows["commit"])
     assert len(sweep(swept / "good.toml", swept / "results", data=root, cache=root / "cache").rows()) == 8
     assert stamps(swept / "results") == before
-    once_more = json.loads((swept / "results" / "_manifest.json").read_text())["runs"]
-    assert [run["cells"] for run in once_more] == [8, 4]
-    assert once_more[1]["last"] != manifest["runs"][1]["last"]
 
 
 @pytest.mark.slow
@@ -197,25 +193,13 @@ def test_a_table_of_the_results(swept: Path, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.slow
-def test_an_estimate_counts_the_cells_and_takes_the_time_of_finished_runs(
-    root: Path, tracker: Tracker, tmp_path: Path
-) -> None:
-    store, inputs = Store(tmp_path), Inputs(root, root / "cache")
-    cells = grid_of(varied(3, 30, runs=2)).cells()
-    before = estimate(cells, inputs, store)
-    assert (before.cells, before.finished, before.runs, before.total_s) == (2, 0, 4, None)
-    assert f"{before}" == (
-        "2 cells: 0 finished, 2 to run (4 runs); how long they take is known when a cell is finished"
-    )
-    rows = sweep(varied(3, runs=2), tmp_path, data=root, cache=root / "cache").rows()
-    # Two runs in a batch of 31 s, each of which compiled for 10 s.
-    rows["seconds.batch"], rows["seconds.compile"] = 31.0, 10.0
-    store.add(rows["cell"][0], rows, pd.DataFrame({"seed": [0, 1]}))
-    after = estimate(cells, inputs, store)
-    assert f"{after}" == (
-        "2 cells: 1 finished, 1 to run (2 runs), about 11 s at 5.5 s per run, as the finished runs"
-    )
-    assert after.to_dict()["total_s"] == 11.0
+def test_a_plan_counts_the_cells_and_runs(root: Path, tracker: Tracker, tmp_path: Path) -> None:
+    store, inputs, grid = Store(tmp_path), Inputs(root, root / "cache"), grid_of(varied(3, 30, runs=2))
+    assert f"{plan(grid, inputs, store)}".endswith("\n2 cells: 0 finished, 2 to run (4 runs)")
+    sweep(varied(3, runs=2), tmp_path, data=root, cache=root / "cache")
+    after = plan(grid, inputs, store)
+    assert f"{after}".endswith("\n2 cells: 1 finished, 1 to run (2 runs)")
+    assert (after.to_dict()["finished"], after.to_dict()["runs"]) == (1, 2)
 
 
 def test_a_dry_run_shows_the_cells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -404,9 +388,11 @@ def test_only_the_instants_of_a_run_count(root: Path, tmp_path: Path) -> None:
     rows = sweep(grid, tmp_path / "out", **folders).rows()
     assert rows["missed_rate"].tolist() == [0.0, 0.0]
     assert (rows["mean_error_m"] < 0.2).all()
-    frames = [Store(tmp_path / "out").errors(key, [0])["frame"].nunique() for key in rows["cell"]]
     known = open_recording(root / "Simulated_Data" / "S01_D2_A").truth.seen.any(axis=1)
-    assert frames == [known[:4].sum(), known[:4:2].sum()]
+    for rate_hz, kept in ((None, known[:4]), (12.5, known[:4:2])):
+        (cell,) = grid_of({**grid, "grid": {"frames": [4]}}).cells()
+        given = Inputs(root, root / "cache").read(cell)
+        assert given.reference(rate_hz).seen.any(axis=1).sum() == kept.sum()
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from psotrack.errors import InputError
 from psotrack.sweeps import Store, locks
 
 KEY = "0" * 40
-#: A run in a manifest.
+#: A run.
 RUN = {"grid": {"settings": {}, "methods": {}, "axes": {}}}
 
 
@@ -33,14 +32,6 @@ def rows(*seeds: int, error_m: float = 0.01) -> pd.DataFrame:
     return pd.DataFrame({"seed": list(seeds), "mean_error_m": [error_m + seed for seed in seeds]})
 
 
-def add(store: Store, key: str, new: pd.DataFrame) -> None:
-    """Add rows, and the errors of two frames for each row."""
-    frames = pd.concat(
-        [new.assign(frame=frame, drone="dron1", error_m=new["mean_error_m"]) for frame in (0, 1)]
-    )
-    store.add(key, new, frames[["seed", "frame", "drone", "error_m"]])
-
-
 def lock_path(store: Store) -> Path:
     return store.folder / "cells" / f".{KEY}.lock"
 
@@ -48,7 +39,7 @@ def lock_path(store: Store) -> Path:
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the threads of a process are listed there")
 def test_reading_starts_no_threads(tmp_path: Path) -> None:
     """A thread of Arrow's that still had the content when a sweep ended aborted the sweep, once in fifty times."""
-    add(Store(tmp_path), KEY, rows(2, 0))
+    Store(tmp_path).add(KEY, rows(2, 0))
     program = """
 import os, sys
 import pandas, pyarrow.parquet
@@ -66,36 +57,29 @@ print(len(os.listdir("/proc/self/task")) - before)
 def test_rows_of_more_seeds_are_added(tmp_path: Path) -> None:
     store = Store(tmp_path)
     assert store.finished_seeds(KEY) == set()
-    add(store, KEY, rows(2, 0))
-    add(store, KEY, rows(1))
+    store.add(KEY, rows(2, 0))
+    store.add(KEY, rows(1))
     assert store.finished_seeds(KEY) == {0, 1, 2}
     pd.testing.assert_frame_equal(store.rows(), rows(0, 1, 2))
-    assert store.errors(KEY, [0, 2])[["seed", "frame"]].to_numpy().tolist() == [
-        [0, 0],
-        [0, 1],
-        [2, 0],
-        [2, 1],
-    ]
 
 
 def test_a_seed_that_is_run_again_replaces_its_row(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    add(store, KEY, rows(0, 1))
-    add(store, KEY, rows(1, error_m=5.0))
+    store.add(KEY, rows(0, 1))
+    store.add(KEY, rows(1, error_m=5.0))
     assert store.rows()["mean_error_m"].tolist() == [0.01, 6.0]
-    assert store.errors(KEY, range(2))["error_m"].tolist() == [0.01, 0.01, 6.0, 6.0]
 
 
 def test_only_the_input_that_was_used_last_counts(tmp_path: Path) -> None:
     """Rows of an older tracker, or of another recording, stay in the folder and are not mixed with the others."""
     store = Store(tmp_path)
-    for key, error_m in (("a-old", 1.0), ("a-new", 2.0), ("b-old", 3.0)):
-        add(store, key, rows(0, error_m=error_m))
-    store.change_manifest(lambda manifest: manifest["inputs"].update(old={}, new={}))
+    for age, (key, error_m) in enumerate((("a-new", 2.0), ("a-old", 1.0), ("b-old", 3.0))):
+        store.add(key, rows(0, error_m=error_m))
+        os.utime(tmp_path / "cells" / f"{key}.parquet", (1000 - age, 1000 - age))
     assert store.rows()["mean_error_m"].tolist() == [2.0, 3.0]
     assert store.status()["finished"] == 2
     # The older tracker is used again.
-    store.change_manifest(lambda manifest: manifest["inputs"].update(old=manifest["inputs"].pop("old")))
+    store.use("a-old")
     assert store.rows()["mean_error_m"].tolist() == [1.0, 3.0]
     assert store.rows({"a-new": [0]})["mean_error_m"].tolist() == [2.0]
 
@@ -103,14 +87,14 @@ def test_only_the_input_that_was_used_last_counts(tmp_path: Path) -> None:
 def test_cells_are_sorted_by_their_settings(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for key, particles in (("c", 20), ("a", 100), ("b", 3)):
-        add(store, key, rows(0).assign(sequence="S01", **{"settings.swarm.particles": particles}))
+        store.add(key, rows(0).assign(sequence="S01", **{"settings.swarm.particles": particles}))
     assert store.rows()["settings.swarm.particles"].tolist() == [3, 20, 100]
 
 
 def test_rows_of_some_cells_and_seeds(tmp_path: Path) -> None:
     store, other = Store(tmp_path), "1" * 40
-    add(store, KEY, rows(0, 1, 2))
-    add(store, other, rows(0, error_m=5.0))
+    store.add(KEY, rows(0, 1, 2))
+    store.add(other, rows(0, error_m=5.0))
     pd.testing.assert_frame_equal(store.rows({KEY: range(1, 3)}), rows(1, 2))
     assert store.rows({other: [0], KEY: [0], "2" * 40: [0]})["mean_error_m"].tolist() == [5.0, 0.01]
 
@@ -118,7 +102,7 @@ def test_rows_of_some_cells_and_seeds(tmp_path: Path) -> None:
 def test_a_half_written_file_is_no_result(tmp_path: Path) -> None:
     """A runner that is killed while it writes leaves a temporary file."""
     store = Store(tmp_path)
-    add(store, KEY, rows(0))
+    store.add(KEY, rows(0))
     left = tmp_path / "cells" / f".{KEY}.0a1b2c3d.partial.parquet"
     left.write_bytes(b"PAR1")
     assert len(store.rows()) == 1
@@ -146,12 +130,12 @@ def test_a_failure_is_stored_until_it_is_removed(tmp_path: Path) -> None:
 
 
 def test_the_folder_is_a_parquet_data_set_of_the_rows(tmp_path: Path) -> None:
-    """Also with errors, failures, a manifest and a locked cell in the folder."""
+    """Also with failures, grids that were run and a locked cell in the folder."""
     store = Store(str(tmp_path))
-    add(store, KEY, rows(0, 1))
-    add(store, "1" * 40, rows(2))
+    store.add(KEY, rows(0, 1))
+    store.add("1" * 40, rows(2))
     store.add_failure("2" * 40, "no such camera", {"sequence": "S01", "method": "ours"})
-    store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
+    store.add_run(RUN)
     with store.lock("3" * 40):
         pd.testing.assert_frame_equal(pd.read_parquet(tmp_path), store.rows())
 
@@ -257,20 +241,12 @@ def test_a_holder_keeps_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             time.sleep(0.01)
 
 
-def test_one_process_at_a_time_changes_the_manifest(tmp_path: Path) -> None:
+def test_each_grid_and_version_is_noted_once(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    assert store.manifest() == {"runs": [], "inputs": {}}
-
-    def count() -> None:
-        for _ in range(5):
-            store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
-
-    threads = [threading.Thread(target=count) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert store.manifest()["runs"] == [RUN] * 20
+    for run in (RUN, RUN, RUN | {"commit": "1"}):
+        store.add_run(run)
+    noted = [json.loads(path.read_text()) for path in (tmp_path / "_runs").iterdir()]
+    assert sorted(noted, key=len) == [RUN, RUN | {"commit": "1"}]
 
 
 def test_missing_results_are_one_clear_line(tmp_path: Path) -> None:
@@ -278,27 +254,14 @@ def test_missing_results_are_one_clear_line(tmp_path: Path) -> None:
         Store(tmp_path).status()
     with pytest.raises(InputError, match="no finished cell"):
         Store(tmp_path).rows()
-    with pytest.raises(InputError, match="expected errors of a finished cell"):
-        Store(tmp_path).errors(KEY, [0])
-    # The manifest of no run is empty.
-    assert json.dumps(Store(tmp_path).manifest()) == '{"runs": [], "inputs": {}}'
 
 
 @pytest.fixture(scope="module")
 def one_cell(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    """A folder with a finished cell, a failed cell and a manifest."""
+    """A folder with a finished cell."""
     store = Store(tmp_path_factory.mktemp("one_cell"))
-    add(store, KEY, rows(0, 1, 2))
-    store.add_failure("f" * 40, "no such video", {"sequence": "S01", "method": "default"})
-    store.change_manifest(lambda manifest: manifest["runs"].append(RUN))
+    store.add(KEY, rows(0, 1, 2))
     return store
-
-
-def _content(store: Store) -> tuple[str, str, object, object]:
-    """Everything that a folder says."""
-    errors = store.errors(KEY, range(3))
-    manifest = {name: store.manifest()[name] for name in ("runs", "inputs")}
-    return store.rows().to_csv(), errors.to_csv(), manifest, store.status()["errors"]
 
 
 @settings(max_examples=60)
@@ -307,9 +270,7 @@ def test_damage_is_an_error_that_names_the_file_and_never_another_result(
     one_cell: Store, data: st.DataObject
 ) -> None:
     """One changed bit, or a file cut short: the same content as before, or an error of one line."""
-    whole = _content(one_cell)
-    files = [path for path in one_cell.folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
-    file = data.draw(st.sampled_from(sorted(files)))
+    whole, file = one_cell.rows().to_csv(), one_cell.folder / "cells" / f"{KEY}.parquet"
     content = file.read_bytes()
     damaged, cut = bytearray(content), data.draw(st.booleans())
     place = data.draw(st.integers(0, len(content) - 1))
@@ -320,7 +281,7 @@ def test_damage_is_an_error_that_names_the_file_and_never_another_result(
     found: object = None
     try:
         file.write_bytes(damaged)
-        found = _content(one_cell)
+        found = one_cell.rows().to_csv()
     except InputError as error:
         found = error
     finally:
@@ -329,13 +290,13 @@ def test_damage_is_an_error_that_names_the_file_and_never_another_result(
         assert f"{found}".startswith(f"{file}: expected ")
         assert "run the same `psotrack sweep` again" in f"{found}"
     else:
-        # A bit of the digest's own key, or the newline at the end of a JSON file.
+        # A bit of the digest's own key.
         assert found == whole
 
 
 def test_a_damaged_cell_is_run_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store, path = Store(tmp_path), tmp_path / "cells" / f"{KEY}.parquet"
-    add(store, KEY, rows(0, 1))
+    store.add(KEY, rows(0, 1))
     content = bytearray(path.read_bytes())
     content[len(content) // 3] ^= 1
     path.write_bytes(content)
@@ -343,5 +304,5 @@ def test_a_damaged_cell_is_run_again(tmp_path: Path, caplog: pytest.LogCaptureFi
         store.rows()
     assert store.finished_seeds(KEY) == set()
     assert f"{path}: damaged rows of a cell" in caplog.text
-    add(store, KEY, rows(0, 1))
+    store.add(KEY, rows(0, 1))
     pd.testing.assert_frame_equal(store.rows(), rows(0, 1))

@@ -75,8 +75,7 @@ def main() -> None:
         rows = tracked({**methods, "sequences": at_hand(data)}, options.out, data)
         show(rows, options.out)
         if options.results:
-            manifest = options.out.glob("*manifest.json")
-            run.copy([*(options.out / name for name in FILES), *manifest], options.results)
+            run.copy([options.out / name for name in FILES], options.results)
     except PsotrackError as error:
         sys.exit(f"table4: {error}")
     if rows.attrs["errors"]:

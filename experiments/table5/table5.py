@@ -4,8 +4,8 @@
     python experiments/table5/table5.py --quick    # a few settings on short sequences
     python experiments/table5/table5.py --data FOLDER_OF_THE_DATASET
 
-Without --data, missing sequences are simulated. Writes results.csv (one row per run), _manifest.json,
-table5.md and pictures to --out. Finished cells in --out are not run again.
+Without --data, missing sequences are simulated. Writes results.csv (one row per run), table5.md and a picture to
+--out. Finished cells in --out are not run again.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ import tomllib
 from pathlib import Path
 
 import pandas as pd
+from _pareto import error_against_work
 
 from psotrack.errors import PsotrackError
-from psotrack.sweeps import Grid, Store, pivot, read_grid, render_table, sweep
+from psotrack.sweeps import Grid, pivot, read_grid, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
 
 HERE = Path(__file__).parent
-#: Files of the result that are committed, besides pictures.
-FILES = ("results.csv", "table5.md")
+#: Files of the result that are committed.
+FILES = ("results.csv", "table5.md", "error_against_work.png")
 #: Title of a table -> column, its factor, and decimals.
 TABLES = {
     "Mean error": ("mean_error_m", 1e3, 1),
@@ -63,8 +64,7 @@ def main() -> None:
         rows = tracked(grid, out, data)
         show(rows, out)
         if options.results:
-            pictures = [*sorted(out.glob("*.png")), *out.glob("*manifest.json")]
-            run.copy([*(out / name for name in FILES), *pictures], options.results)
+            run.copy([out / name for name in FILES], options.results)
     except PsotrackError as error:
         sys.exit(f"table5: {error}")
     if rows.attrs["errors"]:
@@ -93,7 +93,7 @@ def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:
-    """Print the tables; write tables, rows and pictures, unless the files are newer than every cell."""
+    """Print the tables; write tables, rows and the picture."""
     published = tomllib.loads((HERE / "published.toml").read_text())
     tables = {
         title: pivot(
@@ -113,42 +113,17 @@ def show(rows: pd.DataFrame, out: Path) -> None:
         if name in set(rows["sequence"])
     ]
     print("Published mean errors:", ", ".join(said))
-    newest = max(path.stat().st_mtime for path in (out / "cells").glob("*.parquet"))
-    # This file is written last, so after an interrupt it is older than the newest cell.
-    last = out / "table5.md"
-    if last.exists() and last.stat().st_mtime > newest:
-        print(f"{out}: nothing new")
-        return
     rows[[name for name in KEPT if name in rows]].to_csv(
         out / "results.csv", index=False, float_format="%.6g"
     )
-    draw(rows, published, out)
+    figure = error_against_work(rows, published=published)
+    figure.savefig(out / "error_against_work.png")
     parts = [
         f"## {title}\n\n{render_table(table, 'markdown', decimals=TABLES[title][2])}"
         for title, table in tables.items()
     ]
-    last.write_text("\n".join([*parts, f"Published mean errors: {', '.join(said)}.\n"]))
+    (out / "table5.md").write_text("\n".join([*parts, f"Published mean errors: {', '.join(said)}.\n"]))
     print(f"{out}: {', '.join(sorted(path.name for path in out.glob('*.*')))}")
-
-
-def draw(rows: pd.DataFrame, published: dict[str, tuple[float, float]], out: Path) -> None:
-    """Draw the pictures; pictures of single frames show the largest swarm."""
-    from psotrack.sweeps import figures
-
-    figures.save(
-        out / "error_against_work.png", figures.error_against_work(rows, published=published), force=True
-    )
-    particles, iterations = (rows[f"settings.swarm.{name}"].max() for name in ("particles", "iterations"))
-    largest = rows[
-        (rows["settings.swarm.particles"] == particles) & (rows["settings.swarm.iterations"] == iterations)
-    ]
-    store, errors = Store(out), {}
-    for (sequence, method), runs in largest.groupby(["sequence", "method"], sort=False):
-        errors.setdefault(sequence, {})[method] = store.errors(runs["cell"].iloc[0], set(runs["seed"]))
-    for sequence, methods in errors.items():
-        figure = figures.error_over_time(methods, f"{sequence}, {particles} x {iterations}")
-        figures.save(out / f"error_over_time_{sequence}.png", figure, force=True)
-    figures.save(out / "error_per_drone.png", figures.error_per_drone(errors), force=True)
 
 
 if __name__ == "__main__":

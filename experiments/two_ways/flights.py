@@ -3,7 +3,7 @@
     python experiments/two_ways/flights.py --data data
 
 Simulates S01_D2_A and S02_D4_A with three seeds each, with the drones' own cameras, unless they exist. Tracks and
-localises with commands that are printed, fuses, and compares as `two_ways.py` does. Existing files are not made
+localises with commands that are printed, fuses, and compares. Existing files are not made
 again, so delete DATA/two_ways after a change of the code. Writes one row per drone and range of 50 frames.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from two_ways import METHODS, compare_drones, ranges
+from _comparison import METHODS, compare_drones, ranges
 
 from psotrack.recordings.datasets import read_sequence
 

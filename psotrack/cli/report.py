@@ -1,4 +1,4 @@
-"""`psotrack report`: one HTML page about a flight, a sweep or a calibration, or a table of a sweep."""
+"""`psotrack report`: one HTML page about a flight, or a table of a sweep."""
 
 from __future__ import annotations
 
@@ -68,10 +68,9 @@ def report(
     jobs: int | None,
     **table: Any,
 ) -> None:
-    """Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.
+    """Write one HTML page about SOURCE, a file of tracks, or print a table of SOURCE, the folder of a sweep.
 
-    SOURCE is a file of tracks, the folder of a sweep, or the JSON file of `psotrack calibrate rig --json`. With SEQ,
-    the recording of the tracks, which the record beside the tracks names, the page of a flight has errors, cameras, and
+    With SEQ, the recording of the tracks, which the record beside the tracks names, the page has errors, cameras, and
     pictures of events. The page needs no network and no other file: a browser opens it by a double click.
 
     In a table of a sweep, the end of a column's name is enough if no other column ends with it: particles is
@@ -81,9 +80,7 @@ def report(
     Examples:
       psotrack report my_lab/results/tracks.csv
       psotrack report tracks.csv my_lab --compare lines.csv --out report.html
-      psotrack report results
       psotrack report results --table --rows sequence,particles --columns iterations --scale 1000
-      psotrack report calibration.json --out calibration.html
     """
     from psotrack import api
 

@@ -54,7 +54,7 @@ class Where:
     help="Root folder of the sequences that the grid names.",
 )
 @click.option(
-    "--dry-run", is_flag=True, help="Print the cells and an estimate of the time without running a cell."
+    "--dry-run", is_flag=True, help="Print the cells and the number of runs without running a cell."
 )
 @click.option(
     "--status",
@@ -115,7 +115,7 @@ def sweep(
     out = out or grid_file.with_name(f"{grid_file.stem}_results")
     if dry_run:
         inputs = Inputs(data, cache, running["jobs"])
-        output.result(plan(grid, inputs, Store(out) if out.is_dir() else None))
+        output.result(plan(grid, inputs, Store(out)))
         return
     if cluster is not None:
         use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.

@@ -33,7 +33,7 @@ from .plugins import (
     plugin_source,
     register_plugin,
 )
-from .processes import map_in_processes, with_traceback, worker_processes
+from .processes import map_in_processes
 from .progress import (
     Advance,
     Report,
@@ -159,8 +159,6 @@ __all__ = [
     "user_cache",
     "whole_number",
     "widening",
-    "with_traceback",
-    "worker_processes",
     "write_rows",
     "write_toml",
 ]

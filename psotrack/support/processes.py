@@ -64,9 +64,20 @@ def map_in_processes(
     """
     if jobs == 1 or len(tasks) < 2:
         return [function(task, advance) for task in tasks]
+    # Spawned, not forked: a forked copy of a process with JAX or OpenCV threads may hang.
+    context = multiprocessing.get_context("spawn")
+    connections: list[Connection] = []
+    processes = []
     waiting = deque(enumerate(tasks))
     results: dict[int, _Result] = {}
-    with worker_processes(_serve, [function] * min(jobs, len(tasks))) as connections:
+    try:
+        with _start_of_workers():
+            for _ in range(min(jobs, len(tasks))):
+                here, there = context.Pipe()
+                processes.append(context.Process(target=_serve, args=(function, there), daemon=True))
+                processes[-1].start()
+                there.close()
+                connections.append(here)
         for connection in connections:
             connection.send(waiting.popleft())
         while len(results) < len(tasks):
@@ -81,35 +92,6 @@ def map_in_processes(
                     index, results[index] = message
                     if waiting:
                         ready.send(waiting.popleft())
-    return [results[index] for index in range(len(tasks))]
-
-
-@contextlib.contextmanager
-def worker_processes(
-    target: Callable[[_Task, Connection], None], tasks: Sequence[_Task]
-) -> Iterator[list[Connection]]:
-    """Connections to new processes, each of which runs `target(task, connection)`.
-
-    At the end of the block the pipes break: `target` shall return then. A process that does not is ended.
-
-    Args:
-        target: importable by name.
-        tasks: picklable; one for each process.
-    """
-    # Spawned, not forked: a forked copy of a process with JAX or OpenCV threads may hang.
-    context = multiprocessing.get_context("spawn")
-    connections: list[Connection] = []
-    processes = []
-    try:
-        with _sigint_ignored(), _variables_of_workers():
-            for task in tasks:
-                here, there = context.Pipe()
-                process = context.Process(target=_run, args=(target, task, there), daemon=True)
-                process.start()
-                there.close()
-                connections.append(here)
-                processes.append(process)
-        yield connections
     finally:
         for connection in connections:
             connection.close()
@@ -121,31 +103,23 @@ def worker_processes(
                 getattr(process, then)()
         for process in processes:
             process.join()
+    return [results[index] for index in range(len(tasks))]
 
 
 @contextlib.contextmanager
-def _sigint_ignored() -> Iterator[None]:
-    """Processes that start in this block ignore SIGINT: Ctrl-C signals them too, but only the parent reacts."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
-@contextlib.contextmanager
-def _variables_of_workers() -> Iterator[None]:
-    """Processes that start in this block have `_VARIABLES`."""
+def _start_of_workers() -> Iterator[None]:
+    """Processes that start in this block have `_VARIABLES`, and ignore Ctrl-C, to which only the parent reacts."""
     added = {name: value for name, value in _VARIABLES.items() if name not in os.environ}
+    has_signals = threading.current_thread() is threading.main_thread()
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN) if has_signals else None
     os.environ.update(added)
     try:
         yield
     finally:
         for name in added:
             del os.environ[name]
+        if has_signals:
+            signal.signal(signal.SIGINT, previous)
 
 
 def _receive(connection: Connection) -> Any:
@@ -161,58 +135,40 @@ def _receive(connection: Connection) -> Any:
         ) from error
 
 
-class _Progress:
-    """Tells the parent process of progress, some times per second: a message for each step would take its time."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection, self._steps, self._sent_s = connection, 0, 0.0
-
-    def advance(self, steps: int) -> None:
-        """See `Advance`; raises `BrokenPipeError` where the parent process has ended."""
-        self._steps += steps
-        if time.monotonic() - self._sent_s > _PROGRESS_S:
-            self.send()
-
-    def send(self) -> None:
-        """Send the steps that were not sent."""
-        if self._steps:
-            self._connection.send(self._steps)
-        self._steps, self._sent_s = 0, time.monotonic()
-
-
-def _run(target: Callable[[_Task, Connection], None], task: _Task, connection: Connection) -> None:
-    """Run `target` in a worker process, until the pipe breaks."""
+def _serve(function: Callable[..., Any], connection: Connection) -> None:
+    """In a worker: receive tasks; send progress (int), results (index, result) and errors, until the pipe breaks."""
     cv2.setNumThreads(1)
     signal.signal(signal.SIGTERM, _end_in_silence)
+    steps, sent_s = 0, 0.0
+
+    def advance(more: int) -> None:
+        """Tell the parent process some times per second: a message for each step would take its time."""
+        nonlocal steps, sent_s
+        steps += more
+        if time.monotonic() - sent_s > _PROGRESS_S:
+            connection.send(steps)
+            steps, sent_s = 0, time.monotonic()
+
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        target(task, connection)
+        while True:
+            index, task = connection.recv()
+            try:
+                result = function(task, advance)
+                connection.send(steps)
+                steps = 0
+            except Exception as error:
+                if not isinstance(error, PsotrackError):
+                    # The pipe would lose the traceback of a bug.
+                    error.add_note(f"in a worker process:\n{''.join(traceback.format_exception(error))}")
+                connection.send(error)
+            else:
+                connection.send((index, result))
 
 
 def _end_in_silence(number: int, frame: FrameType | None) -> NoReturn:
-    """End a worker process that the parent process terminates; the clean-up of its target runs.
+    """End a worker process that the parent process terminates; the clean-up of its function runs.
 
     What libraries say when they are interrupted is not for the user: the parent process says why it ends.
     """
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     sys.exit(1)
-
-
-def _serve(function: Callable[..., Any], connection: Connection) -> None:
-    """Receive tasks; send progress (int), results (index, result) and exceptions."""
-    while True:
-        index, task = connection.recv()
-        try:
-            progress = _Progress(connection)
-            result = function(task, progress.advance)
-            progress.send()
-        except Exception as error:
-            connection.send(with_traceback(error))
-        else:
-            connection.send((index, result))
-
-
-def with_traceback(error: BaseException) -> BaseException:
-    """An error of a worker process; with its traceback as a note, which a pipe would lose, where it is a bug."""
-    if not isinstance(error, PsotrackError):
-        error.add_note(f"in a worker process:\n{''.join(traceback.format_exception(error))}")
-    return error

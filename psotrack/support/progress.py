@@ -82,10 +82,10 @@ def progress_lines(
         long_s: shortest stage whose end is written, seconds.
         clock: time that only increases, seconds.
     """
-    said = _to_stderr if write is None else write
 
     def report(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
-        return _said(_Stage(description, total, clock), said, _is_line_due, long_s)
+        say = _to_stderr if write is None else write
+        return _said(description, total, say, every_s=_EVERY_S, share=_SHARE, long_s=long_s, clock=clock)
 
     return report
 
@@ -107,80 +107,55 @@ def joined(*reports: Report) -> Report:
     return report
 
 
-class _Stage:
-    """The steps of one stage that are done, and sentences about them; a stage of 0 steps has an unknown number."""
-
-    def __init__(self, description: str, total: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self._description, self.total, self._clock = description, total, clock
-        self._began_s = self._said_s = clock()
-        self.done = self.said_done = 0
-        #: Time and steps at the first sentence.
-        self._first: tuple[float, int] | None = None
-
-    @property
-    def seconds(self) -> float:
-        """Time since the stage began, seconds."""
-        return self._clock() - self._began_s
-
-    @property
-    def silent_s(self) -> float:
-        """Time since the last sentence, or since the stage began, seconds."""
-        return self._clock() - self._said_s
-
-    def so_far(self) -> str:
-        """What is done, the time that it took, and about how long the rest takes.
-
-        The rest is as fast as what followed the first sentence: the first steps may have waited for a compilation.
-        """
-        spent_s, first = self.seconds, self._first
-        self._said_s, self.said_done = self._clock(), self.done
-        self._first = first or (spent_s, self.done)
-        if not self.total:
-            return f"{self._steps()}, {_duration(spent_s)}"
-        left = ""
-        if first and first[1] < self.done < self.total:
-            left_s = (spent_s - first[0]) * (self.total - self.done) / (self.done - first[1])
-            left = f", about {_duration(left_s)} left"
-        return f"{self._steps()} ({self.done / self.total:.0%}), {_duration(spent_s)}{left}"
-
-    def ended(self, how: str) -> str:
-        """What was done, and the time that it took; `how` stands before the time."""
-        return f"{self._steps()}{how} {_duration(self.seconds)}"
-
-    def _steps(self) -> str:
-        of = f" of {self.total}" if self.total else ""
-        return f"{self._description}: {self.done}{of}"
-
-
 @contextlib.contextmanager
 def _said(
-    stage: _Stage, say: Callable[[str], None], is_due: Callable[[_Stage], bool], long_s: float
+    description: str,
+    total: int,
+    say: Callable[[str], None],
+    *,
+    every_s: float,
+    share: float = 0.0,
+    long_s: float = 0.0,
+    clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Advance]:
-    """Say how a stage goes on whenever that is due, and how it ended if that is worth it."""
-    lock = threading.Lock()
+    """Say in sentences how a stage goes on, and how it ended if it took `long_s`; 0 steps are an unknown number.
+
+    A sentence comes `every_s`, if a `share` of the stage was done since the one before, or `_AT_LATEST_S` have passed.
+    The rest is as fast as what followed the first sentence: the first steps may have waited for a compilation.
+    """
+    lock, began_s, done, of = threading.Lock(), clock(), 0, f" of {total}" if total else ""
+    #: Time and steps of each sentence.
+    said: list[tuple[float, int]] = []
+
+    def sentence(now_s: float) -> str | None:
+        """What is done, the time that it took, and about how long the rest takes; None if it is not due."""
+        before_s, before = said[-1] if said else (began_s, 0)
+        silent_s, is_enough = now_s - before_s, not total or done - before >= share * total
+        if silent_s < every_s or 0 < total <= done or not (is_enough or not said or silent_s >= _AT_LATEST_S):
+            return None
+        said.append((now_s, done))
+        fraction, left = f" ({done / total:.0%})" if total else "", ""
+        if total and said[0][1] < done and len(said) > 1:
+            left_s = (now_s - said[0][0]) * (total - done) / (done - said[0][1])
+            left = f", about {_duration(left_s)} left"
+        return f"{description}: {done}{of}{fraction}, {_duration(now_s - began_s)}{left}"
 
     def advance(steps: int) -> None:
+        nonlocal done
         with lock:
-            stage.done += steps
-            if not is_due(stage):
-                return
-            sentence = stage.so_far()
-        say(sentence)
+            done += steps
+            words = sentence(clock())
+        if words is not None:
+            say(words)
 
     how = ", stopped after"
     try:
         yield advance
         how = " in"
     finally:
-        if stage.said_done or stage.seconds >= long_s:
-            say(stage.ended(how))
-
-
-def _is_line_due(stage: _Stage) -> bool:
-    if stage.silent_s < _EVERY_S or 0 < stage.total <= stage.done:
-        return False
-    share = (stage.done - stage.said_done) / max(stage.total, 1)
-    return not stage.said_done or share >= _SHARE or stage.silent_s >= _AT_LATEST_S or not stage.total
+        spent_s = clock() - began_s
+        if said or spent_s >= long_s:
+            say(f"{description}: {done}{of}{how} {_duration(spent_s)}")
 
 
 def _duration(seconds: float) -> str:
@@ -209,10 +184,9 @@ def _in_a_cell(description: str, total: int) -> contextlib.AbstractContextManage
     """Show progress in the output of a notebook's cell: one line, which changes."""
     from IPython.display import display
 
-    stage = _Stage(description, total)
     handle = display({"text/plain": f"{description}: 0"}, raw=True, display_id=True)
 
     def say(sentence: str) -> None:
         handle.update({"text/plain": sentence}, raw=True)
 
-    return _said(stage, say, lambda stage: stage.silent_s >= _REDRAWN_S, 0.0)
+    return _said(description, total, say, every_s=_REDRAWN_S)

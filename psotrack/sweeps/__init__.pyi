@@ -1,16 +1,15 @@
 from .cells import Cell, Perturbation, cameras_label, cell_key
 from .cluster import Cluster
 from .grid_files import Grid, grid, read_grid
-from .grid_runs import Estimate, SweepOutcome, SweepPlan, estimate, plan, sweep
+from .grid_runs import SweepOutcome, SweepPlan, plan, sweep
 from .inputs import Inputs
 from .perturbations import delays_frames, perturb
-from .store import Store, is_results_folder
+from .store import Store
 from .tables import pivot, render_table
 
 __all__ = [
     "Cell",
     "Cluster",
-    "Estimate",
     "Grid",
     "Inputs",
     "Perturbation",
@@ -20,9 +19,7 @@ __all__ = [
     "cameras_label",
     "cell_key",
     "delays_frames",
-    "estimate",
     "grid",
-    "is_results_folder",
     "perturb",
     "pivot",
     "plan",

@@ -13,14 +13,13 @@ import pandas as pd
 
 from psotrack.errors import InputError, PsotrackError
 from psotrack.support import Report, html_block, html_table, report_of, user_cache
-from psotrack.sweeps.cells import Cell, cameras_label, cell_key, cell_name, input_digest, title
+from psotrack.sweeps.cells import Cell, cameras_label, cell_key, cell_name, title
 from psotrack.sweeps.cluster import Cluster, run_on_cluster
 from psotrack.sweeps.grid_files import Grid, read_grid
 from psotrack.sweeps.grid_files import grid as grid_of
 from psotrack.sweeps.inputs import Inputs, folder_of, source_of
 from psotrack.sweeps.locks import POLL_S
 from psotrack.sweeps.machine import provenance
-from psotrack.sweeps.manifest import note_input, note_run
 from psotrack.sweeps.runner import Result, finished_before, run_cell, store_failure
 from psotrack.sweeps.store import Store
 from psotrack.sweeps.tables import DESCRIBING
@@ -137,7 +136,8 @@ def sweep(
         origin = {name: value for name, value in origin.items() if name != "device"} | {"cluster": True}
     store, inputs = Store(out), Inputs(Path(data), Path(cache), jobs)
     store.tidy()
-    store.change_manifest(lambda manifest: note_run(manifest, grid, origin))
+    content = {name: value for name, value in asdict(grid).items() if name != "where"}
+    store.add_run({"grid": content, "cells": len(grid.cells()), **origin})
     results, cells = _sort_out(grid, inputs, store)
     if cluster is None:
         more = _run_here(cells, inputs, store)
@@ -167,29 +167,17 @@ def _run_here(cells: list[Cell], inputs: Inputs, store: Store) -> Generator[Resu
 
 
 def _sort_out(grid: Grid, inputs: Inputs, store: Store) -> tuple[list[Result], list[Cell]]:
-    """Results of the cells that are finished or cannot be read, and the other cells, sorted by their input.
-
-    The manifest notes the inputs of all cells, so that results of these inputs are those that count.
-    """
-    results, cells, noted = [], [], {}
+    """Results of the cells that are finished or cannot be read, and the other cells, sorted by their input."""
+    results, cells = [], []
     for cell in _by_input(grid.cells()):
         try:
-            keys = inputs.keys_of(cell)
+            result = finished_before(cell, cell_key(cell, inputs.keys_of(cell)), store)
         except PsotrackError as error:
-            results.append(store_failure(cell, None, error, store))
-            continue
-        noted[input_digest(keys)] = cell, keys
-        result = finished_before(cell, cell_key(cell, keys), store)
+            result = store_failure(cell, None, error, store)
         if result is None:
             cells.append(cell)
         else:
             results.append(result)
-
-    def note(manifest: dict[str, Any]) -> None:
-        for cell, keys in noted.values():
-            note_input(manifest, cell, keys)
-
-    store.change_manifest(note)
     return results, cells
 
 
@@ -201,132 +189,55 @@ def _by_input(cells: Iterable[Cell]) -> list[Cell]:
     return [cell for group in groups.values() for cell in group]
 
 
-# What is still to run
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a sweep would run.
-
-    Attributes:
-        cells: number of cells of the grid.
-        finished: number of cells that are finished.
-        unread: number of cells whose input cannot be read.
-        runs: number of runs of the other cells that are not finished.
-        run_s: median time of a finished run in the folder of results, without compiling, seconds; None if there is
-            none.
-        faults: why inputs cannot be read, each reason once.
-    """
-
-    cells: int
-    finished: int
-    unread: int
-    runs: int
-    run_s: float | None
-    faults: tuple[str, ...]
-
-    @property
-    def total_s(self) -> float | None:
-        """Time of all runs, if each takes as long as a finished one, seconds; None if that is not known."""
-        return None if self.run_s is None else self.runs * self.run_s
-
-    def to_dict(self) -> dict[str, Any]:
-        """All numbers, fit for JSON."""
-        return asdict(self) | {"total_s": self.total_s}
-
-    def __str__(self) -> str:
-        unread = f", {self.unread} cannot be read" if self.unread else ""
-        to_run = self.cells - self.finished - self.unread
-        said = f"{self.cells} cells: {self.finished} finished{unread}, {to_run} to run ({self.runs} runs)"
-        if not self.runs:
-            return said
-        if self.total_s is None:
-            return f"{said}; how long they take is known when a cell is finished"
-        return f"{said}, about {_in_words(self.total_s)} at {self.run_s:.2g} s per run, as the finished runs"
-
-
 @dataclass(frozen=True)
 class SweepPlan:
-    """The cells of a grid, and what a sweep would run of them; its text is what `psotrack sweep --dry-run` prints.
+    """What a sweep would run of a grid; its text is what `psotrack sweep --dry-run` prints.
 
     Attributes:
         cells: what describes each cell.
-        estimate: what is still to run.
+        finished: number of cells that are finished.
+        runs: number of runs that are not finished, of cells whose input can be read.
+        faults: why the input of a cell cannot be read, for each such cell.
     """
 
     cells: tuple[dict[str, Any], ...]
-    estimate: Estimate
+    finished: int
+    runs: int
+    faults: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """The cells and the estimate, fit for JSON."""
-        return {"cells": list(self.cells), "estimate": self.estimate.to_dict()}
+        """All numbers and words, fit for JSON."""
+        return asdict(self)
 
     def __str__(self) -> str:
         cells = (
             f"{number:4} " + " ".join(f"{name}={value}" for name, value in cell.items())
             for number, cell in enumerate(self.cells)
         )
-        faults = (f"cannot be read: {fault}" for fault in self.estimate.faults)
-        return "\n".join([*cells, *faults, f"{self.estimate}"])
+        faults = (f"cannot be read: {fault}" for fault in dict.fromkeys(self.faults))
+        unread = f", {len(self.faults)} cannot be read" if self.faults else ""
+        to_run = f"{len(self.cells) - self.finished - len(self.faults)} to run ({self.runs} runs)"
+        return "\n".join(
+            [*cells, *faults, f"{len(self.cells)} cells: {self.finished} finished{unread}, {to_run}"]
+        )
 
 
-def plan(grid: Grid, inputs: Inputs, store: Store | None) -> SweepPlan:
+def plan(grid: Grid, inputs: Inputs, store: Store) -> SweepPlan:
     """What a sweep would run, without running a cell.
 
     Args:
         grid: the grid.
         inputs: inputs of the cells.
-        store: stored results; None for no results.
+        store: stored results; its folder need not exist.
     """
-    cells = grid.cells()
-    listed = (
-        {
-            "sequence": cell.sequence,
-            "method": cell.method,
-            "cameras": cameras_label(cell.cameras),
-            "runs": cell.runs,
-            **cell.axes,
-        }
-        for cell in cells
-    )
-    return SweepPlan(tuple(listed), estimate(cells, inputs, store))
-
-
-def estimate(cells: Iterable[Cell], inputs: Inputs, store: Store | None) -> Estimate:
-    """Count the cells that are not finished.
-
-    Args:
-        cells: cells of a grid.
-        inputs: inputs of the cells.
-        store: stored results; None for no results.
-    """
-    missing, faults = [], []
-    for cell in cells:
+    listed, missing, faults = [], [], []
+    for cell in grid.cells():
+        about = {"sequence": cell.sequence, "method": cell.method, "cameras": cameras_label(cell.cameras)}
+        listed.append({**about, "runs": cell.runs, **cell.axes})
         try:
             key = cell_key(cell, inputs.keys_of(cell))
         except PsotrackError as error:
             faults.append(f"{error}")
         else:
-            missing.append(len(set(cell.seeds) - (store.finished_seeds(key) if store else set())))
-    count, reasons = len(missing) + len(faults), tuple(dict.fromkeys(faults))
-    return Estimate(count, missing.count(0), len(faults), sum(missing), _run_s(store), reasons)
-
-
-def _run_s(store: Store | None) -> float | None:
-    """Median time of a finished run, seconds; the times of compiling and of silhouettes are not in it."""
-    try:
-        rows = store.rows() if store else pd.DataFrame()
-    except InputError:
-        return None
-    if "seconds.batch" not in rows:
-        return None
-    per_run_s = rows["seconds.batch"] / rows["runs_in_batch"] - rows["seconds.compile"].fillna(0)
-    return float(per_run_s.median())
-
-
-def _in_words(seconds: float) -> str:
-    """A time with few digits, because the estimate is rough."""
-    for limit, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172800, 3600, "h")):
-        if seconds < limit:
-            return f"{seconds / unit_s:.0f} {unit}"
-    return f"{seconds / 86400:.0f} days"
+            missing.append(len(set(cell.seeds) - store.finished_seeds(key)))
+    return SweepPlan(tuple(listed), missing.count(0), sum(missing), tuple(faults))

@@ -65,16 +65,6 @@ class Locks:
             if is_held:
                 lease.release()
 
-    @contextlib.contextmanager
-    def wait(self, path: Path) -> Iterator[None]:
-        """Hold a lock until the block ends, as soon as no other process holds the lock: for work that is short."""
-        while True:
-            with self.attempt(path) as held:
-                if held:
-                    yield
-                    return
-            time.sleep(POLL_S)
-
     def holder(self, path: Path) -> str | None:
         """The process that holds a lock; None if no process holds the lock."""
         lease = self._lease(path)

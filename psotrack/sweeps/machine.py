@@ -15,7 +15,7 @@ _PACKAGE = Path(__file__).parents[1]
 #: Rooms and modules that compute no part of a row, by the beginnings of their paths in the package.
 COMPUTES_NO_ROW = (
     *("__main__", "api", "cli/", "demo", "inside_out/", "live/", "show/", "simulation/"),
-    *(f"sweeps/{name}" for name in ("cluster", "figures", "grid_files", "grid_runs", "locks", "tables")),
+    *(f"sweeps/{name}" for name in ("cluster", "grid_files", "grid_runs", "locks", "tables")),
 )
 
 

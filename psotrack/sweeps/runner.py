@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from psotrack.errors import InputError, OutputError, PsotrackError
-from psotrack.evaluation import Evaluation, errors_over_time, evaluate
+from psotrack.evaluation import Evaluation, evaluate
 from psotrack.pipeline import TrackedRecording, track_runs, with_real_time
 from psotrack.settings import flatten
 from psotrack.support import drop_programs_if_many
@@ -50,6 +50,7 @@ def finished_before(cell: Cell, key: str, store: Store) -> Result | None:
         return None
     # The runner that finished the cell may have been killed before it removed the record of an earlier failure.
     store.remove_failure(cell_name(cell))
+    store.use(key)
     return Result(cell, "left", key)
 
 
@@ -73,7 +74,7 @@ def run_cell(cell: Cell, inputs: Inputs, store: Store) -> Result:
                 return Result(cell, "busy", key)
             missing = sorted(set(cell.seeds) - store.finished_seeds(key))
             origin = {"cell": key, "input": input_digest(keys)} | dict(flatten(provenance()))
-            store.add(key, *_run_seeds(cell, missing, given, origin))
+            store.add(key, _run_seeds(cell, missing, given, origin))
             store.remove_failure(cell_name(cell))
         return Result(cell, "finished", key)
     except OutputError:
@@ -92,10 +93,8 @@ def store_failure(cell: Cell, key: str | None, error: Exception, store: Store) -
     return Result(cell, "failed", key, sentence)
 
 
-def _run_seeds(
-    cell: Cell, seeds: list[int], given: Input, origin: Mapping[str, Any]
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Track and evaluate with each seed: one row per run, and the errors of every run's frames."""
+def _run_seeds(cell: Cell, seeds: list[int], given: Input, origin: Mapping[str, Any]) -> pd.DataFrame:
+    """Track and evaluate with each seed: one row per run."""
     # Cells with other shapes need other programs.
     drop_programs_if_many()
     settings = [msgspec.structs.replace(cell.settings, seed=seed) for seed in seeds]
@@ -105,10 +104,9 @@ def _run_seeds(
     reference = given.reference(cell.settings.rate_hz)
     of_cell = describe(cell) | {"frames": given.recording.num_frames, "num_cameras": len(given.recording.rig)}
     of_batch = {"runs_in_batch": len(seeds), "seconds.batch": total_s}
-    rows, errors = [], []
+    rows = []
     for seed, result in zip(seeds, results, strict=True):
         of_run: dict[str, Any] = dict.fromkeys(_METRICS, np.nan) | {"missed_rate": 1.0}
-        errors_of_run = pd.DataFrame({"seed": pd.Series(dtype=int)})
         # A run that finds no drones has missed all drones. All runs have the same columns, so that programs can read
         # all cells as one data set.
         if isinstance(result, InputError):
@@ -117,11 +115,8 @@ def _run_seeds(
             evaluation = evaluate(result.trajectories, reference).to_dict()
             of_run |= {name: evaluation[name] for name in _METRICS if evaluation[name] is not None}
             of_run |= {"note": ""} | _times(result, total_s / len(seeds))
-            errors_of_run = errors_over_time(result.trajectories, reference).assign(seed=seed)
-            errors_of_run["error_m"] = errors_of_run["error_m"].astype(np.float32)
         rows.append(of_cell | {"seed": seed} | of_batch | of_run | dict(origin))
-        errors.append(errors_of_run)
-    return pd.DataFrame(rows), pd.concat(errors)
+    return pd.DataFrame(rows)
 
 
 #: Figures of the evaluation that are columns of the rows.

@@ -66,20 +66,18 @@ def pivot(
         numbers = pd.to_numeric(rows[measured]).astype(float)
     except (ValueError, TypeError) as error:
         raise SettingsError("value", expected="a column of numbers", found=measured) from error
-    labels = pd.DataFrame({name: _sorted_labels(rows[name]) for name in axes})
+    labels = rows[axes].map(_label).astype(object)
     _warn_if_mixed(rows, labels)
-    groups = labels.assign(value=(scale * numbers).to_numpy()).groupby(axes, observed=True)["value"]
+    groups = labels.assign(value=scale * numbers).groupby(axes, sort=False)["value"]
     table = groups.agg(["mean", "std", "count"]).set_axis(FIGURES, axis="columns")
     if columns_by:
-        names = axes[len(rows_by) :]
-        across = labels[names].drop_duplicates().sort_values(names).itertuples(index=False, name=None)
-        columns = pd.MultiIndex.from_tuples([(figure, *key) for key in across for figure in FIGURES])
-        table = pd.DataFrame(table.unstack(names))[columns]
-        table.columns = columns.reorder_levels([*range(1, columns.nlevels), 0])
-        counts = columns.get_level_values(0) == "runs"
-        table = table.fillna(dict.fromkeys(table.columns[counts], 0))
-        table = table.astype(dict.fromkeys(table.columns[counts], int))
-    table.index, table.columns = _without_categories(table.index), _without_categories(table.columns)
+        table = pd.DataFrame(table.unstack(axes[len(rows_by) :]))
+        across = sorted({key[1:] for key in table.columns}, key=lambda labels: [*map(natural, labels)])
+        table = table[[(figure, *key) for key in across for figure in FIGURES]]
+        table.columns = pd.MultiIndex.from_tuples([(*key, figure) for key in across for figure in FIGURES])
+        counts = [key for key in table.columns if key[-1] == "runs"]
+        table[counts] = table[counts].fillna(0).astype(int)
+    table = table.sort_index(key=lambda index: pd.Index([*map(natural, index)], tupleize_cols=False))
     table.index.names = rows_by
     table.columns.names = [*columns_by, "figure"]
     table.attrs["value"] = _scaled(value, scale)
@@ -109,25 +107,12 @@ def render_table(table: pd.DataFrame, format: str = "text", *, decimals: int | N
     return writer(_cells(table, _decimals(table) if decimals is None else decimals), _title(table))
 
 
-def natural(value: Any) -> list[tuple[int, Any]]:
+def natural(value: Any) -> tuple[tuple[int, Any], ...]:
     """What a label is sorted by: numbers before words, and numbers in words as numbers."""
     if isinstance(value, int | float):
-        return [(0, value)]
+        return ((0, value),)
     parts = re.findall(r"[0-9]+|[^0-9]+", f"{value}")
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
-
-
-def _sorted_labels(column: pd.Series) -> pd.Categorical:
-    """Labels that can be compared and printed: numbers and words, "-" for missing values, in their natural order."""
-    labels = [_label(value) for value in column]
-    return pd.Categorical(labels, categories=sorted(dict.fromkeys(labels), key=natural), ordered=True)
-
-
-def _without_categories(index: pd.Index) -> pd.Index:
-    if not isinstance(index, pd.MultiIndex):
-        return index.astype(object)
-    parts = [index.get_level_values(level).astype(object) for level in range(index.nlevels)]
-    return pd.MultiIndex.from_arrays(parts, names=index.names)
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts)
 
 
 def _label(value: Any) -> Any:
@@ -164,7 +149,7 @@ def _warn_if_mixed(rows: pd.DataFrame, labels: pd.DataFrame) -> None:
     names = [str(name) for name in rows]
     others = [name for name in names if name.startswith(DESCRIBING) and name not in (*labels, *_RANDOM)]
     values = rows[others].map(_label).set_axis(labels.index)
-    counts = values.groupby([labels[name] for name in labels], observed=True).nunique()
+    counts = values.groupby([labels[name] for name in labels], sort=False).nunique()
     mixed = counts.columns[(counts > 1).any()]
     if len(mixed):
         logger.warning("figures are not only over runs: they mix different %s", ", ".join(mixed))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
@@ -36,7 +35,6 @@ from psotrack.recordings.datasets import (
     write_poses,
 )
 from psotrack.show import flights
-from psotrack.show.reports import write_calibration_report
 from psotrack.simulation.flights.piloting import read_sticks
 from psotrack.simulation.flights.recordings import read_recorded_flight
 from psotrack.sweeps import Store, read_grid
@@ -500,17 +498,14 @@ def _results(folder: Path) -> None:
                 **{figure: [0.5, 0.25] for figure in _FIGURES},
             }
         )
-        store.add(
-            key, rows, pd.DataFrame({"seed": [0, 1], "frame": 0, "drone": "dron1", "error_m": [0.01, 0.02]})
-        )
+        store.add(key, rows)
     store.add_failure("c" * 40, "no file", {"sequence": "S03", "method": "swarm"})
-    store.change_manifest(lambda manifest: manifest["inputs"].update(a="b"))
 
 
 def _of_results(path: Path) -> None:
-    store = Store(path.parent if path.parent.name not in ("cells", "_errors") else path.parents[1])
-    for part in (store.status, store.manifest, store.rows, lambda: store.errors("a" * 40, [0, 1])):
-        part()
+    store = Store(path.parents[1])
+    store.status()
+    store.rows()
     store.finished_seeds("a" * 40)
 
 
@@ -534,17 +529,6 @@ def _network(folder: Path) -> None:
 
 def _detected(path: Path) -> object:
     return OnnxDetector(path, DetectorSettings(size=64)).boxes(np.zeros((48, 64, 3), np.uint8))
-
-
-def _calibration_record(folder: Path) -> None:
-    write_rig(folder / "rig.toml", ring_rig(2))
-    camera = {
-        **{"views": 10, "corners": 80, "rms_px": 0.3, "median_px": 0.2, "own_median_px": 0.2, "covered": 0.5},
-        **{"focal_px": [256.0, 258.0], "centre_m": [4.0, 0.1, 2.0], "centre_std_m": [0.01, None, 0.01]},
-        **{"coverage": [[1, 2], [3, 4]], "image_size_wh": [320, 240], "lens": "5"},
-    }
-    content = {"rig": "rig.toml", "cameras": {"c0": camera, "c1": camera}, "print": [], "advice": []}
-    (folder / "calibration.json").write_text(json.dumps(content, indent=1))
 
 
 def _unpacked(file: str) -> Format:
@@ -590,15 +574,7 @@ _OTHERS = {
         is_refused=True,
     ),
     "sweep-rows": _stored(f"cells/{'a' * 40}.parquet", "report {folder} --table", columns),
-    "sweep-errors": _stored(f"_errors/{'a' * 40}.parquet", "report {folder} --out {out}/page.html", columns),
     "sweep-failure": _stored(f"cells/_{'c' * 40}.error.json", "sweep --status {folder}"),
-    "sweep-manifest": _stored("_manifest.json", "sweep --status {folder}"),
-    "calibration-record": Format(
-        _calibration_record,
-        "calibration.json",
-        (lambda path: write_calibration_report(path.parents[2] / "out" / "page.html", path),),
-        "report {file} --out {out}/page.html",
-    ),
     "archive": Format(
         _archive,
         "a.psotrack",

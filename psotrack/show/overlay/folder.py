@@ -27,9 +27,10 @@ from psotrack.support import (
     atomic_write,
     check_file_name,
     digest_file,
+    json_text,
     map_in_processes,
     no_progress,
-    read_text,
+    read_json,
     refuse_to_overwrite,
 )
 
@@ -103,14 +104,6 @@ class WrittenOverlays:
     def __str__(self) -> str:
         kept = f", {len(self.kept)} were there already" if self.kept else ""
         return f"{self.folder}: {len(self.written)} videos in {self.codec.name}{kept}"
-
-
-class _Inputs(msgspec.Struct):
-    """Content of `INPUTS_FILE`: digests of the videos by their files' names, and of what they are."""
-
-    videos: dict[str, str]
-    recording: str = ""
-    tracks: list[str] = []
 
 
 def write_overlays(
@@ -219,39 +212,23 @@ def _begin(folder: Path, flight: TrackedFlight, videos: dict[str, str], force: b
         InputError: the list cannot be read.
         OutputError: a video of another content exists.
     """
-    before = _digests(folder / INPUTS_FILE)
+    path = folder / INPUTS_FILE
+    said = read_json(path, "the list that `psotrack overlay` writes").get("videos") if path.exists() else None
+    before = said if isinstance(said, dict) else {}
     there = [name for name in videos if (folder / name).exists()]
     kept = [name for name in there if not force and before.get(name) == videos[name]]
     others = [name for name in there if name not in kept]
     for name in others:
-        if not force and name in before:
-            raise OutputError(
-                folder / name,
-                expected=f"a video of {', '.join(str(tracks.path) for tracks in flight.tracks) or 'no tracks'}",
-                found=f"one of other inputs (see {INPUTS_FILE})",
-                remedy="pass --force to replace it",
-            )
         refuse_to_overwrite(folder / name, force)
     for name in others:
         # An old video must not count as one of the new content, if this run is interrupted.
         (folder / name).unlink()
     if len(kept) < len(videos):
-        inputs = _Inputs(before | videos, flight.name, [str(tracks.path) for tracks in flight.tracks])
-        with atomic_write(folder / INPUTS_FILE) as temporary:
-            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(inputs)) + b"\n")
+        tracks = [str(each.path) for each in flight.tracks]
+        content = {"videos": before | videos, "recording": flight.name, "tracks": tracks}
+        with atomic_write(path) as temporary:
+            temporary.write_text(json_text(content) + "\n", encoding="utf-8")
     return kept
-
-
-def _digests(path: Path) -> dict[str, str]:
-    """Digests of a folder's videos by their names."""
-    if not path.exists():
-        return {}
-    try:
-        return msgspec.json.decode(read_text(path), type=_Inputs).videos
-    except msgspec.DecodeError as error:
-        raise InputError(
-            path, expected="the list that `psotrack overlay` writes", found=f"{error}"
-        ) from error
 
 
 def _digest(video: DrawnVideo) -> str:

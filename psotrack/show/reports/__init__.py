@@ -1,8 +1,7 @@
-"""Pages for people: a report of a flight, of a sweep or of a calibration as one HTML file, and 3D views in notebooks.
+"""Pages for people: the report of a flight as one HTML file, and a 3D view in notebooks.
 
-In: tracked flights, results of sweeps, records of calibrations. Out: HTML that needs no network: tables, pictures,
-plots, and 3D views that turn and play. Other rooms may use every name in `__init__.pyi`. The JavaScript of the 3D view
-is in `assets`, with the library three.js.
+In: tracked flights. Out: HTML that needs no network: tables, pictures, plots, and a 3D view that turns and plays. Other
+rooms may use every name in `__init__.pyi`. The JavaScript of the 3D view is in `assets`, with the library three.js.
 """
 
 import lazy_loader

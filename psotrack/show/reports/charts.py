@@ -17,27 +17,13 @@ _OF_PAGE = {INK: "currentColor", FAINT: "var(--faint)", LINE: "var(--line)"}
 
 
 @rc_context(STYLE)
-def figure_svg(figure: Figure) -> Markup:
-    """An SVG element of a figure whose dark text and lines get the colour of the page's text."""
-    for patch in (figure.patch, *(axes.patch for axes in figure.axes)):
-        patch.set_alpha(0)
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    content = text.getvalue()
-    content = content[content.index("<svg") :]
-    for colour, of_page in _OF_PAGE.items():
-        content = content.replace(colour, of_page)
-    return Markup(content)
-
-
-@rc_context(STYLE)
 def quantity_svg(quantity: Quantity) -> Markup:
-    """A plot of a quantity over time with a line per drone, and gaps where a value is not known.
+    """A plot of a quantity over time as an SVG element: a line per drone, and gaps where a value is not known.
 
     Matplotlib leaves out points that do not change how a line looks, so that long flights have small plots.
     """
-    figure = Figure((9.5, 2.6))
-    axes = figure.add_subplot(xlabel="time (s)", ylabel=QUANTITIES[quantity.key][0])
+    figure = Figure((9.5, 2.6), facecolor="none")
+    axes = figure.add_subplot(xlabel="time (s)", ylabel=QUANTITIES[quantity.key][0], facecolor="none")
     for name, colour, values in zip(quantity.names, quantity.colours, quantity.values.T, strict=True):
         axes.plot(quantity.time_s, values, color=colour, linewidth=1.2, label=name)
     axes.margins(x=0.01)
@@ -45,4 +31,10 @@ def quantity_svg(quantity: Quantity) -> Markup:
         axes.set_ylim(bottom=0)
     if len(quantity.names) > 1:
         figure.legend(loc="outside upper left", ncols=5, handlelength=1.4)
-    return figure_svg(figure)
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    content = text.getvalue()
+    content = content[content.index("<svg") :]
+    for colour, of_page in _OF_PAGE.items():
+        content = content.replace(colour, of_page)
+    return Markup(content)

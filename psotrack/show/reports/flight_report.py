@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
 from psotrack.evaluation import Evaluation, evaluate
 from psotrack.pipeline import changed_settings
 from psotrack.show.flights import (
@@ -24,8 +22,8 @@ from psotrack.show.flights import (
 from psotrack.show.reports.charts import quantity_svg
 from psotrack.show.reports.moments import Moment, choose_events, take_pictures
 from psotrack.show.reports.page import check_page_path, render, write_page
-from psotrack.show.reports.scene import row_step, scene_of_flight
-from psotrack.show.reports.tables import PageColumn, PageTable, make_table, percent
+from psotrack.show.reports.scene import row_step, scene_data, shown_times_s
+from psotrack.show.reports.tables import PageColumn, make_table, percent
 from psotrack.support import Report, no_progress
 
 #: Largest number of events with a picture; a picture has about 20 kB.
@@ -71,28 +69,21 @@ _ERRORS = (
 
 
 @dataclass(frozen=True)
-class Section:
-    """What a page shows of one file of tracks.
+class WrittenPage:
+    """A page that was written; its text is what `psotrack report` prints.
 
     Attributes:
-        label: name of the tracks.
-        figures: large numbers with a word each.
-        drones, cameras, errors: tables; None where there is nothing to show.
-        charts: plots over time, each with a caption.
-        moments: events with pictures.
-        more_events: number of events that are not shown.
-        run: how the tracks were made; None where there is no record of it.
+        path: the page.
     """
 
-    label: str
-    figures: list[tuple[str, str]]
-    drones: PageTable
-    cameras: PageTable | None
-    errors: PageTable | None
-    charts: list[tuple[str, Markup]]
-    moments: list[Moment]
-    more_events: int
-    run: dict[str, Any] | None
+    path: Path
+
+    def to_dict(self) -> dict[str, Any]:
+        """Path and size of the page."""
+        return {"page": str(self.path), "bytes": self.path.stat().st_size}
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB"
 
 
 def write_flight_report(
@@ -103,7 +94,7 @@ def write_flight_report(
     jobs: int | None = None,
     force: bool = False,
     report: Report = no_progress,
-) -> None:
+) -> WrittenPage:
     """Write the report of a flight.
 
     Args:
@@ -119,24 +110,26 @@ def write_flight_report(
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     check_page_path(path, force)
-    scene = scene_of_flight(flight)
-    step, span_s = row_step(len(scene.time_s)), float(scene.time_s[-1] - scene.time_s[0])
+    time_s = shown_times_s(flight)
+    step, span_s = row_step(len(time_s)), float(time_s[-1] - time_s[0])
     cameras = "" if flight.recording is None else f", {len(flight.recording.rig)} cameras"
     truth = "" if flight.truth is None else ", compared with a reference"
     text = render(
         "flight.html",
-        scene,
+        scene_data(flight),
         title=flight.name,
-        lead=f"{span_s:.1f} s, {len(scene.time_s)} frames{cameras}{truth}",
+        lead=f"{span_s:.1f} s, {len(time_s)} frames{cameras}{truth}",
         sections=[_section(flight, tracks, pictures, jobs, report) for tracks in flight.tracks],
         scene_note="" if step == 1 else f"The 3D view shows every {step}th frame.",
     )
     write_page(path, text, force=force)
+    return WrittenPage(Path(path))
 
 
 def _section(
     flight: TrackedFlight, tracks: FlightTracks, pictures: bool, jobs: int | None, report: Report
-) -> Section:
+) -> dict[str, Any]:
+    """What the page shows of one file of tracks; None for a part of which there is nothing to show."""
     truth, recording, record = flight.truth, flight.recording, tracks.record
     evaluation = None
     if truth is not None and flight.errors(tracks) is not None:
@@ -151,17 +144,17 @@ def _section(
     cameras = None
     if recording is not None:
         cameras = make_table(_CAMERAS, camera_quality(tracks, recording).to_dict("records"), _CAMERAS_NOTE)
-    return Section(
-        label=tracks.label,
-        figures=_figures(tracks, evaluation),
-        drones=make_table(_DRONES, drones.to_dict("records"), _DRONES_NOTE, tracks.colours),
-        cameras=cameras,
-        errors=None if evaluation is None else _error_table(evaluation),
-        charts=[(QUANTITIES[each.key][1], quantity_svg(each)) for each in quantities(flight, tracks)],
-        moments=moments,
-        more_events=len(events) - len(chosen),
-        run=None if record is None or not record.settings else _run(tracks.path.name, record, flight.name),
-    )
+    return {
+        "label": tracks.label,
+        "figures": _figures(tracks, evaluation),
+        "drones": make_table(_DRONES, drones.to_dict("records"), _DRONES_NOTE, tracks.colours),
+        "cameras": cameras,
+        "errors": None if evaluation is None else _error_table(evaluation),
+        "charts": [(QUANTITIES[each.key][1], quantity_svg(each)) for each in quantities(flight, tracks)],
+        "moments": moments,
+        "more_events": len(events) - len(chosen),
+        "run": None if record is None or not record.settings else _run(tracks.path.name, record, flight.name),
+    }
 
 
 def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[str, str]]:
@@ -183,7 +176,7 @@ def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[
     return shown
 
 
-def _error_table(evaluation: Evaluation) -> PageTable:
+def _error_table(evaluation: Evaluation) -> dict[str, Any]:
     centred = percent("", "").text(evaluation.offset_removed_inside_90_rate)
     note = (
         f"MOTA {evaluation.mota:.3f}, IDF1 {evaluation.idf1:.3f}, HOTA {evaluation.hota:.3f}, GOSPA "

@@ -15,7 +15,6 @@ from markupsafe import Markup
 
 from psotrack import __version__
 from psotrack.errors import OutputError
-from psotrack.show.reports.scene import Scene3D
 from psotrack.support import atomic_write, refuse_to_overwrite
 
 #: Largest size of a page, bytes: what e-mail and chat programs take as an attachment.
@@ -24,41 +23,31 @@ MOST_BYTES = 8_000_000
 _CELL_HEIGHT_PX = 520
 
 
-def asset(name: str) -> str:
-    """Text of a file in `assets`."""
+def _asset(name: str) -> str:
     return (files("psotrack.show.reports") / "assets" / name).read_text(encoding="utf-8")
 
 
 @cache
 def _packed_library() -> str:
     """The library of the 3D view, compressed, as base64; the same bytes each time."""
-    return base64.b64encode(gzip.compress(asset("three.bundle.js").encode(), mtime=0)).decode("ascii")
+    return base64.b64encode(gzip.compress(_asset("three.bundle.js").encode(), mtime=0)).decode("ascii")
 
 
-def _scene_script(scene: Scene3D) -> Markup:
-    """A script that fills the element `scene` with a 3D view."""
-    started = f"psotrackScene(document.getElementById('scene'), {_script_json(scene.data())});"
-    # The JavaScript and the base64 come from the package, and the data hold no "<".
-    return Markup(
-        f"<script>{asset('scene.js')}\npsotrackStart({json.dumps(_packed_library())}, () => {{{started}}});</script>"
-    )
-
-
-def scene_frame(scene: Scene3D, *, height_px: int = _CELL_HEIGHT_PX) -> str:
-    """A 3D view as an HTML element of its own, for a notebook's cell."""
+def scene_frame(scene: dict[str, Any]) -> str:
+    """A 3D view as an HTML element of its own, for a notebook's cell; see `render`."""
     content = render("scene.html", scene, title="3D view")
     return (
         f'<iframe title="3D view" srcdoc="{html.escape(content)}" '
-        f'style="width: 100%; height: {height_px}px; border: 0"></iframe>'
+        f'style="width: 100%; height: {_CELL_HEIGHT_PX}px; border: 0"></iframe>'
     )
 
 
-def render(template: str, scene: Scene3D | None, **values: Any) -> str:
+def render(template: str, scene: dict[str, Any], **values: Any) -> str:
     """The text of a page.
 
     Args:
         template: name of a file in `assets`.
-        scene: the 3D view of the page; None: it has none.
+        scene: data of the 3D view; see `scene.scene_data`.
         **values: what the template shows; text is escaped.
     """
     import jinja2
@@ -70,11 +59,16 @@ def render(template: str, scene: Scene3D | None, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    # `</script>` and the like in the data cannot end the script.
+    data = json.dumps(scene, allow_nan=False).replace("<", "\\u003c").replace("&", "\\u0026")
+    started = f"psotrackScene(document.getElementById('scene'), {data});"
+    script = f"{_asset('scene.js')}\npsotrackStart({json.dumps(_packed_library())}, () => {{{started}}});"
     return environment.get_template(template).render(
-        scripts="" if scene is None else _scene_script(scene),
-        page_css=Markup(asset("page.css")),
-        scene_css=Markup(asset("scene.css")),
-        page_js=Markup(asset("page.js")),
+        # The JavaScript and the base64 come from the package, and the data hold no "<".
+        scripts=Markup(f"<script>{script}</script>"),
+        page_css=Markup(_asset("page.css")),
+        scene_css=Markup(_asset("scene.css")),
+        page_js=Markup(_asset("page.js")),
         version=__version__,
         **values,
     )
@@ -87,7 +81,6 @@ def write_page(path: Path | str, text: str, *, force: bool = False) -> None:
         OutputError: the name does not end in .html, the page is larger than `MOST_BYTES`, the file exists and `force`
             is not set, or it cannot be written.
     """
-    path = Path(path)
     check_page_path(path, force)
     content = text.encode("utf-8")
     if len(content) > MOST_BYTES:
@@ -107,8 +100,3 @@ def check_page_path(path: Path | str, force: bool) -> None:
     if path.suffix.lower() not in (".html", ".htm"):
         raise OutputError(path, expected="a file that ends in .html", found=path.name)
     refuse_to_overwrite(path, force)
-
-
-def _script_json(data: Any) -> str:
-    """JSON that may stand in a script: `</script>` and the like cannot end it."""
-    return json.dumps(data, allow_nan=False).replace("<", "\\u003c").replace("&", "\\u0026")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 
-@dataclass(frozen=True)
-class PageColumn:
+class PageColumn(NamedTuple):
     """A column of a table.
 
     Attributes:
@@ -35,47 +33,31 @@ class PageColumn:
 
 
 def percent(heading: str, key: str, decimals: int = 1) -> PageColumn:
-    """A column of shares as percentages."""
+    """A column of fractions as percentages."""
     return PageColumn(heading, key, decimals, 100.0, " %")
 
 
-@dataclass(frozen=True)
-class PageTable:
-    """A table that sorts by a click on a heading.
-
-    Attributes:
-        headings: names of the columns.
-        rows: of each row the cells: what is shown, and the number by which it is sorted; None sorts by the text.
-        colours: colour of a dot at the begin of each row, as #rrggbb; empty for none.
-        note: a sentence below the table; empty for none.
-    """
-
-    headings: tuple[str, ...]
-    rows: tuple[tuple[tuple[str, float | None], ...], ...]
-    colours: tuple[str, ...] = ()
-    note: str = ""
-
-
 def make_table(
-    columns: Iterable[PageColumn],
+    columns: Sequence[PageColumn],
     rows: Iterable[Mapping[Any, Any]],
     note: str = "",
     colours: tuple[str, ...] = (),
-) -> PageTable:
-    """A table of some columns of data.
+) -> dict[str, Any]:
+    """A table that sorts by a click on a heading, for the template's `show_table`.
 
     Args:
         columns: the columns.
         rows: values by the keys of the columns.
-        note: a sentence below the table.
-        colours: colour of a dot at the begin of each row.
+        note: a sentence below the table; empty for none.
+        colours: colour of a dot at the begin of each row, as #rrggbb; empty for none.
+
+    Returns:
+        `headings`, `note` and `colours`, and `rows`, of each row the cells: what is shown, and the number that
+        sorts it; None sorts by the text.
     """
-    columns = tuple(columns)
-    cells = tuple(tuple(_cell(column, row[column.key]) for column in columns) for row in rows)
-    return PageTable(tuple(column.heading for column in columns), cells, colours, note)
+    cells = [[(column.text(row[column.key]), _number(row[column.key])) for column in columns] for row in rows]
+    return {"headings": [each.heading for each in columns], "rows": cells, "colours": colours, "note": note}
 
 
-def _cell(column: PageColumn, value: Any) -> tuple[str, float | None]:
-    text = column.text(value)
-    is_number = isinstance(value, int | float) and np.isfinite(value)
-    return text, float(value) if is_number else None
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and np.isfinite(value) else None

@@ -13,7 +13,6 @@ Rerun has no lens distortion: marks are drawn in the pixels of the raw images, a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,20 +42,6 @@ class Instants(NamedTuple):
     time_s: Float[np.ndarray, " rows"]
 
 
-class Marks(NamedTuple):
-    """How marks in images look.
-
-    Attributes:
-        counts: (rows,), number of marks of each row.
-        rgb: colours of all marks of all rows, or one colour.
-        labels: names of all marks of all rows; None: no names.
-    """
-
-    counts: Int[np.ndarray, " rows"]
-    rgb: UInt8[np.ndarray, "marks 3"] | tuple[int, int, int]
-    labels: list[str] | None = None
-
-
 class EntityLog:
     """Logs values of entities into a recording of Rerun.
 
@@ -81,23 +66,27 @@ class EntityLog:
         self,
         path: str,
         at: Instants,
-        columns: Callable[[slice], Any],
+        kind: Any,
         counts: Int[np.ndarray, " rows"] | None = None,
+        **values: Any,
     ) -> None:
         """Log values over time, in pieces.
 
         Args:
             path: path of the entity.
             at: the instants of the rows.
-            columns: makes the columns of some of the values.
+            kind: archetype of Rerun.
             counts: (rows,), number of values of each row; a row without values hides those of the row before. None:
                 one value per row.
+            **values: the values of all rows by the archetype's fields; None for a field that is not logged.
         """
         ends = np.arange(len(at.frame) + 1) if counts is None else np.concatenate([[0], np.cumsum(counts)])
         for first in range(0, len(at.frame), _ROWS):
-            rows = slice(first, first + _ROWS)
-            own = ends[first : first + _ROWS + 1]
-            found = columns(slice(int(own[0]), int(own[-1])))
+            rows, own = slice(first, first + _ROWS), ends[first : first + _ROWS + 1]
+            part = slice(int(own[0]), int(own[-1]))
+            found = kind.columns(
+                **{name: each if each is None else each[part] for name, each in values.items()}
+            )
             times = [
                 rr.TimeColumn(TIME, duration=np.asarray(at.time_s[rows], np.float64)),
                 rr.TimeColumn(FRAME, sequence=np.asarray(at.frame[rows], np.int64)),
@@ -105,30 +94,36 @@ class EntityLog:
             found = found if counts is None else found.partition(np.diff(own))
             rr.send_columns(path, times, found, recording=self._stream, strict=True)
 
-    def boxes(self, path: str, at: Instants, marks: Marks, boxes_px: Float[np.ndarray, "boxes 4"]) -> None:
-        """Log boxes in images over time; without names, they have thin lines."""
-        radius = -0.75 if marks.labels is None else -1.5  # negative: in pixels of the screen
+    def boxes(
+        self,
+        path: str,
+        at: Instants,
+        counts: Int[np.ndarray, " rows"],
+        boxes_px: Float[np.ndarray, "boxes 4"],
+        rgb: Any,
+        labels: list[str] | None = None,
+    ) -> None:
+        """Log boxes in images over time, in one colour or in a colour each; without names, they have thin lines."""
+        radius = -0.75 if labels is None else -1.5  # negative: in pixels of the screen
+        self.static(path, rr.Boxes2D.from_fields(radii=[radius], show_labels=labels is not None))
         centre_px, half_px = (boxes_px[:, 2:] + boxes_px[:, :2]) / 2, (boxes_px[:, 2:] - boxes_px[:, :2]) / 2
-        self._marks(path, at, marks, rr.Boxes2D, radius, centers=centre_px, half_sizes=half_px)
+        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(boxes_px), 3))
+        sides = {"centers": centre_px, "half_sizes": half_px}
+        self.rows(path, at, rr.Boxes2D, counts, **sides, colors=colours, labels=labels)
 
     def lines(
-        self, path: str, at: Instants, marks: Marks, lines_px: Float[np.ndarray, "lines points 2"]
+        self,
+        path: str,
+        at: Instants,
+        counts: Int[np.ndarray, " rows"],
+        lines_px: Float[np.ndarray, "lines points 2"],
+        rgb: Any,
+        labels: list[str] | None = None,
     ) -> None:
-        """Log lines in images over time."""
-        self._marks(path, at, marks, rr.LineStrips2D, -1.0, strips=lines_px)
-
-    def _marks(
-        self, path: str, at: Instants, marks: Marks, kind: Any, radius: float, **places: np.ndarray
-    ) -> None:
-        labels = marks.labels
-        self.static(path, kind.from_fields(radii=[radius], show_labels=labels is not None))
-        rgb = np.broadcast_to(np.array(marks.rgb, np.uint8), (int(marks.counts.sum()), 3))
-
-        def columns(part: slice) -> Any:
-            own = {key: list(values[part]) for key, values in places.items()}
-            return kind.columns(**own, colors=rgb[part], labels=None if labels is None else labels[part])
-
-        self.rows(path, at, columns, marks.counts)
+        """Log lines in images over time, in one colour or in a colour each."""
+        self.static(path, rr.LineStrips2D.from_fields(radii=[-1.0], show_labels=labels is not None))
+        colours = np.broadcast_to(np.array(rgb, np.uint8), (len(lines_px), 3))
+        self.rows(path, at, rr.LineStrips2D, counts, strips=list(lines_px), colors=colours, labels=labels)
 
 
 def part(name: str) -> str:

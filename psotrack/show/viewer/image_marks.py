@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -17,7 +16,6 @@ from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSou
 from psotrack.show.viewer.entity_log import (
     EntityLog,
     Instants,
-    Marks,
     camera_path,
     instants,
     shown_rgb,
@@ -97,7 +95,7 @@ def log_images(
         labels = [f"{marker}" for image in shown for marker in image.marker_ids.tolist()]
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
         outlines_px = corners_px[:, [0, 1, 2, 3, 0]] + 0.5
-        log.lines(f"{path}/markers", at, Marks(counts, MARKER_RGB, labels), outlines_px)
+        log.lines(f"{path}/markers", at, counts, outlines_px, MARKER_RGB, labels)
 
 
 def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, tuple[int, float]]:
@@ -108,11 +106,7 @@ def _shown_at(recording: Recording, camera: CameraKey, step: int) -> dict[int, t
     timeline = recording.timeline()
     frame = timeline.frame[:, timeline.cameras.index(camera.name)]
     rows = _rows_shown(frame, step)
-    return dict(
-        zip(
-            frame[rows].tolist(), zip(rows.tolist(), timeline.time_s[rows].tolist(), strict=True), strict=True
-        )
-    )
+    return {int(frame[row]): (int(row), float(timeline.time_s[row])) for row in rows}
 
 
 def _instants(images: Sequence[EncodedImage], instant: Mapping[int, tuple[int, float]]) -> Instants:
@@ -124,17 +118,13 @@ def _log_encoded(
     log: EntityLog, path: str, images: Sequence[EncodedImage], instant: Mapping[int, tuple[int, float]]
 ) -> None:
     """Log some images together, and their silhouettes, which are in front."""
-
-    def encoded(blobs: list[bytes], kind: str, order: float) -> Callable[[slice], Any]:
-        count = len(blobs)
-        found = rr.EncodedImage.columns(blob=blobs, media_type=[kind] * count, draw_order=[order] * count)
-        return lambda _: found
-
     at = _instants(images, instant)
-    if images:
-        log.rows(f"{path}/image", at, encoded([each.jpeg for each in images], "image/jpeg", 0.0))
-    if images and images[0].silhouette:
-        log.rows(f"{path}/silhouettes", at, encoded([each.silhouette for each in images], "image/png", 1.0))
+    kinds = [("image", "image/jpeg", 0.0, [each.jpeg for each in images])]
+    kinds += [("silhouettes", "image/png", 1.0, [each.silhouette for each in images])]
+    for name, kind, order, blobs in kinds:
+        if any(blobs):
+            types, orders = [kind] * len(blobs), [order] * len(blobs)
+            log.rows(f"{path}/{name}", at, rr.EncodedImage, blob=blobs, media_type=types, draw_order=orders)
 
 
 def _log_boxes(
@@ -142,7 +132,7 @@ def _log_boxes(
 ) -> None:
     """Log the boxes of each row, without names."""
     counts = np.array([len(each) for each in boxes_px], int)
-    log.boxes(path, at, Marks(counts, rgb), np.concatenate([np.zeros((0, 4)), *boxes_px]))
+    log.boxes(path, at, counts, np.concatenate([np.zeros((0, 4)), *boxes_px]), rgb)
 
 
 def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
@@ -152,11 +142,8 @@ def _log_path(log: EntityLog, path: str, onboard: OnboardVideo) -> None:
     known = np.isfinite(position_m).all(axis=1) & np.isfinite(orientation_wxyz).all(axis=1)
     frame, position_m = np.flatnonzero(known), position_m[known]
     rotation = rotation_matrices(orientation_wxyz[known])
-    log.rows(
-        path,
-        Instants(frame, frame / onboard.video.fps),
-        lambda rows: rr.Transform3D.columns(translation=position_m[rows], mat3x3=rotation[rows]),
-    )
+    poses = {"translation": position_m, "mat3x3": rotation}
+    log.rows(path, Instants(frame, frame / onboard.video.fps), rr.Transform3D, **poses)
     if onboard.K is not None:
         log.static(path, pinhole(onboard.K, np.array(onboard.video.image_size_wh), _ONBOARD_DISTANCE_M))
 
@@ -172,23 +159,19 @@ def _log_tracks(log: EntityLog, recording: Recording, tracks: FlightTracks, step
         boxes_px = views.boxes_px[rows, :, index]
         there = np.isfinite(boxes_px).all(axis=-1)
         labels = [tracks.names[drone] for drone in np.nonzero(there)[1]]
-        marks = Marks(there.sum(axis=1), rgb[rows][there], labels)
-        log.boxes(tracks_path(f"{path}/boxes", tracks), at, marks, boxes_px[there])
+        own = tracks_path(f"{path}/boxes", tracks)
+        log.boxes(own, at, there.sum(axis=1), boxes_px[there], rgb[rows][there], labels)
         if tracks.trajectories.covariance_m2 is None:
             continue
         middle_px, shape_px2 = views.middle_px[rows, :, index], views.shape_px2[rows, :, index]
         there = np.isfinite(middle_px).all(axis=-1) & np.isfinite(shape_px2).all(axis=(-2, -1))
         # Pixel centres are at whole numbers, in Rerun half a pixel further.
         outlines_px = ellipse_outlines_px(middle_px[there] + 0.5, shape_px2[there])
-        marks = Marks(there.sum(axis=1), rgb[rows][there])
-        log.lines(tracks_path(f"{path}/ellipses", tracks), at, marks, outlines_px)
-
-
-def _is_new(frame: Int[np.ndarray, " instants"]) -> np.ndarray:
-    """(instants,), whether a camera shows another frame than at the instant before."""
-    return (frame >= 0) & (np.diff(frame, prepend=-1) != 0)
+        own = tracks_path(f"{path}/ellipses", tracks)
+        log.lines(own, at, there.sum(axis=1), outlines_px, rgb[rows][there])
 
 
 def _rows_shown(frame: Int[np.ndarray, " instants"], step: int) -> Int[np.ndarray, " rows"]:
     """Instants at which a camera shows a new frame whose number is a multiple of `step`."""
-    return np.flatnonzero(_is_new(frame) & (frame % step == 0))
+    is_new = (frame >= 0) & (np.diff(frame, prepend=-1) != 0)
+    return np.flatnonzero(is_new & (frame % step == 0))

@@ -97,7 +97,7 @@ class LiveView:
             trail.append(position_m[name])
         rgb = shown_rgb(tracks)[0, [rows.drones.index(name) for name in known]]
         strips_m = [np.stack(trail) for trail in self._trails.values()]
-        self._show("world/drones/trail", rr.LineStrips3D.columns(strips=strips_m, colors=rgb), len(known))
+        self._show("world/drones/trail", rr.LineStrips3D, len(known), strips=strips_m, colors=rgb)
 
     def _show_deviations(self, rows: Trajectories) -> None:
         if rows.covariance_m2 is None:
@@ -110,15 +110,15 @@ class LiveView:
         values_mm = np.full(len(names), np.nan)
         own_mm = np.where(rows.seen[0], deviations_mm(rows.covariance_m2[0]), np.nan)
         values_mm[[names.index(name) for name in rows.drones]] = own_mm
-        self._show(path, rr.Scalars.columns(scalars=values_mm), len(names))
+        self._show(path, rr.Scalars, len(names), scalars=values_mm)
 
     def show_delay(self, delay_s: float) -> None:
         """Show the delay of the instant whose rows were written last, seconds."""
-        self._show("plots/delay_ms", rr.Scalars.columns(scalars=[1e3 * delay_s]), 1)
+        self._show("plots/delay_ms", rr.Scalars, 1, scalars=[1e3 * delay_s])
 
-    def _show(self, path: str, values: Any, count: int) -> None:
+    def _show(self, path: str, kind: Any, count: int, **values: Any) -> None:
         """Show some values of one entity at this instant."""
-        self._log.rows(path, self._now, lambda _: values, np.array([count]))
+        self._log.rows(path, self._now, kind, np.array([count]), **values)
 
     def __exit__(
         self,

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Any
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float
 
 from psotrack.show.flights import (
     EventKind,
@@ -44,7 +41,7 @@ def _log_quantities(log: EntityLog, flight: TrackedFlight, tracks: FlightTracks)
         for name, colour, values in zip(quantity.names, quantity.colours, quantity.values.T, strict=True):
             path, shown = drone_path(f"plots/{quantity.key}", tracks, name), f"{tracks.group} {name}".strip()
             log.static(path, rr.SeriesLines(colors=[colour_rgb(colour)], names=[shown], widths=[1.5]))
-            log.rows(path, at, partial(_scalars, values))
+            log.rows(path, at, rr.Scalars, scalars=values)
 
 
 def log_status(log: EntityLog, tracks: FlightTracks, before: Mapping[str, int] = {}) -> None:
@@ -63,7 +60,7 @@ def log_status(log: EntityLog, tracks: FlightTracks, before: Mapping[str, int] =
             continue
         log.static(path, rr.StateConfiguration(values=words, labels=words, colors=_STATUS_RGB))
         at = Instants(*(part[changes] for part in instants(tracks)))
-        log.rows(path, at, partial(_states, [words[each] for each in status[changes]]))
+        log.rows(path, at, rr.StateChange, state=[words[each] for each in status[changes]])
 
 
 def _log_events(log: EntityLog, flight: TrackedFlight) -> None:
@@ -75,17 +72,5 @@ def _log_events(log: EntityLog, flight: TrackedFlight) -> None:
         at = Instants(
             np.array([event.frame for event in own], int), np.array([event.time_s for event in own], float)
         )
-        level = "WARN" if kind in _WARNINGS else "INFO"
-        log.rows(f"events/{kind.replace(' ', '_')}", at, partial(_sentences, texts, level))
-
-
-def _scalars(values: Float[np.ndarray, " rows"], rows: slice) -> Any:
-    return rr.Scalars.columns(scalars=values[rows])
-
-
-def _states(words: list[str], rows: slice) -> Any:
-    return rr.StateChange.columns(state=words[rows])
-
-
-def _sentences(texts: list[str], level: str, rows: slice) -> Any:
-    return rr.TextLog.columns(text=texts[rows], level=[level] * len(texts[rows]))
+        level = ["WARN" if kind in _WARNINGS else "INFO"] * len(own)
+        log.rows(f"events/{kind.replace(' ', '_')}", at, rr.TextLog, text=texts, level=level)

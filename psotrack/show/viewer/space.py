@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -70,7 +68,7 @@ def log_flight(log: EntityLog, flight: TrackedFlight) -> None:
         known = np.isfinite(position_m).all(axis=-1)
         log.static(f"{path}/point", rr.Points3D.from_fields(colors=[_TRUTH_RGBA], radii=[0.03]))
         at = Instants(truth.frame, truth.time_s)
-        log.rows(f"{path}/point", at, partial(_points, position_m[known]), known.astype(int))
+        log.rows(f"{path}/point", at, rr.Points3D, known.astype(int), positions=position_m[known])
         log.static(f"{path}/path", rr.LineStrips3D([position_m[known]], colors=[_TRUTH_RGBA], radii=[0.004]))
 
 
@@ -92,17 +90,8 @@ def log_drones(log: EntityLog, path: str, tracks: FlightTracks, drones: Sequence
         name if each == Status.TRACKED else f"{name} {Status(each).label}"
         for name, each in zip(names, status[known].tolist(), strict=True)
     ]
-    log.rows(
-        f"{path}/body",
-        at,
-        lambda part: rr.Boxes3D.columns(
-            centers=position_m[known][part],
-            half_sizes=half_m[known][part],
-            colors=rgb[known][part],
-            labels=labels[part],
-        ),
-        known.sum(axis=1),
-    )
+    shapes = {"centers": position_m[known], "half_sizes": half_m[known], "colors": rgb[known]}
+    log.rows(f"{path}/body", at, rr.Boxes3D, known.sum(axis=1), **shapes, labels=labels)
     if flown.covariance_m2 is None:
         return
     ellipsoids = ellipsoids_90(flown.covariance_m2[:, drones])
@@ -112,17 +101,8 @@ def log_drones(log: EntityLog, path: str, tracks: FlightTracks, drones: Sequence
     # A large ellipsoid must not hide what is behind.
     fill = rr.components.FillMode.TransparentFillMajorWireframe
     log.static(f"{path}/ellipsoid", rr.Ellipsoids3D.from_fields(fill_mode=fill))
-    log.rows(
-        f"{path}/ellipsoid",
-        at,
-        lambda part: rr.Ellipsoids3D.columns(
-            centers=position_m[shown][part],
-            half_sizes=ellipsoids.half_axes_m[shown][part],
-            quaternions=turned[part],
-            colors=rgb[shown][part],
-        ),
-        shown.sum(axis=1),
-    )
+    shapes = {"centers": position_m[shown], "half_sizes": ellipsoids.half_axes_m[shown], "colors": rgb[shown]}
+    log.rows(f"{path}/ellipsoid", at, rr.Ellipsoids3D, shown.sum(axis=1), **shapes, quaternions=turned)
 
 
 def pinhole(K: Float[np.ndarray, "3 3"], image_size_wh: np.ndarray, distance_m: float) -> rr.Pinhole:
@@ -146,22 +126,14 @@ def pinhole(K: Float[np.ndarray, "3 3"], image_size_wh: np.ndarray, distance_m: 
     )
 
 
-def _points(position_m: Float[np.ndarray, "rows 3"], rows: slice) -> Any:
-    return rr.Points3D.columns(positions=position_m[rows])
-
-
 def _log_path(log: EntityLog, tracks: FlightTracks, drone: int, path: str) -> None:
     """Log the trail of a drone, from each row before to this one, and the whole path where it is not lost."""
     position_m, rgb = tracks.trajectories.position_m[:, drone], shown_rgb(tracks)[:, drone]
     known = np.isfinite(position_m).all(axis=-1)
     follows = known & np.roll(known, 1) & (np.arange(len(known)) > 0)
     strips_m = np.stack([np.roll(position_m, 1, axis=0), position_m], axis=1)[follows]
-    log.rows(
-        f"{path}/trail",
-        instants(tracks),
-        lambda part: rr.LineStrips3D.columns(strips=strips_m[part], colors=rgb[follows][part]),
-        follows.astype(int),
-    )
+    lines = {"strips": strips_m, "colors": rgb[follows]}
+    log.rows(f"{path}/trail", instants(tracks), rr.LineStrips3D, follows.astype(int), **lines)
     flown = intervals(known & (statuses(tracks.trajectories)[:, drone] != Status.LOST))
     own = (*colour_rgb(tracks.colours[drone]), _PATH_OPACITY)
     whole_m = [position_m[start:stop] for start, stop in flown]

@@ -1,6 +1,6 @@
 // A view of a flight in 3D that turns and plays. psotrackScene(host, data) fills the element `host`.
 //
-// `data` comes from psotrack/show/reports/scene.py: times, drones, truth, cameras and clouds of points, in metres, z up. Arrays
+// `data` comes from psotrack/show/reports/scene.py: times, drones, truth and cameras, in metres, z up. Arrays
 // of numbers are base64 of little-endian float32; NaN where a position is not known.
 
 function psotrackScene(host, data) {
@@ -19,7 +19,6 @@ function psotrackScene(host, data) {
     half: drone.half_axes_m && decode(drone.half_axes_m),
     turn: drone.rotation_xyzw && decode(drone.rotation_xyzw),
   }));
-  const clouds = data.clouds.map((cloud) => ({ ...cloud, position: decode(cloud.position_m) }));
   const isKnown = (array, row) => Number.isFinite(array[3 * row]);
   const at = (array, row) => [array[3 * row], array[3 * row + 1], array[3 * row + 2]];
 
@@ -182,17 +181,6 @@ function psotrackScene(host, data) {
       groupOf("90 % ellipsoids x 10").add(drone.ellipsoid);
     }
   }
-  for (const cloud of clouds) {
-    cloud.geometry = new THREE.BufferGeometry();
-    cloud.rows = cloud.position.length / (3 * count);
-    cloud.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * cloud.rows), 3));
-    const points = new THREE.Points(
-      cloud.geometry,
-      new THREE.PointsMaterial({ color: cloud.colour, size: cloud.size_px, sizeAttenuation: false }),
-    );
-    points.frustumCulled = false;
-    groupOf(cloud.name).add(points);
-  }
 
   const choices = host.querySelector(".scene-choices");
   for (const [name, group] of Object.entries(groups)) {
@@ -229,7 +217,7 @@ function psotrackScene(host, data) {
   const show = (wanted) => {
     row = Math.max(0, Math.min(count - 1, wanted));
     slider.value = `${row}`;
-    clock.textContent = data.step_name ? `${data.step_name} ${row}` : `${time[row].toFixed(2)} s`;
+    clock.textContent = `${time[row].toFixed(2)} s`;
     for (const drone of drones) {
       const there = isKnown(drone.position, row) && drone.status[row] < 2;
       drone.body.visible = there;
@@ -252,11 +240,6 @@ function psotrackScene(host, data) {
       buffer.array.set(points);
       buffer.needsUpdate = true;
       drone.trail.geometry.instanceCount = points.length / 6;
-    }
-    for (const cloud of clouds) {
-      const attribute = cloud.geometry.attributes.position;
-      attribute.array.set(cloud.position.subarray(3 * cloud.rows * row, 3 * cloud.rows * (row + 1)));
-      attribute.needsUpdate = true;
     }
     draw();
   };

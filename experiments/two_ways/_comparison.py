@@ -1,17 +1,11 @@
 """One rig, two methods: errors of outside-in, inside-out and both fused, beside each other, and in ranges of frames.
 
-    python experiments/two_ways/two_ways.py data/Simulated_Data/S01_D2_A dron1.csv dron2.csv tracks.csv
-    python experiments/two_ways/two_ways.py SEQ INSIDE.csv [INSIDE.csv ...] OUTSIDE.csv --range 25 --out rows.csv
-
-INSIDE are paths of `psotrack onboard localise`, whose drones are named as in SEQ's reference; OUTSIDE is a file of
-`psotrack track`. The constant offset of each track from the reference is removed in the axes of the body, because a
-camera, the middle of a silhouette and a body's origin are different points. Only frames that both methods cover count.
+The constant offset of each track from the reference is removed in the axes of the body, because a camera, the middle of
+a silhouette and a body's origin are different points. Only frames that both methods cover count.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +14,9 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import InputError, PsotrackError
+from psotrack.errors import InputError
 from psotrack.inside_out import CameraPath, FusedTracks, fuse, read_camera_path
 from psotrack.recordings.datasets import read_sequence
-from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import Trajectories, read_trajectories
 
 METHODS = ("outside", "inside", "fused")
@@ -36,31 +29,6 @@ class Compared:
     drone: str
     error_m: dict[str, np.ndarray]
     frame: np.ndarray
-
-
-def main() -> None:
-    """Fuse the tracks, compare them, and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("sequence", type=Path)
-    parser.add_argument("inside", type=Path, nargs="+", help="INSIDE.csv, one per drone, then OUTSIDE.csv")
-    parser.add_argument("--range", type=int, default=50, metavar="FRAMES", help="[default: 50]")
-    parser.add_argument("--out", type=Path, help="write a row per drone and range as CSV")
-    parser.add_argument("--force", action="store_true", help="replace an existing file")
-    options = parser.parse_args()
-    *inside, outside = options.inside
-    try:
-        if options.out is not None:
-            refuse_to_overwrite(options.out, options.force)
-        compared = compare_drones(options.sequence, inside, outside)
-        rows = pd.concat([ranges(one, options.range) for one in compared])
-        print(render(compared, rows))
-        if options.out is not None:
-            with atomic_write(options.out) as temporary:
-                rows.to_csv(temporary, index=False)
-    except PsotrackError as error:
-        sys.exit(f"two_ways: {error}")
 
 
 def compare_drones(sequence: Path, inside: Sequence[Path], outside: Path) -> list[Compared]:
@@ -78,33 +46,6 @@ def compare_drones(sequence: Path, inside: Sequence[Path], outside: Path) -> lis
     if truth is None or truth.orientation_wxyz is None:
         raise InputError(sequence, expected="a reference with orientations", found="none")
     return [one for name in paths if (one := _compared(name, paths[name], tracks, fused, truth))]
-
-
-def render(compared: list[Compared], rows: pd.DataFrame) -> str:
-    """A table in Markdown, one line per drone."""
-    lines = [
-        "| drone | outside, mm: median, mean, p99 | inside | fused | ranges | fused is no worse in | worst ratio |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for one in compared:
-        own = rows[rows.drone == one.drone]
-        cells = [_words(one.error_m[method]) for method in METHODS]
-        no_worse = f"{(own.ratio <= 1).sum()} of {len(own)}"
-        worst = own.loc[own.ratio.idxmax()]
-        excess_mm = 1e3 * (worst.fused_m - min(worst.inside_m, worst.outside_m))
-        cells += [
-            f"{len(own)}",
-            no_worse,
-            f"{worst.ratio:.2f} ({excess_mm:+.2f} mm, from frame {worst.first_frame})",
-        ]
-        lines.append(f"| {one.drone} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _words(error_m: np.ndarray) -> str:
-    return ", ".join(
-        f"{1e3 * value:.2f}" for value in (np.median(error_m), error_m.mean(), np.quantile(error_m, 0.99))
-    )
 
 
 def _compared(
@@ -166,7 +107,3 @@ def ranges(one: Compared, length: int) -> pd.DataFrame:
             {"drone": one.drone, "first_frame": first, "frames": inside.sum(), **mean_m, "ratio": ratio}
         )
     return pd.DataFrame(rows)
-
-
-if __name__ == "__main__":
-    main()
