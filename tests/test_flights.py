@@ -19,7 +19,6 @@ from psotrack.recordings.exchange import export_tracks
 from psotrack.show.flights import (
     EventKind,
     camera_quality,
-    drone_quality,
     ellipsoids_90,
     find_events,
     find_recording,
@@ -214,22 +213,6 @@ class TestEvents:
 
 
 class TestQuality:
-    def test_drones(self, tmp_path):
-        tracks = with_status(straight_tracks(), 0, slice(0, 5), Status.LOST)
-        tracks = with_status(tracks, 0, slice(10, 12), Status.COASTING)
-        record = {"drones": [{"drone": 0, "size_m": [0.4, 0.4, 0.2], "size_std_m": [None, None, None]}]}
-        (read,) = read_flight([write_flight(tmp_path, tracks, record)]).tracks
-        first, second = drone_quality(read).to_dict("records")
-        assert (first["seen"], first["coasting"], first["first_s"], first["last_s"]) == (
-            0.75,
-            0.1,
-            0.5,
-            pytest.approx(1.9),
-        )
-        assert (first["num_cameras"], first["fitness"], first["speed_m_s"]) == (3, 0.5, pytest.approx(2.0))
-        assert first["radius_90_m"] == pytest.approx(0.03 * np.sqrt(chi2.ppf(0.9, 3)))
-        assert (first["size_z_m"], second["size_z_m"]) == (0.2, 0.3)
-
     def test_cameras(self, tmp_path):
         record = {
             "camera_errors": {"cameras": {"c1": {"noise_px": [3.0, 4.0], "lasting_px": [0.1, 0.1]}}},

@@ -131,9 +131,10 @@ class TestFlight:
 
     def test_the_page_explains_its_figures(self, page):
         text = page.read_text(encoding="utf-8")
-        assert (
-            "In 90 % ellipsoid: share of the frames in which the ellipsoid that the run states holds" in text
-        )
+        assert "share of the frames in which the ellipsoid that the run states holds" in text
+        # The tables are those of a notebook: of an evaluation, with the figures of all drones, and of tracks.
+        assert "<td>all</td>" in text
+        assert "<td>50 50 20</td>" in text
         assert "<b>1.5 times</b><span>faster than the video</span>" in text
 
     def test_the_same_tracks_again_is_a_script_that_processes_may_import(self, page):
@@ -294,7 +295,7 @@ class TestInABrowser:
             assert shown.evaluate(row) == FRAMES - 2
             shown.locator(".jump").first.click()
             assert shown.evaluate(row) < FRAMES - 2
-            errors = shown.locator("table.sorts").first
+            errors = shown.locator("table:has(thead)").first
             heading = errors.locator("th button").nth(2)
             heading.click()
             shown_mm = [float(text) for text in errors.locator("tbody td:nth-child(3)").all_inner_texts()]
@@ -329,4 +330,4 @@ class TestInABrowser:
             shown.wait_for_selector(".scene-none")
             assert "no 3D graphics" in shown.inner_text(".scene-none")
             shown.locator(".jump").first.click()
-            assert shown.locator("table.sorts").count() == 3
+            assert shown.locator("table:has(thead)").count() == 3

@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 #: Shortest compile time of a program that is stored, seconds. Reading a smaller program back takes as long.
 WORTH_KEEPING_S = 0.3
-#: Share of the memory maps that Linux allows a process, above which programs are dropped.
+#: Fraction of the memory maps that Linux allows a process, above which programs are dropped.
 _MOST_MAPS = 0.5
 _MAPS = Path("/proc/self/maps")
 _MAP_LIMIT = Path("/proc/sys/vm/max_map_count")

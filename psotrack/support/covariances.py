@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-#: Largest size of an eigenvalue below zero that is a rounding error, as a share of the largest eigenvalue: sums in
+#: Largest size of an eigenvalue below zero that is a rounding error, as a fraction of the largest eigenvalue: sums in
 #: float32 and files with six digits have such errors.
 _ROUNDING = 1e-5
 

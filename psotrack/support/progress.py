@@ -22,8 +22,8 @@ Report = Callable[[str, int], contextlib.AbstractContextManager[Advance]]
 LONG_S = 20.0
 #: Least time between two lines about a stage, and the time after which a line comes in any case, seconds.
 _EVERY_S, _AT_LATEST_S = 20.0, 300.0
-#: Least share of the stage between two lines about it, unless `_AT_LATEST_S` have passed.
-_SHARE = 0.1
+#: Least fraction of the stage between two lines about it, unless `_AT_LATEST_S` have passed.
+_FRACTION = 0.1
 #: Time between two changes of a line in a notebook, seconds.
 _REDRAWN_S = 0.2
 
@@ -85,7 +85,7 @@ def progress_lines(
 
     def report(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
         say = _to_stderr if write is None else write
-        return _said(description, total, say, every_s=_EVERY_S, share=_SHARE, long_s=long_s, clock=clock)
+        return _said(description, total, say, every_s=_EVERY_S, least=_FRACTION, long_s=long_s, clock=clock)
 
     return report
 
@@ -114,14 +114,15 @@ def _said(
     say: Callable[[str], None],
     *,
     every_s: float,
-    share: float = 0.0,
+    least: float = 0.0,
     long_s: float = 0.0,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[Advance]:
     """Say in sentences how a stage goes on, and how it ended if it took `long_s`; 0 steps are an unknown number.
 
-    A sentence comes `every_s`, if a `share` of the stage was done since the one before, or `_AT_LATEST_S` have passed.
-    The rest is as fast as what followed the first sentence: the first steps may have waited for a compilation.
+    A sentence comes `every_s`, if the fraction `least` of the stage was done since the one before, or
+    `_AT_LATEST_S` have passed. The rest is as fast as what followed the first sentence: the first steps may have waited
+    for a compilation.
     """
     lock, began_s, done, of = threading.Lock(), clock(), 0, f" of {total}" if total else ""
     #: Time and steps of each sentence.
@@ -130,7 +131,7 @@ def _said(
     def sentence(now_s: float) -> str | None:
         """What is done, the time that it took, and about how long the rest takes; None if it is not due."""
         before_s, before = said[-1] if said else (began_s, 0)
-        silent_s, is_enough = now_s - before_s, not total or done - before >= share * total
+        silent_s, is_enough = now_s - before_s, not total or done - before >= least * total
         if silent_s < every_s or 0 < total <= done or not (is_enough or not said or silent_s >= _AT_LATEST_S):
             return None
         said.append((now_s, done))

@@ -29,7 +29,7 @@ class Perturbation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     Attributes:
         extrinsics_deg: angle by which every camera is turned about its own centre, around a random axis, degrees.
         clock_frames: largest delay of a camera, frames; each camera gets a random delay from 0 to this, with fractions.
-        flipped: share of the full-size silhouettes' pixels that are inverted.
+        flipped: fraction of the full-size silhouettes' pixels that are inverted.
         draw: number of the random draw, from 0.
 
     Raises:

@@ -107,7 +107,7 @@ def sweep(
         The outcome; its `rows()` are a pandas frame with the grid's cells and seeds, in the grid's order. Settings are
         columns with dots (`settings.swarm.particles`), and metrics have units in their names. `seconds.*`, `device.*`,
         `versions.*` and `commit` record the time and the origin of a row. `real_time_factor` is seconds of video per
-        second of wall clock of a run's share of its batch, with stored silhouettes; `real_time_factor_running` is the
+        second of wall clock of a run's part of its batch, with stored silhouettes; `real_time_factor_running` is the
         same without compilation. `attrs["errors"]` lists failed cells by title.
 
     Raises:

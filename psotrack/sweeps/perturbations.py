@@ -155,21 +155,21 @@ def _delay(stored: _Frames, frames: float) -> _Frames:
     Frames before the first one are equal to the first frame.
     """
     whole = math.floor(frames)
-    share = np.float32(frames - whole)
+    fraction = np.float32(frames - whole)
     late = np.empty_like(stored)
     for block in _blocks(len(stored)):
         index = np.arange(block.start, block.stop) - whole
         nearer, farther = (stored[np.maximum(at, 0)].astype(np.float32) for at in (index, index - 1))
-        late[block] = np.round((1 - share) * nearer + share * farther)
+        late[block] = np.round((1 - fraction) * nearer + fraction * farther)
     return late
 
 
-def _flip_pixels(stored: _Frames, share: float, pixels: int, rng: np.random.Generator) -> _Frames:
-    """Flip a random share of the full-size pixels; each value of the silhouettes stands for `pixels` pixels."""
+def _flip_pixels(stored: _Frames, fraction: float, pixels: int, rng: np.random.Generator) -> _Frames:
+    """Flip a random fraction of the full-size pixels; each value of the silhouettes stands for `pixels` pixels."""
     noisy = np.empty_like(stored)
     for block in _blocks(len(stored)):
         count = np.round(stored[block] / 255 * pixels).astype(np.int64)
-        count = count - rng.binomial(count, share) + rng.binomial(pixels - count, share)
+        count = count - rng.binomial(count, fraction) + rng.binomial(pixels - count, fraction)
         noisy[block] = np.round(255 * count / pixels)
     return noisy
 

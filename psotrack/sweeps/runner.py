@@ -128,7 +128,7 @@ def _times(result: TrackedRecording, wall_s: float) -> dict[str, float]:
 
     Args:
         result: result of the run.
-        wall_s: the run's share of the seconds of wall clock of all runs.
+        wall_s: the run's part of the seconds of wall clock of all runs.
     """
     seconds = result.record["seconds"]
     # A sweep reads stored silhouettes and starts once for all cells, so neither is in the seconds of a run.

@@ -13,7 +13,7 @@ from .flight import (
     split_sequence,
 )
 from .image_views import ImageViews, ellipse_outlines_px, view_in_images
-from .quality import QUANTITIES, Quantity, camera_quality, deviations_mm, drone_quality, quantities
+from .quality import QUANTITIES, Quantity, camera_quality, deviations_mm, quantities
 from .run_record import (
     LearnedDrone,
     MeetingRecord,
@@ -42,7 +42,6 @@ __all__ = [
     "camera_quality",
     "colour_rgb",
     "deviations_mm",
-    "drone_quality",
     "ellipse_outlines_px",
     "ellipsoids_90",
     "find_events",

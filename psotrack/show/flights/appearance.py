@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from psotrack.evaluation import INSIDE_90
 from psotrack.trajectories import Status, Trajectories
 
-#: Share of the pale colour in the colours of predicted drones, and the grey of lost ones, 0 to 255.
+#: Fraction of the pale colour in the colours of predicted drones, and the grey of lost ones, 0 to 255.
 _COASTING_PALER, _LOST_GREY = 0.65, 150
 
 
@@ -40,7 +40,7 @@ def status_rgb(
     Args:
         status: (..., drones), values of `Status`.
         colours: a colour per drone, as #rrggbb.
-        lighter: share of white that is mixed into all colours, for dark backgrounds.
+        lighter: fraction of white that is mixed into all colours, for dark backgrounds.
         pale: grey level that is mixed into the colours of predicted drones, 0 to 255.
     """
     own = np.array([colour_rgb(colour) for colour in colours], float).reshape(-1, 3)

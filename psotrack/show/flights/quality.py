@@ -1,4 +1,4 @@
-"""Quality of tracks: quantities over time, and tables with one row per drone or per camera."""
+"""Quality of tracks: quantities over time, and a table with one row per camera."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.recordings import Recording
-from psotrack.show.flights.appearance import ellipsoids_90
 from psotrack.show.flights.flight import FlightTracks, TrackedFlight
 from psotrack.show.flights.image_views import view_in_images
 from psotrack.support import drone_colour
-from psotrack.trajectories import Status
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -74,50 +72,11 @@ def deviations_mm(covariance_m2: Float[np.ndarray, "*points 3 3"]) -> Float[np.n
     return 1e3 * np.sqrt(np.maximum(np.trace(covariance_m2, axis1=-2, axis2=-1), 0.0))
 
 
-def drone_quality(tracks: FlightTracks) -> DataFrame:
-    """One row per drone.
-
-    Returns:
-        Columns `drone`; `seen`, share of the frames in which the drone is seen; `coasting`, share of the frames in
-        which it is predicted only; `first_s`, `last_s`, times of the first and the last frame in which it is seen;
-        `fitness`, `num_cameras`, means over the frames in which it is seen; `radius_90_m`, median of the longest half
-        axis of the 90 % ellipsoid; `speed_m_s`, mean speed; `size_x_m`, `size_y_m`, `size_z_m`, lengths. NaN where
-        unknown.
-    """
-    import pandas as pd
-
-    flown, seen = tracks.trajectories, tracks.trajectories.seen
-
-    def of_seen(values: np.ndarray | None) -> DataFrame:
-        """A column per drone, with the values of the frames in which it is seen."""
-        return pd.DataFrame(np.where(seen, np.nan if values is None else values, np.nan))
-
-    times_s = of_seen(flown.time_s[:, None])
-    covariance_m2, velocity_m_s = flown.covariance_m2, flown.velocity_m_s
-    longest_m = None if covariance_m2 is None else ellipsoids_90(covariance_m2).half_axes_m[..., 2]
-    speed_m_s = None if velocity_m_s is None else np.linalg.norm(velocity_m_s, axis=-1)
-    coasting = None if flown.status is None else seen & (flown.status == Status.COASTING)
-    return pd.DataFrame(
-        {
-            "drone": list(flown.drones),
-            "seen": seen.mean(axis=0),
-            "coasting": np.nan if coasting is None else coasting.mean(axis=0),
-            "first_s": times_s.min(),
-            "last_s": times_s.max(),
-            "fitness": of_seen(flown.fitness).mean(),
-            "num_cameras": of_seen(flown.num_cameras).mean(),
-            "radius_90_m": of_seen(longest_m).median(),
-            "speed_m_s": of_seen(speed_m_s).mean(),
-            **{f"size_{axis}_m": lengths_m for axis, lengths_m in zip("xyz", tracks.size_m.T, strict=True)},
-        }
-    )
-
-
 def camera_quality(tracks: FlightTracks, recording: Recording) -> DataFrame:
     """One row per camera of the recording's rig.
 
     Returns:
-        Columns `camera`; `frames`, share of the instants at which the camera has a frame; `in_view`, share of the
+        Columns `camera`; `frames`, fraction of the instants at which the camera has a frame; `in_view`, share of the
         drones' positions that are in its image; `width_px`, median width of the drones' boxes in its image; `noise_px`,
         the noise of the drones' places in its image as the run learned it, root mean square of columns and rows;
         `left_out`, number of its frames that the run left out. NaN where unknown.

@@ -92,15 +92,6 @@ class WrittenOverlays:
     written: tuple[Path, ...]
     kept: tuple[Path, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Paths of the videos."""
-        return {
-            "folder": str(self.folder),
-            "codec": self.codec.name,
-            "written": [str(path) for path in self.written],
-            "kept": [str(path) for path in self.kept],
-        }
-
     def __str__(self) -> str:
         kept = f", {len(self.kept)} were there already" if self.kept else ""
         return f"{self.folder}: {len(self.written)} videos in {self.codec.name}{kept}"

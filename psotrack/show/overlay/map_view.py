@@ -15,7 +15,7 @@ from psotrack.show.overlay.drawing import DrawnTracks, draw_line, line_width_px,
 _BACKGROUND, _GRID, _CAMERA = (34, 30, 28), (58, 52, 48), (190, 190, 190)
 #: Empty part of the map at each side.
 _MARGIN = 0.12
-#: Length of the drawn views of the cameras, share of the map's side.
+#: Length of the drawn views of the cameras, fraction of the map's side.
 _VIEW = 0.06
 #: Largest width of a map with a line per metre, metres.
 _FINE_GRID_M = 30.0

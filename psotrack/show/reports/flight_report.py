@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from markupsafe import Markup
 
 from psotrack.evaluation import Evaluation, evaluate
 from psotrack.pipeline import changed_settings
@@ -15,7 +17,6 @@ from psotrack.show.flights import (
     RunRecord,
     TrackedFlight,
     camera_quality,
-    drone_quality,
     find_events,
     quantities,
 )
@@ -23,48 +24,19 @@ from psotrack.show.reports.charts import quantity_svg
 from psotrack.show.reports.moments import Moment, choose_events, take_pictures
 from psotrack.show.reports.page import check_page_path, render, write_page
 from psotrack.show.reports.scene import row_step, scene_data, shown_times_s
-from psotrack.show.reports.tables import PageColumn, make_table, percent
-from psotrack.support import Report, no_progress
+from psotrack.support import Report, html_table, no_progress
+from psotrack.trajectories import drones_html
 
 #: Largest number of events with a picture; a picture has about 20 kB.
 MOST_PICTURES = 40
-_DRONES = (
-    PageColumn("drone", "drone"),
-    percent("seen", "seen"),
-    percent("coasting", "coasting"),
-    PageColumn("first (s)", "first_s", 2),
-    PageColumn("last (s)", "last_s", 2),
-    PageColumn("score", "fitness", 2),
-    PageColumn("cameras", "num_cameras", 1),
-    PageColumn("90 % radius (mm)", "radius_90_m", 1, 1e3),
-    PageColumn("speed (m/s)", "speed_m_s", 2),
-    PageColumn("size (cm)", "size_cm"),
-)
-_DRONES_NOTE = (
-    "Score: soft IoU in [0, 1], mean. 90 % radius: longest half axis of the ellipsoid that holds the position with "
-    "probability 0.9, median."
-)
+#: Columns of the table of cameras: the heading, where the values are, and how they are shown.
 _CAMERAS = (
-    PageColumn("camera", "camera"),
-    percent("frames there", "frames", 0),
-    percent("drones in view", "in_view"),
-    PageColumn("width of a drone (px)", "width_px", 0),
-    PageColumn("noise (px)", "noise_px", 2),
-    PageColumn("left out", "left_out", 0),
-)
-_CAMERAS_NOTE = (
-    "Noise: of a drone's place in the image, as the run learned it. Left out: frames full of foreground."
-)
-_ERRORS = (
-    PageColumn("reference", "drone"),
-    PageColumn("track", "estimate"),
-    PageColumn("mean (mm)", "mean_error_m", 1, 1e3),
-    PageColumn("median (mm)", "median_error_m", 1, 1e3),
-    PageColumn("95 % (mm)", "p95_error_m", 1, 1e3),
-    PageColumn("largest (mm)", "max_error_m", 1, 1e3),
-    PageColumn("without offset (mm)", "offset_removed_mean_error_m", 1, 1e3),
-    percent("missed", "missed_rate"),
-    percent("in 90 % ellipsoid", "inside_90_rate", 0),
+    ("camera", "camera", "{}"),
+    ("frames there", "frames", "{:.0%}"),
+    ("drones in view", "in_view", "{:.1%}"),
+    ("width of a drone (px)", "width_px", "{:.0f}"),
+    ("noise (px)", "noise_px", "{:.2f}"),
+    ("left out", "left_out", "{}"),
 )
 
 
@@ -77,10 +49,6 @@ class WrittenPage:
     """
 
     path: Path
-
-    def to_dict(self) -> dict[str, Any]:
-        """Path and size of the page."""
-        return {"page": str(self.path), "bytes": self.path.stat().st_size}
 
     def __str__(self) -> str:
         return f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB"
@@ -139,17 +107,17 @@ def _section(
     moments = [Moment(event) for event in chosen]
     if pictures and recording is not None and recording.videos:
         moments = take_pictures(chosen, tracks, recording, jobs=jobs, report=report)
-    drones = drone_quality(tracks)
-    drones["size_cm"] = [" × ".join(f"{100 * side_m:.0f}" for side_m in size_m) for size_m in tracks.size_m]  # noqa: RUF001
     cameras = None
     if recording is not None:
-        cameras = make_table(_CAMERAS, camera_quality(tracks, recording).to_dict("records"), _CAMERAS_NOTE)
+        quality = camera_quality(tracks, recording).to_dict("records")
+        rows = [[_text(row[key], form) for _, key, form in _CAMERAS] for row in quality]
+        cameras = Markup(html_table([heading for heading, _, _ in _CAMERAS], rows))
     return {
         "label": tracks.label,
         "figures": _figures(tracks, evaluation),
-        "drones": make_table(_DRONES, drones.to_dict("records"), _DRONES_NOTE, tracks.colours),
+        "drones": Markup(drones_html(tracks.trajectories, tracks.size_m)),
         "cameras": cameras,
-        "errors": None if evaluation is None else _error_table(evaluation),
+        "errors": None if evaluation is None else Markup(evaluation._repr_html_()),
         "charts": [(QUANTITIES[each.key][1], quantity_svg(each)) for each in quantities(flight, tracks)],
         "moments": moments,
         "more_events": len(events) - len(chosen),
@@ -157,15 +125,19 @@ def _section(
     }
 
 
+def _text(value: Any, form: str) -> str:
+    return "-" if value is None or value != value else form.format(value)
+
+
 def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[str, str]]:
-    flown, seen = tracks.trajectories, percent("", "").text
-    shown = [(f"{flown.num_drones}", "drones"), (seen(float(flown.seen.mean())), "of all frames seen")]
+    """Large numbers, with a word each."""
+    flown = tracks.trajectories
+    shown = [(f"{flown.num_drones}", "drones"), (f"{flown.seen.mean():.1%}", "of all frames seen")]
     if evaluation is not None:
-        error = PageColumn("", "", 1, 1e3, " mm").text
+        found = evaluation.to_dict()
         shown += [
-            (error(evaluation.mean_error_m), "mean error"),
-            (error(evaluation.offset_removed_mean_error_m), "without offsets"),
-            (seen(evaluation.missed_rate), "missed"),
+            (_text(found["mean_error_m"] and 1e3 * found["mean_error_m"], "{:.1f} mm"), "mean error"),
+            (f"{evaluation.missed_rate:.1%}", "missed"),
             (f"{evaluation.id_switches}", "identity switches"),
             (f"{evaluation.hota:.3f}", "HOTA"),
         ]
@@ -174,18 +146,6 @@ def _figures(tracks: FlightTracks, evaluation: Evaluation | None) -> list[tuple[
         times, word = (factor, "faster") if factor >= 1 else (1 / factor, "slower")
         shown.append((f"{times:.2g} times", f"{word} than the video"))
     return shown
-
-
-def _error_table(evaluation: Evaluation) -> dict[str, Any]:
-    centred = percent("", "").text(evaluation.offset_removed_inside_90_rate)
-    note = (
-        f"MOTA {evaluation.mota:.3f}, IDF1 {evaluation.idf1:.3f}, HOTA {evaluation.hota:.3f}, GOSPA "
-        f"{1e3 * evaluation.gospa_m:.1f} mm, identity switches {evaluation.id_switches}. In 90 % ellipsoid: share of "
-        "the frames in which the ellipsoid that the run states holds the reference. 90 % is right. Less says that the "
-        "run is too sure, or that the track and the reference are two points of the drone, a constant offset apart: "
-        f"without each drone's offset it is {centred} of all frames."
-    )
-    return make_table(_ERRORS, map(asdict, evaluation.per_drone), note)
 
 
 def _run(file: str, record: RunRecord, name: str) -> dict[str, Any]:

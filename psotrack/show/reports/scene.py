@@ -23,7 +23,7 @@ from psotrack.trajectories import Status, Trajectories
 
 #: Largest number of rows of a view. 5,000 rows of ten drones take 2 MB, and a slider has fewer pixels.
 MOST_ROWS = 5000
-#: Length of the drawn pyramids of the cameras, as a share of the extent of the scene.
+#: Length of the drawn pyramids of the cameras, as a fraction of the extent of the scene.
 _PYRAMID = 0.06
 #: Coordinates beyond this distance from the world's origin lose millimetres in float32, metres.
 _FAR_M = 1000.0

@@ -30,7 +30,7 @@ from psotrack.support import Report, atomic_write, no_progress
 
 #: Largest size by default: this number of bytes per second of the recording, up to the second number.
 _BYTES_PER_S, _MOST_BYTES = 5.8e6, 1.95e9
-#: Share of the rest of the size that images take, and bytes of the list of contents at the end of the file.
+#: Fraction of the rest of the size that images take, and bytes of the list of contents at the end of the file.
 _IMAGES_SHARE, _CONTENTS_BYTES = 0.96, 250e3
 #: End of a complete file.
 _END = b"RRF2FOOT\x01\x00\x00\x00"

@@ -27,7 +27,7 @@ _START_S, _END_S = 30.0, 0.5
 _LOOK_S = 0.1
 #: Levels of Rerun's log at which it says where it listens, and nothing else.
 _SAYS_WHERE = "off,re_grpc_server=info,re_sdk::web_viewer=info"
-#: Share of the memory up to which the server keeps a flight.
+#: Fraction of the memory up to which the server keeps a flight.
 _MEMORY = "75%"
 _WITHOUT_WINDOW = (
     "`psotrack view --save FLIGHT.rrd` or `--web`, and `psotrack live --view web`, need no screen"

@@ -2,16 +2,16 @@
 (() => {
   "use strict";
   const valueOf = (row, column) => {
-    const cell = row.cells[column];
-    const number = cell.dataset.value === undefined ? NaN : Number(cell.dataset.value);
-    return Number.isNaN(number) ? cell.textContent.trim() : number;
+    const text = row.cells[column].textContent.trim();
+    const number = Number.parseFloat(text);
+    return Number.isNaN(number) ? text : number;
   };
   const compare = (a, b) => {
     if (typeof a === "number" && typeof b === "number") return a - b;
     if (typeof a !== typeof b) return typeof a === "number" ? -1 : 1; // what is unknown comes last
     return a.localeCompare(b, undefined, { numeric: true });
   };
-  for (const table of document.querySelectorAll("table.sorts")) {
+  for (const table of document.querySelectorAll("table:has(thead)")) {
     [...table.tHead.rows[0].cells].forEach((heading, column) => {
       const button = document.createElement("button");
       button.type = "button";

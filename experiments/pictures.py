@@ -1,6 +1,6 @@
-"""Make the pictures of the viewer and of an overlay video, which README and how-to pages show, with their record.
+"""Make the pictures of the viewer, of an overlay video and of a report, which README and how-to pages show.
 
-python experiments/viewer_picture.py
+python experiments/pictures.py      # needs Chromium and the package playwright
 """
 
 from __future__ import annotations
@@ -23,16 +23,23 @@ from psotrack.show.viewer import viewer_program
 SCENARIO = "S02_D4_A"
 FRAMES = 125
 WINDOW_WH = (1600, 900)
-#: Place of the shown moment: share of the flight, and the slider's ends and height in the window, pixels.
+#: Place of the shown moment: fraction of the flight, and the slider's ends and height in the window, pixels.
 MOMENT, SLIDER_X_PX, SLIDER_Y_PX = 0.62, (267, 1393), 886
+#: Windows of the report: width and height in pixels, and colour scheme.
+REPORTS = {"report": (1280, 860, "light"), "report_phone": (400, 860, "dark")}
 #: Time in which the page must be complete, and between two looks at it, seconds.
 LONGEST_S, LOOK_S = 180.0, 3.0
 #: Least standard deviation of the page's right half with images, of 255.
 LOADED = 35.0
 #: Largest size of a picture, bytes.
 MOST_BYTES = 400_000
-#: How a browser without graphics card draws.
-ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+#: How a browser without graphics card draws, also for root.
+ARGUMENTS = [
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--no-sandbox",
+]
 
 
 def main() -> None:
@@ -43,16 +50,15 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "pictures", help="folder of the pictures"
     )
-    parser.add_argument(
-        "--browser", default=shutil.which("chromium"), help="Chromium; default: chromium, or Playwright's own"
-    )
     parser.add_argument("--frames", type=int, default=FRAMES, help="number of frames of the flight")
     parser.add_argument(
         "--scale", type=float, default=1.0, help="size of the images per size of the dataset's"
     )
     options = parser.parse_args()
-    started = _results.Run("viewer_picture")
-    with tempfile.TemporaryDirectory() as temporary:
+    from playwright.sync_api import sync_playwright
+
+    started = _results.Run("pictures")
+    with tempfile.TemporaryDirectory() as temporary, sync_playwright() as playwright:
         root = Path(temporary)
         sequence, tracks = root / "Simulated_Data" / SCENARIO, root / "tracks.csv"
         cache = ("--cache", root / "cache")
@@ -60,10 +66,20 @@ def main() -> None:
         run("track", sequence, "--out", tracks, *cache)
         run("view", tracks, sequence, "--save", root / "flight.rrd", *cache)
         run("overlay", tracks, sequence, "--out", root, "--mosaic")
+        run("report", tracks, sequence, "--out", root / "report.html")
+        path = shutil.which("chromium") or shutil.which("google-chrome")
+        chromium = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
         pictures = {
-            "viewer": photograph(root / "flight.rrd", options.browser),
+            "viewer": photograph(root / "flight.rrd", chromium),
             "overlay": list(read_frames(probe(root / "mosaic.mp4")))[round(MOMENT * options.frames)],
         }
+        for name, (width, height, scheme) in REPORTS.items():
+            page = chromium.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+            page.goto((root / "report.html").as_uri())
+            page.wait_for_selector(".scene canvas")
+            page.evaluate(f"document.querySelector('.scene').scene.seek({MOMENT * options.frames / 25})")
+            pictures[name] = look(page)
+        chromium.close()
     paths = []
     for name, picture in pictures.items():
         paths.append(options.out / f"{name}.png")
@@ -76,12 +92,9 @@ def run(*arguments: object) -> None:
     subprocess.run([sys.executable, "-m", "psotrack", *map(str, arguments), "--quiet"], check=True)
 
 
-def photograph(path: Path, browser: str | None) -> np.ndarray:
+def photograph(path: Path, chromium) -> np.ndarray:
     """The viewer's page with a flight, as soon as it does not change any more."""
-    from playwright.sync_api import sync_playwright
-
-    with viewer_program(path, web=True) as program, sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=browser, args=ARGUMENTS)
+    with viewer_program(path, web=True) as program:
         width, height = WINDOW_WH
         page = chromium.new_page(viewport={"width": width, "height": height}, color_scheme="dark")
         page.goto(program.page)
@@ -93,9 +106,7 @@ def photograph(path: Path, browser: str | None) -> np.ndarray:
         page.mouse.click(left + MOMENT * (right - left), SLIDER_Y_PX)
         # Away from everything that explains itself under the mouse.
         page.mouse.move(width // 4, 12)
-        picture = at_rest(page)
-        chromium.close()
-    return picture
+        return at_rest(page)
 
 
 def look(page) -> np.ndarray:
