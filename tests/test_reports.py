@@ -131,7 +131,7 @@ class TestFlight:
 
     def test_the_page_explains_its_figures(self, page):
         text = page.read_text(encoding="utf-8")
-        assert "share of the frames in which the ellipsoid that the run states holds" in text
+        assert "fraction of the frames in which the ellipsoid that the run states holds" in text
         # The tables are those of a notebook: of an evaluation, with the figures of all drones, and of tracks.
         assert "<td>all</td>" in text
         assert "<td>50 50 20</td>" in text
