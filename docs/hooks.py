@@ -34,7 +34,7 @@ sys.path[:0] = [str(HERE), str(ROOT)]
 import figures  # noqa: E402
 
 #: Parts of the package without a public Python interface.
-HIDDEN = {"__init__", "__main__", "cli", "demo"}
+HIDDEN = {"__init__", "__main__", "cli"}
 #: Pictures that pages show, by folder below the repository's root.
 PICTURES = ("experiments/pictures", "experiments/table5/results")
 

@@ -6,6 +6,7 @@ use.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import shlex
 import time
@@ -407,11 +408,14 @@ def run(
     # What follows from a step that was done is done again, too.
     anew = again
 
-    def step(words: Sequence[object], made: Path | None, do: Callable[[], object]) -> bool:
+    def step(
+        command: str, made: Path | None, do: Callable[[], object], *given: object, **options: object
+    ) -> bool:
         if made is not None and made.exists() and not anew:
             say(f"{made}: there already")
             return False
-        say(f"$ psotrack {shlex.join(map(str, words))}")
+        typed = [words for name, value in options.items() for words in _option(name, value)]
+        say(f"$ psotrack {command} {shlex.join(map(str, [*given, *typed]))}")
         done = do()
         if done is not None:
             say(f"{done}")
@@ -421,27 +425,23 @@ def run(
     if not is_drafted or again or not open_recording(folder).is_placed:
         if board.is_dir():
             if square_m is None and (again or not rig.exists()):
-                raise SettingsError(
-                    "--square", expected="the side of a square of the board, metres", found="none"
-                )
-            words = [
-                "calibrate",
-                "rig",
-                board,
-                "--square",
-                square_m,
-                *_option("--floor", floor),
-                "--out",
-                rig,
-            ]
-            known: dict[str, Any] = {"square_m": square_m, "floor": floor, "out": rig, "force": again}
-            step(words, rig, lambda: calibrate_rig(board, **known, **common))
+                expected = "the side of a square of the board, metres"
+                raise SettingsError("--square", expected=expected, found="none")
+            known: dict[str, Any] = {
+                "square_m": square_m,
+                "floor": floor,
+                "out": rig,
+                "force": again,
+                **common,
+            }
+            calibrate = functools.partial(calibrate_rig, board, **known)
+            step("calibrate rig", rig, calibrate, board, square=square_m, floor=floor, out=rig)
         # Another rig file is found by itself.
         if rig.exists():
             more = {"calibration": rig, **more}
-        words = ["init", folder, *_option("--calibration", more.get("calibration"))]
         # A recording whose cameras have no places yet is drafted anew; the old file is kept beside the new one.
-        anew = step(words + ["--force"] * is_drafted, None, lambda: _drafted(folder, DraftOptions(**more)))
+        draft = functools.partial(_drafted, folder, DraftOptions(**more))
+        anew = step("init", None, draft, folder, calibration=more.get("calibration"), force=is_drafted)
     if not open_recording(folder).is_placed:
         raise InputError(
             folder,
@@ -449,32 +449,23 @@ def run(
             found="neither",
             remedy="`psotrack board` draws a board",
         )
-    words = ["doctor", folder, "--json", found]
-    anew |= step(words, found, lambda: _written(found, doctor(folder, **common)))
+    anew |= step("doctor", found, lambda: _written(found, doctor(folder, **common)), folder, json=found)
     kinds = [(each["kind"], *each["nearly_as_likely"]) for each in read_json(found)["findings"]]
     is_late = any("clock" in of_one for of_one in kinds)
     chosen = {"clocks": "auto"} if is_late else {}
-    words = [
-        "track",
-        folder,
-        *_option("--clocks", chosen.get("clocks")),
-        *_option("--drones", drones),
-        "--out",
-        tracks,
-    ]
-    settings = {**chosen, "drones.count": drones}
-    anew |= step(words, tracks, lambda: _tracked(folder, tracks, settings, **common))
+    track_all = functools.partial(_tracked, folder, tracks, {**chosen, "drones.count": drones}, **common)
+    anew |= step("track", tracks, track_all, folder, **chosen, drones=drones, out=tracks)
     shown: dict[str, Any] = {"recording": folder, "force": anew, **common}
-    step(["report", tracks, folder, "--out", page], page, lambda: report(tracks, page, **shown))
+    step("report", page, lambda: report(tracks, page, **shown), tracks, folder, out=page)
     # Finished videos of the same tracks are kept.
     videos = results / "overlay"
-    step(["overlay", tracks, folder, "--out", videos], None, lambda: overlay(tracks, videos, **shown))
+    step("overlay", None, lambda: overlay(tracks, videos, **shown), tracks, folder, out=videos)
     return flights.run_summary(folder)
 
 
-def _option(name: str, value: object) -> tuple[object, ...]:
-    """Words of a command for an option; none for None."""
-    return () if value is None else (name, value)
+def _option(name: str, value: object) -> list[object]:
+    """Words of a command for an option; none for one that is not given."""
+    return [] if value is None or value is False else [f"--{name}"] if value is True else [f"--{name}", value]
 
 
 def _drafted(folder: Path, options: DraftOptions) -> Draft:

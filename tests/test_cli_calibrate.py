@@ -170,15 +170,6 @@ def test_wrong_combinations_of_options_are_refused(tmp_path, arguments, message)
     assert message in refused("rig", *arguments, "--out", tmp_path / "out.toml")
 
 
-def test_the_old_name_of_the_command_says_the_new_one():
-    result = CliRunner().invoke(calibrate, ["extrinsics", "--pairs", "pairs.csv"])
-    assert "extrinsics is `psotrack calibrate rig --pairs` now" in result.output
-    assert (
-        "intrinsics is `psotrack calibrate rig` now"
-        in CliRunner().invoke(calibrate, ["intrinsics", "a.avi"]).output
-    )
-
-
 def test_wrong_combinations_of_lens_options_are_refused(tmp_path):
     pairs = pairs_of(tmp_path / "pairs.csv", ring_rig(1))
     start = ("rig", "--pairs", pairs, "--out", tmp_path / "out.toml")

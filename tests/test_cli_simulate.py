@@ -75,7 +75,7 @@ def test_fields_are_changed_from_the_command_line(tmp_path):
         (("--seed", "1"), "simulate: expected the NAME of a scenario or --scenario FILE.toml, found neither"),
         (("S01_D2_A", "--scenario", "x.toml"), "found both"),
         (("S99", "--out", "x"), "scenario: expected one of S01_D2_A"),
-        (("S01_D2_A", "--out", "x", "--set", "imaging"), "--set: expected NAME=VALUE"),
+        (("S01_D2_A", "--out", "x", "--set", "imaging"), "--set: expected FIELD=VALUE"),
         (("S01_D2_A", "--out", "x", "--set", "imaging.noise=1"), "imaging.noise"),
         (("S01_D2_A", "--out", "x", "--set", "drones[0].model=kite"), "drones[0].model"),
         (("S01_D2_A", "--out", "x", "--set", "cameras=[]"), "cameras"),

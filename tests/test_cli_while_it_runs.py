@@ -179,16 +179,6 @@ class TestConfig:
         assert str(caught.value).startswith(str(file))
         assert "\n" not in str(caught.value)
 
-    def test_set_has_the_names_of_sweeps(self, run: Run, tmp_path: Path) -> None:
-        for option, message in (
-            ("swarm.particles=many", 'swarm.particles: expected a whole number, found "many"'),
-            ("swarm.partcles=3", "did you mean swarm.particles?"),
-            ("particles", "--set: expected NAME=VALUE, such as swarm.particles=50, found particles"),
-        ):
-            code, _, err = run("track", tmp_path, "--out", tmp_path / "t.csv", "--set", option)
-            assert (code, err.count("\n")) == (2, 1)
-            assert message in err
-
     def test_a_file_that_exists_is_kept(self, run: Run, tmp_path: Path) -> None:
         file = tmp_path / "run.toml"
         file.write_text("mine", encoding="utf-8")
@@ -229,7 +219,7 @@ class TestTable:
         )
         size_m = np.full((drones, 3), 1.234)
         size_m[4] = np.nan
-        Output(0.0).drones(tracks, size_m)
+        Output().drones(tracks, size_m)
         lines = capsys.readouterr().out.splitlines()
         assert max(map(len, lines)) <= 80
         assert not any("…" in line for line in lines)
@@ -258,10 +248,8 @@ class TestTable:
 
     def test_nothing_with_quiet_or_json_on_stdout(self, capsys: pytest.CaptureFixture[str]) -> None:
         tracks = Trajectories(np.arange(1), np.zeros(1), ("a",), np.zeros((1, 1, 3)))
-        hidden, of_json = Output(0.0), Output(0.0)
-        hidden.quiet, of_json.json_path = True, Path("-")
-        hidden.drones(tracks)
-        of_json.drones(tracks)
+        for hidden in (Output(quiet=True), Output(json_path=Path("-"))):
+            hidden.drones(tracks)
         assert capsys.readouterr().out == ""
-        Output(0.0).drones(tracks)
+        Output().drones(tracks)
         assert "100.0%" in capsys.readouterr().out

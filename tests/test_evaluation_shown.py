@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -164,63 +163,54 @@ class TestTable:
         assert frame["missed_rate"].tolist() == [0, 0, 1]
 
 
-def axes_of(projection: str | None = None):
-    figure = Figure()
-    FigureCanvasAgg(figure)
-    return figure.add_subplot(projection=projection)
+@pytest.fixture
+def drawn(monkeypatch):
+    """Axes of the overview of an estimate and its reference: both views, and the errors."""
 
+    def draw_overview(est, ref):
+        figure = Figure()
+        monkeypatch.setattr(plots, "save_figure", lambda path, size, draw, force: draw(figure))
+        plots.save_overview("overview.png", est, ref)
+        return figure.axes
 
-def labels(axes) -> list[str]:
-    return [text.get_text() for text in axes.get_legend().get_texts()]
+    return draw_overview
 
 
 class TestPictures:
-    def test_errors_in_millimetres_have_gaps_where_a_drone_is_missed(self):
-        axes = axes_of()
-        plots.draw_errors(axes, *flights())
-        line = next(line for line in axes.lines if line.get_label() == LABELS[2])
+    def test_errors_in_millimetres_have_gaps_where_a_drone_is_missed(self, drawn):
+        above, _, errors = drawn(*flights())
         expected_mm = np.full(NUM_FRAMES, 20.0)
         expected_mm[10:20] = np.nan
-        np.testing.assert_allclose(line.get_ydata(), expected_mm, rtol=1e-12)
-        assert labels(axes) == [*LABELS, "missed"]
-        assert axes.get_yscale() == "linear"
+        np.testing.assert_allclose(errors.lines[2].get_ydata(), expected_mm, rtol=1e-12)
+        assert [text.get_text() for text in above.get_legend().get_texts()] == ["reference", *LABELS]
+        assert errors.get_yscale() == "linear"
 
-    def test_a_swap_is_marked_and_makes_the_scale_logarithmic(self):
-        axes = axes_of()
-        plots.draw_errors(axes, *flights(swap=True))
-        marks = [line for line in axes.lines if line.get_label() == "identity switch"]
-        assert [list(mark.get_xdata()) for mark in marks] == [[40 / 25] * 2]
-        assert axes.get_yscale() == "log"
+    def test_a_swap_is_marked_and_makes_the_scale_logarithmic(self, drawn):
+        errors = drawn(*flights(swap=True))[2]
+        assert [list(mark.get_xdata()) for mark in errors.lines[3:]] == [[40 / 25] * 2]
+        assert errors.get_yscale() == "log"
 
-    def test_lines_have_gaps_at_frames_without_reference(self):
+    def test_lines_have_gaps_at_frames_without_reference(self, drawn):
         est, ref = flights()
         ref.position_m[25:30] = np.nan
-        axes = axes_of()
-        plots.draw_errors(axes, est, ref)
-        line = next(line for line in axes.lines if line.get_label() == LABELS[0])
-        # The line has 45 frames with a reference, and one NaN for the gap.
-        assert len(line.get_ydata()) == 46
-        assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [25]
+        for axes in drawn(est, ref):
+            # A line has 45 frames with a reference, and one NaN for the gap.
+            assert len(axes.lines[0].get_ydata()) == 46
+            assert np.flatnonzero(np.isnan(axes.lines[0].get_ydata())).tolist() == [25]
 
-    def test_all_axes_of_the_paths_have_one_scale(self):
+    def test_views_have_one_scale(self, drawn):
         est, ref = flights()
-        axes = axes_of("3d")
-        plots.draw_trajectories(axes, est, ref)
-        paths = [np.array(line.get_data_3d()).T for line in axes.lines]
-        assert any(np.array_equal(path, ref.position_m[:, 0]) for path in paths)
-        assert any(np.array_equal(path, est.position_m[:, 0]) for path in paths)
-        extent_m = np.diff([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)[:, 0]
-        ratio = extent_m / axes.get_box_aspect()
-        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
-        assert axes.get_zlim()[0] == 0.0
-        assert labels(axes) == [*LABELS, "truth"]
+        above, side, _ = drawn(est, ref)
+        for axes, two in ((above, [0, 1]), (side, [0, 2])):
+            np.testing.assert_array_equal(axes.lines[0].get_xydata(), ref.position_m[:, 0, two])
+            np.testing.assert_array_equal(axes.lines[3].get_xydata(), est.position_m[:, 0, two])
+            assert axes.get_aspect() == 1
+        assert above.get_xlim() == side.get_xlim()
 
-    def test_a_false_track_is_grey(self):
+    def test_a_false_track_is_named(self, drawn):
         est, ref = flights()
-        axes = axes_of("3d")
         two = Trajectories(ref.frame, ref.time_s, ref.drones[:2], ref.position_m[:, :2])
-        plots.draw_trajectories(axes, est, two)
-        assert labels(axes)[-1] == "false track"
+        assert drawn(est, two)[0].get_legend().get_texts()[-1].get_text() == "false track 2"
 
     def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path):
         path = tmp_path / "picture.png"
@@ -242,7 +232,7 @@ class TestPictures:
         assert not list(tmp_path.iterdir())
 
 
-def test_importing_loads_neither_pandas_nor_matplotlib():
+def test_importing_loads_neither_pandas_nor_matplotlib(tmp_path):
     """Drawing does not load pyplot either, which has global state."""
     code = (
         "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectories.files;"
@@ -251,7 +241,8 @@ def test_importing_loads_neither_pandas_nor_matplotlib():
     subprocess.run([sys.executable, "-c", code], check=True)
     # A separate process is needed, because other tests may have imported pyplot.
     code = (
-        "import sys, test_evaluation_shown as shown; shown.plots.draw_errors(shown.axes_of(), *shown.flights());"
+        "import sys, test_evaluation_shown as shown;"
+        f"shown.plots.save_overview({str(tmp_path / 'picture.png')!r}, *shown.flights());"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent)

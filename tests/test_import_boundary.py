@@ -78,7 +78,6 @@ ORDER = [
     "show.viewer",
     "show.reports",
     "api",
-    "demo",
     "cli",
     "__main__",
 ]

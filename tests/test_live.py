@@ -314,7 +314,7 @@ def test_each_reason_why_a_device_is_silent_is_said(tmp_path: Path) -> None:
     assert first_line("device 63") == f"{expected}; {again}"
     file = tmp_path / "video0"
     file.touch()
-    expected = f"expected frames of device {file}, found no camera at {file}, or another program that uses it"
+    expected = f"expected frames of device {file}, found no such camera, or another program that uses it"
     assert first_line(f"device {file}") == f"{expected}; {again}"
 
 

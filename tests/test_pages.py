@@ -207,8 +207,8 @@ def test_the_demonstration_ends_with_a_command_that_is_understood(
     run_psotrack: Callable[..., Output], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("psotrack.demo.NUM_FRAMES", 6)
-    monkeypatch.setattr("psotrack.demo.SCALE", 0.25)
+    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
     code, out, _ = run_psotrack("demo", "--out", "demo", "--jobs", "1")
     assert code == 0
     words = shlex.split(out.splitlines()[-1].removeprefix("next: "))[1:]

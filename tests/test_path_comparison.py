@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.evaluation import PathSettings, Statistics, compare_paths
 from psotrack.evaluation.path_comparison import mean_rotation, wrap_deg
-from psotrack.evaluation.path_plots import PATHS, REFERENCE, save_paths
+from psotrack.evaluation.plots import save_paths
+from psotrack.support import COLOURS, FAINT
 from psotrack.trajectories import Status, Trajectories
 
 FPS = 25.0
@@ -440,19 +441,16 @@ class TestPlots:
         path, comparison = noisy_flight
         png = tmp_path / "paths.png"
         save_paths(png, {"filter": comparison}, title="a flight")
-        for colour in (PATHS[0], REFERENCE):
+        for colour in (COLOURS[0], FAINT):
             assert self.has_colour(png, colour).sum() > 500
         with pytest.raises(OutputError, match="expected a path that does not exist yet"):
             save_paths(png, {"filter": comparison})
-        # A pose far away does not change the scale of the views; the title counts it.
+        # A pose far away does not change the scale of the views; it is cut off.
         wild = replace(path, position_m=path.position_m.copy())
         wild.position_m[100] = 1e4
         save_paths(tmp_path / "wild.png", {"wild": compare(wild, *recording())})
         # Measured 0.99 of the pixels, because a piece of the line is missing.
-        assert (
-            self.has_colour(tmp_path / "wild.png", REFERENCE).sum()
-            > 0.9 * self.has_colour(png, REFERENCE).sum()
-        )
+        assert self.has_colour(tmp_path / "wild.png", FAINT).sum() > 0.9 * self.has_colour(png, FAINT).sum()
 
     def test_without_orientations_there_is_no_panel_of_angles(self, tmp_path, noisy_flight):
         path, comparison = noisy_flight
@@ -462,4 +460,4 @@ class TestPlots:
         heights = [cv2.imread(str(tmp_path / f"{name}.png")).shape[0] for name in ("both", "distances")]
         assert heights[1] < 0.9 * heights[0]
         # The second path has a colour of its own, in the panels over time too.
-        assert self.has_colour(tmp_path / "both.png", PATHS[1]).sum() > 500
+        assert self.has_colour(tmp_path / "both.png", COLOURS[1]).sum() > 500

@@ -297,8 +297,8 @@ def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
 def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
     """Found: after a full disk, the next call refused the sequence that the first one had simulated."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("psotrack.demo.NUM_FRAMES", 6)
-    monkeypatch.setattr("psotrack.demo.SCALE", 0.25)
+    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
     words = ["demo", "--out", "demo", "--jobs", "1", "--quiet"]
     assert run_psotrack(*words).code == 0
 

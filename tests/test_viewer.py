@@ -269,7 +269,7 @@ def assert_one_line(result, *words):
 
 def test_wrong_input_is_one_line(run, folder, tmp_path, monkeypatch):
     tracks, sequence = folder / "tracks.csv", folder / "flight"
-    assert_one_line(run("--save", tmp_path / "x.rrd"), "expected TRACKS, SEQ or both")
+    assert_one_line(run("--save", tmp_path / "x.rrd"), "Missing argument 'TRACKS... [SEQ]'")
     assert_one_line(run(tracks, "--save", tmp_path / "x.html"), "ends in .rrd")
     assert_one_line(run(tracks, "--save", tmp_path / "x.rrd", "--web"), "both")
     assert_one_line(run(tracks, sequence, "--save", tmp_path / "x.rrd", "--onboard"), "--onboard")

@@ -26,7 +26,7 @@ from _sightings import Sightings, detected, mislabelled
 
 from psotrack.errors import PsotrackError
 from psotrack.evaluation import PathComparison, compare_paths
-from psotrack.evaluation.path_plots import save_paths
+from psotrack.evaluation.plots import save_paths
 from psotrack.inside_out import CameraPath
 from psotrack.support import atomic_write
 

@@ -17,72 +17,21 @@ import sys
 import click
 
 from psotrack import __version__
-from psotrack.cli.lazy import SETTINGS, LazyGroup, commands_in
+from psotrack.cli.lazy import LazyGroup
 from psotrack.errors import PsotrackError, SettingsError, one_short_line
 
 __all__ = ["cli", "main"]
 
-#: Commands with the first sentences of their help, below the headings of the list. A test holds the sentences equal to
-#: the commands' own.
-COMMANDS = commands_in(
-    "psotrack.cli",
-    {
-        "Start": {
-            "demo": "Simulate four drones, track them in eight videos, print the errors and save a picture.",
-            "run": "Calibrate, check, track and show the videos of a rig in FOLDER, from board to report.",
-            "board": "Draw a ChArUco board to print, in its true size.",
-            "init": "Write the recording.toml of the videos, images and detections in FOLDER, or show "
-            "what a recording contains.",
-            "calibrate": "Calibrate cameras, and convert calibration files.",
-            "doctor": "Check the calibration of SEQ against the detections of its cameras, before tracking.",
-            "track": "Track the drones of SEQ from its videos, or from detections in them.",
-            "live": "Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.",
-        },
-        "Results": {
-            "evaluate": "Compare TRACKS with the reference of SEQ.",
-            "view": "Show TRACKS and their recording in space and time, in the viewer Rerun.",
-            "report": "Write one HTML page about SOURCE: tracks of a flight, results of a sweep, or a calibration.",
-            "overlay": "Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.",
-            "export": "Write TRACKS in a format of another program.",
-            "archive": "Pack TRACKS and what is needed to compute them again into one file, or unpack such a file.",
-        },
-        "Research": {
-            "simulate": "Simulate sequences: videos, calibration, ground truth, masks and detections.",
-            "sweep": "Track with every combination of a grid's settings, and keep one row per run.",
-            "detect": "Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, "
-            "or as blobs of foreground.",
-            "cache": "List, prune and empty the cache of silhouettes and compiled programs.",
-        },
-        "On-board": {
-            "onboard": "Localise drones by their own cameras, from ArUco markers of known place.",
-        },
-    },
-)
-#: Commands that there were once, and what replaces them.
-RENAMED = {
-    "detect-markers": "onboard detect",
-    "fly": "simulate fly",
-    "fuse": "onboard fuse",
-    "info": "init SEQ --show",
-    "labels": "simulate labels",
-    "localise": "onboard localise",
-    "map-markers": "onboard map",
-    "pack": "archive",
-    "silhouettes": "detect --silhouettes",
-    "synchronise": "doctor --tracks",
-    "table": "report --table",
-    "unpack": "archive",
+_COMMANDS = {
+    "Start": ["demo", "run", "board", "init", "calibrate", "doctor", "track", "live"],
+    "Results": ["evaluate", "view", "report", "overlay", "export", "archive"],
+    "Research": ["simulate", "sweep", "detect", "cache"],
+    "On-board": ["onboard"],
 }
-
 _COMPLETION_VARIABLE = "_PSOTRACK_COMPLETE"
 
 
-@click.group(
-    cls=LazyGroup,
-    lazy_commands=COMMANDS,
-    renamed=RENAMED,
-    context_settings=SETTINGS,
-)
+@click.group(cls=LazyGroup, package=__name__, below=_COMMANDS)
 @click.version_option(__version__, prog_name="psotrack")
 @click.option("--verbose", "-v", is_flag=True, help="Log the steps of the work on stderr.")
 def cli(verbose: bool) -> None:
@@ -134,7 +83,6 @@ def main(started: float | None = None) -> None:
         error.show()
         sys.exit(2)
     except click.ClickException as error:
-        _keep_near_suggestions(error)
         # `error.show` would print four lines.
         failed = error.ctx if isinstance(error, click.UsageError) else None
         remedy = f"; see `{failed.command_path} --help`" if failed else ""
@@ -156,22 +104,6 @@ def main(started: float | None = None) -> None:
 def _drop_output() -> None:
     """Let the end of the interpreter write what stdout did not take to nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _keep_near_suggestions(error: click.ClickException) -> None:
-    """Remove far-fetched names from a suggestion of Click's, which takes --quiet for a slip of --out."""
-    from psotrack.support import nearest
-
-    possibilities = getattr(error, "possibilities", None)
-    typed = getattr(error, "option_name", None) or getattr(error, "command_name", None)
-    if not possibilities or not typed:
-        return
-    word = typed.lstrip("-")
-    error.possibilities = [  # type: ignore[attr-defined]
-        name
-        for name in possibilities
-        if (other := name.lstrip("-")) and (nearest(word, [other]) or other in word or word in other)
-    ]
 
 
 def _complete() -> None:

@@ -4,35 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
-
-from psotrack.cli.options import (
-    CACHE,
-    TRACKS,
-    cache_folder,
-    out_option,
-    running,
-    sequence_argument,
-    sequence_of,
-)
+from psotrack.cli.commands import command
+from psotrack.cli.options import Cache, SeqOfTracks, cache_folder, sequence_of
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX
 
 
-@click.command(cls=HelpfulCommand)
-@TRACKS
-@sequence_argument
-@out_option(
-    f"The archive, which ends in {ARCHIVE_SUFFIX}, or the folder into which one is unpacked.  [default: beside TRACKS, "
-    "with the same name]"
-)
-@click.option("--videos", is_flag=True, help="Pack the videos, too.  [default: a digest of each video]")
-@CACHE
-@running(json=False)
+@command(without=["json_path"])
 def archive(
-    output: Output, tracks: Path, sequence: Path | None, out: Path | None, videos: bool, cache: Path | None
+    output: Output,
+    tracks: Path,
+    sequence: SeqOfTracks = None,
+    *,
+    out: Path | None = None,
+    videos: bool = False,
+    cache: Cache = None,
 ) -> None:
     """Pack TRACKS and what is needed to compute them again into one file, or unpack such a file.
 
@@ -47,6 +34,11 @@ def archive(
       psotrack archive tracks.csv my_lab --out flight.psotrack --videos
       psotrack track flight.psotrack --out again.csv
       psotrack archive flight.psotrack --out flight
+
+    Options:
+        out: the archive, which ends in .psotrack, or the folder into which one is unpacked. None: beside TRACKS, with
+            the same name.
+        videos: pack the videos, too. None: a digest of each video.
     """
     from psotrack.pipeline.archives import pack_tracks, unpack
     from psotrack.recordings.datasets import open_recording

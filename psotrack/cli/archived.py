@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from psotrack.cli.records import is_given
+from psotrack.cli.commands import is_given
 from psotrack.errors import InputError
 from psotrack.settings import TrackSettings
 

@@ -3,43 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-import click
-
-from psotrack.cli.options import FORCE, QUIET, out_option
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
-from psotrack.cli.types import Size
+from psotrack.cli.commands import command
+from psotrack.cli.output import Output
+from psotrack.cli.types import says
 
 
-@click.command(cls=HelpfulCommand)
-@out_option("Page to write: .pdf, .png or .svg.", default=Path("board.pdf"), show_default=True)
-@click.option(
-    "--squares",
-    "squares_wh",
-    type=Size(),
-    default="7x5",
-    show_default=True,
-    metavar="COLUMNSxROWS",
-    help="Number of squares.",
-)
-@click.option(
-    "--square", "square_m", type=float, default=0.035, show_default=True, help="Side of a square in metres."
-)
-@click.option(
-    "--marker", "marker_m", type=float, help="Side of a marker in metres.  [default: 3/4 of a square]"
-)
-@click.option("--dictionary", default="4x4_50", show_default=True, help="Dictionary of the markers.")
-@FORCE
-@QUIET
-@pass_output
+@command(without=["progress", "json_path"])
 def board(
     output: Output,
-    out: Path,
-    squares_wh: tuple[int, int],
-    square_m: float,
-    marker_m: float | None,
-    dictionary: str,
+    *,
+    out: Path = Path("board.pdf"),
+    squares_wh: Annotated[tuple[int, int], says(flag="squares", metavar="COLUMNS,ROWS")] = (7, 5),
+    square_m: float = 0.035,
+    marker_m: float | None = None,
+    dictionary: str = "4x4_50",
 ) -> None:
     """Draw a ChArUco board to print, in its true size.
 
@@ -50,6 +29,13 @@ def board(
     Examples:
       psotrack board
       psotrack board --square 0.06 --out large.pdf
+
+    Options:
+        out: page to write: .pdf, .png or .svg.
+        squares_wh: number of squares.
+        square_m: side of a square in metres.
+        marker_m: side of a marker in metres. None: 3/4 of a square.
+        dictionary: dictionary of the markers.
     """
     from psotrack.calibration import Board, describe_board, save_board
 

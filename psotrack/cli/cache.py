@@ -3,41 +3,28 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
 from msgspec import Meta
 
-from psotrack.cli.options import CACHE, cache_folder, running
+from psotrack.cli.commands import command
+from psotrack.cli.options import Cache, cache_folder
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 
 if TYPE_CHECKING:
     from psotrack.foreground.silhouettes import CacheEntry
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What is removed; entries are listed otherwise.
-
-    Attributes:
-        older_than: remove entries that were not used for DAYS days.
-        max_gb: then remove entries until the rest has at most GB gigabytes, those first that were used longest ago.
-        empty: remove all entries.
-    """
-
-    older_than: Annotated[float, Meta(ge=0, extra={"metavar": "DAYS"})] | None = None
-    max_gb: Annotated[float, Meta(ge=0, extra={"metavar": "GB"})] | None = None
-    empty: bool = False
-
-
-@click.command(cls=HelpfulCommand)
-@options_of(Wanted, "wanted")
-@CACHE
-@running(progress=False)
-def cache(output: Output, wanted: Wanted, cache: Path | None) -> None:
+@command(without=["progress"])
+def cache(
+    output: Output,
+    *,
+    older_than: Annotated[Annotated[float, Meta(ge=0)] | None, says(metavar="DAYS")] = None,
+    max_gb: Annotated[Annotated[float, Meta(ge=0)] | None, says(metavar="GB")] = None,
+    empty: bool = False,
+    cache: Cache = None,
+) -> None:
     """List, prune and empty the cache of silhouettes and compiled programs.
 
     The next run makes anew what is missing or damaged. A running command has read its silhouettes and is not disturbed.
@@ -48,13 +35,18 @@ def cache(output: Output, wanted: Wanted, cache: Path | None) -> None:
       psotrack cache
       psotrack cache --older-than 30 --max-gb 20
       psotrack cache --empty
+
+    Options:
+        older_than: remove entries that were not used for DAYS days.
+        max_gb: then remove entries until the rest has at most GB gigabytes, those first that were used longest ago.
+        empty: remove all entries.
     """
     from psotrack.foreground.silhouettes import choose_to_prune, list_entries, remove_entry
 
     folder, now_s = cache_folder(cache), time.time()
     entries = list_entries(folder)
     content: dict[str, Any] = {"cache": str(folder), "entries": [_described(each, now_s) for each in entries]}
-    if wanted == Wanted():
+    if older_than is None and max_gb is None and not empty:
         output.json(content)
         rows = (
             (each.path.name, each.video, f"{each.size_bytes / 1e6:.1f}", f"{_days(each, now_s):.1f}")
@@ -64,8 +56,8 @@ def cache(output: Output, wanted: Wanted, cache: Path | None) -> None:
         output.table(("silhouettes", "video", "MB", "days unused"), rows)
         output.say(f"{folder}: {_counted(entries)}")
         return
-    max_bytes = None if wanted.max_gb is None else 1e9 * wanted.max_gb
-    chosen = entries if wanted.empty else choose_to_prune(entries, now_s, wanted.older_than, max_bytes)
+    max_bytes = None if max_gb is None else 1e9 * max_gb
+    chosen = entries if empty else choose_to_prune(entries, now_s, older_than, max_bytes)
     for each in chosen:
         remove_entry(each)
     output.json({**content, "removed": [str(each.path) for each in chosen]})

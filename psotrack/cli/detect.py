@@ -6,22 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-from msgspec import Meta
 from msgspec.structs import replace
 
-from psotrack.cli.options import (
-    SEQUENCE,
-    Extent,
-    beside,
-    extent_options,
-    filmed_recording,
-    out_option,
-    running,
-)
+from psotrack.cli.commands import Group, command
+from psotrack.cli.options import Extent, Seq, beside, filmed_recording
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.cli.settings import settings_options
+from psotrack.cli.settings import TrackingSettings
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.foreground.detection import DetectorSettings
 from psotrack.foreground.silhouettes import SilhouetteSettings
@@ -47,27 +38,26 @@ class DetectOptions:
             so on, or as one video (.mp4, or .avi without loss).
     """
 
-    detector: Annotated[str, Meta(extra={"metavar": "MODEL.onnx|NAME"})] | None = None
+    detector: Annotated[str | None, says(metavar="MODEL.onnx|NAME")] = None
     blobs: bool = False
     silhouettes: bool = False
-    masks: Annotated[Path, Meta(extra={"metavar": "FOLDER|FILE.mp4"})] | None = None
+    masks: Annotated[Path | None, says(metavar="FOLDER|FILE.mp4")] = None
 
 
-@click.command(cls=HelpfulCommand)
-@SEQUENCE
-@options_of(DetectOptions, "what")
-@out_option("Folder of the detections.  [default: SEQ/results/detections]")
-@options_of(DetectorSettings, "network", heading="With --detector")
-@settings_options("silhouettes.background", "silhouettes.drone_px", part="silhouettes.")
-@extent_options
-@running()
+@command()
 def detect(
     output: Output,
-    sequence: Path,
+    sequence: Seq,
+    *,
     what: DetectOptions,
-    out: Path | None,
-    network: DetectorSettings,
-    settings: dict[str, Any],
+    out: Path | None = None,
+    network: Annotated[DetectorSettings, Group("With --detector")],
+    settings: Annotated[
+        dict[str, Any],
+        TrackingSettings(
+            usual=("silhouettes.background", "silhouettes.drone_px"), part="silhouettes.", files=False
+        ),
+    ],
     extent: Extent,
 ) -> None:
     """Detect the drones of SEQ in each of its videos as 2D boxes: with a neural network, or as blobs of foreground.
@@ -87,6 +77,9 @@ def detect(
       psotrack detect pictures/ --blobs --out boxes --min-blob 16
       psotrack detect my_lab --silhouettes --frames 100 --json -
       psotrack detect flight.mp4 --masks flight_mask.mp4
+
+    Options:
+        out: folder of the detections. None: SEQ/results/detections.
     """
     wanted = {f"--{name}": value for name, value in vars(what).items()}
     given = [name for name, value in wanted.items() if value]

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import click
-from msgspec import Meta
-
-from psotrack.cli.options import BODIES, CACHE, JOBS, SEQUENCE, cache_folder, detections_of, running
+from psotrack.cli.commands import command
+from psotrack.cli.options import Bodies, Cache, Jobs, Seq, cache_folder, detections_of
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 from psotrack.errors import errors_name
 
 #: Exit code if something was found.
@@ -20,39 +17,18 @@ FOUND = 1
 _Bounds = tuple[float, float, float, float, float, float]
 
 
-@dataclass(frozen=True)
-class DoctorOptions:
-    """What is checked.
-
-    Attributes:
-        detections: detections in dl_data, blobs of the foreground, or a folder of files in the layout of dl_data; None:
-            yolo where there are some, else blobs.
-        bounds_m: bounds of the room in metres; None: far around the cameras, above and below.
-        tracks: find the offset between the clocks of SEQ's reference and of its videos instead, from the motion in
-            these tracks.
-        max_offset_s: largest offset that is tried in seconds, in both directions, with --tracks.
-    """
-
-    detections: Annotated[str, Meta(extra={"metavar": "yolo|blobs|FOLDER"})] | None = None
-    bounds_m: Annotated[_Bounds, Meta(extra={"metavar": "X0,X1,Y0,Y1,Z0,Z1"})] | None = None
-    tracks: Annotated[Path, Meta(extra={"metavar": "TRACKS"})] | None = None
-    max_offset_s: float = 2.0
-
-
-@click.command(cls=HelpfulCommand)
-@SEQUENCE
-@options_of(DoctorOptions, "checked")
-@BODIES
-@CACHE
-@JOBS
-@running()
+@command()
 def doctor(
     output: Output,
-    sequence: Path,
-    checked: DoctorOptions,
-    bodies: dict[str, tuple[str, ...]],
-    cache: Path | None,
-    jobs: int | None,
+    sequence: Seq,
+    *,
+    detections: Annotated[str | None, says(metavar="yolo|blobs|FOLDER")] = None,
+    bounds_m: Annotated[_Bounds | None, says(metavar="X0,X1,Y0,Y1,Z0,Z1")] = None,
+    tracks: Annotated[Path | None, says(metavar="TRACKS")] = None,
+    max_offset_s: float = 2.0,
+    bodies: Bodies,
+    cache: Cache = None,
+    jobs: Jobs = None,
 ) -> None:
     """Check the calibration of SEQ against the detections of its cameras, before tracking.
 
@@ -75,6 +51,14 @@ def doctor(
       psotrack doctor my_lab
       psotrack doctor data/Real_Data/R12_D4 --detections blobs --json -
       psotrack doctor data/Real_Data/R12_D4 --tracks tracks.csv --max-offset 10
+
+    Options:
+        detections: detections in dl_data, blobs of the foreground, or a folder of files in the layout of dl_data. None:
+            yolo where there are some, else blobs.
+        bounds_m: bounds of the room in metres. None: far around the cameras, above and below.
+        tracks: find the offset between the clocks of SEQ's reference and of its videos instead, from the motion in
+            these tracks.
+        max_offset_s: largest offset that is tried in seconds, in both directions, with --tracks.
     """
     from psotrack import api
     from psotrack.calibration.clocks import reference_offset
@@ -82,15 +66,15 @@ def doctor(
     from psotrack.recordings.exchange import read_tracks
 
     recording = open_recording(sequence, bodies=bodies)
-    if checked.tracks is not None:
-        estimate = read_tracks(checked.tracks, recording=recording)
-        with errors_name(f"{checked.tracks} and {recording.folder}"):
-            output.result(reference_offset(recording, estimate, max_offset_s=checked.max_offset_s))
+    if tracks is not None:
+        estimate = read_tracks(tracks, recording=recording)
+        with errors_name(f"{tracks} and {recording.folder}"):
+            output.result(reference_offset(recording, estimate, max_offset_s=max_offset_s))
         return
     diagnosis = api.doctor(
         recording,
-        detections=checked.detections or detections_of(output, recording),
-        bounds_m=checked.bounds_m,
+        detections=detections or detections_of(output, recording),
+        bounds_m=bounds_m,
         cache=cache_folder(cache),
         jobs=jobs,
         progress=output.report,

@@ -3,76 +3,46 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import click
-from msgspec import Meta
-
-from psotrack.cli.options import (
-    BODIES,
-    FORCE,
-    JSON,
-    QUIET,
-    TRACKS,
-    plot_option,
-    sequence_argument,
-    sequence_of,
-)
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.errors import SettingsError, errors_name
+from psotrack.cli.commands import Group, command
+from psotrack.cli.options import Bodies, Plot, SeqOfTracks, sequence_of
+from psotrack.cli.output import Output
+from psotrack.cli.types import Words, says
+from psotrack.errors import errors_name
 from psotrack.evaluation import PathSettings
 from psotrack.support import first_line
 
-if TYPE_CHECKING:
-    from psotrack.evaluation import PathComparison
-    from psotrack.trajectories import Trajectories
+
+def _offset(given: str) -> float | Literal["auto"]:
+    """The value of --offset."""
+    if given == "auto":
+        return "auto"
+    if not math.isfinite(float(given)):
+        raise ValueError
+    return float(given)
 
 
-@dataclass(frozen=True)
-class ReferenceOptions:
-    """What of the reference a path is compared with.
-
-    Attributes:
-        drone: drone of the reference that carries the camera; None: the name in TRACKS, or the only drone.
-        orientations: orientations of the reference by a clock of their own, as of an IMU, as TUM.
-    """
-
-    drone: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
-    orientations: Path | None = None
-
-
+_PATHS = "Paths with orientations"
 _NAMES = {"with_lever_arm": "lever-arm", "with_turn": "turn", "max_offset_s": "max-offset"}
 
 
-@click.command(cls=HelpfulCommand)
-@TRACKS
-@sequence_argument
-@plot_option("3D paths and error over time", "beside TRACKS, as .png")
-@click.option(
-    "--offset",
-    metavar="SECONDS|auto",
-    callback=lambda _, __, given: _read_offset(given),
-    help="Time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s.  [default: 0; "
-    "auto for paths with orientations]",
-)
-@options_of(ReferenceOptions, "given", heading="Paths with orientations")
-@options_of(PathSettings, "settings", names=_NAMES, heading="Paths with orientations")
-@BODIES
-@FORCE
-@QUIET
-@JSON
-@pass_output
+@command(without=["progress"])
 def evaluate(
     output: Output,
     tracks: Path,
-    sequence: Path | None,
-    plot: Path | None,
-    offset: float | Literal["auto"] | None,
-    bodies: dict[str, tuple[str, ...]],
-    **options: Any,
+    sequence: SeqOfTracks = None,
+    *,
+    plot: Plot = None,
+    offset: Annotated[
+        float | Literal["auto"] | None,
+        says(metavar="SECONDS|auto", type=Words("SECONDS|auto", "a number of seconds, or auto", _offset)),
+    ] = None,
+    drone: Annotated[str | None, says(metavar="NAME", heading=_PATHS)] = None,
+    orientations: Annotated[Path | None, says(heading=_PATHS)] = None,
+    settings: Annotated[PathSettings, Group(_PATHS, _NAMES)],
+    bodies: Bodies,
 ) -> None:
     """Compare TRACKS with the reference of SEQ.
 
@@ -95,39 +65,48 @@ def evaluate(
       psotrack evaluate dron1.csv data/Simulated_Data/S01_D2_A --json errors.json --plot errors.png
       psotrack evaluate gopro.csv data/Real_Data/R17_D1_A --orientations imu.tum
       psotrack evaluate slam.tum groundtruth.tum --offset 0 --no-lever-arm --no-turn
+
+    Options:
+        plot: save paths from above and from the side, and errors over time. None: beside TRACKS, as .png.
+        offset: time by which the reference's clock is ahead of the videos'; auto estimates it, up to 2 s. None: 0 s;
+            auto for paths with orientations.
+        drone: drone of the reference that carries the camera. None: the name in TRACKS, or the only drone.
+        orientations: orientations of the reference by a clock of their own, as of an IMU, as TUM.
     """
+    from psotrack import evaluation
     from psotrack.calibration.clocks import own_reference, reference_for
-    from psotrack.evaluation import evaluate as compare
     from psotrack.evaluation import plots, tables
-    from psotrack.evaluation.path_plots import save_paths
     from psotrack.recordings.datasets import open_recording
     from psotrack.recordings.exchange import read_tracks
 
     sequence = sequence_of(tracks, sequence)
+    picture = None if plot is None else plot if plot.name else tracks.with_suffix(".png")
     is_poses = sequence.is_file() and sequence.suffix.lower() not in (".toml", ".c3d")
-    if is_poses or options["given"] != ReferenceOptions() or _is_camera_path(tracks):
+    if is_poses or drone is not None or orientations is not None or _is_camera_path(tracks):
+        path = evaluation.drone_of(read_tracks(tracks), drone)
         reference = (
             read_tracks(sequence) if is_poses else own_reference(open_recording(sequence, bodies=bodies))
         )
-        found = _compare_path(tracks, sequence, reference, None if offset == "auto" else offset, **options)
-        output.json(found.to_dict())
-        output.show(tables.render_paths(found, title=f"{tracks.name} and {sequence.name}"))
-        if plot is not None:
-            picture = plot if plot.name else tracks.with_suffix(".png")
-            save_paths(picture, {tracks.stem: found}, force=output.force)
-            output.say(f"{picture}: the path, and errors over time")
+        turns = None if orientations is None else evaluation.drone_of(read_tracks(orientations))
+        with errors_name(f"{tracks} and {sequence}"):
+            body = evaluation.drone_of(reference, drone or path.drones[0])
+            offset_s = None if offset == "auto" else offset
+            compared = evaluation.compare_paths(path, body, turns, settings, offset_s=offset_s)
+        output.json(compared.to_dict())
+        output.show(tables.render_paths(compared, title=f"{tracks.name} and {sequence.name}"))
+        if picture is not None:
+            plots.save_paths(picture, {tracks.stem: compared}, force=output.force)
+            output.say(f"{picture}: paths, and errors over time")
         return
     recording = open_recording(sequence, bodies=bodies)
     estimate = read_tracks(tracks, recording=recording)
     with errors_name(f"{tracks} and {sequence}"):
-        truth, offset_s = reference_for(recording, estimate, offset)
-        evaluation = compare(estimate, truth)
-    content = evaluation.to_dict() | ({} if offset is None else {"reference_offset_s": offset_s})
-    output.json(content)
-    clock = "" if offset is None else f", reference's clock {offset_s:+.4f} s"
-    output.show(tables.render(evaluation, title=f"{recording.name}{clock}"))
-    if plot is not None:
-        picture = plot if plot.name else tracks.with_suffix(".png")
+        truth, by_s = reference_for(recording, estimate, offset)
+        found = evaluation.evaluate(estimate, truth)
+    output.json(found.to_dict() | ({} if offset is None else {"reference_offset_s": by_s}))
+    clock = "" if offset is None else f", reference's clock {by_s:+.4f} s"
+    output.show(tables.render(found, title=f"{recording.name}{clock}"))
+    if picture is not None:
         plots.save_overview(picture, estimate, truth, force=output.force)
         output.say(f"{picture}: paths, and errors over time")
 
@@ -135,38 +114,3 @@ def evaluate(
 def _is_camera_path(tracks: Path) -> bool:
     """Whether a file is a table of `psotrack onboard localise`."""
     return tracks.is_file() and tracks.suffix.lower() == ".csv" and "reprojection_px" in first_line(tracks)
-
-
-def _compare_path(
-    tracks: Path,
-    sequence: Path,
-    reference: Trajectories,
-    offset_s: float | None,
-    *,
-    given: ReferenceOptions,
-    settings: PathSettings,
-) -> PathComparison:
-    """Compare the path of one drone with its reference."""
-    from psotrack.evaluation import compare_paths, drone_of
-    from psotrack.recordings.exchange import read_tracks
-
-    path = drone_of(read_tracks(tracks), given.drone)
-    turns = None if given.orientations is None else drone_of(read_tracks(given.orientations))
-    with errors_name(f"{tracks} and {sequence}"):
-        body = drone_of(reference, given.drone or path.drones[0])
-        return compare_paths(path, body, turns, settings, offset_s=offset_s)
-
-
-def _read_offset(given: str | None) -> float | Literal["auto"] | None:
-    """The value of --offset."""
-    if given is None:
-        return None
-    if given == "auto":
-        return "auto"
-    try:
-        offset_s = float(given)
-    except ValueError:
-        offset_s = math.nan
-    if not math.isfinite(offset_s):
-        raise SettingsError("--offset", expected="a number of seconds, or auto", found=given)
-    return offset_s

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from psotrack.cli.options import TRACKS, out_option, running, sequence_argument
+from psotrack.cli.commands import command
+from psotrack.cli.options import SeqOfTracks
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand
-from psotrack.cli.types import Numbers
+from psotrack.cli.types import says
 from psotrack.errors import OutputError, SettingsError, errors_name
 
 if TYPE_CHECKING:
@@ -23,32 +23,16 @@ _SUFFIXES = {"c3d": ".c3d", "mcap": ".mcap", "csv": ".csv", "parquet": ".parquet
 FORMAT_NAMES = ("tum", "kitti", "mot", "c3d", "mcap", "csv", "parquet", "json")
 
 
-@click.command(cls=HelpfulCommand)
-@TRACKS
-@sequence_argument
-@click.option("--to", type=click.Choice(FORMAT_NAMES), required=True, help="Format of the output.")
-@out_option(
-    "File of the output; a folder for tum with several drones, kitti, and mot with SEQ; either for mcap.  [default: "
-    "beside TRACKS, with the format in its name]"
-)
-@click.option("--images", is_flag=True, help="Write the images of SEQ's cameras too; only with --to mcap.")
-@click.option(
-    "--drone-size",
-    "drone_size_m",
-    type=Numbers(3),
-    metavar="X,Y,Z",
-    help="Full lengths of a drone along x, y and z, in metres, for boxes of --to mot.  [default: those that the record "
-    "beside TRACKS has]",
-)
-@running(progress=False, json=False)
+@command(without=["progress", "json_path"])
 def export(
     output: Output,
     tracks: Path,
-    sequence: Path | None,
-    to: str,
-    out: Path | None,
-    images: bool,
-    drone_size_m: tuple[float, ...] | None,
+    sequence: SeqOfTracks = None,
+    *,
+    to: Annotated[str, says(type=click.Choice(FORMAT_NAMES))],
+    out: Path | None = None,
+    images: bool = False,
+    drone_size_m: Annotated[tuple[float, float, float] | None, says(metavar="X,Y,Z")] = None,
 ) -> None:
     """Write TRACKS in a format of another program.
 
@@ -61,6 +45,14 @@ def export(
       psotrack export tracks.csv --to c3d --out tracks.c3d
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mot --out mot
       psotrack export tracks.csv data/Simulated_Data/S02_D4_A --to mcap --out flight.mcap --images
+
+    Options:
+        to: format of the output.
+        out: file of the output; a folder for tum with several drones, kitti, and mot with SEQ; either for mcap. None:
+            beside TRACKS, with the format in its name.
+        images: write the images of SEQ's cameras too; only with --to mcap.
+        drone_size_m: full lengths of a drone along x, y and z, in metres, for boxes of --to mot. None: those that the
+            record beside TRACKS has.
     """
     from psotrack.recordings.datasets import open_recording
     from psotrack.recordings.exchange import Footage, export_tracks, read_tracks

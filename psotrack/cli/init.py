@@ -3,78 +3,45 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.options import BODIES, out_option, positive, running
+from psotrack.cli.commands import command
+from psotrack.cli.options import Bodies
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand
-from psotrack.cli.types import SequencePath, Size
-from psotrack.errors import SettingsError
+from psotrack.cli.types import SequencePath, Words, says
 
 if TYPE_CHECKING:
     from psotrack.recordings.datasets import DraftOptions, Unclear, Unmatched
 
 
-def _pairs(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Cameras and files of --match."""
-    pairs = []
-    for match in given:
-        camera, equals, file = match.partition("=")
-        if not (camera and equals and file):
-            raise SettingsError("--match", expected="CAMERA=FILE", found=match)
-        pairs.append((camera, file))
-    return pairs
+def _pair(match: str) -> tuple[str, str]:
+    """Camera and file of --match."""
+    camera, _, file = match.partition("=")
+    if not (camera and file):
+        raise ValueError
+    return camera, file
 
 
-@click.command("init", cls=HelpfulCommand)
-@click.argument("folder", type=SequencePath(path_type=Path))
-@click.option(
-    "--calibration",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Rig file, of any format that `calibrate convert` reads.  [default: the one in FOLDER]",
-)
-@click.option(
-    "--units",
-    "unit",
-    type=click.Choice(["m", "cm", "mm"]),
-    help="Unit of the lengths in the rig file; needed if the format leaves the unit open.",
-)
-@click.option(
-    "--match",
-    multiple=True,
-    callback=_pairs,
-    metavar="CAMERA=FILE",
-    help="FILE of FOLDER, or address of a stream, that belongs to CAMERA; may be repeated.",
-)
-@click.option(
-    "--leave-out", multiple=True, metavar="FILE", help="File of FOLDER that is not used; may be repeated."
-)
-@click.option(
-    "--fps",
-    type=float,
-    callback=positive,
-    help="Frames per second of cameras that have images or detections only.",
-)
-@click.option(
-    "--size",
-    "size_wh",
-    type=Size(),
-    metavar="W,H",
-    help="Size of the images of cameras that have detections only, if the rig file does not state it.",
-)
-@out_option("[default: FOLDER/recording.toml]", metavar="FILE")
-@click.option(
-    "--show",
-    "shown",
-    is_flag=True,
-    help="Show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.",
-)
-@BODIES
-@running(progress=False)
-def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: Any) -> None:
+@command(without=["progress"])
+def init(
+    output: Output,
+    folder: Annotated[Path, says(type=SequencePath(path_type=Path))],
+    *,
+    calibration: Annotated[Path | None, says(metavar="FILE")] = None,
+    unit: Annotated[Literal["m", "cm", "mm"] | None, says(flag="units")] = None,
+    match: Annotated[
+        tuple[tuple[str, str], ...], says(multiple=True, type=Words("CAMERA=FILE", "CAMERA=FILE", _pair))
+    ] = (),
+    leave_out: Annotated[tuple[str, ...], says(multiple=True, metavar="FILE", type=str)] = (),
+    fps: Annotated[float, Meta(gt=0, le=1e6)] | None = None,
+    size_wh: Annotated[tuple[int, int] | None, says(flag="size", metavar="W,H")] = None,
+    out: Annotated[Path | None, says(metavar="FILE")] = None,
+    show: bool = False,
+    bodies: Bodies,
+) -> None:
     """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
 
     Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to
@@ -94,17 +61,29 @@ def init(output: Output, folder: Path, out: Path | None, shown: bool, **chosen: 
       psotrack init my_lab --calibration rig.toml --match left=GX010123.MP4 --leave-out test.mp4
       psotrack init my_lab --calibration rig.toml --body cf1=M1,M2,M3,M4 --body cf2
       psotrack init data/Simulated_Data/S02_D4_A --show
+
+    Options:
+        calibration: rig file, of any format that `calibrate convert` reads. None: the one in FOLDER.
+        unit: unit of the lengths in the rig file; needed if the format leaves the unit open.
+        match: FILE of FOLDER, or address of a stream, that belongs to CAMERA; may be repeated.
+        leave_out: file of FOLDER that is not used; may be repeated.
+        fps: frames per second of cameras that have images or detections only.
+        size_wh: size of the images of cameras that have detections only, if the rig file does not state it.
+        out: file to write. None: FOLDER/recording.toml.
+        show: show what the recording FOLDER contains, and check its files, of videos the last frame; write nothing.
     """
     from psotrack.recordings import RECORDING_FILE, inventory_table
     from psotrack.recordings.datasets import DraftOptions, draft_recording
 
-    if shown:
-        _show(output, folder, chosen["bodies"])
+    if show:
+        _show(output, folder, bodies)
         return
     out = out or folder / RECORDING_FILE
     check_suffix("--out", out, ".toml")
     output.refuse(out)
-    options = DraftOptions(**chosen)
+    options = DraftOptions(
+        calibration, unit=unit, match=match, leave_out=leave_out, fps=fps, size_wh=size_wh, bodies=bodies
+    )
     draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
     older = draft.write()
     content = draft.to_dict()

@@ -7,25 +7,28 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
 from msgspec import Meta
 
-from psotrack.cli.options import CACHE, FORCE, JSON, LOG, QUIET, SEQUENCE, compiled_folder, recording_named
-from psotrack.cli.output import Output, check_suffix, pass_output, write_json
-from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.cli.settings import config_options, settings_options
+from psotrack.cli.commands import command
+from psotrack.cli.options import Cache, Cameras, MostDrones, Seq, compiled_folder, recording_named
+from psotrack.cli.output import Output, check_suffix, write_json
+from psotrack.cli.settings import TrackingSettings
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
 from psotrack.support.interrupts import unhurried_end
 
 if TYPE_CHECKING:
-    from psotrack.live import LiveResult, LiveSession, RowsOutput
+    from rich.table import Table
+
+    from psotrack.live import LiveResult, LiveSession
     from psotrack.recordings import Recording
     from psotrack.show.viewer import LiveView
 
@@ -33,81 +36,31 @@ if TYPE_CHECKING:
 _SHOWN_S = 0.5
 
 
-@dataclass(frozen=True)
-class TargetOptions:
-    """Where rows go.
-
-    Attributes:
-        out: file of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end.
-        lines: write each row as a line of JSON to stdout.
-        udp: send each row as a line of JSON by UDP.
-        websocket: send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer;
-            without HOST, only programs on this computer reach the server.
-        record: keep what the cameras film in FOLDER, as a recording that can be tracked again.
-    """
-
-    out: Path | None = None
-    lines: bool = False
-    udp: Annotated[str, Meta(extra={"metavar": "HOST:PORT"})] | None = None
-    websocket: Annotated[str, Meta(extra={"metavar": "[HOST:]PORT"})] | None = None
-    record: Annotated[Path, Meta(extra={"metavar": "FOLDER"})] | None = None
-
-
-@dataclass(frozen=True)
-class SessionOptions:
-    """What is filmed, and how long.
-
-    Attributes:
-        seconds: end after this time.
-        replay: play the videos of SEQ at their own rate, instead of cameras.
-        speed: seconds of video per second, for --replay.
-        loops: how often the videos are played, for --replay.
-        cameras: use these cameras only; None: all cameras of the calibration.
-        most_drones: largest number of drones at one time.
-    """
-
-    seconds: Annotated[float, Meta(gt=0)] | None = None
-    replay: bool = False
-    speed: Annotated[float, Meta(gt=0)] = 1.0
-    loops: Annotated[int, Meta(ge=1)] = 1
-    cameras: tuple[str, ...] | None = None
-    most_drones: Annotated[int, Meta(ge=1, le=1000)] = 16
-
-
-@click.command(cls=HelpfulCommand)
-@SEQUENCE
-@options_of(TargetOptions, "targets")
-@click.option(
-    "--view",
-    "viewer",
-    is_flag=False,
-    flag_value="window",
-    type=click.Choice(["window", "web"]),
-    help="Show drones in space and their values over time, in a window of Rerun or on a page for a browser.  [without "
-    "a value: window]",
-)
-@options_of(SessionOptions, "chosen", rare=("most_drones",))
-@settings_options(
-    "swarm.particles",
-    "swarm.iterations",
-    "drones.count",
-    without=["method", "detections", "init", "smooth", "clocks", "rate_hz"],
-)
-@CACHE
-@config_options
-@FORCE
-@QUIET
-@LOG
-@JSON
-@pass_output
+@command(without=["progress"])
 def live(
     output: Output,
-    sequence: Path,
-    targets: TargetOptions,
-    viewer: str | None,
-    chosen: SessionOptions,
-    cache: Path | None,
-    settings: dict[str, Any],
+    sequence: Seq,
+    *,
+    out: Path | None = None,
+    lines: bool = False,
+    udp: Annotated[str | None, says(metavar="HOST:PORT")] = None,
+    websocket: Annotated[str | None, says(metavar="[HOST:]PORT")] = None,
+    record: Annotated[Path | None, says(metavar="FOLDER")] = None,
+    view: Annotated[Literal["window", "web"] | None, says(is_flag=False, flag_value="window")] = None,
+    seconds: Annotated[float, Meta(gt=0)] | None = None,
+    replay: bool = False,
+    speed: Annotated[float, Meta(gt=0)] = 1.0,
+    loops: Annotated[int, Meta(ge=1)] = 1,
+    cameras: Cameras = None,
+    most_drones: MostDrones = 16,
+    settings: Annotated[
+        dict[str, Any],
+        TrackingSettings(
+            usual=("swarm.particles", "swarm.iterations", "drones.count"),
+            without=("method", "detections", "init", "smooth", "clocks", "rate_hz"),
+        ),
+    ],
+    cache: Cache = None,
 ) -> None:
     """Track drones while the cameras of SEQ film: devices and streams, or videos that are replayed.
 
@@ -124,91 +77,106 @@ def live(
       psotrack live lab/recording.toml --view
       psotrack live data/Simulated_Data/S02_D4_A --replay --out tracks.csv
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
+
+    Options:
+        out: file of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end.
+        lines: write each row as a line of JSON to stdout.
+        udp: send each row as a line of JSON by UDP.
+        websocket: send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer;
+            without HOST, only programs on this computer reach the server.
+        record: keep what the cameras film in FOLDER, as a recording that can be tracked again.
+        view: show drones in space and their values over time, in a window of Rerun or on a page for a browser.
+            [without a value: window]
+        seconds: end after this time.
+        replay: play the videos of SEQ at their own rate, instead of cameras.
+        speed: seconds of video per second, for --replay.
+        loops: how often the videos are played, for --replay.
+        most_drones: largest number of drones at one time.
     """
-    from psotrack.live import (
-        WAIT_S,
-        CameraRecorder,
-        LiveSession,
-        UdpLines,
-        WebSocketLines,
-        live_cameras,
-        recording_folder,
-        write_lines,
-    )
+    from rich.console import Console
+    from rich.live import Live
+
+    from psotrack import live as filming
     from psotrack.pipeline import warn_of_missing_drones, with_real_time
     from psotrack.recordings.datasets import open_recording
     from psotrack.support import keep_compiled
     from psotrack.trajectories import RowStream
 
-    out, record = targets.out, targets.record
-    if viewer is None and targets == TargetOptions(record=record):
+    if not (out or lines or udp or websocket or view):
         expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None:
         check_suffix("--out", out, ".csv", ".parquet")
         output.refuse(out, out.with_suffix(".json"))
-    if viewer is not None:
-        _check_viewer(viewer)
+    if view is not None:
+        _check_viewer(view)
     tracking = TrackSettings().changed(settings)
     keep_compiled(compiled_folder(cache))
-    start_s = time.perf_counter() - output.started_s
+    start_s = output.elapsed_s
     recording = open_recording(sequence)
-    if chosen.replay:
-        recording = recording.usable(chosen.cameras)
-    used = live_cameras(
-        recording, chosen.cameras, replay=chosen.replay, speed=chosen.speed, loops=chosen.loops
-    )
+    if replay:
+        recording = recording.usable(cameras)
+    used = filming.live_cameras(recording, cameras, replay=replay, speed=speed, loops=loops)
     if record is not None:
-        used = [replace(each, recorder=CameraRecorder(record, each.name, each.fps)) for each in used]
-    first_s = float(recording.timeline().time_s[0]) if chosen.replay else 0.0
-    session = LiveSession(
+        used = [replace(each, recorder=filming.CameraRecorder(record, each.name, each.fps)) for each in used]
+    session = filming.LiveSession(
         recording,
         used,
         tracking,
-        most_drones=chosen.most_drones,
-        first_s=first_s,
+        most_drones=most_drones,
+        first_s=float(recording.timeline().time_s[0]) if replay else 0.0,
         # In a slow replay everything may take longer.
-        wait_s=WAIT_S / min(1.0, chosen.speed) if chosen.replay else WAIT_S,
+        wait_s=filming.WAIT_S / min(1.0, speed) if replay else filming.WAIT_S,
     )
-    hidden = output.quiet or targets.lines
+    hidden = output.quiet or lines
     with contextlib.ExitStack() as stack:
         if record is not None:
             names = [camera.name for camera in used]
-            stack.enter_context(recording_folder(record, recording, names, force=output.force))
-        outputs: list[RowsOutput] = [partial(write_lines, sys.stdout)] if targets.lines else []
-        if targets.udp is not None:
-            outputs.append(stack.enter_context(contextlib.closing(UdpLines(targets.udp))).write)
+            stack.enter_context(filming.recording_folder(record, recording, names, force=output.force))
+        outputs: list[filming.RowsOutput] = []
+        if out is not None:
+            rows = stack.enter_context(RowStream(out, force=output.force, record=out.with_suffix(".json")))
+            outputs.append(rows.write)
+        if lines:
+            outputs.append(partial(filming.write_lines, sys.stdout))
+        if udp is not None:
+            outputs.append(stack.enter_context(contextlib.closing(filming.UdpLines(udp))).write)
         server = None
-        if targets.websocket is not None:
-            server = stack.enter_context(contextlib.closing(WebSocketLines(targets.websocket)))
+        if websocket is not None:
+            server = stack.enter_context(contextlib.closing(filming.WebSocketLines(websocket)))
             outputs.append(server.write)
             if not output.quiet:
                 click.echo(f"rows are sent to clients of {server.address}", err=True)
-        if out is not None:
-            rows = stack.enter_context(RowStream(out, force=output.force, record=out.with_suffix(".json")))
-            outputs.insert(0, rows.write)
-        shown = None if viewer is None else stack.enter_context(_open_view(viewer, recording, hidden))
+        shown = None if view is None else stack.enter_context(_open_view(view, recording, hidden))
         outputs += [] if shown is None else [shown.write]
-        table = stack.enter_context(_Table(hidden, shown))
+        console, changed_s = Console(stderr=True), 0.0
+        table = None
+        if console.is_terminal and not hidden:
+            table = stack.enter_context(Live(console=console, auto_refresh=False, transient=True))
         stack.enter_context(_ended_by_ctrl_c(session))
 
         def show(result: LiveResult) -> None:
+            nonlocal changed_s
             if result.instants == 1:
                 stack.enter_context(unhurried_end())
-            table.show(result)
+            if shown is not None:
+                shown.show_delay(result.delay_s[-1])
+            if table is not None and time.monotonic() - changed_s > _SHOWN_S:
+                changed_s = time.monotonic()
+                table.update(_table(result), refresh=True)
 
-        result = session.run(outputs, show, longest_s=chosen.seconds or float("inf"))
+        result = session.run(outputs, show, longest_s=seconds or float("inf"))
     warn_of_missing_drones(tracking, len(result.drones))
     report = {"sequence": recording.name, **session.record, **_record(result)}
     if server is not None:
         report["websocket"] = {"clients": server.num_clients}
     if out is not None:
         report["recording"] = recording_named(sequence, out)
-    report = with_real_time(report, time.perf_counter() - output.started_s, start_s=start_s)
+    report = with_real_time(report, output.elapsed_s, start_s=start_s)
     if out is not None:
         write_json(out.with_suffix(".json"), report)
     output.json(report)
-    if not targets.lines:
+    if not lines:
         output.say(
             f"{out or 'live'}: {report['drones']} drones, {result.instants} frames, "
             f"delay {1e3 * report['delay_s']['median']:.0f} ms, {result.left_out} frames left out"
@@ -218,19 +186,19 @@ def live(
         raise result.failed_outputs[0]
 
 
-def _check_viewer(viewer: str) -> None:
+def _check_viewer(view: str) -> None:
     from psotrack.show.viewer import check_display, check_installed
 
     check_installed()
-    if viewer == "window":
+    if view == "window":
         check_display()
 
 
 @contextlib.contextmanager
-def _open_view(viewer: str, recording: Recording, quiet: bool) -> Iterator[LiveView]:
+def _open_view(chosen: str, recording: Recording, quiet: bool) -> Iterator[LiveView]:
     from psotrack.show.viewer import LiveView
 
-    with LiveView(recording, web=viewer == "web") as view:
+    with LiveView(recording, web=chosen == "web") as view:
         if view.page:
             click.echo(view.page, err=quiet)
         yield view
@@ -258,49 +226,23 @@ def _record(result: LiveResult) -> dict[str, Any]:
     }
 
 
-class _Table:
-    """A table on the terminal; shows nothing where stderr is no terminal. The viewer gets the delay."""
+def _table(result: LiveResult) -> Table:
+    """What the session has done so far."""
+    import numpy as np
+    from rich.table import Table
 
-    def __init__(self, hidden: bool, view: LiveView | None) -> None:
-        self._hidden, self._shown_s, self._view = hidden, 0.0, view
-
-    def __enter__(self) -> _Table:
-        from rich.console import Console
-        from rich.live import Live
-
-        console = Console(stderr=True)
-        self._hidden = self._hidden or not console.is_terminal
-        self._live = None if self._hidden else Live(console=console, auto_refresh=False, transient=True)
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def show(self, result: LiveResult) -> None:
-        """Show what the session has done so far."""
-        if self._view is not None:
-            self._view.show_delay(result.delay_s[-1])
-        if self._live is None or time.monotonic() - self._shown_s < _SHOWN_S:
-            return
-        import numpy as np
-        from rich.table import Table
-
-        self._shown_s = time.monotonic()
-        recent_ms = 1e3 * np.array(result.delay_s[-250:])
-        rate_hz = result.instants / max(result.seconds, 1e-3)
-        table = Table(
-            title=f"{len(result.drones)} drones, {rate_hz:.1f} frames/s, delay {np.median(recent_ms):.0f} ms "
-            f"(99 %: {np.quantile(recent_ms, 0.99):.0f}), {result.left_out} left out"
-        )
-        for column in ("camera", "", "frames", "missing", "late", "twice", "left out", "stops"):
-            table.add_column(column, justify="left" if column in ("camera", "") else "right")
-        for name, camera in result.cameras.items():
-            counts = (f"{value}" for value in vars(camera.counts).values())
-            table.add_row(name, "films" if camera.films else "silent", *counts)
-        self._live.update(table, refresh=True)
+    recent_ms = 1e3 * np.array(result.delay_s[-250:])
+    rate_hz = result.instants / max(result.seconds, 1e-3)
+    table = Table(
+        title=f"{len(result.drones)} drones, {rate_hz:.1f} frames/s, delay {np.median(recent_ms):.0f} ms "
+        f"(99 %: {np.quantile(recent_ms, 0.99):.0f}), {result.left_out} left out"
+    )
+    for column in ("camera", "", "frames", "missing", "late", "twice", "left out", "stops"):
+        table.add_column(column, justify="left" if column in ("camera", "") else "right")
+    for name, camera in result.cameras.items():
+        counts = (f"{value}" for value in vars(camera.counts).values())
+        table.add_row(name, "films" if camera.films else "silent", *counts)
+    return table
 
 
 @contextlib.contextmanager

@@ -7,10 +7,8 @@ import logging
 import re
 import shlex
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-
-import click
 
 from psotrack import __version__
 from psotrack.errors import OutputError, PsotrackError
@@ -23,62 +21,53 @@ said.propagate = False
 _TIME = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]")
 
 
-class LogFile:
-    """A file that gets warnings, steps of the work, stages of the progress, printed sentences and the error.
-
-    Args:
-        path: the file; lines are added at its end.
+@contextlib.contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """Add warnings, steps of the work, stages of the progress, printed sentences and the error to the end of a file.
 
     Raises:
         OutputError: the file cannot be opened for writing, or is another file than a log.
     """
-
-    def __init__(self, path: Path) -> None:
-        if path == Path("-"):
-            raise OutputError(path, expected="the path of a log file", found="-; stderr is /dev/stderr")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_file() and not _begins_like_a_log(path):
-                # A user who names a file of tracks by mistake must not get lines of a log in it.
-                raise OutputError(
-                    path,
-                    expected="a new file, or a log of psotrack",
-                    found="another file, which is unchanged",
-                )
-            self._handler = _Handler(path, encoding="utf-8")
-        except OSError as error:
-            found = error.strerror or f"{error}"
-            raise OutputError(path, expected="a log file that can be written", found=found) from error
-        self._handler.setLevel(logging.INFO)
-        self._handler.setFormatter(_Formatter())
-        self._steps = logging.getLogger("psotrack")
-        self._level = self._steps.level
-
-    def __enter__(self) -> LogFile:
-        for logger in (logging.getLogger(), said):
-            logger.addHandler(self._handler)
-        for logger in (self._steps, said):
-            logger.setLevel(logging.INFO)
+    handler, steps = _opened(path), logging.getLogger("psotrack")
+    level, loggers = steps.level, (logging.getLogger(), said)
+    for logger in loggers:
+        logger.addHandler(handler)
+    for logger in (steps, said):
+        logger.setLevel(logging.INFO)
+    try:
         said.info("psotrack %s: %s", __version__, shlex.join(["psotrack", *sys.argv[1:]]))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
-        if isinstance(error, click.ClickException):
-            said.error("%s", error.format_message())
-        elif isinstance(error, PsotrackError):
-            said.error("%s", error)
-        elif isinstance(error, KeyboardInterrupt):
-            said.error("interrupted")
-        elif isinstance(error, Exception) and not isinstance(error, click.exceptions.Exit):
-            said.error("%s", error, exc_info=error)
-        for logger in (logging.getLogger(), said):
-            logger.removeHandler(self._handler)
-        self._steps.setLevel(self._level)
+        yield
+    except (PsotrackError, KeyboardInterrupt) as error:
+        said.error("%s", f"{error}" or "interrupted")
+        raise
+    except Exception as error:
+        said.exception("%s", error)
+        raise
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+        steps.setLevel(level)
         # What could not be written was said by the handler.
         with contextlib.suppress(OSError):
-            self._handler.close()
+            handler.close()
+
+
+def _opened(path: Path) -> _Handler:
+    if path == Path("-"):
+        raise OutputError(path, expected="the path of a log file", found="-; stderr is /dev/stderr")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_file() and not _begins_like_a_log(path):
+            # A user who names a file of tracks by mistake must not get lines of a log in it.
+            expected, found = "a new file, or a log of psotrack", "another file, which is unchanged"
+            raise OutputError(path, expected=expected, found=found)
+        handler = _Handler(path, encoding="utf-8")
+    except OSError as error:
+        found = error.strerror or f"{error}"
+        raise OutputError(path, expected="a log file that can be written", found=found) from error
+    handler.setLevel(logging.INFO)
+    handler.setFormatter(_Formatter())
+    return handler
 
 
 def _begins_like_a_log(path: Path) -> bool:

@@ -2,173 +2,48 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import click
+from msgspec import Meta
 
-from psotrack.cli.log_file import LogFile
-from psotrack.cli.output import PROGRESS, Output, current_output, pass_output
-from psotrack.cli.records import Command, Option
-from psotrack.cli.types import Names, SequencePath
-from psotrack.errors import InputError, SettingsError, check_positive
+from psotrack.cli.output import Output
+from psotrack.cli.types import RUNNING, SequencePath, says
+from psotrack.errors import InputError, SettingsError
 from psotrack.settings import BLOBS, YOLO
-from psotrack.support import refuse_files, user_cache
+from psotrack.support import user_cache
 
 if TYPE_CHECKING:
     from psotrack.recordings import Recording
 
 #: Side of a detector network's square input, pixels: the size that YOLO networks are trained with.
 DETECTOR_SIZE = 640
-#: Heading of the options that are not about the work itself.
-RUNNING = "Running"
 
-TRACKS = click.argument("tracks", type=click.Path(path_type=Path))
-SEQUENCE = click.argument("sequence", metavar="SEQ", type=SequencePath(path_type=Path))
-
-
-def sequence_argument(command: Command) -> Command:
-    """Add [SEQ], which a command does without where the record of the tracks names the recording."""
-    return click.argument("sequence", metavar="[SEQ]", type=SequencePath(path_type=Path), required=False)(
-        command
-    )
-
-
-def _flag(name: str, words: str, *more: str) -> Callable[[Command], Command]:
-    """A flag that sets an attribute of the command's `Output`."""
-
-    def choose(_: click.Context, __: click.Parameter, value: bool) -> None:
-        setattr(current_output(), name, value)
-
-    return click.option(
-        f"--{name}",
-        *more,
-        is_flag=True,
-        is_eager=True,
-        expose_value=False,
-        callback=choose,
-        cls=Option,
+Seq = Annotated[Path, says(metavar="SEQ", type=SequencePath(path_type=Path))]
+#: A command does without it where the record of the tracks names the recording.
+SeqOfTracks = Annotated[Path | None, says(metavar="[SEQ]", type=SequencePath(path_type=Path))]
+Cache = Annotated[
+    Path | None,
+    says(
+        words="folder of silhouettes and compiled programs. None: $PSOTRACK_CACHE, or psotrack in your cache folder.",
+        envvar="PSOTRACK_CACHE",
         heading=RUNNING,
-        help=words,
-    )
-
-
-FORCE = _flag("force", "Replace existing files.")
-QUIET = _flag("quiet", "Print no progress and no results, only errors.", "-q")
-
-
-def _take_progress(_: click.Context, __: click.Parameter, chosen: str) -> None:
-    current_output().progress = chosen
-
-
-def _open_log(context: click.Context, _: click.Parameter, path: Path | None) -> None:
-    if path is not None and not context.resilient_parsing:
-        # The outermost context ends after everything that the command says, its errors included.
-        context.find_root().with_resource(LogFile(path))
-
-
-def _take_json(context: click.Context, _: click.Parameter, path: Path | None) -> None:
-    """A file that cannot be written, or must not be replaced, is refused before the work."""
-    # /dev/stdout is stdout, which then gets nothing but the JSON.
-    path = Path("-") if path == Path("/dev/stdout") else path
-    output = current_output()
-    if path is not None and path != Path("-") and not context.resilient_parsing:
-        refuse_files(path, force=output.force)
-    output.json_path = path
-
-
-LOG = click.option(
-    "--log",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    callback=_open_log,
-    expose_value=False,
-    cls=Option,
-    heading=RUNNING,
-    help="Add warnings, steps, seconds of each stage, results and errors to the end of FILE, with times.",
-)
-_PROGRESS = click.option(
-    "--progress",
-    type=click.Choice(list(PROGRESS)),
-    default="auto",
-    show_default=True,
-    envvar="PSOTRACK_PROGRESS",
-    callback=_take_progress,
-    expose_value=False,
-    cls=Option,
-    heading=RUNNING,
-    help="Progress on stderr. auto: a bar on a terminal, else lines now and then about work that takes long; bar: "
-    "a bar in any case; lines: lines, and the seconds of each stage; none: nothing.",
-)
-JSON = click.option(
-    "--json",
-    "json_path",
-    type=click.Path(path_type=Path),
-    metavar="OUT",
-    callback=_take_json,
-    expose_value=False,
-    cls=Option,
-    heading=RUNNING,
-    help="Write the results as JSON to OUT; - is stdout.",
-)
-CACHE = click.option(
-    "--cache",
-    type=click.Path(path_type=Path),
-    envvar="PSOTRACK_CACHE",
-    cls=Option,
-    heading=RUNNING,
-    help="Folder of silhouettes and compiled programs.  [default: $PSOTRACK_CACHE, or psotrack in your cache folder]",
-)
-JOBS = click.option(
-    "--jobs",
-    type=click.IntRange(min=1),
-    cls=Option,
-    heading=RUNNING,
-    help="Largest number of processes.  [default: one per processor]",
-)
-
-
-def reporting(command: Command) -> Command:
-    """Options of commands with long work: --quiet, --progress and --log."""
-    return QUIET(_PROGRESS(LOG(command)))
-
-
-def running(*, progress: bool = True, json: bool = True) -> Callable[[Command], Command]:
-    """Give a command its `Output`, and the options that are not about the work itself.
-
-    Args:
-        progress: whether the work may take long: with --progress and --log.
-        json: whether there are results for --json.
-    """
-
-    def decorate(command: Command) -> Command:
-        command = pass_output(command)
-        command = JSON(command) if json else command
-        return FORCE(reporting(command) if progress else QUIET(command))
-
-    return decorate
-
-
-def positive(_: click.Context, parameter: click.Parameter, value: float | None) -> float | None:
-    """Callback of an option whose value is a number above 0."""
-    if value is not None:
-        check_positive(parameter.opts[0], value)
-    return value
-
-
-def out_option(words: str, **attributes: Any) -> Callable[[Command], Command]:
-    """Option `--out`: a path."""
-    return click.option("--out", type=click.Path(path_type=Path), help=words, **attributes)
-
-
-CAMERAS = click.option(
-    "--cameras",
-    type=Names(),
-    help="Use these cameras only.  [default: all cameras of the calibration]",
-)
+    ),
+]
+Jobs = Annotated[
+    Annotated[int, Meta(ge=1)] | None,
+    says(words="largest number of processes. None: one per processor.", heading=RUNNING),
+]
+Cameras = Annotated[
+    tuple[str, ...] | None, says(words="use these cameras only. None: all cameras of the calibration.")
+]
+NumFrames = Annotated[
+    int | None, says(flag="frames", metavar="N", words="use the first N frames only. None: all.")
+]
+MostDrones = Annotated[Annotated[int, Meta(ge=1, le=1000)], says(rare=True)]
+Dictionary = Annotated[str, says(words="dictionary of the markers; any dictionary of OpenCV.")]
 
 
 def _read_bodies(_: click.Context, __: click.Parameter, given: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
@@ -186,34 +61,28 @@ def _read_bodies(_: click.Context, __: click.Parameter, given: tuple[str, ...]) 
     return bodies
 
 
-BODIES = click.option(
-    "--body",
-    "bodies",
-    multiple=True,
-    metavar="NAME=LABEL,...",
-    callback=_read_bodies,
-    help="Markers of drone NAME in the C3D file of the reference; `cf1:` stands for all markers of the body cf1, and "
-    "NAME alone for those of the body NAME; may be repeated.  [default: bodies called dron..., or rigid ones]",
-)
+Bodies = Annotated[
+    dict[str, tuple[str, ...]],
+    says(
+        words="markers of drone NAME in the C3D file of the reference; `cf1:` stands for all markers of the body cf1, "
+        "and NAME alone for those of the body NAME; may be repeated. None: bodies called dron..., or rigid ones.",
+        flag="body",
+        metavar="NAME=LABEL,...",
+        multiple=True,
+        required=False,
+        callback=_read_bodies,
+    ),
+]
 
 
-def frames_option(command: Command) -> Command:
-    """Add `--frames`, and name it as a way out where a video ends early."""
+def _check_picture(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
+    if path is not None and path.name and path.suffix.lower() != ".png":
+        raise SettingsError("--plot", expected="a file that ends in .png", found=path.name)
+    return path
 
-    @functools.wraps(command)
-    def with_way_out(*args: Any, **options: Any) -> None:
-        from psotrack.recordings import TruncatedVideoError
 
-        try:
-            command(*args, **options)
-        except TruncatedVideoError as error:
-            if not error.num_instants:
-                raise
-            raise error.with_way_on(f"--frames {error.num_instants} uses the time before") from None
-
-    return click.option(
-        "--frames", "num_frames", type=int, metavar="N", help="Use the first N frames only.  [default: all]"
-    )(with_way_out)
+#: `--plot [PNG]`: a picture, at a default place if no path follows; the value is then empty.
+Plot = Annotated[Path | None, says(is_flag=False, flag_value="", metavar="[PNG]", callback=_check_picture)]
 
 
 @dataclass(frozen=True)
@@ -227,61 +96,15 @@ class Extent:
         jobs: largest number of processes; None is one per processor.
     """
 
-    cameras: tuple[str, ...] | None
-    num_frames: int | None
-    cache: Path | None
-    jobs: int | None
+    cameras: Cameras = None
+    num_frames: NumFrames = None
+    cache: Cache = None
+    jobs: Jobs = None
 
     @property
     def silhouettes(self) -> Path:
         """Folder of the stored silhouettes."""
         return cache_folder(self.cache)
-
-
-def extent_options(command: Command) -> Command:
-    """Add --cameras, --frames, --cache and --jobs; the command gets them as `extent`."""
-
-    @functools.wraps(command)
-    def with_extent(
-        *args: Any,
-        cameras: tuple[str, ...] | None,
-        num_frames: int | None,
-        cache: Path | None,
-        jobs: int | None,
-        **options: Any,
-    ) -> None:
-        command(*args, **options, extent=Extent(cameras, num_frames, cache, jobs))
-
-    return CAMERAS(frames_option(CACHE(JOBS(with_extent))))
-
-
-def dictionary_option(default: str = "4x4_1000") -> Callable[[Command], Command]:
-    """Option `--dictionary`: the markers' dictionary."""
-    return click.option(
-        "--dictionary",
-        default=default,
-        show_default=True,
-        help="Dictionary of the markers; any dictionary of OpenCV.",
-    )
-
-
-def plot_option(content: str, default_path: str) -> Callable[[Command], Command]:
-    """Option `--plot [PNG]`: a picture of `content`, at `default_path` if no path follows; the value is then empty."""
-
-    def check(_: click.Context, __: click.Parameter, path: Path | None) -> Path | None:
-        if path is not None and path.name and path.suffix.lower() != ".png":
-            raise SettingsError("--plot", expected="a file that ends in .png", found=path.name)
-        return path
-
-    return click.option(
-        "--plot",
-        type=click.Path(path_type=Path),
-        callback=check,
-        is_flag=False,
-        flag_value="",
-        metavar="[PNG]",
-        help=f"Save {content}.  [default: {default_path}]",
-    )
 
 
 def filmed_recording(source: Path, extent: Extent) -> Recording:

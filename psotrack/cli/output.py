@@ -1,23 +1,22 @@
-"""What commands print and write: progress, sentences and tables for people, JSON for programs.
-
-`Output` holds the options that are about nothing else: --quiet, --force, --json and --progress. A command gets it by
-`@pass_output`.
-"""
+"""What commands print and write: progress, sentences and tables for people, JSON for programs."""
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
 
 import click
 
-from psotrack.cli.log_file import said
+from psotrack.cli.log_file import logged, said
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.support import (
+    POSITION,
     Report,
     atomic_write,
     joined,
@@ -44,7 +43,6 @@ PROGRESS: dict[str, Report] = {
     "lines": progress_lines(),
     "none": no_progress,
 }
-_STDOUT = Path("-")
 
 
 @runtime_checkable
@@ -55,26 +53,59 @@ class _Shown(Protocol):
         """The content of --json."""
 
 
+def _started_s() -> float:
+    """Value of `time.perf_counter` when the program started; now where nobody has noted it."""
+    context = click.get_current_context(silent=True)
+    return (context and context.find_root().obj) or time.perf_counter()
+
+
+@dataclass(frozen=True)
 class Output:
     """What a command prints and writes.
 
     Attributes:
-        quiet: whether nothing is printed but errors.
-        force: whether existing files are replaced.
-        json_path: file of the results as JSON; `-` is stdout, which then gets nothing else; None is no file.
-        progress: one of `PROGRESS`.
+        force: replace existing files.
+        quiet: print no progress and no results, only errors.
+        progress: progress on stderr. auto: a bar on a terminal, else lines now and then about work that takes long;
+            bar: a bar in any case; lines: lines, and the seconds of each stage; none: nothing.
+        log: add warnings, steps, seconds of each stage, results and errors to the end of FILE, with times.
+        json_path: write the results as JSON to OUT; - is stdout.
         started_s: value of `time.perf_counter` when the program started.
     """
 
-    def __init__(self, started_s: float) -> None:
-        self.quiet, self.force, self.progress = False, False, "auto"
-        self.json_path: Path | None = None
-        self.started_s = started_s
+    force: bool = False
+    quiet: Annotated[bool, says(short=["-q"])] = False
+    progress: Annotated[Literal["auto", "bar", "lines", "none"], says(envvar="PSOTRACK_PROGRESS")] = "auto"
+    log: Annotated[Path, says(metavar="FILE")] | None = None
+    json_path: Annotated[Path, says(metavar="OUT")] | None = None
+    started_s: float = field(default_factory=_started_s)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[Output]:
+        """The output during the command, whose sentences and errors go to the log, too.
+
+        Raises:
+            OutputError: the file of the log or of the results cannot be written, or must not be replaced.
+        """
+        with contextlib.nullcontext() if self.log is None else logged(self.log):
+            if self.json_path is not None and not self._json_on_stdout:
+                refuse_files(self.json_path, force=self.force)
+            yield self
+
+    @property
+    def _json_on_stdout(self) -> bool:
+        """Whether stdout gets the results as JSON, and nothing else."""
+        return self.json_path in (Path("-"), Path("/dev/stdout"))
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the program started, seconds."""
+        return time.perf_counter() - self.started_s
 
     @property
     def shows(self) -> bool:
         """Whether people get sentences and tables on stdout."""
-        return not self.quiet and self.json_path != _STDOUT
+        return not self.quiet and not self._json_on_stdout
 
     @property
     def can_ask(self) -> bool:
@@ -104,7 +135,7 @@ class Output:
         """Print sentences, a line each, and log them; with `always` they are printed with --quiet too."""
         for sentence in sentences:
             said.info("%s", sentence)
-            if self.shows or (always and self.json_path != _STDOUT):
+            if self.shows or (always and not self._json_on_stdout):
                 click.echo(sentence)
 
     def show(self, *shown: object, wide: bool = False) -> None:
@@ -118,10 +149,16 @@ class Output:
             for each in shown:
                 console.print(each)
 
-    def table(self, headings: tuple[str, ...], rows: Iterable[tuple[str, ...]], title: str = "") -> None:
-        """Print a table, names in the first column and numbers in the others."""
+    def table(
+        self,
+        headings: tuple[str, ...],
+        rows: Iterable[tuple[str, ...]],
+        title: str = "",
+        whole: tuple[str, ...] = (POSITION,),
+    ) -> None:
+        """Print a table, names in the first column and numbers in the others; see `text_table`."""
         if self.shows:
-            click.echo(text_table(headings, rows, title))
+            click.echo(text_table(headings, rows, title, whole))
 
     def result(self, result: _Shown) -> None:
         """Write a result as --json says, and print it."""
@@ -135,50 +172,24 @@ class Output:
             tracks: the tracks of the drones.
             size_m: (drones, 3), learned sizes, metres; None where they are not known.
         """
-        if not self.shows:
-            return
-        from rich import box
-        from rich.table import Table
-        from rich.text import Text
-
         from psotrack.trajectories import summary_columns
 
+        if not self.shows:
+            return
         columns = summary_columns(tracks, size_m)
         # These two would make the table wider than 80 characters; notebooks show them.
         for heading in ("extent (m)", "speed (m/s)"):
             columns.pop(heading, None)
-        table = Table(box=box.HORIZONTALS, show_edge=False, pad_edge=False, padding=(0, 0, 0, 1))
-        for heading in columns:
-            # Long names are folded; numbers are on one line.
-            style = {"min_width": 5} if heading == "drone" else {"justify": "right", "no_wrap": True}
-            table.add_column(heading, overflow="fold", **style)
-        for row in zip(*columns.values(), strict=True):
-            table.add_row(*map(Text, row))
-        self.show(table)
+        headings = tuple(columns)
+        self.table(headings, zip(*columns.values(), strict=True), whole=headings)
 
     def json(self, content: Any) -> None:
         """Write the results for programs, as --json says; a missing number, NaN, is written as null."""
-        if self.json_path == _STDOUT:
+        if self._json_on_stdout:
             click.echo(json_text(content))
         elif self.json_path is not None:
             refuse_files(self.json_path, force=self.force)
             write_json(self.json_path, content)
-
-
-def current_output() -> Output:
-    """The output of the command that runs."""
-    context = click.get_current_context()
-    return context.meta.setdefault("psotrack.output", Output(context.find_root().obj or time.perf_counter()))
-
-
-def pass_output(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command its `Output` as the first argument."""
-
-    @functools.wraps(command)
-    def with_output(*args: Any, **options: Any) -> None:
-        command(current_output(), *args, **options)
-
-    return with_output
 
 
 def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:

@@ -3,50 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-import click
+from msgspec import Meta
 
-from psotrack.cli.options import (
-    FORCE,
-    TRACKS,
-    Extent,
-    extent_options,
-    out_option,
-    reporting,
-    sequence_argument,
-    sequence_of,
-)
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.commands import command
+from psotrack.cli.options import Extent, SeqOfTracks, sequence_of
+from psotrack.cli.output import Output
 
 
-@click.command(cls=HelpfulCommand)
-@TRACKS
-@sequence_argument
-@out_option("Folder of the videos, CAMERA.mp4.  [default: overlay beside TRACKS]")
-@click.option(
-    "--mosaic",
-    is_flag=True,
-    help="Write one video of all cameras with a map from above, mosaic.mp4, instead of a video per camera.",
-)
-@click.option(
-    "--scale",
-    type=click.FloatRange(min=0, min_open=True, max=4),
-    default=1.0,
-    show_default=True,
-    help="Size of the videos per size of the cameras' videos; the mosaic is 1920 pixels wide.",
-)
-@extent_options
-@FORCE
-@reporting
-@pass_output
+@command(without=["json_path"])
 def overlay(
     output: Output,
     tracks: Path,
-    sequence: Path | None,
-    out: Path | None,
-    mosaic: bool,
-    scale: float,
+    sequence: SeqOfTracks = None,
+    *,
+    out: Path | None = None,
+    mosaic: bool = False,
+    scale: Annotated[float, Meta(gt=0, le=4)] = 1.0,
     extent: Extent,
 ) -> None:
     """Draw TRACKS into the videos of SEQ: boxes, names, trails, 90 % ellipses and time.
@@ -59,6 +33,11 @@ def overlay(
       psotrack overlay my_lab/results/tracks.csv
       psotrack overlay tracks.csv my_lab --out videos --mosaic
       psotrack overlay tracks.csv my_lab --out videos --cameras cam1,cam2 --scale 0.5
+
+    Options:
+        out: folder of the videos, CAMERA.mp4. None: overlay beside TRACKS.
+        mosaic: write one video of all cameras with a map from above, mosaic.mp4, instead of a video per camera.
+        scale: size of the videos per size of the cameras' videos; the mosaic is 1920 pixels wide.
     """
     from psotrack import api
 

@@ -2,71 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import click
 
-from psotrack.cli.options import FORCE, JOBS, out_option, reporting, sequence_argument
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import Command, HelpfulCommand, Option
+from psotrack.cli.commands import command
+from psotrack.cli.options import Jobs, SeqOfTracks
+from psotrack.cli.output import Output
+from psotrack.cli.types import says
 from psotrack.errors import errors_name
 
-
-def _table_option(name: str, words: str, **attributes: Any) -> Callable[[Command], Command]:
-    return click.option(name, cls=Option, heading="With --table", help=words, **attributes)
+WITH_TABLE = says(heading="With --table")
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument("source", metavar="SOURCE", type=click.Path(path_type=Path))
-@sequence_argument
-@out_option("Page to write; it ends in .html.  [default: beside SOURCE, with the same name]")
-@click.option(
-    "--compare",
-    type=click.Path(path_type=Path),
-    multiple=True,
-    metavar="TRACKS",
-    help="Further tracks of the same flight to show beside; may be repeated.",
-)
-@click.option(
-    "--no-pictures", is_flag=True, help="Show events without pictures, which need the videos of SEQ."
-)
-@click.option(
-    "--table",
-    "layout",
-    type=click.Choice(["text", "markdown", "latex", "csv"]),
-    is_flag=False,
-    flag_value="text",
-    help="Print a table of a sweep's results instead: mean +- standard deviation over runs.  [without a value: text]",
-)
-@_table_option(
-    "--rows",
-    "Columns of the results, with commas between them, that label the rows.",
-    default="sequence",
-    show_default=True,
-)
-@_table_option(
-    "--columns",
-    "Columns of the results that label the table's columns.  [default: method; sequence if --rows names method]",
-)
-@_table_option("--value", "Column of the numbers in the table.", default="mean_error_m", show_default=True)
-@_table_option(
-    "--scale", "Factor of the numbers; 1000 turns m into mm.", type=float, default=1.0, show_default=True
-)
-@JOBS
-@FORCE
-@reporting
-@pass_output
+@command(without=["json_path"])
 def report(
     output: Output,
     source: Path,
-    sequence: Path | None,
-    out: Path | None,
-    compare: tuple[Path, ...],
-    no_pictures: bool,
-    jobs: int | None,
-    **table: Any,
+    sequence: SeqOfTracks = None,
+    *,
+    out: Path | None = None,
+    compare: Annotated[
+        tuple[Path, ...], says(multiple=True, metavar="TRACKS", type=click.Path(path_type=Path))
+    ] = (),
+    no_pictures: bool = False,
+    table: Annotated[
+        Literal["text", "markdown", "latex", "csv"] | None, says(is_flag=False, flag_value="text")
+    ] = None,
+    rows: Annotated[str, WITH_TABLE] = "sequence",
+    columns: Annotated[str | None, WITH_TABLE] = None,
+    value: Annotated[str, WITH_TABLE] = "mean_error_m",
+    scale: Annotated[float, WITH_TABLE] = 1.0,
+    jobs: Jobs = None,
 ) -> None:
     """Write one HTML page about SOURCE, a file of tracks, or print a table of SOURCE, the folder of a sweep.
 
@@ -81,11 +49,22 @@ def report(
       psotrack report my_lab/results/tracks.csv
       psotrack report tracks.csv my_lab --compare lines.csv --out report.html
       psotrack report results --table --rows sequence,particles --columns iterations --scale 1000
+
+    Options:
+        out: page to write; it ends in .html. None: beside SOURCE, with the same name.
+        compare: further tracks of the same flight to show beside; may be repeated.
+        no_pictures: show events without pictures, which need the videos of SEQ.
+        table: print a table of a sweep's results instead: mean +- standard deviation over runs.  [without a value:
+            text]
+        rows: columns of the results, with commas between them, that label the rows.
+        columns: columns of the results that label the table's columns. None: method; sequence if --rows names method.
+        value: column of the numbers in the table.
+        scale: factor of the numbers; 1000 turns m into mm.
     """
     from psotrack import api
 
-    if table["layout"] is not None:
-        click.echo(_table(source, **table))
+    if table is not None:
+        click.echo(_table(source, table, rows, columns, value, scale))
         return
     written = api.report(
         [source, *compare],

@@ -3,36 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-import click
+from psotrack.cli.commands import command
+from psotrack.cli.options import compiled_folder
+from psotrack.cli.output import Output
+from psotrack.cli.types import says
 
-from psotrack.cli.options import JSON, compiled_folder, reporting
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand
 
-
-@click.command(cls=HelpfulCommand)
-@click.argument("folder", type=click.Path(path_type=Path))
-@click.option(
-    "--square",
-    "square_m",
-    type=float,
-    metavar="METRES",
-    help="Side of a square of the board in FOLDER/board, as it was printed; needed where FOLDER has no rig file.",
-)
-@click.option(
-    "--floor",
-    type=int,
-    metavar="FRAME",
-    help="Frame of the board's videos in which the board lies on the floor, which becomes the world's origin.",
-)
-@click.option("--drones", type=int, metavar="N", help="Number of drones.  [default: all that are found]")
-@click.option("--again", is_flag=True, help="Do all steps again, also those that are done.")
-@reporting
-@JSON
-@pass_output
+@command(without=["force"])
 def run(
-    output: Output, folder: Path, square_m: float | None, floor: int | None, drones: int | None, again: bool
+    output: Output,
+    folder: Path,
+    *,
+    square_m: Annotated[float | None, says(metavar="METRES")] = None,
+    floor: Annotated[int | None, says(metavar="FRAME")] = None,
+    drones: Annotated[int | None, says(metavar="N")] = None,
+    again: bool = False,
 ) -> None:
     """Calibrate, check, track and show the videos of a rig in FOLDER, from board to report.
 
@@ -45,6 +32,12 @@ def run(
     Examples:
       psotrack run my_lab --square 0.035
       psotrack run my_lab --square 0.035 --floor 0 --drones 4
+
+    Options:
+        square_m: side of a square of the board in FOLDER/board, as it was printed; needed where FOLDER has no rig file.
+        floor: frame of the board's videos in which the board lies on the floor, which becomes the world's origin.
+        drones: number of drones. None: all that are found.
+        again: do all steps again, also those that are done.
     """
     from psotrack import api
     from psotrack.cli.init import asked

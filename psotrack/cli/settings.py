@@ -1,26 +1,26 @@
-"""Settings of tracking as options: an option for each setting, --set, --config and --save-config.
+"""Settings of tracking as options: an option for each setting, --config and --save-config.
 
 A setting is found in this order: what is typed, the file of --config, the archive that is tracked again, the default.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 import msgspec
 
 from psotrack import __version__
 from psotrack.cli.archived import archive_of
-from psotrack.cli.output import check_suffix, current_output
-from psotrack.cli.records import Command, Option, fields_of, is_given, option_of, parameter_name
-from psotrack.cli.types import change_of
+from psotrack.cli.commands import Field, Group, fields_of, is_given, option_of
+from psotrack.cli.output import check_suffix
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings, flatten
-from psotrack.support import atomic_write, read_toml, toml_value
+from psotrack.support import atomic_write, read_toml, refuse_files, toml_value
 
 #: Names of options that are not those of the settings.
 _NAMES = {
@@ -37,77 +37,67 @@ _NAMES = {
 }
 
 
-def settings_options(
-    *common: str, part: str = "", without: Collection[str] = ()
-) -> Callable[[Command], Command]:
-    """Add an option for each setting, --set and --help-all; the command gets `settings`, the values by dotted name.
+@dataclass(frozen=True)
+class TrackingSettings(Group):
+    """An option for each setting, and --help-all; the command gets the values that were given, by dotted name.
 
-    Args:
-        common: dotted names of the settings whose options --help shows.
+    Attributes:
+        usual: dotted names of the settings whose options --help shows.
         part: the part of the settings, such as "silhouettes."; "" for all.
         without: dotted names of settings without an option.
+        files: whether there are --config and --save-config.
     """
-    fields = [
-        field
-        for field in fields_of(TrackSettings)
-        if field.name.startswith(part) and field.name not in without
-    ]
 
-    def decorate(command: Command) -> Command:
-        @functools.wraps(command)
-        def with_settings(*args: Any, set_changes: tuple[str, ...], **options: Any) -> None:
-            context = click.get_current_context()
-            given = {field.name: options.pop(parameter_name(field.name)) for field in fields}
-            chosen = {name: value for name, value in given.items() if is_given(context, parameter_name(name))}
-            changes = dict(map(change_of, set_changes))
-            command(*args, **options, settings=chosen | changes)
+    usual: Collection[str] = ()
+    part: str = ""
+    without: Collection[str] = ()
+    files: bool = True
 
-        decorated: Command = with_settings
-        for field in reversed(fields):
-            option = option_of(
-                field,
-                flag=_NAMES.get(field.name, ""),
-                heading=_heading(field.name, common),
-                rare=field.name not in common,
-            )
-            decorated = option(decorated)
-        sets = click.option(
-            "--set",
-            "set_changes",
-            multiple=True,
-            metavar="NAME=VALUE",
-            help="Change a setting by its name in sweeps, such as swarm.particles=50; may be repeated. --help-all "
-            "lists the settings.",
-        )
-        return sets(decorated)
+    def parameters(self, record: type) -> list[click.Parameter]:
+        """The options."""
+        files = fields_of(_Files) if self.files else ()
+        return [*map(self._option, self._fields(record)), *map(option_of, files)]
 
-    return decorate
+    def _fields(self, record: type) -> list[Field]:
+        fields = fields_of(TrackSettings)
+        return [each for each in fields if each.name.startswith(self.part) and each.name not in self.without]
 
+    def _option(self, field: Field) -> click.Parameter:
+        part, is_usual = field.name.rpartition(".")[0], field.name in self.usual
+        heading = "Options" if is_usual else f"Settings {part}.*" if part else "Settings"
+        return option_of(field, _NAMES.get(field.name, ""), heading, not is_usual, limited=False)
 
-def _heading(name: str, common: Collection[str]) -> str:
-    part = name.rpartition(".")[0]
-    return "Options" if name in common else f"Settings {part}.*" if part else "Settings"
+    def take(self, record: type, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The values of the settings that the user chose."""
+        files = _Files(values.get("config"), values.get("save_config"))
+        check_suffix("--save-config", files.save_config, ".toml")
+        if files.save_config is not None:
+            refuse_files(files.save_config, force=values["force"])
+        context = click.get_current_context()
+        chosen = {} if files.config is None else read_config(files.config)
+        for field in self._fields(record):
+            if is_given(context, field.parameter):
+                chosen[field.name] = values[field.parameter]
+        return chosen
+
+    def finish(self, taken: dict[str, Any], values: Mapping[str, Any]) -> None:
+        """Write the file of --save-config."""
+        if (path := values.get("save_config")) is not None:
+            with atomic_write(path) as temporary:
+                temporary.write_text(config_text(chosen_settings(taken)), encoding="utf-8")
 
 
-def config_options(command: Command) -> Command:
-    """Add --config and --save-config to a command with `settings_options`."""
+@dataclass(frozen=True)
+class _Files:
+    """Files of settings.
 
-    @functools.wraps(command)
-    def with_files(
-        *args: Any, config: Path | None, save_config: Path | None, settings: dict[str, Any], **options: Any
-    ) -> None:
-        check_suffix("--save-config", save_config, ".toml")
-        current_output().refuse(save_config)
-        in_file = {} if config is None else read_config(config)
-        command(*args, **options, settings=in_file | settings)
-        if save_config is not None:
-            with atomic_write(save_config) as temporary:
-                temporary.write_text(config_text(chosen_settings(in_file | settings)), encoding="utf-8")
+    Attributes:
+        config: take settings from FILE.toml; what is typed has precedence.
+        save_config: write all settings of this run to FILE.toml at the end.
+    """
 
-    path = functools.partial(click.option, type=click.Path(path_type=Path), metavar="FILE.toml", cls=Option)
-    config = path("--config", help="Take settings from FILE.toml; what is typed has precedence.")
-    save = path("--save-config", help="Write all settings of this run to FILE.toml at the end.")
-    return config(save(with_files))
+    config: Annotated[Path, says(metavar="FILE.toml")] | None = None
+    save_config: Annotated[Path, says(metavar="FILE.toml")] | None = None
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -3,81 +3,33 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import click
 from msgspec import Meta
 
-from psotrack.cli.options import (
-    CACHE,
-    FORCE,
-    JOBS,
-    JSON,
-    cache_folder,
-    compiled_folder,
-    out_option,
-    reporting,
-)
-from psotrack.cli.output import Output, pass_output
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.commands import command
+from psotrack.cli.options import Cache, Jobs, cache_folder, compiled_folder
+from psotrack.cli.output import Output
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 
 
-@dataclass(frozen=True)
-class Where:
-    """Where the cells run.
-
-    Attributes:
-        cluster: run the cells on a Dask cluster: local starts a cluster on this machine; ADDRESS names a running
-            scheduler.
-        workers: number of processes of --cluster local; None: one per processor; one with --device gpu.
-        device: device that computes; None: JAX's choice.
-    """
-
-    cluster: Annotated[str, Meta(extra={"metavar": "local|ADDRESS"})] | None = None
-    workers: Annotated[int, Meta(ge=1)] | None = None
-    device: Literal["cpu", "gpu"] | None = None
-
-
-@click.command(cls=HelpfulCommand)
-@click.argument("grid_file", metavar="GRID.toml", type=click.Path(path_type=Path), required=False)
-@out_option(
-    "Folder of the results; it is made if it does not exist.  [default: beside GRID.toml, named GRID_results]"
-)
-@click.option(
-    "--data",
-    type=click.Path(path_type=Path),
-    default=Path("data"),
-    show_default=True,
-    help="Root folder of the sequences that the grid names.",
-)
-@click.option(
-    "--dry-run", is_flag=True, help="Print the cells and the number of runs without running a cell."
-)
-@click.option(
-    "--status",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Print the numbers of finished, failed and locked cells in DIR and the processes at work; run nothing.",
-)
-@options_of(Where, "where")
-@CACHE
-@JOBS
-@reporting
-@FORCE
-@JSON
-@pass_output
+@command()
 def sweep(
     output: Output,
-    grid_file: Path | None,
-    out: Path | None,
-    data: Path,
-    dry_run: bool,
-    status: Path | None,
-    where: Where,
-    **running: Any,
+    grid_file: Annotated[Path | None, says(metavar="[GRID.toml]")] = None,
+    *,
+    out: Path | None = None,
+    data: Path = Path("data"),
+    dry_run: bool = False,
+    status: Annotated[Path | None, says(metavar="DIR")] = None,
+    cluster: Annotated[str | None, says(metavar="local|ADDRESS")] = None,
+    workers: Annotated[int, Meta(ge=1)] | None = None,
+    device: Literal["cpu", "gpu"] | None = None,
+    cache: Cache = None,
+    jobs: Jobs = None,
 ) -> None:
     """Track with every combination of a grid's settings, and keep one row per run.
 
@@ -92,41 +44,47 @@ def sweep(
       psotrack sweep grid.toml --data data --out results --cluster tls://10.0.0.5:8786
       psotrack sweep --status results
       psotrack report results --table --rows particles --columns iterations --value mean_error_m
+
+    Options:
+        out: folder of the results; it is made if it does not exist. None: beside GRID.toml, named GRID_results.
+        data: root folder of the sequences that the grid names.
+        dry_run: print the cells and the number of runs without running a cell.
+        status: print the numbers of finished, failed and locked cells in DIR and the processes at work; run nothing.
+        cluster: run the cells on a Dask cluster: local starts a cluster on this machine; ADDRESS names a running
+            scheduler.
+        workers: number of processes of --cluster local. None: one per processor; one with --device gpu.
+        device: device that computes. None: JAX's choice.
     """
     if status is not None:
         _status(output, status)
         return
     if grid_file is None:
         raise SettingsError("sweep", expected="GRID.toml or --status DIR", found="neither")
-    if where.workers is not None and where.cluster is None:
+    if workers is not None and cluster is None:
         raise SettingsError("--workers", expected="--cluster local", found="no --cluster")
+    from psotrack import sweeps
     from psotrack.support import keep_compiled, share_processors, use_device
-    from psotrack.sweeps import Cluster, Inputs, Store, plan, read_grid
-    from psotrack.sweeps import sweep as run
 
     def say(address: str) -> None:
         if not output.quiet:
             click.echo(f"the cluster listens at {address}, for programs on this computer only", err=True)
 
-    cluster, cache = None, cache_folder(running["cache"])
-    if where.cluster is not None:
-        cluster = Cluster(where.cluster, where.workers, where.device, say)
-    grid = read_grid(grid_file)
+    cache = cache_folder(cache)
+    grid = sweeps.read_grid(grid_file)
     out = out or grid_file.with_name(f"{grid_file.stem}_results")
     if dry_run:
-        inputs = Inputs(data, cache, running["jobs"])
-        output.result(plan(grid, inputs, Store(out)))
+        inputs = sweeps.Inputs(data, cache, jobs)
+        output.result(sweeps.plan(grid, inputs, sweeps.Store(out)))
         return
     if cluster is not None:
         use_device("cpu")  # This process computes nothing, and must not take a GPU from the workers.
     else:
         share_processors()
-        if where.device is not None:
-            use_device(where.device)
+        if device is not None:
+            use_device(device)
         keep_compiled(compiled_folder(cache))
-    outcome = run(
-        grid, out, data=data, cache=cache, jobs=running["jobs"], cluster=cluster, progress=output.report
-    )
+    at = None if cluster is None else sweeps.Cluster(cluster, workers, device, say)
+    outcome = sweeps.sweep(grid, out, data=data, cache=cache, jobs=jobs, cluster=at, progress=output.report)
     output.result(outcome)
     if outcome.count("failed"):
         sys.exit(2)

@@ -1,90 +1,92 @@
-"""Types of the values of options."""
+"""Types of the values of arguments and options, and what is said of those that several commands have."""
 
 from __future__ import annotations
 
 import os
-import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
+from msgspec import Meta
 
-from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX, whole_number
 
+#: Heading of the options that are not about the work itself.
+RUNNING = "Running"
 
-class Numbers(click.ParamType):
+
+def says(**said: Any) -> Meta:
+    """What is said of a parameter beside its type, default and description.
+
+    Args:
+        **said: `words`, the description; `flag`, the option's name without dashes; `short`, further names; `heading` of
+            its part of the help; and arguments of `click.Option` or `click.Argument`, such as `metavar` and `type`.
+    """
+    return Meta(extra=said)
+
+
+class Words(click.ParamType):
+    """A value that is read from a word.
+
+    Args:
+        name: what stands for the value in the help.
+        expected: what the word should be, for the message.
+        read: reads the word; raises `ValueError` for another word.
+    """
+
+    def __init__(self, name: str, expected: str, read: Callable[[str], Any]) -> None:
+        self.name, self._expected, self._read = name, expected, read
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The value of a string; a value that is not a string is returned as it is."""
+        if not isinstance(value, str):
+            return value
+        try:
+            return self._read(value)
+        except ValueError:
+            self.fail(f"expected {self._expected}, found {value!r}", param, ctx)
+
+
+def numbers(count: int) -> Words:
     """`count` numbers with commas between them, such as 0.5,0.5,0.2; any count where `count` is 0."""
 
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self.name = ",".join(["NUMBER"] * count) or "NUMBER,..."
+    def read(value: str) -> tuple[float, ...]:
+        found = tuple(float(word) for word in value.split(","))
+        if count and len(found) != count:
+            raise ValueError
+        return found
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Tuple of floats from a string; a value that is not a string is returned as it is."""
-        if not isinstance(value, str):
-            return value
-        try:
-            numbers = tuple(float(word) for word in value.split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != (self.count or max(len(numbers), 1)):
-            count = f"{self.count} numbers" if self.count else "numbers"
-            self.fail(f"expected {count} with commas between them, found {value!r}", param, ctx)
-        return numbers
+    expected = f"{count} numbers" if count else "numbers"
+    return Words(",".join(["NUMBER"] * count) or "NUMBER,...", f"{expected} with commas between them", read)
 
 
-class Names(click.ParamType):
-    """Names with commas between them, such as left,right."""
-
-    name = "NAME,NAME..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Tuple of names from a string; a value that is not a string is returned as it is."""
-        if not isinstance(value, str):
-            return value
-        names = tuple(name.strip() for name in value.split(","))
-        if not all(names):
-            self.fail(f"expected names with commas between them, found {value!r}", param, ctx)
-        return names
+def _names(value: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in value.split(","))
+    if not all(names):
+        raise ValueError
+    return names
 
 
-class Size(click.ParamType):
-    """Two whole numbers above 0, such as 1920,1080 or 7x5."""
-
-    name = "W,H"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Pair of integers from a string; a value that is not a string is returned as it is."""
-        if not isinstance(value, str):
-            return value
-        words = value.replace("x", ",").split(",")
-        numbers = [whole_number(word) for word in words]
-        if len(numbers) != 2 or not all(numbers):
-            self.fail(f"expected two whole numbers above 0, such as 1920,1080, found {value!r}", param, ctx)
-        return tuple(numbers)
+def _size(value: str) -> tuple[int, ...]:
+    width, height = (whole_number(word) for word in value.replace("x", ",").split(","))
+    if not width or not height:
+        raise ValueError
+    return width, height
 
 
-class Distance(click.ParamType):
-    """Two cameras and the distance between their centres, such as left,right=4.20."""
+def _distance(value: str) -> tuple[str, str, float]:
+    names, _, length = value.partition("=")
+    first, second = names.split(",")
+    metres = float(length)
+    if not 0 < metres < float("inf"):
+        raise ValueError
+    return first, second, metres
 
-    name = "NAME,NAME=METRES"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Names and metres from a string; a value that is not a string is returned as it is."""
-        if not isinstance(value, str):
-            return value
-        names, _, length = value.partition("=")
-        cameras = tuple(names.split(","))
-        try:
-            metres = float(length)
-        except ValueError:
-            metres = 0.0
-        if len(cameras) != 2 or not 0 < metres < float("inf"):
-            self.fail(
-                f"expected two cameras and metres, such as left,right=4.20, found {value!r}", param, ctx
-            )
-        return *cameras, metres
+NAMES = Words("NAME,NAME...", "names with commas between them", _names)
+SIZE = Words("W,H", "two whole numbers above 0, such as 1920,1080", _size)
+DISTANCE = Words("NAME,NAME=METRES", "two cameras and metres, such as left,right=4.20", _distance)
 
 
 class SequencePath(click.Path):
@@ -105,15 +107,3 @@ def opened_sequence(path: Path) -> Path:
     from psotrack.cli.archived import opened_archive
 
     return opened_archive(click.get_current_context(), path)
-
-
-def change_of(text: str, example: str = "swarm.particles=50") -> tuple[str, Any]:
-    """Name and value of `NAME=VALUE`; the value is parsed as TOML, and kept as text if it is not valid TOML."""
-    name, equals, value = text.partition("=")
-    if not equals or not name.strip():
-        raise SettingsError("--set", expected=f"NAME=VALUE, such as {example}", found=text)
-    try:
-        return name.strip(), tomllib.loads(f"value = {value}")["value"]
-    except ValueError:
-        # Not valid TOML, or an integer of thousands of digits.
-        return name.strip(), value

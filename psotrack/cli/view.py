@@ -12,10 +12,10 @@ from typing import Annotated
 import click
 from msgspec import Meta
 
-from psotrack.cli.options import Extent, extent_options, running
+from psotrack.cli.commands import command
+from psotrack.cli.options import Dictionary, Extent
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.cli.types import opened_sequence
+from psotrack.cli.types import opened_sequence, says
 from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX
 
@@ -30,23 +30,24 @@ class ViewOptions:
         max_size_mb: largest size: images get smaller, then frames are left out; None: 5.8 per second, at most 1950.
         silhouettes: compute the silhouettes that are not stored, not only show stored ones.
         onboard: show the cameras on drones too, with the markers that they see.
-        dictionary: dictionary of the markers; any dictionary of OpenCV.
     """
 
-    save: Annotated[Path, Meta(extra={"metavar": "FILE.rrd"})] | None = None
+    save: Annotated[Path | None, says(metavar="FILE.rrd")] = None
     web: bool = False
-    max_size_mb: Annotated[float, Meta(ge=1, extra={"metavar": "MB"})] | None = None
+    max_size_mb: Annotated[Annotated[float, Meta(ge=1)] | None, says(metavar="MB")] = None
     silhouettes: bool = False
     onboard: bool = False
-    dictionary: str = "4x4_1000"
+    dictionary: Dictionary = "4x4_1000"
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument("tracks", nargs=-1, metavar="TRACKS... [SEQ]", type=click.Path(path_type=Path))
-@options_of(ViewOptions, "shown")
-@extent_options
-@running(json=False)
-def view(output: Output, tracks: tuple[Path, ...], shown: ViewOptions, extent: Extent) -> None:
+@command(without=["json_path"])
+def view(
+    output: Output,
+    tracks: Annotated[tuple[Path, ...], says(metavar="TRACKS... [SEQ]")],
+    *,
+    shown: ViewOptions,
+    extent: Extent,
+) -> None:
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
 
     SEQ is the recording, with its cameras, their images and its reference; the record beside TRACKS names it. Several
@@ -60,29 +61,18 @@ def view(output: Output, tracks: tuple[Path, ...], shown: ViewOptions, extent: E
       psotrack view swarm.csv lines.csv my_lab --web
       psotrack view my_lab --frames 250
     """
+    from psotrack.show import viewer
     from psotrack.show.flights import first_instants, read_flight, split_sequence
-    from psotrack.show.viewer import (
-        check_display,
-        check_installed,
-        find_silhouettes,
-        show_in_browser,
-        show_window,
-    )
 
     save = shown.save
     if save is not None and shown.web:
         raise SettingsError("--web", expected="either --save or --web", found="both")
     check_suffix("--save", save, ".rrd")
-    check_installed()
-    # These names need Rerun.
-    from psotrack.show.viewer import ViewContent, write_flight
-
+    viewer.check_installed()
     if save is not None:
         output.refuse(save)
     elif not shown.web:
-        check_display()
-    if not tracks:
-        raise SettingsError("view", expected="TRACKS, SEQ or both", found="neither")
+        viewer.check_display()
     archive = tracks[-1].suffix == ARCHIVE_SUFFIX
     files, sequence = split_sequence((*tracks[:-1], opened_sequence(tracks[-1])) if archive else tracks)
     flight = read_flight(files, sequence, cameras=extent.cameras)
@@ -91,18 +81,18 @@ def view(output: Output, tracks: tuple[Path, ...], shown: ViewOptions, extent: E
     if shown.onboard and (flight.recording is None or not flight.recording.onboard):
         raise SettingsError("--onboard", expected="a recording with cameras on drones", found="none")
     report, jobs = output.report, extent.jobs
-    content = ViewContent(
-        silhouettes=find_silhouettes(
-            flight, extent.silhouettes, make=shown.silhouettes, jobs=jobs, report=report
-        ),
+    silhouettes = viewer.find_silhouettes(
+        flight, extent.silhouettes, make=shown.silhouettes, jobs=jobs, report=report
+    )
+    content = viewer.ViewContent(
+        silhouettes=silhouettes,
         onboard=shown.onboard,
         dictionary=shown.dictionary,
         max_bytes=None if shown.max_size_mb is None else 1e6 * shown.max_size_mb,
     )
 
     def write(path: Path) -> None:
-        written = write_flight(path, flight, content, jobs=jobs, report=report)
-        output.say(f"{written}")
+        output.say(f"{viewer.write_flight(path, flight, content, jobs=jobs, report=report)}")
 
     if save is not None:
         write(save)
@@ -111,9 +101,9 @@ def view(output: Output, tracks: tuple[Path, ...], shown: ViewOptions, extent: E
         path = Path(folder) / "flight.rrd"
         write(path)
         if shown.web:
-            show_in_browser(path, _say_page)
+            viewer.show_in_browser(path, _say_page)
         else:
-            show_window(path)
+            viewer.show_window(path)
 
 
 def _say_page(page: str) -> None:

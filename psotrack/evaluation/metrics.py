@@ -10,6 +10,7 @@ References:
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -39,6 +40,8 @@ from psotrack.trajectories.association import (
 
 logger = logging.getLogger(__name__)
 
+#: Values of the tracks in an `AlignedPair`.
+_OF_TRACKS = ("est_m", "orientation_est_wxyz", "covariance_m2", "relative_covariance_m2")
 #: Share of the frames after the end of the tracks that is worth a warning.
 _MUCH = 0.05
 
@@ -89,8 +92,16 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
             100 * beyond / len(pair.frame),
         )
     partner = fixed_identity(pair)
-    followed = _follow(pair, partner)
-
+    # Each drone with the track that follows it in all frames.
+    followed = {name: fixed_partner_values(getattr(pair, name), partner) for name in _OF_TRACKS}
+    residual_m = followed["est_m"] - pair.ref_m
+    each_drone = [
+        _centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))
+    ]
+    followed |= {
+        "residual_m": residual_m,
+        "centred_m": np.stack([centred_m for _, centred_m in each_drone], axis=1),
+    }
     kept = partners_per_frame(pair.distance_m, keep=True)
     kept_m = paired_values(pair.distance_m, kept)
     matched_m = paired_values(pair.distance_m, partners_per_frame(pair.distance_m, keep=False))
@@ -100,7 +111,7 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
     num_matched = int(np.isfinite(kept_m).sum())
     misses, false_positives = num_known - num_matched, num_estimated - num_matched
     return Evaluation(
-        **_errors(followed, slice(None)),
+        **_errors(pair, followed, slice(None)),
         **vars(hota(pair.distance_m, known, counted)),
         **vars(gospa(pair.distance_m, known, counted)),
         frames=len(pair.frame),
@@ -112,11 +123,11 @@ def evaluate(traj_est: Trajectories, traj_ref: Trajectories) -> Evaluation:
         matched_mean_error_m=_mean(matched_m),
         per_drone=tuple(
             DroneEvaluation(
-                **_errors(followed, slice(drone, drone + 1)),
+                **_errors(pair, followed, slice(drone, drone + 1)),
                 drone=name,
                 estimate=None if partner[drone] == UNASSIGNED else pair.drones_est[partner[drone]],
                 frames=int(known[:, drone].sum()),
-                **vars(followed.offsets[drone]),
+                **vars(each_drone[drone][0]),
             )
             for drone, name in enumerate(pair.drones)
         ),
@@ -144,45 +155,12 @@ def _identity_true_positives(distance_m: Float[np.ndarray, "frames drones estima
 
 
 @dataclass(frozen=True)
-class _Followed:
-    """Each drone with the track that follows it in all frames; NaN where either is not known."""
-
-    pair: AlignedPair
-    est_m: Float[np.ndarray, "frames drones 3"]
-    orientation_est_wxyz: Float[np.ndarray, "frames drones 4"]
-    covariance_m2: Float[np.ndarray, "frames drones 3 3"]
-    relative_covariance_m2: Float[np.ndarray, "frames drones 3 3"]
-    residual_m: Float[np.ndarray, "frames drones 3"]
-    centred_m: Float[np.ndarray, "frames drones 3"]
-    offsets: tuple[_Offset, ...]
-
-
-@dataclass(frozen=True)
 class _Offset:
     """Mean residual of one drone: its lever arm."""
 
     offset_m: tuple[float, float, float] | None = None
     offset_standard_error_m: tuple[float, float, float] | None = None
     offset_frame: Literal["body", "world"] | None = None
-
-
-def _follow(pair: AlignedPair, partner: Int[np.ndarray, "drones"]) -> _Followed:
-    est_m = fixed_partner_values(pair.est_m, partner)
-    residual_m = est_m - pair.ref_m
-    offsets, centred_m = zip(
-        *(_centre(residual_m[:, drone], pair.orientation_wxyz[:, drone]) for drone in range(len(partner))),
-        strict=True,
-    )
-    return _Followed(
-        pair=pair,
-        est_m=est_m,
-        orientation_est_wxyz=fixed_partner_values(pair.orientation_est_wxyz, partner),
-        covariance_m2=fixed_partner_values(pair.covariance_m2, partner),
-        relative_covariance_m2=fixed_partner_values(pair.relative_covariance_m2, partner),
-        residual_m=residual_m,
-        centred_m=np.stack(centred_m, axis=1),
-        offsets=offsets,
-    )
 
 
 def _centre(
@@ -209,30 +187,23 @@ def _centre(
     return _Offset((x, y, z), standard_error_m, "body" if in_body else "world"), centred_m
 
 
-def _errors(followed: _Followed, drones: slice) -> dict[str, Any]:
+def _errors(pair: AlignedPair, followed: Mapping[str, np.ndarray], drones: slice) -> dict[str, Any]:
     """Figures that are given for each drone and for all drones together."""
-    pair = followed.pair
-    residual_m, centred_m = followed.residual_m[:, drones], followed.centred_m[:, drones]
-    error_m = np.linalg.norm(residual_m, axis=-1)
+    of_tracks = {name: values[:, drones] for name, values in followed.items()}
+    residual_m, centred_m = of_tracks["residual_m"], of_tracks["centred_m"]
+    error_m, known = np.linalg.norm(residual_m, axis=-1), pair.truth_known[:, drones]
     paths = path_errors(
-        followed.est_m[:, drones],
+        of_tracks["est_m"],
         pair.ref_m[:, drones],
-        followed.orientation_est_wxyz[:, drones],
+        of_tracks["orientation_est_wxyz"],
         pair.orientation_wxyz[:, drones],
         rows_apart(pair.frame, pair.time_s),
     )
-    known = pair.truth_known[:, drones]
+    covariances = of_tracks["covariance_m2"], of_tracks["relative_covariance_m2"]
     return {
         **vars(_summary(error_m)),
         **vars(paths),
-        **vars(
-            consistency(
-                residual_m,
-                centred_m,
-                followed.covariance_m2[:, drones],
-                followed.relative_covariance_m2[:, drones],
-            )
-        ),
+        **vars(consistency(residual_m, centred_m, *covariances)),
         "missed_rate": float((known & np.isnan(error_m)).sum() / known.sum()),
         "offset_removed_mean_error_m": _mean(np.linalg.norm(centred_m, axis=-1)),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,22 +31,7 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
     unit = _unit_of(evaluation)
     heading = _heading(evaluation, unit)
     scores = "\n".join(f"{label:<10}{line}" for label, line in _scores(evaluation, unit).items())
-    table = Table(
-        title=Text(f"{title}: {heading}" if title else heading, style="bold"),
-        caption=Text(scores, style="default"),
-        box=box.HORIZONTALS,
-        show_edge=False,
-        pad_edge=False,
-        # The width of the caption, which would wrap otherwise.
-        min_width=76,
-        padding=(0, 0, 0, 1),
-        title_justify="left",
-        caption_justify="left",
-    )
-    # Only the names are folded where the table would be too wide; nothing is cut.
-    table.add_column("drone", overflow="fold", max_width=20)
-    for name in _COLUMNS:
-        table.add_column(name, justify="right", no_wrap=True)
+    table = _table(f"{title}: {heading}" if title else heading, scores, "drone", _COLUMNS)
     *drones, together = _rows(evaluation, unit)
     for name, *cells in drones:
         table.add_row(Text(name), *cells)
@@ -63,24 +49,34 @@ def render_paths(comparison: PathComparison, title: str) -> Table:
         lines.append(f"the clock of the reference's orientations is {turning.offset_s:+.4f} s ahead")
     arm = " ".join(f"{1e3 * part:+.1f}" for part in found.lever_arm_m)
     lines.append(f"lever arm {arm} mm; length of the reference's path {found.path_length_m:.2f} m")
-    table = Table(
-        title=Text(title, style="bold"),
-        caption=Text("\n".join(lines), style="default"),
-        box=box.HORIZONTALS,
-        show_edge=False,
-        min_width=76,
-        title_justify="left",
-        caption_justify="left",
-    )
-    table.add_column("")
-    for name in ("mean", "median", "std", "min", "max", "frames"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = _table(title, "\n".join(lines), "", ("mean", "median", "std", "min", "max", "frames"))
     for key, one in found.statistics.items():
         *words, unit = key.split("_")
         factor, decimals, unit = (1e3, 2, "mm") if unit == "m" else (1.0, 3, "deg")
         values = (one.mean, one.median, one.std, one.minimum, one.maximum)
         cells = (f"{factor * value:.{decimals}f}" for value in values)
         table.add_row(f"{' '.join(words)} ({unit})", *cells, str(one.count))
+    return table
+
+
+def _table(title: str, caption: str, names: str, columns: Sequence[str]) -> Table:
+    """A table without rows: names on the left, then numbers; nothing is cut."""
+    table = Table(
+        title=Text(title, style="bold"),
+        caption=Text(caption, style="default"),
+        box=box.HORIZONTALS,
+        show_edge=False,
+        pad_edge=False,
+        # The width of the caption, which would wrap otherwise.
+        min_width=76,
+        padding=(0, 0, 0, 1),
+        title_justify="left",
+        caption_justify="left",
+    )
+    # Only the names are folded where the table would be too wide.
+    table.add_column(names, overflow="fold", max_width=24)
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
     return table
 
 

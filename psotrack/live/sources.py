@@ -71,17 +71,11 @@ def why_silent(address: str, took_s: float) -> str:
 
 
 def _why_no_device(path: str) -> str:
-    if sys.platform != "linux":
-        return "no such camera, no permission for it, or another program that uses it"
-    try:
-        os.close(os.open(path, os.O_RDWR | os.O_NONBLOCK))
-    except FileNotFoundError:
+    if sys.platform == "linux" and not os.path.exists(path):
         return f"no {path}; is the camera plugged in?"
-    except PermissionError:
+    if sys.platform == "linux" and not os.access(path, os.R_OK | os.W_OK):
         return f"no permission for {path}; is this user in the group that owns it, mostly `video`?"
-    except OSError as error:
-        return f"{error.strerror} ({path})"
-    return f"no camera at {path}, or another program that uses it"
+    return "no such camera, or another program that uses it"
 
 
 logger = logging.getLogger(__name__)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Sequence
+from typing import Any
 
 #: Heading of a column of positions; each of its cells stays on one line.
 POSITION = "centre (m)"
@@ -28,9 +29,11 @@ def text_table(
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=box.HORIZONTALS, show_edge=False, title=title or None)
+    tight: Any = {"show_edge": False, "pad_edge": False, "padding": (0, 0, 0, 1)}
+    table = Table(box=box.HORIZONTALS, title=title or None, **tight)
     for index, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if index else "left", no_wrap=heading in whole)
+        style: Any = {"justify": "right"} if index else {"min_width": 5}
+        table.add_column(heading, no_wrap=index > 0 and heading in whole, overflow="fold", **style)
     for row in rows:
         table.add_row(*map(Text, row))
     console = Console(color_system=None)

@@ -2,27 +2,10 @@
 
 import click
 
-from psotrack.cli.lazy import SETTINGS, LazyGroup, commands_in
-
-#: Commands by name, as in `psotrack.cli`.
-COMMANDS = commands_in(
-    "psotrack.cli.calibrate",
-    {
-        "Commands": {
-            "convert": "Convert the calibration IN, of any program in the list below, to OUT.",
-            "rig": "Calibrate a rig from nothing: lenses and places of all cameras, from a board that is "
-            "moved before them.",
-        },
-    },
-)
+from psotrack.cli.lazy import LazyGroup
 
 
-@click.group(
-    cls=LazyGroup,
-    lazy_commands=COMMANDS,
-    renamed={"extrinsics": "calibrate rig --pairs", "intrinsics": "calibrate rig"},
-    context_settings=SETTINGS,
-)
+@click.group(cls=LazyGroup, package=__name__, below={"Commands": ["convert", "rig"]})
 def calibrate() -> None:
     """Calibrate cameras, and convert calibration files.
 

@@ -6,12 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-from msgspec import Meta
-
-from psotrack.cli.options import running
+from psotrack.cli.commands import command
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.support import POSITION, format_numbers
 
@@ -33,19 +30,21 @@ class ConvertOptions:
     """
 
     size: tuple[int, int] | None = None
-    units: Annotated[str, Meta(extra={"metavar": "m|cm|mm"})] | None = None
-    format: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
-    to: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
+    units: Annotated[str | None, says(metavar="m|cm|mm")] = None
+    format: Annotated[str | None, says(metavar="NAME")] = None
+    to: Annotated[str | None, says(metavar="NAME")] = None
     lenses: bool = False
     undistorted: bool = False
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument("source", metavar="IN", type=click.Path(path_type=Path))
-@click.argument("out", metavar="OUT", type=click.Path(path_type=Path))
-@options_of(ConvertOptions, "how")
-@running(progress=False)
-def convert(output: Output, source: Path, out: Path, how: ConvertOptions) -> None:
+@command(without=["progress"])
+def convert(
+    output: Output,
+    source: Annotated[Path, says(metavar="IN")],
+    out: Annotated[Path, says(metavar="OUT")],
+    *,
+    how: ConvertOptions,
+) -> None:
     """Convert the calibration IN, of any program in the list below, to OUT.
 
     \b

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import click
+from typing import Annotated, Any
 
 from psotrack.calibration.rig.settings import (
     BoardSettings,
@@ -14,32 +12,27 @@ from psotrack.calibration.rig.settings import (
     SheetSettings,
     WorldSettings,
 )
-from psotrack.cli.options import out_option, plot_option, running
+from psotrack.cli.commands import Group, command
+from psotrack.cli.options import Plot
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument("sources", metavar="[VIDEO...]", nargs=-1, type=click.Path(path_type=Path))
-@options_of(
-    BoardSettings,
-    "board",
-    names={"kind": "board"},
-    heading="Board",
-    rare=("kind", "separation_m", "first_marker"),
-)
-@options_of(LensSettings, "lens", heading="Lenses")
-@options_of(SheetSettings, "sheet", heading="Lenses", rare=("fov_deg", "size"))
-@options_of(WorldSettings, "world")
-@options_of(PointSettings, "points", heading="Instead of a board", rare=("stick_m", "noise_px"))
-@plot_option("a picture of where each camera saw the board", "beside OUT, as .png")
-@out_option(
-    "Calibration to write: a file that ends in .toml, .yml or .csv.",
-    default=Path("rig.toml"),
-    show_default=True,
-)
-@running()
-def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path, **known: Any) -> None:
+@command()
+def rig(
+    output: Output,
+    sources: Annotated[tuple[Path, ...], says(metavar="[VIDEO...]")] = (),
+    *,
+    board: Annotated[
+        BoardSettings, Group("Board", {"kind": "board"}, rare=("kind", "separation_m", "first_marker"))
+    ],
+    lens: Annotated[LensSettings, Group("Lenses")],
+    sheet: Annotated[SheetSettings, Group("Lenses", rare=("fov_deg", "size"))],
+    world: WorldSettings,
+    points: Annotated[PointSettings, Group("Instead of a board", rare=("stick_m", "noise_px"))],
+    plot: Plot = None,
+    out: Path = Path("rig.toml"),
+) -> None:
     """Calibrate a rig from nothing: lenses and places of all cameras, from a board that is moved before them.
 
     Each VIDEO is that of one camera: a video, a folder of images, or a pattern such as 'left*.png'; a folder of
@@ -64,11 +57,17 @@ def rig(output: Output, sources: tuple[Path, ...], plot: Path | None, out: Path,
       psotrack calibrate rig --pairs pairs.csv --lenses lenses.toml --out rig.toml
       psotrack calibrate rig --pairs pairs.csv --places points.csv --fov 92.4,60.8 --size 1920,1080 --out rig.yml
       psotrack calibrate rig SEQ --markers SEQ/aruco_corners.csv --lenses lenses.toml --out rig.toml
+
+    Options:
+        plot: save a picture of where each camera saw the board. None: beside OUT, as .png.
+        out: calibration to write: a file that ends in .toml, .yml or .csv.
     """
     from psotrack import api
 
     output.refuse(out)
-    settings = {name: value for record in known.values() for name, value in vars(record).items()}
+    settings = {
+        name: value for record in (board, lens, sheet, world, points) for name, value in vars(record).items()
+    }
     if plot is not None:
         plot = plot if plot.name else out.with_suffix(".png")
     written: dict[str, Any] = {"plot": plot, "force": output.force, "progress": output.report}

@@ -2,30 +2,13 @@
 
 import click
 
-from psotrack.cli.lazy import SETTINGS, LazyCommand, LazyGroup
+from psotrack.cli.lazy import LazyGroup
 
-#: Commands by name, as in `psotrack.cli`.
-COMMANDS = {
-    "detect": LazyCommand(
-        "psotrack.cli.onboard.detect_markers:detect_markers",
-        "Find the ArUco markers and AprilTags in IMAGES, and their corners.",
-    ),
-    "map": LazyCommand(
-        "psotrack.cli.onboard.map_markers:map_markers",
-        "Write the table of a room's marker corners from SOURCE, or check such a table.",
-    ),
-    "localise": LazyCommand(
-        "psotrack.cli.onboard.localise:localise",
-        "Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.",
-    ),
-    "fuse": LazyCommand(
-        "psotrack.cli.onboard.fuse:fuse",
-        "Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.",
-    ),
-}
+_COMMANDS = {"Commands": ["detect", "map", "localise", "fuse"]}
+_MODULES = {"detect": "detect_markers", "map": "map_markers"}
 
 
-@click.group(cls=LazyGroup, lazy_commands=COMMANDS, context_settings=SETTINGS)
+@click.group(cls=LazyGroup, package=__name__, below=_COMMANDS, modules=_MODULES)
 def onboard() -> None:
     """Localise drones by their own cameras, from ArUco markers of known place.
 

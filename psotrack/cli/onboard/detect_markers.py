@@ -6,25 +6,23 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
-
-from psotrack.cli.options import dictionary_option, frames_option, out_option, running
+from psotrack.cli.commands import command
+from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand
 from psotrack.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from psotrack.foreground.markers import DetectedMarkers
 
 
-@click.command("detect", cls=HelpfulCommand)
-@click.argument("images", nargs=-1, required=True, type=click.Path(path_type=Path))
-@out_option("CSV file of the markers.", default=Path("markers.csv"), show_default=True)
-@dictionary_option("4x4_50")
-@frames_option
-@running()
+@command("detect")
 def detect_markers(
-    output: Output, images: tuple[Path, ...], out: Path, dictionary: str, num_frames: int | None
+    output: Output,
+    images: tuple[Path, ...],
+    *,
+    out: Path = Path("markers.csv"),
+    dictionary: Dictionary = "4x4_50",
+    num_frames: NumFrames = None,
 ) -> None:
     """Find the ArUco markers and AprilTags in IMAGES, and their corners.
 
@@ -42,6 +40,9 @@ def detect_markers(
       psotrack onboard detect photos --dictionary apriltag_36h11 --out markers.csv
       psotrack onboard detect a.jpg b.png c.tif --dictionary 6x6_250 --out markers.csv --json -
       psotrack onboard detect flight.mp4 --dictionary 4x4_1000 --out markers.csv --frames 100
+
+    Options:
+        out: CSV file of the markers.
     """
     from psotrack.foreground.markers import marker_dictionary
     from psotrack.inside_out import markers_of_images, markers_of_video, open_source, write_marker_table

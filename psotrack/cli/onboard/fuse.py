@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import click
-
-from psotrack.cli.options import out_option, running
+from psotrack.cli.commands import command
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand
+from psotrack.cli.types import says
 from psotrack.errors import InputError, check_positive, errors_name
 
 if TYPE_CHECKING:
@@ -18,33 +16,15 @@ if TYPE_CHECKING:
     from psotrack.trajectories import Trajectories
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument("inside", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.argument("outside", type=click.Path(path_type=Path))
-@out_option("CSV file of the fused tracks.  [default: fused.csv beside OUTSIDE]")
-@click.option(
-    "--at",
-    "point",
-    type=click.Choice(["camera", "middle"]),
-    default="camera",
-    show_default=True,
-    help="Tracked point of the fused tracks: the camera's centre, or the middle of the drone as static cameras see it.",
-)
-@click.option(
-    "--max-offset",
-    "max_offset_s",
-    type=float,
-    metavar="SECONDS",
-    help="Estimate the offset of each on-board camera's clock, up to SECONDS.  [default: no clock has an offset]",
-)
-@running(progress=False)
+@command(without=["progress"])
 def fuse(
     output: Output,
     inside: tuple[Path, ...],
     outside: Path,
-    out: Path | None,
-    point: Any,
-    max_offset_s: float | None,
+    *,
+    out: Path | None = None,
+    point: Annotated[Literal["camera", "middle"], says(flag="at")] = "camera",
+    max_offset_s: Annotated[float | None, says(metavar="SECONDS")] = None,
 ) -> None:
     """Fuse INSIDE, paths of on-board cameras, with OUTSIDE, tracks of the same drones from static cameras.
 
@@ -59,6 +39,12 @@ def fuse(
       psotrack onboard fuse dron1.csv dron2.csv tracks.csv --out fused.csv
       psotrack onboard fuse dron1.csv tracks.csv --out fused.csv --max-offset 5 --json -
       psotrack evaluate fused.csv data/Simulated_Data/S01_D2_A
+
+    Options:
+        out: CSV file of the fused tracks. None: fused.csv beside OUTSIDE.
+        point: tracked point of the fused tracks: the camera's centre, or the middle of the drone as static cameras see
+            it.
+        max_offset_s: estimate the offset of each on-board camera's clock, up to SECONDS. None: no clock has an offset.
     """
     from psotrack.inside_out import fuse as fuse_paths
     from psotrack.inside_out import read_camera_path, write_fused

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
 from msgspec import Meta
 
+from psotrack.cli.commands import Group, command
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, onboard_videos
-from psotrack.cli.options import frames_option, out_option, running
+from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 from psotrack.errors import InputError, SettingsError
 from psotrack.support.interrupts import unhurried_end
 
@@ -31,16 +31,15 @@ class SourceOptions:
         side_m: side of the markers in metres, if --markers has only their centres; None: estimated for each marker.
         drone: drone whose video is used, if VIDEO is a sequence's folder.
         name: name of the drone in the table; None: --drone, or VIDEO's name.
-        dictionary: dictionary of the markers; any dictionary of OpenCV.
         fps: frames per second of a folder of images.
         live: VIDEO is a camera's number or a stream; always use the newest frame.
     """
 
     markers: Path | None = None
     side_m: float | None = None
-    drone: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
-    name: Annotated[str, Meta(extra={"metavar": "NAME"})] | None = None
-    dictionary: str = "4x4_1000"
+    drone: Annotated[str | None, says(metavar="NAME")] = None
+    name: Annotated[str | None, says(metavar="NAME")] = None
+    dictionary: Dictionary = "4x4_1000"
     fps: float | None = None
     live: bool = False
 
@@ -64,24 +63,19 @@ class PoseOptions:
     smooth: bool = False
     map_error: Annotated[float, Meta(ge=0, lt=1000, extra={"metavar": "MM"})] = 0.0
     focal_error: Annotated[float, Meta(ge=0, lt=100, extra={"metavar": "PERCENT"})] = 0.0
-    readout_s: Annotated[float, Meta(extra={"metavar": "S"})] | None = None
+    readout_s: Annotated[float | None, says(metavar="S")] = None
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument("video")
-@out_option("CSV file of the poses, one row per frame.  [default: NAME.csv, by the drone's name]")
-@options_of(SourceOptions, "given", names={"side_m": "marker-size"})
-@options_of(OnboardLensOptions, "lenses", names=LENS_NAMES, heading="Lens", rare=("names", "scale"))
-@options_of(PoseOptions, "poses", heading="Poses", rare=("readout_s",))
-@frames_option
-@running()
+@command()
 def localise(
     output: Output,
     video: str,
-    out: Path | None,
-    num_frames: int | None,
-    given: SourceOptions,
-    **known: Any,
+    *,
+    out: Path | None = None,
+    given: Annotated[SourceOptions, Group(names={"side_m": "marker-size"})],
+    lenses: Annotated[OnboardLensOptions, Group("Lens", LENS_NAMES, rare=("names", "scale"))],
+    poses: Annotated[PoseOptions, Group("Poses", rare=("readout_s",))],
+    num_frames: NumFrames = None,
 ) -> None:
     """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.
 
@@ -110,6 +104,9 @@ def localise(
       psotrack onboard localise phone.mp4 --markers corners.csv --camera lens.yml --readout 0.02 --out track.csv
       psotrack onboard localise flight.mp4 --markers centres.csv --camera lens.toml --out track.csv --map-error 5
       psotrack onboard localise 0 --live --markers corners.csv --camera lens.yml --out track.csv
+
+    Options:
+        out: CSV file of the poses, one row per frame. None: NAME.csv, by the drone's name.
     """
     from dataclasses import replace
 
@@ -125,7 +122,6 @@ def localise(
     from psotrack.inside_out import localise_video as localise_camera
     from psotrack.recordings.datasets import find_marker_corners
 
-    poses: PoseOptions = known["poses"]
     source, drone_name, onboard = _input(video, given)
     out = out or Path(f"{drone_name}.csv")
     check_suffix("--out", out, ".csv")
@@ -141,7 +137,7 @@ def localise(
             raise SettingsError(
                 "--marker-size", expected="a table of centres alone", found=f"corners in {table}"
             )
-    lens = known["lenses"].of(source.image_size_wh, K=None if onboard is None else onboard.K)
+    lens = lenses.of(source.image_size_wh, K=None if onboard is None else onboard.K)
     name, source = source.name, source.first(num_frames)
     rows = source.image_size_wh[1]
     shutter = _shutter(poses.readout_s, rows, source.fps)

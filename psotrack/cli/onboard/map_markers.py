@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import click
 from msgspec import Meta
 
+from psotrack.cli.commands import Group, command
 from psotrack.cli.onboard.shown import show_built, show_check, show_measured
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, known_corners, leading, videos_of
-from psotrack.cli.options import frames_option, out_option, running
+from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 from psotrack.errors import SettingsError, check_positive
 
 #: Exit code if a marker of a map was reported.
@@ -34,7 +34,7 @@ class WorldOptions:
         estimate_sides: estimate the sides of unknown markers, too.
     """
 
-    known: Annotated[str, Meta(extra={"metavar": "ID,ID..."})] | None = None
+    known: Annotated[str | None, says(metavar="ID,ID...")] = None
     markers: Path | None = None
     side_m: float | None = None
     estimate_sides: bool = False
@@ -46,39 +46,26 @@ class VideoOptions:
 
     Attributes:
         drone: drones of a sequence whose videos are used; None: all.
-        dictionary: dictionary of the markers; any dictionary of OpenCV.
         fps: frames per second of folders of images, on which only the time from row to row depends; None: 25 for
             folders of images.
     """
 
     drone: tuple[str, ...] | None = None
-    dictionary: str = "4x4_1000"
+    dictionary: Dictionary = "4x4_1000"
     fps: Annotated[float, Meta(gt=0)] | None = None
 
 
-@click.command("map", cls=HelpfulCommand)
-@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@out_option("Table of corners to write.  [default: aruco_corners.csv]")
-@click.option(
-    "--check",
-    "checked",
-    type=click.Path(path_type=Path),
-    metavar="MAP",
-    help="Check the table MAP instead of writing one.",
-)
-@options_of(WorldOptions, "world", heading="World")
-@options_of(VideoOptions, "given")
-@options_of(OnboardLensOptions, "lenses", names=LENS_NAMES, heading="Lenses", rare=("names", "scale"))
-@frames_option
-@running()
+@command("map")
 def map_markers(
     output: Output,
-    sources: tuple[Path, ...],
-    out: Path | None,
-    checked: Path | None,
-    world: WorldOptions,
-    num_frames: int | None,
-    **filmed: Any,
+    sources: Annotated[tuple[Path, ...], says(metavar="SOURCE...")],
+    *,
+    out: Path | None = None,
+    check: Annotated[Path | None, says(metavar="MAP")] = None,
+    world: Annotated[WorldOptions, Group("World")],
+    given: VideoOptions,
+    lenses: Annotated[OnboardLensOptions, Group("Lenses", LENS_NAMES, rare=("names", "scale"))],
+    num_frames: NumFrames = None,
 ) -> None:
     """Write the table of a room's marker corners from SOURCE, or check such a table.
 
@@ -100,6 +87,10 @@ def map_markers(
       psotrack onboard map photos/ --known 7 --side 0.2 --camera lens.toml --out corners.csv
       psotrack onboard map data/Simulated_Data/S01_D2_A --drone dron1 --known 7 --out corners.csv --json -
       psotrack onboard map data/Simulated_Data/S01_D2_A --check corners.csv
+
+    Options:
+        out: table of corners to write. None: aruco_corners.csv.
+        check: check the table MAP instead of writing one.
     """
     from psotrack.inside_out import (
         build_map,
@@ -111,9 +102,9 @@ def map_markers(
     )
     from psotrack.recordings.datasets import write_marker_corners
 
-    if out is not None and checked is not None:
+    if out is not None and check is not None:
         raise SettingsError("onboard map", expected="--out FILE or --check MAP", found="both")
-    if checked is None:
+    if check is None:
         out = out or Path("aruco_corners.csv")
         check_suffix("--out", out, ".csv")
         output.refuse(out)
@@ -129,15 +120,14 @@ def map_markers(
         show_measured(output, measured, out)
         return
     # Errors of small files are found before the videos are read, which takes long.
-    marker_map = None if checked is None else read_marker_map(checked)
+    marker_map = None if check is None else read_marker_map(check)
     known = {} if out is None else known_corners(world.known, world.markers, world.side_m, sources)
-    given: VideoOptions = filmed["given"]
-    videos = videos_of(sources, given.drone, filmed["lenses"], given.fps)
+    videos = videos_of(sources, given.drone, lenses, given.fps)
     videos = {name: (leading(video, num_frames), lens) for name, (video, lens) in videos.items()}
     sightings = find_sightings(list(videos.values()), given.dictionary, report=output.report)
     if marker_map is not None:
         checkup = check_map(sightings, marker_map)
-        show_check(output, checkup, Path(str(checked)))
+        show_check(output, checkup, Path(str(check)))
         if checkup.findings:
             sys.exit(FOUND)
     elif out is not None:

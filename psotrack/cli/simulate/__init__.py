@@ -2,22 +2,12 @@
 
 import click
 
-from psotrack.cli.lazy import SETTINGS, LazyGroup, commands_in
+from psotrack.cli.lazy import LazyGroup
 
-#: Commands by name, as in `psotrack.cli`.
-COMMANDS = commands_in(
-    "psotrack.cli.simulate",
-    {
-        "Commands": {
-            "sequence": "Simulate a sequence: videos, calibration, ground truth, masks and detections.",
-            "fly": "Fly a simulated drone by hand and record the flight for a scenario.",
-            "labels": "Write a YOLO training set from sequences with a reference.",
-        },
-    },
-)
+_COMMANDS = {"Commands": ["sequence", "fly", "labels"]}
 
 
-@click.group(cls=LazyGroup, lazy_commands=COMMANDS, default="sequence", context_settings=SETTINGS)
+@click.group(cls=LazyGroup, package=__name__, below=_COMMANDS, default="sequence")
 def simulate() -> None:
     """Simulate sequences: videos, calibration, ground truth, masks and detections.
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import click
 from msgspec import Meta
 
-from psotrack.cli.options import running
+from psotrack.cli.commands import command
 from psotrack.cli.output import Output, check_suffix
-from psotrack.cli.records import HelpfulCommand, options_of
+from psotrack.cli.types import says
 from psotrack.errors import errors_name
 from psotrack.support.interrupts import unhurried_end
 
@@ -29,18 +28,16 @@ class PilotingOptions:
         max_seconds: longest duration of the flight, in seconds.
     """
 
-    device: Annotated[str, Meta(extra={"metavar": "gamepad|keyboard|FILE.csv"})]
-    out: Annotated[Path, Meta(extra={"metavar": "FILE.csv"})] = Path("flight.csv")
+    device: Annotated[str, says(metavar="gamepad|keyboard|FILE.csv")]
+    out: Annotated[Path, says(metavar="FILE.csv")] = Path("flight.csv")
     rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 25.0
     hall: str = "laboratory"
-    start_m: Annotated[tuple[float, float, float], Meta(extra={"metavar": "X,Y,Z"})] = (0.0, 0.0, 1.0)
+    start_m: Annotated[tuple[float, float, float], says(metavar="X,Y,Z")] = (0.0, 0.0, 1.0)
     max_seconds: Annotated[float, Meta(ge=1)] = 300.0
 
 
-@click.command(cls=HelpfulCommand)
-@options_of(PilotingOptions, "flight")
-@running(progress=False, json=False)
-def fly(output: Output, flight: PilotingOptions) -> None:
+@command(without=["progress", "json_path"])
+def fly(output: Output, *, flight: PilotingOptions) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in

@@ -3,36 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-import click
-
-from psotrack.cli.options import JOBS, out_option, running
+from psotrack.cli.commands import command
+from psotrack.cli.options import Jobs
 from psotrack.cli.output import Output
-from psotrack.cli.records import HelpfulCommand, options_of
-from psotrack.cli.types import Names
+from psotrack.cli.types import says
 from psotrack.foreground.detection import LabelSettings
 
 
-@click.command(cls=HelpfulCommand)
-@click.argument(
-    "sequences", metavar="SEQ [SEQ ...]", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
-@out_option("Folder of the training set.", default=Path("yolo"), show_default=True)
-@options_of(LabelSettings, "settings")
-@click.option(
-    "--validation",
-    type=Names(),
-    help="Sequences for validation, not for training.  [default: the last sequence]",
-)
-@JOBS
-@running()
+@command()
 def labels(
     output: Output,
-    sequences: tuple[Path, ...],
-    out: Path,
+    sequences: Annotated[tuple[Path, ...], says(metavar="SEQ [SEQ ...]")],
+    *,
+    out: Path = Path("yolo"),
     settings: LabelSettings,
-    validation: tuple[str, ...] | None,
-    jobs: int | None,
+    validation: tuple[str, ...] | None = None,
+    jobs: Jobs = None,
 ) -> None:
     """Write a YOLO training set from sequences with a reference.
 
@@ -44,6 +32,10 @@ def labels(
     Examples:
       psotrack simulate labels data/Simulated_Data/S0* --out yolo --drone-size 0.43,0.43,0.23 --every 5
       psotrack simulate labels R01_D2 R12_D4 --out yolo --drone-size 0.4,0.4,0.2 --offset 0,0,-0.117 --validation R12_D4
+
+    Options:
+        out: folder of the training set.
+        validation: sequences for validation, not for training. None: the last sequence.
     """
     from psotrack.foreground.detection import DATA_SET, write_data_set
     from psotrack.recordings.datasets import open_recording
