@@ -234,7 +234,7 @@ def is_given(context: click.Context, name: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Group:
+class OptionGroup:
     """The options of a record's fields, which a command gets as one argument.
 
     Attributes:
@@ -247,21 +247,21 @@ class Group:
     names: Mapping[str, str] = field(default_factory=dict)
     rare: Collection[str] = ()
 
-    def parameters(self, record: type) -> list[click.Parameter]:
+    def parameters(self, record: Any) -> list[click.Parameter]:
         """The options."""
         return [
             option_of(each, self.names.get(each.name, ""), self.heading, each.name in self.rare)
             for each in self._fields(record)
         ]
 
-    def take(self, record: type, values: Mapping[str, Any]) -> Any:
+    def take(self, record: Any, values: Mapping[str, Any]) -> Any:
         """The argument of the command, from the values of the parameters of click."""
         return record(**{each.name: values[each.parameter] for each in self._fields(record)})
 
     def finish(self, taken: Any, values: Mapping[str, Any]) -> None:
         """What is to be done when the command has succeeded."""
 
-    def _fields(self, record: type) -> list[Field]:
+    def _fields(self, record: Any) -> list[Field]:
         return [each for each in fields_of(record) if self.names.get(each.name) != ""]
 
 
@@ -278,8 +278,8 @@ def command(
     def decorate(function: Callable[..., None]) -> HelpfulCommand:
         hints = get_type_hints(function, include_extras=True)
         words = _descriptions(function, "Options")
-        of_output = Group(RUNNING, {"json_path": "json", "started_s": "", **dict.fromkeys(without, "")})
-        groups: dict[str, tuple[type, Group]] = {}
+        of_output = OptionGroup(RUNNING, {"json_path": "json", "started_s": "", **dict.fromkeys(without, "")})
+        groups: dict[str, tuple[Any, OptionGroup]] = {}
         params: list[click.Parameter] = []
         for each in list(inspect.signature(function).parameters.values())[1:]:
             if (group := _group_of(hints[each.name])) is not None:
@@ -322,10 +322,10 @@ def command(
     return decorate
 
 
-def _group_of(hint: Any) -> tuple[type, Group] | None:
+def _group_of(hint: Any) -> tuple[Any, OptionGroup] | None:
     """The record of a parameter and how its options are shown; None for a single option or argument."""
     record, *said = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    group = next((each for each in said if isinstance(each, Group)), None)
+    group = next((each for each in said if isinstance(each, OptionGroup)), None)
     if group is None and inspect.isclass(record) and (is_dataclass(record) or issubclass(record, Struct)):
-        group = Group()
+        group = OptionGroup()
     return None if group is None else (record, group)

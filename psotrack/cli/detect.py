@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec.structs import replace
 
-from psotrack.cli.commands import Group, command
+from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import Extent, Seq, beside, filmed_recording
 from psotrack.cli.output import Output
 from psotrack.cli.settings import TrackingSettings
@@ -51,7 +51,7 @@ def detect(
     *,
     what: DetectOptions,
     out: Path | None = None,
-    network: Annotated[DetectorSettings, Group("With --detector")],
+    network: Annotated[DetectorSettings, OptionGroup("With --detector")],
     settings: Annotated[
         dict[str, Any],
         TrackingSettings(

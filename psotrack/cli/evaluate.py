@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from psotrack.cli.commands import Group, command
+from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import Bodies, Plot, SeqOfTracks, sequence_of
 from psotrack.cli.output import Output
 from psotrack.cli.types import Words, says
@@ -41,7 +41,7 @@ def evaluate(
     ] = None,
     drone: Annotated[str | None, says(metavar="NAME", heading=_PATHS)] = None,
     orientations: Annotated[Path | None, says(heading=_PATHS)] = None,
-    settings: Annotated[PathSettings, Group(_PATHS, _NAMES)],
+    settings: Annotated[PathSettings, OptionGroup(_PATHS, _NAMES)],
     bodies: Bodies,
 ) -> None:
     """Compare TRACKS with the reference of SEQ.

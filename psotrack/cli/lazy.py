@@ -18,7 +18,7 @@ SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
 
 class LazyGroup(click.Group):
-    """Group whose `--help` and completion of names import no command.
+    """OptionGroup whose `--help` and completion of names import no command.
 
     Args:
         package: package of the commands' modules; a command is the function that has the name of its module.

@@ -15,7 +15,7 @@ import msgspec
 
 from psotrack import __version__
 from psotrack.cli.archived import archive_of
-from psotrack.cli.commands import Field, Group, fields_of, is_given, option_of
+from psotrack.cli.commands import Field, OptionGroup, fields_of, is_given, option_of
 from psotrack.cli.output import check_suffix
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
@@ -38,7 +38,7 @@ _NAMES = {
 
 
 @dataclass(frozen=True)
-class TrackingSettings(Group):
+class TrackingSettings(OptionGroup):
     """An option for each setting, and --help-all; the command gets the values that were given, by dotted name.
 
     Attributes:
@@ -53,12 +53,12 @@ class TrackingSettings(Group):
     without: Collection[str] = ()
     files: bool = True
 
-    def parameters(self, record: type) -> list[click.Parameter]:
+    def parameters(self, record: Any) -> list[click.Parameter]:
         """The options."""
         files = fields_of(_Files) if self.files else ()
         return [*map(self._option, self._fields(record)), *map(option_of, files)]
 
-    def _fields(self, record: type) -> list[Field]:
+    def _fields(self, record: Any) -> list[Field]:
         fields = fields_of(TrackSettings)
         return [each for each in fields if each.name.startswith(self.part) and each.name not in self.without]
 
@@ -67,7 +67,7 @@ class TrackingSettings(Group):
         heading = "Options" if is_usual else f"Settings {part}.*" if part else "Settings"
         return option_of(field, _NAMES.get(field.name, ""), heading, not is_usual, limited=False)
 
-    def take(self, record: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    def take(self, record: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         """The values of the settings that the user chose."""
         files = _Files(values.get("config"), values.get("save_config"))
         check_suffix("--save-config", files.save_config, ".toml")

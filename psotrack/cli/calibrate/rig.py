@@ -12,7 +12,7 @@ from psotrack.calibration.rig.settings import (
     SheetSettings,
     WorldSettings,
 )
-from psotrack.cli.commands import Group, command
+from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import Plot
 from psotrack.cli.output import Output
 from psotrack.cli.types import says
@@ -24,12 +24,12 @@ def rig(
     sources: Annotated[tuple[Path, ...], says(metavar="[VIDEO...]")] = (),
     *,
     board: Annotated[
-        BoardSettings, Group("Board", {"kind": "board"}, rare=("kind", "separation_m", "first_marker"))
+        BoardSettings, OptionGroup("Board", {"kind": "board"}, rare=("kind", "separation_m", "first_marker"))
     ],
-    lens: Annotated[LensSettings, Group("Lenses")],
-    sheet: Annotated[SheetSettings, Group("Lenses", rare=("fov_deg", "size"))],
+    lens: Annotated[LensSettings, OptionGroup("Lenses")],
+    sheet: Annotated[SheetSettings, OptionGroup("Lenses", rare=("fov_deg", "size"))],
     world: WorldSettings,
-    points: Annotated[PointSettings, Group("Instead of a board", rare=("stick_m", "noise_px"))],
+    points: Annotated[PointSettings, OptionGroup("Instead of a board", rare=("stick_m", "noise_px"))],
     plot: Plot = None,
     out: Path = Path("rig.toml"),
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
-from psotrack.cli.commands import Group, command
+from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, onboard_videos
 from psotrack.cli.options import Dictionary, NumFrames
 from psotrack.cli.output import Output, check_suffix
@@ -72,9 +72,9 @@ def localise(
     video: str,
     *,
     out: Path | None = None,
-    given: Annotated[SourceOptions, Group(names={"side_m": "marker-size"})],
-    lenses: Annotated[OnboardLensOptions, Group("Lens", LENS_NAMES, rare=("names", "scale"))],
-    poses: Annotated[PoseOptions, Group("Poses", rare=("readout_s",))],
+    given: Annotated[SourceOptions, OptionGroup(names={"side_m": "marker-size"})],
+    lenses: Annotated[OnboardLensOptions, OptionGroup("Lens", LENS_NAMES, rare=("names", "scale"))],
+    poses: Annotated[PoseOptions, OptionGroup("Poses", rare=("readout_s",))],
     num_frames: NumFrames = None,
 ) -> None:
     """Find the position of the camera of VIDEO in every frame, from the ArUco markers that it sees.

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from psotrack.cli.commands import Group, command
+from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.onboard.shown import show_built, show_check, show_measured
 from psotrack.cli.onboard.sources import LENS_NAMES, OnboardLensOptions, known_corners, leading, videos_of
 from psotrack.cli.options import Dictionary, NumFrames
@@ -62,9 +62,9 @@ def map_markers(
     *,
     out: Path | None = None,
     check: Annotated[Path | None, says(metavar="MAP")] = None,
-    world: Annotated[WorldOptions, Group("World")],
+    world: Annotated[WorldOptions, OptionGroup("World")],
     given: VideoOptions,
-    lenses: Annotated[OnboardLensOptions, Group("Lenses", LENS_NAMES, rare=("names", "scale"))],
+    lenses: Annotated[OnboardLensOptions, OptionGroup("Lenses", LENS_NAMES, rare=("names", "scale"))],
     num_frames: NumFrames = None,
 ) -> None:
     """Write the table of a room's marker corners from SOURCE, or check such a table.

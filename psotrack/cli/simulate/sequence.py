@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import click
 
 from psotrack import simulation
-from psotrack.cli.commands import Group, command
+from psotrack.cli.commands import OptionGroup, command
 from psotrack.cli.options import Jobs
 from psotrack.cli.output import Output
 from psotrack.cli.types import says
@@ -31,7 +31,7 @@ def sequence(
     changes: Annotated[
         tuple[str, ...], says(flag="set", multiple=True, metavar="FIELD=VALUE", type=str)
     ] = (),
-    settings: Annotated[simulation.SimulationSettings, Group(names={"num_frames": "frames"})],
+    settings: Annotated[simulation.SimulationSettings, OptionGroup(names={"num_frames": "frames"})],
     jobs: Jobs = None,
 ) -> None:
     """Simulate a sequence: videos, calibration, ground truth, masks and detections.
