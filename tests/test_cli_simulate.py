@@ -3,6 +3,7 @@
 import json
 import tomllib
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -63,10 +64,10 @@ def test_a_preset_can_be_edited_into_a_new_scenario(tmp_path):
 
 
 def test_fields_are_changed_from_the_command_line(tmp_path):
-    changes = ("--set", "camera_spread.focal_length=0.05", "--set", "name=OTHER")
+    changes = ("--set", "image_size_wh=[1280,960]", "--set", "name=OTHER")
     run_simulate("S11_D4", "--out", tmp_path, *changes, *SMALL)
     rig = read_sequence(tmp_path / "Simulated_Data" / "OTHER").rig
-    assert len({round(float(focal), 3) for focal in rig.cameras.K[:, 0, 0]}) == 4
+    np.testing.assert_array_equal(rig.cameras.image_size_wh, np.tile([128, 96], (4, 1)))
 
 
 @pytest.mark.parametrize(

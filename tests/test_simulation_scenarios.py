@@ -294,14 +294,14 @@ def test_change_scenario_changes_only_the_given_fields():
         S02,
         {
             "imaging.reflections": 0,
-            "camera_spread.focal_length": 0.02,
+            "surroundings.screen": 0.02,
             "drones[1].flight.terms[0].period_s": 8.0,
             "drones[2].model": {"file": "a.obj"},
             "onboard": None,
         },
     )
     assert changed.imaging == msgspec.structs.replace(S02.imaging, reflections=0.0)
-    assert changed.camera_spread.focal_length == 0.02
+    assert changed.surroundings.screen == 0.02
     assert changed.drones[1].flight.terms[0].period_s == 8.0
     assert changed.drones[2].model == Mesh(file="a.obj")
     assert changed.onboard is None
@@ -309,7 +309,7 @@ def test_change_scenario_changes_only_the_given_fields():
         changed,
         {
             "imaging.reflections": S02.imaging.reflections,
-            "camera_spread": {},
+            "surroundings": {},
             "drones[1].flight.terms[0].period_s": S02.drones[1].flight.terms[0].period_s,
             "drones[2].model": S02.drones[2].model,
             "onboard": {},
@@ -373,45 +373,6 @@ def test_an_invalid_change_is_refused_and_its_path_is_named(path, value, sentenc
     start, _, end = sentence.partition(".*")
     assert str(error_info.value).startswith(start)
     assert str(error_info.value).endswith(end)
-
-
-# --- cameras that differ
-
-
-def test_without_spread_cameras_do_not_depend_on_the_seed():
-    for seed in (0, 7):
-        K = build(S02, seed=seed).rig.cameras.K
-        np.testing.assert_array_equal(K, np.tile([[1156.3, 0, 960], [0, 1156.3, 540], [0, 0, 1]], (8, 1, 1)))
-
-
-def test_with_spread_the_intrinsics_depend_on_the_seed():
-    spread = change_scenario(S02, {"camera_spread": {"focal_length": 0.02, "principal_point_px": 12.0}})
-    scene, again, other_seed = (build(spread, seed=seed) for seed in (3, 3, 4))
-    K = scene.rig.cameras.K
-    np.testing.assert_array_equal(K, again.rig.cameras.K)
-    assert np.abs(K - other_seed.rig.cameras.K).max() > 1
-    np.testing.assert_array_equal(scene.rig.cameras.T_cam_world, build(S02).rig.cameras.T_cam_world)
-    # The spread of the cameras does not change the flights of a seed.
-    np.testing.assert_array_equal(scene.positions_m(20), build(S02, seed=3).positions_m(20))
-    # Pixels stay square, and random draws are limited to 2.5 standard deviations.
-    np.testing.assert_array_equal(K[:, 0, 0], K[:, 1, 1])
-    assert np.all(np.abs(K[:, 0, 0] / 1156.3 - 1) <= 0.05 + 1e-12)
-    assert np.all(np.abs(K[:, :2, 2] - [960, 540]) <= 30 + 1e-9)
-    # Another scale gives the same cameras.
-    small = build(spread, seed=3, scale=0.5).rig.cameras.K
-    np.testing.assert_allclose(small[:, 0, 0], K[:, 0, 0] / 2, rtol=1e-12)
-    np.testing.assert_allclose(small[:, :2, 2] + 0.5, (K[:, :2, 2] + 0.5) / 2, rtol=1e-12)
-
-
-def test_the_spread_is_the_standard_deviation_of_the_cameras():
-    places = msgspec.structs.replace(S02, cameras=RIGS["laboratory"] * 100)
-    spread = change_scenario(places, {"camera_spread": {"focal_length": 0.02, "principal_point_px": 12.0}})
-    K = build(spread, scale=1.0).rig.cameras.K
-    # With 800 draws the standard deviation has a standard error of 2.5 %, and cutting the tails reduces it by 3 %.
-    assert np.std(K[:, 0, 0] / 1156.3) == pytest.approx(0.02, rel=0.12)
-    assert np.std(K[:, 0, 2]) == pytest.approx(12.0, rel=0.12)
-    assert np.std(K[:, 1, 2]) == pytest.approx(12.0, rel=0.12)
-    assert abs(np.corrcoef(K[:, 0, 2], K[:, 1, 2])[0, 1]) < 0.15
 
 
 # --- refused before anything is drawn

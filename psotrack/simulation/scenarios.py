@@ -265,18 +265,6 @@ class CameraPlace(_Record, frozen=True, kw_only=True):
     fisheye: bool = False
 
 
-class CameraSpread(_Record, frozen=True, kw_only=True):
-    """Standard deviations of the random differences between the cameras and their records; 0 is no difference.
-
-    Attributes:
-        focal_length: standard deviation of the focal length, relative.
-        principal_point_px: standard deviation of the principal point along x and along y.
-    """
-
-    focal_length: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = 0.0
-    principal_point_px: NotNegative = 0.0
-
-
 class OnboardCamera(_Record, frozen=True, kw_only=True):
     """The on-board camera of each drone, fixed to the drone's body (the `_A` sequences).
 
@@ -445,7 +433,6 @@ class Scenario(_Record, frozen=True, kw_only=True):
             with the size, so a smaller image has a smaller field of view.
         markers: whether ArUco markers hang on the walls.
         onboard: on-board camera of each drone; None: no on-board cameras.
-        camera_spread: random differences between the cameras and their records.
         imaging: effects of camera and light.
         surroundings: what changes around the drones.
         detector: errors of the simulated detector.
@@ -463,7 +450,6 @@ class Scenario(_Record, frozen=True, kw_only=True):
     image_size_wh: tuple[Count, Count] = (1920, 1080)
     markers: bool = False
     onboard: OnboardCamera | None = None
-    camera_spread: CameraSpread = CameraSpread()
     imaging: Imaging = Imaging()
     surroundings: Surroundings = Surroundings()
     detector: SimulatedDetector = SimulatedDetector()

@@ -19,8 +19,6 @@ from psotrack.simulation.world.rooms import Room, room
 #: Smallest and largest side of an image, pixels. Smaller images show nothing; larger images cannot be written, because
 #: MPEG-4 stores a side in 13 bits.
 _MIN_SIDE_PX, _MAX_SIDE_PX = 32, 8190
-#: Second number of the cameras' random seed. It differs from the flights' second numbers, which count attempts.
-_FOR_CAMERAS = 1_000_003
 
 
 @dataclass(frozen=True)
@@ -92,32 +90,19 @@ def build(scenario: Scenario, *, scale: float = 1.0, seed: int = 0) -> Scene:
     if seed < 0:
         raise SettingsError("seed", expected="0 or more", found=f"{seed}")
     check(scenario)
-    rig = _rig(scenario, scale, seed)
+    cameras = (_camera(place, scenario, scale) for place in camera_places(scenario))
+    rig = make_rig({f"cam{number}": camera for number, camera in enumerate(cameras, start=1)})
     models = tuple(model(drone.model) for drone in scenario.drones)
     flights = plan(scenario, seed)
     check_flights(scenario, flights)
     return Scene(scenario, seed, scale, rig, flights, models)
 
 
-def _rig(scenario: Scenario, scale: float, seed: int) -> Rig:
-    """Cameras of the scenario, with random deviations of the size that `camera_spread` gives."""
-    places = camera_places(scenario)
-    spread = scenario.camera_spread
-    normal = np.random.default_rng([seed, _FOR_CAMERAS]).standard_normal((len(places), 3))
-    # Without the tails of the distribution, which would give implausible lenses.
-    draws = np.clip(normal, -2.5, 2.5) * [spread.focal_length, *2 * [spread.principal_point_px]]
-    cameras = (_camera(place, draw, scenario, scale) for place, draw in zip(places, draws, strict=True))
-    return make_rig({f"cam{number}": camera for number, camera in enumerate(cameras, start=1)})
-
-
-def _camera(place: CameraPlace, draw: Float[np.ndarray, "3"], scenario: Scenario, scale: float) -> Camera:
-    """Camera with changes of its lens: relative focal length, and principal point right and down in pixels."""
+def _camera(place: CameraPlace, scenario: Scenario, scale: float) -> Camera:
     R, t_m = look_at(place.position_m, place.target_m)
-    longer, *moved_px = draw.tolist()
-    focal = place.focal_length_px * (1 + longer) * scale
+    focal = place.focal_length_px * scale
     # Pixel centres have integer coordinates, so the image's corner, which the scale does not move, is at -0.5.
-    centre_px = zip(place.principal_point_px, moved_px, strict=True)
-    cx, cy = ((at + by + 0.5) * scale - 0.5 for at, by in centre_px)
+    cx, cy = ((at + 0.5) * scale - 0.5 for at in place.principal_point_px)
     K = np.array([[focal, place.skew_px * scale, cx], [0.0, focal * place.aspect, cy], [0.0, 0.0, 1.0]])
     size_wh = image_size_wh(scenario, scale)
     return make_camera(R=R, t_m=t_m, K=K, image_size_wh=size_wh, dist=place.distortion, fisheye=place.fisheye)

@@ -47,7 +47,7 @@ def sequence(
       psotrack simulate S02_D4_A --out restless --restless
       psotrack simulate S02_D4_A --as-own-cameras --out my_lab
       psotrack simulate S02_D4_A --show > mine.toml
-      psotrack simulate --scenario mine.toml --out data --set camera_spread.focal_length=0.02
+      psotrack simulate --scenario mine.toml --out data --set imaging.jpeg_quality=40
 
     Options:
         out: root folder of the data.
