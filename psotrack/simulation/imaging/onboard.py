@@ -71,7 +71,8 @@ class OnboardRenderer:
 
     def cam_at(self, time_s: float) -> Pinhole:
         """Camera at a given time."""
-        return self._cams(np.array([time_s]))[0]
+        (centre_m,), (to_world,) = _poses(self.scene, self.drone_index, np.array([time_s]))
+        return Pinhole(to_world.T, -to_world.T @ centre_m, self.K, self.width, self.height)
 
     def frame(self, frame: int) -> Image:
         """(height, width, 3), BGR image of a frame from the sensor, before the codec."""
@@ -117,13 +118,6 @@ class OnboardRenderer:
         """Motion of the image between the exposures of two neighbouring rows, pixels, as in `_motion_px`."""
         ends_s = np.array([self._row_time_s(time_s, row) for row in (0.0, self.height - 1.0)])
         return self._motion_px(ends_s) / self.height if self.onboard.line_time_s else 0.0
-
-    def _cams(self, time_s: Float[np.ndarray, "times"]) -> list[Pinhole]:
-        position_m, to_world = _poses(self.scene, self.drone_index, time_s)
-        return [
-            Pinhole(turn.T, -turn.T @ centre, self.K, self.width, self.height)
-            for centre, turn in zip(position_m, to_world, strict=True)
-        ]
 
     def _samples(self, time_s: float) -> Float[np.ndarray, "samples 3"]:
         """(samples, 3), positions in the pixel (x, y) and times in the exposure (-1/2 to 1/2), with mean 0."""

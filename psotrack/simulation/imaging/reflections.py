@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.backdrop import Backdrop, lens_blur, numbers_and_depth, render_light
@@ -103,18 +103,14 @@ def mirror(room: Room, cam: Pinhole, imaging: Imaging, empty: Backdrop) -> Mirro
     _, depth = numbers_and_depth(below, full_view(cam))
     light = render_light(below, cam, imaging.antialiasing)
     beyond = np.clip(1 - empty.depth_m / depth, 0, 1)
-    share = fresnel(_cosine_to_floor(cam), imaging.reflections) * _cover(empty.floor, imaging)
+    floor = lens_blur(empty.floor.astype(np.float32), imaging.lens_blur_px)
+    share = fresnel(_cosine_to_floor(cam), imaging.reflections) * floor
     return Mirror(cam, share, _blurred(light, beyond, ROUGHNESS_RAD * cam.K[0, 0], imaging), depth)
 
 
 def fresnel(cosine: Float[np.ndarray, "*shape"], at_normal: float) -> Float[np.ndarray, "*shape"]:
     """Share of mirrored light by the cosine of the angle of incidence (Schlick, 1994); 1 at grazing incidence."""
     return at_normal + (1 - at_normal) * (1 - cosine) ** 5
-
-
-def _cover(floor: Bool[np.ndarray, "height width"], imaging: Imaging) -> Float[np.ndarray, "height width"]:
-    """(height, width), share of the floor in each pixel after the lens's blur."""
-    return lens_blur(floor.astype(np.float32), imaging.lens_blur_px)
 
 
 def _cosine_to_floor(cam: Pinhole) -> Float[np.ndarray, "height width"]:
