@@ -32,7 +32,7 @@ from psotrack.simulation.imaging.raster import RasterView, pinhole
 from psotrack.simulation.labels.detector import detect, iou
 from psotrack.simulation.labels.masks import Silhouette, silhouettes
 from psotrack.simulation.scenarios import Mesh
-from psotrack.simulation.world import drones
+from psotrack.simulation.world import drones, models
 
 S02 = scenario("S02_D4_A")
 NO_ROOM_M = 90.0
@@ -78,7 +78,7 @@ def centroid(mask):
 
 
 def cube(side_m):
-    triangles = drones.box((0.0, 0.0, 0.0), (side_m, side_m, side_m))
+    triangles = models.box((0.0, 0.0, 0.0), (side_m, side_m, side_m))
     return drones.DroneModel(triangles, np.ones(len(triangles)), np.zeros((0, 3)), np.zeros(0))
 
 

@@ -10,7 +10,7 @@ from placed_drones import cube, drone_masks, pixel_of, ray_point, straight_fligh
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.simulation import CameraRenderer, build, scenario
 from psotrack.simulation.imaging import posing, raster, sensor
-from psotrack.simulation.world import drones, rooms
+from psotrack.simulation.world import drones, models, rooms
 
 S02 = scenario("S02_D4_A")
 
@@ -90,7 +90,7 @@ def test_objects_behind_the_camera_are_not_drawn():
     )
     view = raster.full_view(raster.pinhole(cam))
     colour, depth = raster.empty_buffers(view)
-    raster.draw(view, drones.box((-3.0, 0.0, 1.5), (1.0, 1.0, 1.0)), np.ones((12, 1, 3)), colour, depth)
+    raster.draw(view, models.box((-3.0, 0.0, 1.5), (1.0, 1.0, 1.0)), np.ones((12, 1, 3)), colour, depth)
     assert not colour.any()
     assert np.all(depth == raster.FAR_M)
 
