@@ -539,6 +539,8 @@ def test_a_second_run_uses_the_stored_compiled_program(sequence: Path, tmp_path:
 def test_usage_errors_are_one_line(run: Run) -> None:
     assert_one_line(run("trakc"), "trakc", "track", "psotrack --help")
     assert_one_line(run("track"), "SEQ", "psotrack track --help")
+    # Found: options without a default were not asked for, and the command failed later.
+    assert_one_line(run("simulate", "fly"), "--device", "psotrack simulate fly --help")
     assert_one_line(run("track", "x", "--out", "y", "--body-offset", "1,2"), "--body-offset", "1,2")
 
 
