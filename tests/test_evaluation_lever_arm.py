@@ -102,12 +102,6 @@ class TestLeverArm:
         assert keys[place : place + 3] == ["offset_m", "offset_standard_error_m", "offset_frame"]
         assert len(json.loads(json.dumps(drone, allow_nan=False))["offset_standard_error_m"]) == 3
 
-    def test_data_frame_has_a_column_per_component(self):
-        evaluation = evaluate(*turning_flight(noise_m=0.02))
-        frame = tables.to_frame(evaluation)
-        assert frame["offset_standard_error_z_m"][0] == evaluation.per_drone[0].offset_standard_error_m[2]
-        assert "offset_standard_error_m" not in frame
-
     def test_the_table_shows_the_largest_standard_error(self):
         def print_table(evaluation):
             console = Console(file=io.StringIO(), width=80)

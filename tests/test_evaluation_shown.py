@@ -153,15 +153,6 @@ class TestTable:
         assert "end with frame 7, the reference with frame 49" in line
         assert "missed in the last 84 % of the frames" in line
 
-    def test_data_frame_of_drones(self):
-        est, ref = flights()
-        est.status[:, 2] = Status.LOST
-        frame = tables.to_frame(evaluate(est, ref))
-        assert frame["drone"].tolist() == ["dron0", "dron1", "dron2"]
-        np.testing.assert_allclose(frame["offset_x_m"], [0.02, 0.02, np.nan], atol=1e-12)
-        assert frame["mean_error_m"].dtype == float
-        assert frame["missed_rate"].tolist() == [0, 0, 1]
-
 
 @pytest.fixture
 def drawn(monkeypatch):

@@ -1,4 +1,4 @@
-"""Tables of an evaluation: for the terminal, and as a data frame with one row per drone."""
+"""Tables of an evaluation, for terminals and notebooks."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from rich.text import Text
 from psotrack.support import html_block, html_lines, html_table
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
-
     from psotrack.evaluation.path_comparison import PathComparison
     from psotrack.evaluation.records import DroneEvaluation, Evaluation
 
@@ -96,23 +94,6 @@ def to_html(evaluation: Evaluation) -> str:
         html_table(["drone", *_COLUMNS], _rows(evaluation, unit)),
         html_lines(_scores(evaluation, unit)),
     )
-
-
-def to_frame(evaluation: Evaluation) -> DataFrame:
-    """One row per drone, with the keys of `per_drone` in `Evaluation.to_dict` as columns.
-
-    Vectors have one column per axis: `offset_x_m`, `offset_standard_error_x_m` and so on.
-    """
-    import pandas as pd
-
-    rows = []
-    for drone in evaluation.to_dict()["per_drone"]:
-        for name in ("offset", "offset_standard_error"):
-            parts_m = drone.pop(f"{name}_m") or (None, None, None)
-            drone |= {f"{name}_{axis}_m": part_m for axis, part_m in zip("xyz", parts_m, strict=True)}
-        rows.append(drone)
-    words = ("drone", "estimate", "offset_frame")
-    return pd.DataFrame(rows).astype({key: float for key in rows[0] if key not in (*words, "frames")})
 
 
 @dataclass(frozen=True)
