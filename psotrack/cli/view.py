@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import tempfile
 import webbrowser
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,32 +19,17 @@ from psotrack.errors import SettingsError
 from psotrack.support import ARCHIVE_SUFFIX
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """What is shown, and where.
-
-    Attributes:
-        save: write a file that `rerun FILE.rrd` shows, instead of opening a window.
-        web: show a page for a browser on this computer, instead of a window.
-        max_size_mb: largest size: images get smaller, then frames are left out; None: 5.8 per second, at most 1950.
-        silhouettes: compute the silhouettes that are not stored, not only show stored ones.
-        onboard: show the cameras on drones too, with the markers that they see.
-    """
-
-    save: Annotated[Path | None, says(metavar="FILE.rrd")] = None
-    web: bool = False
-    max_size_mb: Annotated[Annotated[float, Meta(ge=1)] | None, says(metavar="MB")] = None
-    silhouettes: bool = False
-    onboard: bool = False
-    dictionary: Dictionary = "4x4_1000"
-
-
 @command(without=["json_path"])
 def view(
     output: Output,
     tracks: Annotated[tuple[Path, ...], says(metavar="TRACKS... [SEQ]")],
     *,
-    shown: ViewOptions,
+    save: Annotated[Path | None, says(metavar="FILE.rrd")] = None,
+    web: bool = False,
+    max_size_mb: Annotated[Annotated[float, Meta(ge=1)] | None, says(metavar="MB")] = None,
+    silhouettes: bool = False,
+    onboard: bool = False,
+    dictionary: Dictionary = "4x4_1000",
     extent: Extent,
 ) -> None:
     """Show TRACKS and their recording in space and time, in the viewer Rerun.
@@ -60,35 +44,39 @@ def view(
       psotrack view tracks.csv my_lab --save flight.rrd
       psotrack view swarm.csv lines.csv my_lab --web
       psotrack view my_lab --frames 250
+
+    Options:
+        save: write a file that `rerun FILE.rrd` shows, instead of opening a window.
+        web: show a page for a browser on this computer, instead of a window.
+        max_size_mb: largest size: images get smaller, then frames are left out. None: 5.8 per second, at most 1950.
+        silhouettes: compute the silhouettes that are not stored, not only show stored ones.
+        onboard: show the cameras on drones too, with the markers that they see.
     """
     from psotrack.show import viewer
     from psotrack.show.flights import first_instants, read_flight, split_sequence
 
-    save = shown.save
-    if save is not None and shown.web:
+    if save is not None and web:
         raise SettingsError("--web", expected="either --save or --web", found="both")
     check_suffix("--save", save, ".rrd")
     viewer.check_installed()
     if save is not None:
         output.refuse(save)
-    elif not shown.web:
+    elif not web:
         viewer.check_display()
     archive = tracks[-1].suffix == ARCHIVE_SUFFIX
     files, sequence = split_sequence((*tracks[:-1], opened_sequence(tracks[-1])) if archive else tracks)
     flight = read_flight(files, sequence, cameras=extent.cameras)
     if extent.num_frames is not None:
         flight = first_instants(flight, extent.num_frames)
-    if shown.onboard and (flight.recording is None or not flight.recording.onboard):
+    if onboard and (flight.recording is None or not flight.recording.onboard):
         raise SettingsError("--onboard", expected="a recording with cameras on drones", found="none")
     report, jobs = output.report, extent.jobs
-    silhouettes = viewer.find_silhouettes(
-        flight, extent.silhouettes, make=shown.silhouettes, jobs=jobs, report=report
-    )
+    stored = extent.silhouettes
     content = viewer.ViewContent(
-        silhouettes=silhouettes,
-        onboard=shown.onboard,
-        dictionary=shown.dictionary,
-        max_bytes=None if shown.max_size_mb is None else 1e6 * shown.max_size_mb,
+        silhouettes=viewer.find_silhouettes(flight, stored, make=silhouettes, jobs=jobs, report=report),
+        onboard=onboard,
+        dictionary=dictionary,
+        max_bytes=None if max_size_mb is None else 1e6 * max_size_mb,
     )
 
     def write(path: Path) -> None:
@@ -100,7 +88,7 @@ def view(
     with tempfile.TemporaryDirectory(prefix="psotrack-") as folder:
         path = Path(folder) / "flight.rrd"
         write(path)
-        if shown.web:
+        if web:
             viewer.show_in_browser(path, _say_page)
         else:
             viewer.show_window(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,34 +16,18 @@ if TYPE_CHECKING:
     from psotrack.geometry import Rig
 
 
-@dataclass(frozen=True)
-class ConvertOptions:
-    """How a calibration is read and written.
-
-    Attributes:
-        size: size of the images in pixels, if the calibration file does not contain the size.
-        units: unit of the lengths in IN; needed if the format leaves the unit open.
-        format: format of IN; None: found by the content.
-        to: format of OUT; None: by the name of OUT.
-        lenses: convert only the lenses; IN need not have poses.
-        undistorted: set the distortion to zero: the videos are undistorted already.
-    """
-
-    size: tuple[int, int] | None = None
-    units: Annotated[str | None, says(metavar="m|cm|mm")] = None
-    format: Annotated[str | None, says(metavar="NAME")] = None
-    to: Annotated[str | None, says(metavar="NAME")] = None
-    lenses: bool = False
-    undistorted: bool = False
-
-
 @command(without=["progress"])
 def convert(
     output: Output,
     source: Annotated[Path, says(metavar="IN")],
     out: Annotated[Path, says(metavar="OUT")],
     *,
-    how: ConvertOptions,
+    size: tuple[int, int] | None = None,
+    units: Annotated[str | None, says(metavar="m|cm|mm")] = None,
+    format: Annotated[str | None, says(metavar="NAME")] = None,
+    to: Annotated[str | None, says(metavar="NAME")] = None,
+    lenses: bool = False,
+    undistorted: bool = False,
 ) -> None:
     """Convert the calibration IN, of any program in the list below, to OUT.
 
@@ -58,24 +42,32 @@ def convert(
     Examples:
       psotrack calibrate convert calibration.toml rig.toml --units mm
       psotrack calibrate convert cameras_calibration.csv rig.yml --size 1920,1080
+
+    Options:
+        size: size of the images in pixels, if the calibration file does not contain the size.
+        units: unit of the lengths in IN; needed if the format leaves the unit open.
+        format: format of IN. None: found by the content.
+        to: format of OUT. None: by the name of OUT.
+        lenses: convert only the lenses; IN need not have poses.
+        undistorted: set the distortion to zero: the videos are undistorted already.
     """
     from psotrack.geometry import Rig
     from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
 
-    if how.units is not None and how.units not in UNITS_M:
-        raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=how.units)
-    if how.lenses:
-        rig = read_lenses(source, how.size, file_format=how.format)
+    if units is not None and units not in UNITS_M:
+        raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=units)
+    if lenses:
+        rig = read_lenses(source, size, file_format=format)
     else:
-        metres = None if how.units is None else UNITS_M[how.units]
-        rig = read_rig(source, how.size, metres_per_unit=metres, file_format=how.format)
-    if how.undistorted:
+        metres = None if units is None else UNITS_M[units]
+        rig = read_rig(source, size, metres_per_unit=metres, file_format=format)
+    if undistorted:
         rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
-    if how.lenses:
+    if lenses:
         write_lenses(out, rig, force=output.force)
     else:
-        write_rig(out, rig, force=output.force, file_format=how.to)
-    _show(output, rig, out, placed=not how.lenses)
+        write_rig(out, rig, force=output.force, file_format=to)
+    _show(output, rig, out, placed=not lenses)
 
 
 def _show(output: Output, rig: Rig, out: Path, *, placed: bool) -> None:

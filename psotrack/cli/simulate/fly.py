@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -15,29 +14,17 @@ from psotrack.errors import errors_name
 from psotrack.support.interrupts import unhurried_end
 
 
-@dataclass(frozen=True)
-class PilotingOptions:
-    """How a drone is flown.
-
-    Attributes:
-        device: controller; a file has the columns time_s,forward,left,up,turn, the last four from -1 to 1.
-        out: CSV file of the recorded flight.
-        rate_hz: samples per second.
-        hall: hall in which the drone flies; halls are named as in scenarios.
-        start_m: position in which the drone hovers at first, in metres.
-        max_seconds: longest duration of the flight, in seconds.
-    """
-
-    device: Annotated[str, says(metavar="gamepad|keyboard|FILE.csv")]
-    out: Annotated[Path, says(metavar="FILE.csv")] = Path("flight.csv")
-    rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 25.0
-    hall: str = "laboratory"
-    start_m: Annotated[tuple[float, float, float], says(metavar="X,Y,Z")] = (0.0, 0.0, 1.0)
-    max_seconds: Annotated[float, Meta(ge=1)] = 300.0
-
-
 @command(without=["progress", "json_path"])
-def fly(output: Output, *, flight: PilotingOptions) -> None:
+def fly(
+    output: Output,
+    *,
+    device: Annotated[str, says(metavar="gamepad|keyboard|FILE.csv")],
+    out: Annotated[Path, says(metavar="FILE.csv")] = Path("flight.csv"),
+    rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 25.0,
+    hall: str = "laboratory",
+    start_m: Annotated[tuple[float, float, float], says(metavar="X,Y,Z")] = (0.0, 0.0, 1.0),
+    max_seconds: Annotated[float, Meta(ge=1)] = 300.0,
+) -> None:
     """Fly a simulated drone by hand and record the flight for a scenario.
 
     Writes position and orientation over time to OUT, and the movements of the sticks to a file beside OUT that ends in
@@ -50,26 +37,33 @@ def fly(output: Output, *, flight: PilotingOptions) -> None:
       psotrack simulate fly --out loop.csv --device gamepad
       psotrack simulate fly --out loop.csv --device keyboard --start -2,0,1.5
       psotrack simulate fly --out again.csv --device loop.sticks.csv --start -2,0,1.5 --rate 100
+
+    Options:
+        device: controller; a file has the columns time_s,forward,left,up,turn, the last four from -1 to 1.
+        out: CSV file of the recorded flight.
+        rate_hz: samples per second.
+        hall: hall in which the drone flies; halls are named as in scenarios.
+        start_m: position in which the drone hovers at first, in metres.
+        max_seconds: longest duration of the flight, in seconds.
     """
     import numpy as np
 
     from psotrack.simulation import flight_space, write_recorded_flight
     from psotrack.simulation.flights import devices, piloting
 
-    out = flight.out
     sticks_path = out.with_suffix(".sticks.csv")
     check_suffix("--out", out, ".csv")
     output.refuse(out, sticks_path)
-    space = flight_space(flight.hall)
+    space = flight_space(hall)
     # Ctrl-C ends the flight, which is then written.
-    with unhurried_end(), errors_name(flight.device):
-        with devices.open_device(flight.device, space) as (samples, watch):
-            start_m, rate_hz, max_s = np.array(flight.start_m), flight.rate_hz, flight.max_seconds
-            recorded, used = piloting.fly(samples, start_m, space, rate_hz=rate_hz, max_s=max_s, watch=watch)
+    with unhurried_end(), errors_name(device):
+        with devices.open_device(device, space) as (samples, watch):
+            known: dict[str, Any] = {"rate_hz": rate_hz, "max_s": max_seconds, "watch": watch}
+            recorded, used = piloting.fly(samples, np.array(start_m), space, **known)
         write_recorded_flight(out, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
         piloting.write_sticks(sticks_path, used)
     output.say(
-        f"{out}: {len(recorded.time_s)} samples at {flight.rate_hz:g} Hz, {recorded.duration_s:.1f} s",
+        f"{out}: {len(recorded.time_s)} samples at {rate_hz:g} Hz, {recorded.duration_s:.1f} s",
         f'in a scenario: flight = {{ kind = "recording", file = "{out}" }}',
         f"the same again: --device {sticks_path}, with the same --start and --hall",
     )
