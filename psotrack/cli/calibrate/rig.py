@@ -59,8 +59,8 @@ def rig(
       psotrack calibrate rig SEQ --markers SEQ/aruco_corners.csv --lenses lenses.toml --out rig.toml
 
     Options:
-        plot: save a picture of where each camera saw the board. None: beside OUT, as .png.
-        out: calibration to write: a file that ends in .toml, .yml or .csv.
+        plot: save a picture of where cameras saw the board. None: beside OUT, as .png.
+        out: file to write, which ends in .toml, .yml or .csv.
     """
     from psotrack import api
 
