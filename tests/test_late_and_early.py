@@ -45,7 +45,7 @@ def test_one_late_video_is_late_to_the_offsets_of_cameras():
         ],
         axis=2,
     )
-    late = camera_offsets(RIG, points_px, FPS).late_frames
+    late = -camera_offsets(RIG, points_px, FPS).offset_frames
     assert late[3] - np.median(late) == pytest.approx(LATE, abs=0.05)
 
 

@@ -69,11 +69,6 @@ class CameraOffsets:
     rms_before_px: float
     rms_after_px: float
 
-    @property
-    def late_frames(self) -> Float[np.ndarray, "cameras"]:
-        """(cameras,), by how many frames each video shows the scene late; negative for a video that is early."""
-        return -self.offset_frames
-
 
 def camera_offsets(
     rig: Rig,

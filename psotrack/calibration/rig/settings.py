@@ -47,21 +47,12 @@ class LensSettings:
         lens: number of distortion coefficients of OpenCV's lens model, or its fisheye model; auto chooses by views that
             are left out.
         lenses: calibration whose lenses are kept; a camera that is not in the file gets a lens from the board.
-    """
-
-    lens: Annotated[str, Meta(extra={"metavar": "auto|0|4|5|8|12|14|fisheye"})] = "auto"
-    lenses: Path | None = None
-
-
-@dataclass(frozen=True)
-class SheetSettings:
-    """The lens of all cameras by their data sheet.
-
-    Attributes:
         fov_deg: horizontal and vertical field of view in degrees, with `size`, instead of `lenses`.
         size: size of the images in pixels, if no file states it.
     """
 
+    lens: Annotated[str, Meta(extra={"metavar": "auto|0|4|5|8|12|14|fisheye"})] = "auto"
+    lenses: Path | None = None
     fov_deg: Annotated[tuple[float, float], Meta(extra={"metavar": "H,V"})] | None = None
     size: tuple[int, int] | None = None
 
@@ -109,10 +100,10 @@ class WorldSettings:
 
 
 @dataclass(frozen=True)
-class RigSettings(WorldSettings, PointSettings, SheetSettings, LensSettings, BoardSettings):
+class RigSettings(WorldSettings, PointSettings, LensSettings, BoardSettings):
     """What is known before a rig is calibrated; of a board, the side of a square is enough.
 
-    Its fields are those of `BoardSettings`, `LensSettings`, `SheetSettings`, `PointSettings` and `WorldSettings`.
+    Its fields are those of `BoardSettings`, `LensSettings`, `PointSettings` and `WorldSettings`.
     """
 
     def __post_init__(self) -> None:

@@ -9,7 +9,6 @@ from psotrack.calibration.rig.settings import (
     BoardSettings,
     LensSettings,
     PointSettings,
-    SheetSettings,
     WorldSettings,
 )
 from psotrack.cli.commands import OptionGroup, command
@@ -26,8 +25,7 @@ def rig(
     board: Annotated[
         BoardSettings, OptionGroup("Board", {"kind": "board"}, rare=("kind", "separation_m", "first_marker"))
     ],
-    lens: Annotated[LensSettings, OptionGroup("Lenses")],
-    sheet: Annotated[SheetSettings, OptionGroup("Lenses", rare=("fov_deg", "size"))],
+    lens: Annotated[LensSettings, OptionGroup("Lenses", rare=("fov_deg", "size"))],
     world: WorldSettings,
     points: Annotated[PointSettings, OptionGroup("Instead of a board", rare=("stick_m", "noise_px"))],
     plot: Plot = None,
@@ -66,7 +64,7 @@ def rig(
 
     output.refuse(out)
     settings = {
-        name: value for record in (board, lens, sheet, world, points) for name, value in vars(record).items()
+        name: value for record in (board, lens, world, points) for name, value in vars(record).items()
     }
     if plot is not None:
         plot = plot if plot.name else out.with_suffix(".png")
