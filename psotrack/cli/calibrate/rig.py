@@ -47,7 +47,6 @@ def rig(
     Examples:
       psotrack calibrate rig my_lab/board --square 0.04 --out my_lab/rig.toml
       psotrack calibrate rig cam_0.mp4 cam_1.mp4 --squares 4x5 --square 0.054 --marker 0.0405 --out rig.toml
-      psotrack calibrate rig left right --squares 10x7 --square 0.025 --floor 0 --out rig.toml
       psotrack calibrate rig a b --squares 6x6 --marker 0.09 --separation 0.03 --dictionary apriltag_36h11 --out r.toml
       psotrack calibrate rig a b --squares 1x1 --marker 0.2 --first-marker 7 --lenses lenses.toml --out rig.toml
       psotrack calibrate rig board.avi --square 0.04 --lens fisheye --out lens.toml
