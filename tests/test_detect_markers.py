@@ -130,8 +130,8 @@ def test_photographs_of_24_and_50_megapixels(size_wh, side_px):
     assert set(found.ids.tolist()) == {7, *(sheet.marker for sheet in others)}
     large = found.corners_px[found.ids.tolist().index(7)]
     true = (coarse.corners_px + 0.5) * np.array(size_wh) / small.shape[::-1] - 0.5
-    # Measured 0.50 and 1.04 pixels of the picture that was enlarged; its own edges are steps of a pixel.
-    assert np.linalg.norm(large - true, axis=-1).max() < 1.2 * scale
+    # Found: a blurred edge between two samples counted as sharp, and the corner was off by 12 pixels.
+    assert np.linalg.norm(large - true, axis=-1).max() < 0.3 * scale
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,8 @@ _ACROSS = np.linspace(-1.0, 1.0, 17)
 _MIDDLES = (_ACROSS[1:] + _ACROSS[:-1]) / 2
 #: Weights whose sums over the middles give the height of a transition, and its first and second moment.
 _MOMENTS = np.stack([_MIDDLES**0, _MIDDLES, _MIDDLES**2], axis=-1).astype(np.float32)
+#: Variance of a rise about the middle of the two samples between which it is.
+_WITHIN = (_ACROSS[1] - _ACROSS[0]) ** 2 / 12
 #: Fraction of the steepest rise across an edge below which a rise counts as noise. Noise grows with light, so that the
 #: noise of the white side would draw the transition to that side.
 _NOISE = 0.1
@@ -76,7 +78,7 @@ def find_transitions(
     height, first, second = np.moveaxis((rise @ _MOMENTS).astype(np.float64), -1, 0)
     total = np.maximum(height, 1e-9)
     offset = first / total
-    return EdgeTransitions(offset, np.sqrt(np.maximum(second / total - offset**2, 0.0)), height)
+    return EdgeTransitions(offset, np.sqrt(np.maximum(second / total - offset**2, 0.0) + _WITHIN), height)
 
 
 @dataclass(frozen=True)
