@@ -157,13 +157,8 @@ def row(name: str, method: str, flight: Flight, data: Path) -> dict[str, Any]:
     where = ("--out", str(tracks), "--cache", str(_runs.cache_folder(data)), "--seed", str(flight.seed))
     refused = psotrack("track", str(flight.sequence), *METHODS[method], *where, "--force")
     if refused:
-        return {
-            "flight": name,
-            "method": method,
-            "tracks": 0,
-            "missed": 1.0,
-            "note": refused.replace(str(flight.sequence), name),
-        }
+        note = refused.replace(str(flight.sequence), name)
+        return {"flight": name, "method": method, "tracks": 0, "missed": 1.0, "note": note}
     record = json.loads(tracks.with_suffix(".json").read_text())
     found = read_trajectories(tracks)
     truth = open_recording(flight.sequence).truth if flight.truth is None else flight.truth
@@ -194,15 +189,7 @@ def _figures(found: Trajectories, truth: Trajectories, gate_m: float) -> dict[st
 def compared(table: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
     """The rows beside those of another table, with the reasons why a row is worse."""
     keys = ["flight", "method"]
-    columns = [
-        "mean_mm",
-        "centred_mm",
-        "missed",
-        "switches",
-        "false_tracks",
-        "inside_90",
-        "centred_inside_90",
-    ]
+    columns = ["mean_mm", "centred_mm", *FIGURES, "false_tracks"]
     both = table.merge(before, on=keys, suffixes=("", "_before"))
     worse = {
         "mean error": both.mean_mm > WORST_RATIO * both.mean_mm_before,
