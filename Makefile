@@ -20,7 +20,7 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow fuzz kills lint format size bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
+.PHONY: help demo test test-slow fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -70,59 +70,7 @@ format: $(VENV)/.installed  ## let ruff mend and format
 size:  ## lines of code per room, and their budgets
 	@$(PYTHON) experiments/size.py
 
-bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
-
-help:  ## list the targets
-	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
-
-$(VENV)/.package: pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
-	  || { echo "psotrack: set-up failed: '$(PYTHON)' is not Python 3.11 or newer; name one, e.g. make PYTHON=python3.12" >&2; exit 1; }
-	@echo "psotrack: making a Python environment in $(VENV)"
-	@{ if command -v uv >/dev/null 2>&1; then \
-	    test -d $(VENV) || uv venv --quiet --python $(PYTHON) $(VENV); \
-	  else \
-	    test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV); \
-	  fi \
-	  && echo "psotrack: installing psotrack, its libraries (JAX, OpenCV, SciPy, pandas and more) and its viewer: 1.7 GB on the disk, some minutes" \
-	  && $(call install,view); } || { $(failed); exit 1; }
-	@touch $@
-
-$(VENV)/.installed: $(VENV)/.package
-	@echo "psotrack: installing what tests and lint need (Hypothesis, Jupyter, Playwright, ruff, mypy and more): 0.6 GB more, a minute or two"
-	@{ $(call install,test$(comma)lint) && $(oracle); } || { $(failed); exit 1; }
-	@touch $@
-
-demo: $(VENV)/.package  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
-	@$(BIN)/psotrack demo --out demo --force
-
-test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/test_video.py ..." for some files
-	@$(pytest) -m 'not slow' $(NAMES)
-
-test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and experiments at small sizes
-	@PSOTRACK_TYPE_CHECKS=off $(pytest) -m slow $(NAMES)
-
-fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINUTES=60 for more, SEED=7 for others
-	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))
-
-kills: $(VENV)/.installed  ## kill commands at random moments and run them again; COUNT=1000 for more, SEED=7 for others
-	@$(BIN)/python experiments/kills.py --count $(or $(COUNT),300) --seed $(or $(SEED),0) --out build/kills-$(or $(SEED),0)
-
-lint: $(VENV)/.installed  ## ruff, its format check, mypy
-	@$(BIN)/ruff check .
-	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy
-
-format: $(VENV)/.installed  ## let ruff mend and format
-	@$(BIN)/ruff check --fix .
-	@$(BIN)/ruff format .
-
-size:  ## lines of code per room, and their budgets
-	@$(PYTHON) experiments/size.py
-
-bench: $(VENV)/.installed  ## the swarm against pyswarms and evosax
-	@$(call install,bench)
-	@$(BIN)/python experiments/benchmarks/track_stage.py
+bench: bench-videos  ## from videos to tracks, stage by stage: as fast as the cameras?
 
 bench-videos bench-live bench-batch: $(VENV)/.installed  ## from videos to tracks; live; many runs at once: some minutes each
 	@$(BIN)/python experiments/benchmarks/benchmark.py $(@:bench-%=%) $(if $(DATA),--data $(DATA))
