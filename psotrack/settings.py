@@ -81,7 +81,8 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """The search for the best positions in one frame: a particle swarm, or another search.
 
     Attributes:
-        search: name of the search: "pso", or the name of a plugin.
+        search: name of the search: "pso"; "pso-kernel", the same as one kernel per frame, which no GPU has run yet; or
+            the name of a plugin.
         kind: "joint", one swarm over the positions of all drones as in the paper, or "per-drone", one for each drone.
         particles: number of particles of every swarm.
         iterations: number of iterations per frame.
@@ -93,7 +94,7 @@ class SwarmSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     prefix: ClassVar[str] = "swarm."
-    search: Annotated[str, _metavar("pso|NAME")] = "pso"
+    search: Annotated[str, _metavar("pso|pso-kernel|NAME")] = "pso"
     kind: SwarmKind = "per-drone"
     particles: Particles = 30
     iterations: Iterations = 30

@@ -361,7 +361,7 @@ def test_a_registered_plugin_is_found_by_name(tmp_path):
     """The plugin is made from its part of the settings, and a second call replaces the plugin."""
     write_own_parts(tmp_path)
     assert run_python(REGISTERED_PARTS, tmp_path).stdout.splitlines() == [
-        "swarm.search: expected one of pso, found own; no installed package adds more "
+        "swarm.search: expected one of pso, pso-kernel, found own; no installed package adds more "
         "(entry points psotrack.searches)",
         "score.kind: expected one of soft, hard, found own; no installed package adds more "
         "(entry points psotrack.scores)",
@@ -555,7 +555,7 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
     [
         (
             lambda: find_search(pt.SwarmSettings(search="predict")),
-            "swarm.search: expected one of pso, prediction, found predict; did you mean prediction?",
+            "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
         ),
         (
             lambda: find_score(pt.ScoreSettings(kind="iou")),

@@ -1,4 +1,4 @@
-from .boxes import Boxes, Extents, make_extents, moved_extents, project_boxes
+from .boxes import Boxes, Extents, boxes_at, make_extents, moved_extents, project_boxes
 from .camera_names import camera_key, cameras_of, chosen_camera, chosen_cameras, files_by_camera
 from .cameras import (
     NEAR_M,
@@ -38,6 +38,7 @@ __all__ = [
     "Extents",
     "LensNumbers",
     "Rig",
+    "boxes_at",
     "camera_key",
     "cameras_of",
     "chosen_camera",

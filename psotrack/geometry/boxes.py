@@ -164,7 +164,17 @@ def project_boxes(seen: Extents, position_m: Float[Array, "*#drones 3"]) -> Boxe
     Returns:
         Boxes with axes (..., cameras).
     """
-    x_m, y_m, z_m = (position_m[..., i : i + 1] for i in range(3))
+    x, y, z = (position_m[..., i : i + 1] for i in range(3))
+    return boxes_at(seen, x, y, z)
+
+
+def boxes_at(
+    seen: Extents,
+    x_m: Float[Array, "*#drones 1"],
+    y_m: Float[Array, "*#drones 1"],
+    z_m: Float[Array, "*#drones 1"],
+) -> Boxes:
+    """`project_boxes` for the coordinates of the positions one by one: a kernel cannot take columns of an array."""
     x, y, z = (
         seen.rotation[3 * i] * x_m
         + seen.rotation[3 * i + 1] * y_m

@@ -1,6 +1,7 @@
 from .block import on_device
 from .fitness import (
     PAPER_SCORE,
+    DroneFitness,
     Score,
     ScoreInputs,
     SoftIoU,
@@ -18,6 +19,7 @@ from .tracker import DISPERSION_FRAMES
 __all__ = [
     "DISPERSION_FRAMES",
     "PAPER_SCORE",
+    "DroneFitness",
     "ParticleSwarm",
     "Places",
     "RunInputs",

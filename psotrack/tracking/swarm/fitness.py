@@ -123,7 +123,13 @@ class SoftIoU:
         self, inputs: ScoreInputs, position_m: Float[Array, "*batch drones 3"]
     ) -> tuple[Float[Array, "*batch drones cameras"], Float[Array, "*batch drones cameras"]]:
         """See `Score`."""
-        boxes, patches, rounded = project_boxes(inputs.extents, position_m), inputs.patches, self.whole_pixels
+        return self.box_scores(inputs, project_boxes(inputs.extents, position_m))
+
+    def box_scores(
+        self, inputs: ScoreInputs, boxes: Boxes
+    ) -> tuple[Float[Array, "*batch cameras"], Float[Array, "*batch cameras"]]:
+        """The scores and weights of positions, from the drones' boxes there."""
+        patches, rounded = inputs.patches, self.whole_pixels
         in_ring, _ = _foreground_and_area(patches, boxes, self.ring, rounded)
 
         def iou(scale: float) -> Array:
@@ -210,8 +216,14 @@ def drone_fitness(
     the share that is clear of other drones. A camera of less weight than `MIN_WEIGHT` does not see the drone. Neither
     do several cameras of small weight, if the sum of their weights is less than half of the least number of cameras.
     """
-    score, weight = camera_scores(inputs, position_m)
-    total, least = weight.sum(axis=-1), inputs.score.min_cameras
+    return weighted_fitness(*camera_scores(inputs, position_m), inputs.score.min_cameras)
+
+
+def weighted_fitness(
+    score: Float[Array, "*batch cameras"], weight: Float[Array, "*batch cameras"], least: int
+) -> Float[Array, "*batch"]:
+    """`drone_fitness` from the scores and weights of the cameras, of which at least `least` must see the drone."""
+    total = weight.sum(axis=-1)
     # XLA on a CPU gives a sum of 4,096 numbers or more to a library (YNNPACK), together with the multiplications and
     # additions that come before the sum. The rest of the score is then computed again for each read of a table, which
     # takes up to ten times as long. The library computes no choices: this one keeps the score in one piece.
@@ -219,6 +231,18 @@ def drone_fitness(
     mean = weighted.sum(axis=-1) / jnp.maximum(total, 1e-6)
     enough = ((weight > MIN_WEIGHT).sum(axis=-1) >= least) & (total > least / 2)
     return jnp.where(enough, mean, jnp.nan)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DroneFitness:
+    """The objective of one search per drone: `drone_fitness` of the inputs."""
+
+    inputs: ScoreInputs
+
+    def __call__(self, position_m: Float[Array, "*batch drones 3"]) -> Float[Array, "*batch drones"]:
+        """Fitness of each drone."""
+        return drone_fitness(self.inputs, position_m)
 
 
 def joint_fitness(

@@ -19,6 +19,8 @@ from psotrack.support.array_types import Array, Key
 
 #: Maps positions (particles, groups, dims) to fitness (particles, groups).
 Objective = Callable[[Float[Array, "particles groups dims"]], Float[Array, "particles groups"]]
+#: The random factors r1 and r2 of one iteration.
+Factors = tuple[Float[Array, "particles groups dims"], Float[Array, "particles groups dims"]]
 
 
 @jax.tree_util.register_dataclass
@@ -100,7 +102,11 @@ def move(key: Key, state: SwarmState, params: SwarmParams) -> SwarmState:
     v <- w v + c1 r1 (pbest - x) + c2 r2 (gbest - x), r1 and r2 uniform in [0, 1) for every dimension, then clamped to
     `max_step`; x <- x + v. A particle that would leave the bounds stops at them, so that it can turn round at once.
     """
-    r1, r2 = random_factors(key, state.position.shape)
+    return _moved(random_factors(key, state.position.shape), state, params)
+
+
+def _moved(factors: Factors, state: SwarmState, params: SwarmParams) -> SwarmState:
+    r1, r2 = factors
     velocity = (
         params.inertia * state.velocity
         + params.cognitive * r1 * (state.pbest_position - state.position)
@@ -118,7 +124,11 @@ def step(key: Key, objective: Objective, state: SwarmState, params: SwarmParams)
     In this order the loop hands finished positions from one iteration to the next. If the move came first, XLA on a CPU
     would compute the move, random numbers included, again in each of the loops into which it splits the objective.
     """
-    return move(key, evaluate(objective, state), params)
+    return _step(random_factors(key, state.position.shape), objective, state, params)
+
+
+def _step(factors: Factors, objective: Objective, state: SwarmState, params: SwarmParams) -> SwarmState:
+    return _moved(factors, evaluate(objective, state), params)
 
 
 def run(
@@ -133,13 +143,28 @@ def run(
     The key is consumed; the number of iterations may be traced.
     """
 
+    def factors(iteration: Array) -> Factors:
+        return random_factors(jax.random.fold_in(key, iteration), position.shape)
+
+    return repeat(factors, objective, position, params, num_iterations)
+
+
+def repeat(
+    factors: Callable[[Array], Factors],
+    objective: Objective,
+    position: Float[Array, "particles groups dims"],
+    params: SwarmParams,
+    num_iterations: Int[Array, ""] | int,
+) -> SwarmState:
+    """`run` with the random factors of each iteration, from 0; a kernel, too, can compute it."""
+
     def body(iteration: Array, state: SwarmState) -> SwarmState:
-        return step(jax.random.fold_in(key, iteration), objective, state, params)
+        return _step(factors(iteration), objective, state, params)
 
     return evaluate(objective, jax.lax.fori_loop(0, num_iterations, body, init(position, params)))
 
 
-def random_factors(key: Key, shape: tuple[int, ...]) -> tuple[Array, Array]:
+def random_factors(key: Key, shape: tuple[int, ...]) -> Factors:
     """Two independent uniform numbers in [0, 1) for every element: the halves of one word, in steps of 2^-16.
 
     JAX's own generator would take a tenth of the swarm's time, so it only makes the key. The words are a hash of the

@@ -14,6 +14,9 @@ from psotrack.tracking.swarm import tracker
 from psotrack.tracking.swarm.fitness import PAPER_SCORE, Score, SoftIoU
 from psotrack.tracking.swarm.search import Search, particle_swarm
 
+#: Name of the swarm as one kernel. Its module is imported when it is chosen: Pallas takes long to import.
+KERNEL = "pso-kernel"
+
 
 @dataclass(frozen=True)
 class TrackerSettings:
@@ -41,12 +44,17 @@ def tracker_settings(
         score: replaces the score that the settings name.
 
     Raises:
-        SettingsError: the settings name a search or a score that does not exist.
+        SettingsError: the settings name a search or a score that does not exist, or that do not fit each other.
     """
+    camera_score = find_score(settings.score) if score is None else score
+    if search is None and settings.swarm.search == KERNEL:
+        from psotrack.tracking.swarm.kernel import check_kernel
+
+        check_kernel(settings.swarm.kind, camera_score)
     return TrackerSettings(
         settings,
         search=find_search(settings.swarm) if search is None else search,
-        camera_score=find_score(settings.score) if score is None else score,
+        camera_score=camera_score,
     )
 
 
@@ -58,8 +66,17 @@ def find_search(settings: SwarmSettings) -> Search:
     """
     if settings.search == "pso":
         return particle_swarm(settings)
+    if settings.search == KERNEL:
+        from psotrack.tracking.swarm.kernel import kernel_swarm
+
+        return kernel_swarm(settings)
     return make_plugin(
-        "search", settings.search, settings, interface=Search, setting="swarm.search", built_in=["pso"]
+        "search",
+        settings.search,
+        settings,
+        interface=Search,
+        setting="swarm.search",
+        built_in=["pso", KERNEL],
     )
 
 

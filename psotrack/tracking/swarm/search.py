@@ -1,6 +1,6 @@
 """The search in one frame: from first positions to the position of largest objective.
 
-`Search` is the interface; `particle_swarm` makes the search of this package.
+`Search` is the interface; `particle_swarm` makes the search of this package, `kernel.kernel_swarm` the same for a GPU.
 Another search is any object with the same `__call__`: given to `psotrack.track(..., search=...)`, or by name as a
 plugin (see `psotrack.support.plugins`).
 """

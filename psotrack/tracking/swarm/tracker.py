@@ -24,6 +24,7 @@ from psotrack.geometry import Camera, make_extents, project_boxes
 from psotrack.support.array_types import Array, Key, Positions
 from psotrack.tracking.motion import MotionParams, MotionState, kalman
 from psotrack.tracking.swarm.fitness import (
+    DroneFitness,
     Score,
     ScoreInputs,
     SoftIoU,
@@ -458,11 +459,10 @@ def _search(
     particles, drones, _ = first.shape
     groups = (1, 3 * drones) if program.joint else (drones, 3)
 
-    def objective(position: Array) -> Array:
-        if program.joint:
-            return joint_fitness(inputs, position.reshape(first.shape), slots.present)[:, None]
-        return drone_fitness(inputs, position)
+    def together(position: Array) -> Array:
+        return joint_fitness(inputs, position.reshape(first.shape), slots.present)[:, None]
 
+    objective = together if program.joint else DroneFitness(inputs)
     of_groups = SearchRegion(
         low=region.low.reshape(groups),
         high=region.high.reshape(groups),
