@@ -62,7 +62,7 @@ ORDER = [
     "inside_out.frames",
     "inside_out.pose",
     "inside_out.filtering",
-    "inside_out.line_time",
+    "inside_out.rolling_shutter",
     "inside_out.mapping",
     "inside_out.localising",
     "inside_out.fusing",

@@ -15,7 +15,7 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.inside_out import PoseSettings
 from psotrack.inside_out.pose import CameraPose, CornerNoise, estimate_pose
-from psotrack.inside_out.pose.fit import FALSE_ALARM
+from psotrack.inside_out.pose.estimating import FALSE_ALARM
 
 K = np.array([[920.0, 0, 959.5], [0, 921.0, 539.5], [0, 0, 1]])
 SETTINGS = PoseSettings()

@@ -186,7 +186,8 @@ def test_exchanged_markers_are_reported(walk, tmp_path):
     result = CliRunner().invoke(map_markers, [str(word) for word in (walk / "walk.avi", *words)])
     assert result.exit_code == FOUND
     findings = json.loads(result.stdout)["findings"]
-    assert [(one["kind"], one["markers"]) for one in findings] == [("exchanged", [7, 22])]
+    assert [(one["kind"], one["markers"]) for one in findings] == [("moved", [7]), ("moved", [22])]
+    assert "where the map has marker 22" in findings[0]["message"]
 
 
 def test_a_map_from_motion_capture(tmp_path):

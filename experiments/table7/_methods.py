@@ -69,6 +69,7 @@ def _paper_pose(markers: DetectedMarkers, recording: Recording) -> MarkerPose | 
         position_m=(-R.T @ t)[:, 0],
         R_world_cam=R.T,
         covariance=np.full((6, 6), np.nan),
+        num_markers=len(markers),
         used=np.ones(len(markers), bool),
         reprojection_px=float(np.sqrt(squared_px.mean())),
         ambiguity=0.0,

@@ -7,7 +7,7 @@ tracks of static cameras. Other rooms use the names that this room exports, and 
 From a frame to a path: `frames` (reading), `pose` (of one frame), `filtering` (over time), `localising` (the complete
 localisation). `mapping` builds and checks maps, `fusing` joins paths and tracks; `psotrack.evaluation` compares paths
 with references. Imports go in this order: camera_path, lens_files, marker_map, frames, pose, filtering,
-line_time (of a rolling shutter), mapping, localising, fusing.
+rolling_shutter, mapping, localising, fusing.
 """
 
 import lazy_loader

@@ -1,18 +1,29 @@
 from .camera_path import CameraPath, Flag, read_camera_path, write_camera_path
 from .filtering import PoseFilterParams, smooth
 from .frames import FrameSource, open_source
-from .fusing import FusedTracks, fuse
-from .fusing.fused_table import write_fused
+from .fusing import FusedTracks, fuse, write_fused
 from .lens_files import choose_lens, lens_from_matrix
-from .line_time import LineTime
 from .localising import LocalisedVideo, LocaliseSettings, localise_video
-from .mapping import BuiltMap, build_map, corners_in_own_frame
-from .mapping.checking import MapCheck, check_map
-from .mapping.sightings import find_sightings
-from .mapping.square_fitting import FittedSquares, fit_squares, read_measured_corners
-from .marker_map import MarkerCentres, MarkerMap, read_marker_map, read_marker_table
+from .mapping import (
+    BuiltMap,
+    MapCheck,
+    build_map,
+    check_map,
+    corners_in_own_frame,
+    find_sightings,
+)
+from .marker_map import (
+    FittedSquares,
+    MarkerCentres,
+    MarkerMap,
+    fit_squares,
+    read_marker_map,
+    read_marker_table,
+    read_measured_corners,
+)
 from .marker_table import markers_of_images, markers_of_video, write_marker_table
-from .pose import PoseSettings, RollingShutter
+from .pose import PoseSettings
+from .rolling_shutter import LineTime, RollingShutter
 
 __all__ = [
     "BuiltMap",

@@ -7,7 +7,7 @@ command that reads tracks reads the table too.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 from pathlib import Path
@@ -16,17 +16,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from psotrack.errors import InputError, errors_name
-from psotrack.geometry import LENGTH_TOLERANCE, rotation_matrices
+from psotrack.geometry import rotation_matrices
 from psotrack.support import (
     Table,
     TextRow,
+    atomic_write,
     has_negative_eigenvalue,
     read_table,
     refuse_to_overwrite,
     short_repr,
-    write_rows,
 )
-from psotrack.trajectories import Status, Trajectories, roll_pitch_yaw_deg
+from psotrack.trajectories import Status, Trajectories, read_trajectories, roll_pitch_yaw_deg
 
 #: Axes of the covariance: the world's axes, in metres, then small turns about the camera's axes, in radians.
 _AXES = "xyzabc"
@@ -37,8 +37,6 @@ _QUATERNION = ("qw", "qx", "qy", "qz")
 _ROTATION = tuple(f"r{row}{column}" for row, column in itertools.product("123", repeat=2))
 _ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 _COVARIANCE = tuple(_AXES[row] + _AXES[column] for row, column in zip(*_UPPER, strict=True))
-_STATUS = {status.label: status for status in Status}
-_SEPARATOR = ","
 
 
 class Flag(IntFlag):
@@ -143,6 +141,8 @@ def write_camera_path(path: Path | str, camera_path: CameraPath, name: str, *, f
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
+    import pandas as pd
+
     path = Path(path)
     refuse_to_overwrite(path, force)
     count = camera_path.num_frames
@@ -163,10 +163,8 @@ def write_camera_path(path: Path | str, camera_path: CameraPath, name: str, *, f
         "flags": np.array([Flag(int(flags)).label for flags in camera_path.flags], str),
         "status": np.array([Status(int(status)).label for status in camera_path.status], str),
     }
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    write_rows(
-        path, [list(columns), *([_cell(value) for value in row] for row in rows)], separator=_SEPARATOR
-    )
+    with atomic_write(path) as temporary:
+        pd.DataFrame(columns).to_csv(temporary, index=False)
 
 
 def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
@@ -179,7 +177,7 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
         InputError: the file cannot be read, a column is missing, or a value is invalid; the message names the line.
     """
     path = Path(path)
-    table = read_table(path, _SEPARATOR)
+    table = read_table(path, ",")
     if table.find("qw") is None:
         raise InputError(
             path,
@@ -187,74 +185,46 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
             found="none",
             remedy="localise writes one",
         )
-    names = {row.text(table.column("drone")) for row in table.rows}
-    if len(names) > 1:
-        raise InputError(path, expected="the path of one drone", found=f"{', '.join(sorted(names))}")
-    covariance = np.zeros((len(table.rows), 6, 6))
-    covariance[:, *_UPPER] = _numbers(table, *(f"cov_{axes}" for axes in _COVARIANCE))
+    tracks = read_trajectories(path)
+    if tracks.num_drones > 1:
+        expected, found = "the path of one drone", ", ".join(sorted(tracks.drones))
+        raise InputError(path, expected=expected, found=found)
+    # Tracks have the order of frames.
+    rows = sorted(table.rows, key=lambda row: row.count(table.column("frame")))
+    covariance = np.zeros((len(rows), 6, 6))
+    covariance[:, *_UPPER] = _numbers(table, rows, *(f"cov_{axes}" for axes in _COVARIANCE))
     covariance += np.triu(covariance, 1).swapaxes(-1, -2)
-    orientation_wxyz = _numbers(table, *_QUATERNION)
-    _check_poses(table, orientation_wxyz, covariance)
-    velocity_m_s = _numbers(table, *_VELOCITY)
-    with errors_name(path):
-        camera_path = CameraPath(
-            frame=_counts(table, "frame"),
-            time_s=np.array([row.number(table.column("time_s")) for row in table.rows]),
-            position_m=_numbers(table, *_POSITION),
-            orientation_wxyz=orientation_wxyz,
-            covariance=covariance,
-            num_markers=_counts(table, "num_markers"),
-            reprojection_px=_numbers(table, "reprojection_px")[:, 0],
-            ambiguity=_numbers(table, "ambiguity")[:, 0],
-            status=np.array([_status(row, table) for row in table.rows]),
-            flags=np.array([_flags(row, table) for row in table.rows]),
-            velocity_m_s=velocity_m_s if np.isfinite(velocity_m_s).any() else None,
-        )
-    return camera_path, names.pop()
-
-
-def _check_poses(
-    table: Table, orientation_wxyz: Float[np.ndarray, "rows 4"], covariance: Float[np.ndarray, "rows 6 6"]
-) -> None:
-    length = np.linalg.norm(orientation_wxyz, axis=1)
-    for row in np.flatnonzero(np.abs(length - 1) > LENGTH_TOLERANCE):
-        expected, found = "a unit quaternion in qw to qz", f"length {length[row]:g}"
-        raise table.rows[row].error(table.column("qw"), expected, found)
     for row in np.flatnonzero(has_negative_eigenvalue(covariance)):
         expected, found = "a covariance in cov_xx to cov_cc", "a matrix with a negative eigenvalue"
-        raise table.rows[row].error(table.column("cov_xx"), expected, found)
+        raise rows[row].error(table.column("cov_xx"), expected, found)
+    unknown = np.full((len(rows), 4), np.nan)
+    with errors_name(path):
+        camera_path = CameraPath(
+            frame=tracks.frame,
+            time_s=tracks.time_s,
+            position_m=tracks.position_m[:, 0],
+            orientation_wxyz=unknown if tracks.orientation_wxyz is None else tracks.orientation_wxyz[:, 0],
+            covariance=covariance,
+            num_markers=np.array([row.count(table.column("num_markers")) for row in rows]),
+            reprojection_px=_numbers(table, rows, "reprojection_px")[:, 0],
+            ambiguity=_numbers(table, rows, "ambiguity")[:, 0],
+            status=np.zeros(len(rows), int) if tracks.status is None else tracks.status[:, 0],
+            flags=np.array([_flags(row, table) for row in rows]),
+            velocity_m_s=None if tracks.velocity_m_s is None else tracks.velocity_m_s[:, 0],
+        )
+    return camera_path, tracks.drones[0]
 
 
 def _split(names: tuple[str, ...] | list[str], values: Float[np.ndarray, "frames columns"]) -> Mapping:
     return dict(zip(names, values.T, strict=True))
 
 
-def _cell(value: object) -> object:
-    return "" if value != value else value
-
-
-def _numbers(table: Table, *names: str) -> Float[np.ndarray, "rows columns"]:
+def _numbers(table: Table, rows: Sequence[TextRow], *names: str) -> Float[np.ndarray, "rows columns"]:
     """(rows, columns), NaN for empty cells."""
     columns = [table.column(name) for name in names]
     return np.array(
-        [
-            [row.number(column) if row.cells[column.index] else np.nan for column in columns]
-            for row in table.rows
-        ]
+        [[row.number(each) if row.cells[each.index] else np.nan for each in columns] for row in rows]
     )
-
-
-def _counts(table: Table, name: str) -> Int[np.ndarray, "rows"]:
-    column = table.column(name)
-    return np.array([row.count(column) for row in table.rows])
-
-
-def _status(row: TextRow, table: Table) -> int:
-    column = table.column("status")
-    word = row.text(column)
-    if word not in _STATUS:
-        raise row.error(column, f"one of {', '.join(_STATUS)}", repr(word))
-    return int(_STATUS[word])
 
 
 def _flags(row: TextRow, table: Table) -> int:

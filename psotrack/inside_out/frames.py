@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYetError
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -59,6 +59,10 @@ class Frame:
     number: int
     time_s: float
     bgr: UInt8[np.ndarray, "height width 3"]
+
+    def grey(self) -> UInt8[np.ndarray, "height width"]:
+        """(height, width), the image in grey."""
+        return np.asarray(cv2.cvtColor(self.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -155,19 +159,17 @@ def _stream(address: str, fps: float | None, live: bool) -> FrameSource:
         raise InputError(address, expected="a camera or a stream", found=found)
 
     def frames() -> Iterator[Frame]:
-        bgr, number = first, 0
-        clock = _Clock(lambda: capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, fps)
+        bgr = first
         try:
-            while True:
-                yield Frame(number, clock.time_s(number), np.asarray(bgr, np.uint8))
-                there, bgr = capture.read()
-                number += 1
-                if not there:
-                    break
+            for number, time_s in enumerate(_times_s(lambda: capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3, fps)):
                 if bgr.shape != first.shape:
                     size = f"{first.shape[1]} x {first.shape[0]} pixels"
                     found = f"{bgr.shape[1]} x {bgr.shape[0]} in frame {number}"
                     raise InputError(address, expected=size, found=found)
+                yield Frame(number, time_s, np.asarray(bgr, np.uint8))
+                there, bgr = capture.read()
+                if not there:
+                    break
         finally:
             capture.release()
 
@@ -176,34 +178,25 @@ def _stream(address: str, fps: float | None, live: bool) -> FrameSource:
     )
 
 
-class _Clock:
-    """Times of a stream's frames: from a given rate, else from the stream's timestamps, else from the times of arrival.
+def _times_s(stamp_s: Callable[[], float], fps: float | None) -> Iterator[float]:
+    """Increasing times of a stream's frames, seconds, one each time that a frame was read.
+
+    From a given rate, else from the stream's timestamps, else from the times of arrival.
 
     Args:
         stamp_s: returns the timestamp of the frame that was read last, seconds.
         fps: frames per second; None if unknown.
     """
-
-    def __init__(self, stamp_s: Callable[[], float], fps: float | None) -> None:
-        self._stamp_s, self._fps = stamp_s, fps
-        self._began_s, self._last_stamp_s = time.monotonic(), stamp_s()
-        self._time_s, self._stamped = 0.0, True
-
-    def time_s(self, number: int) -> float:
-        """Time of the frame that was read last, seconds; always later than the time of the frame before."""
-        if self._fps is not None:
-            return number / self._fps
-        if number == 0:
-            return 0.0
-        stamp_s = self._stamp_s()
+    if fps is not None:
+        yield from (number / fps for number in count())
+    began_s, last_s, time_s, is_stamped = time.monotonic(), stamp_s(), 0.0, True
+    while True:
+        yield time_s
         # Some cameras give no timestamps, and the timestamps of some streams restart at 0.
-        self._stamped &= stamp_s > self._last_stamp_s
-        if self._stamped:
-            self._time_s += stamp_s - self._last_stamp_s
-            self._last_stamp_s = stamp_s
-        else:
-            self._time_s = max(time.monotonic() - self._began_s, self._time_s + 1e-3)
-        return self._time_s
+        now_s = stamp_s()
+        is_stamped &= now_s > last_s
+        time_s = time_s + now_s - last_s if is_stamped else max(time.monotonic() - began_s, time_s + 1e-3)
+        last_s = now_s
 
 
 def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Item]:
@@ -246,7 +239,7 @@ def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Ite
     thread = threading.Thread(target=work, daemon=True, name="psotrack-frames")
     thread.start()
     try:
-        while (item := _get(waiting)) is not done:
+        while (item := _until_there(lambda: waiting.get(timeout=_WAIT_S), queue.Empty)) is not done:
             if isinstance(item, BaseException):
                 raise item
             yield item  # type: ignore[misc]
@@ -256,11 +249,11 @@ def read_ahead(items: Iterator[_Item], *, newest: bool = False) -> Iterator[_Ite
         thread.join(timeout=1.0)
 
 
-def _get(waiting: queue.Queue[object]) -> object:
-    """Get the next item; Ctrl-C can interrupt the wait."""
+def _until_there(get: Callable[[], _Item], not_yet: type[Exception]) -> _Item:
+    """Call a function until it does not raise `not_yet`; Ctrl-C can interrupt the wait."""
     while True:
-        with contextlib.suppress(queue.Empty):
-            return waiting.get(timeout=_WAIT_S)
+        with contextlib.suppress(not_yet):
+            return get()
 
 
 def map_ahead(
@@ -280,20 +273,18 @@ def map_ahead(
         return
     pool = ThreadPoolExecutor(workers, thread_name_prefix="psotrack-map")
     waiting: deque[Future[_Result]] = deque()
+
+    def first() -> _Result:
+        future = waiting.popleft()
+        return _until_there(lambda: future.result(timeout=_WAIT_S), NotYetError)
+
     try:
         for item in items:
             waiting.append(pool.submit(function, item))
             # One item more than threads, so that no thread is idle while a result is in use.
             if len(waiting) > workers:
-                yield _result(waiting.popleft())
+                yield first()
         while waiting:
-            yield _result(waiting.popleft())
+            yield first()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _result(future: Future[_Result]) -> _Result:
-    """Wait for a result; Ctrl-C can interrupt the wait."""
-    while True:
-        with contextlib.suppress(NotYetError):
-            return future.result(timeout=_WAIT_S)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-
-import cv2
-import numpy as np
+from typing import Any
 
 from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
@@ -30,15 +28,7 @@ def markers_of_images(
         InputError: a file is no image.
         SettingsError: there is no dictionary of this name.
     """
-    detector = MarkerDetector(dictionary, thorough=True)
-
-    def found(path: Path) -> DetectedMarkers:
-        return detector.detect(read_grey(path))
-
-    with report("markers", len(paths)) as advance:
-        for markers in map_ahead(found, iter(paths), _WORKERS):
-            advance(1)
-            yield markers
+    return _markers(MarkerDetector(dictionary, thorough=True), read_grey, iter(paths), len(paths), report)
 
 
 def markers_of_video(
@@ -50,13 +40,15 @@ def markers_of_video(
         InputError: the video ends early, or a frame has another size.
         SettingsError: there is no dictionary of this name.
     """
-    detector = MarkerDetector(dictionary)
+    frames = read_ahead(source.frames())
+    return _markers(MarkerDetector(dictionary), Frame.grey, frames, source.num_frames or 0, report)
 
-    def found(frame: Frame) -> DetectedMarkers:
-        return detector.detect(np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8))
 
-    with report("markers", source.num_frames or 0) as advance:
-        for markers in map_ahead(found, read_ahead(source.frames()), _WORKERS):
+def _markers(
+    detector: MarkerDetector, grey_of: Callable[[Any], Any], items: Iterator[Any], count: int, report: Report
+) -> Iterator[DetectedMarkers]:
+    with report("markers", count) as advance:
+        for markers in map_ahead(lambda item: detector.detect(grey_of(item)), items, _WORKERS):
             advance(1)
             yield markers
 

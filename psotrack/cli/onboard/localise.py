@@ -179,6 +179,7 @@ def _input(video: str, given: SourceOptions) -> tuple[FrameSource, str, OnboardV
         raise InputError(
             video, expected="a video", found="no such file", remedy="pass --live if it is a camera's number"
         )
+    has_images = of_folder and is_picture_folder(folder)
     if of_folder and read_onboard(folder):
         chosen = onboard_videos(folder, None if given.drone is None else (given.drone,))
         if len(chosen) > 1:
@@ -187,7 +188,7 @@ def _input(video: str, given: SourceOptions) -> tuple[FrameSource, str, OnboardV
         return open_source(onboard.video.path, fps=given.fps), given.name or drone, onboard
     if given.drone is not None:
         raise SettingsError("--drone", expected="a folder with videos of drones' own cameras", found=video)
-    if of_folder and not is_picture_folder(folder):
+    if of_folder and not has_images:
         raise InputError(
             folder,
             expected=f"images, which end in {', '.join(IMAGE_SUFFIXES)}, or an _A sequence of the dataset",

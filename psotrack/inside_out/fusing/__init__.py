@@ -2,12 +2,12 @@
 
 In: a `CameraPath` for each drone that carries a camera, and `Trajectories` of static cameras. Out: `FusedTracks`, with
 the arm between camera and silhouette, and the scales of both sources' covariances for each drone. Other rooms use
-`fuse`, its results, and `fused_table.write_fused`.
+`fuse`, its results, and `write_fused`.
 
 Imports go in this order: `sources` (both at the same frames), `pairing` (which track belongs to which drone),
-`weighting` (one drone), `fused` (all drones), `fused_table`.
+`weighting` (one drone), `fused` (all drones, and their table).
 """
 
-from psotrack.inside_out.fusing.fused import FusedDrone, FusedTracks, fuse
+import lazy_loader
 
-__all__ = ["FusedDrone", "FusedTracks", "fuse"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

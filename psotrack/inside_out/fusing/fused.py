@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +22,13 @@ from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.fusing.pairing import pair_tracks, reorder_tracks
 from psotrack.inside_out.fusing.sources import Inside, inside_at, nearest_index, outside_at
 from psotrack.inside_out.fusing.weighting import Point, Weighted, weigh
+from psotrack.support import atomic_write, refuse_to_overwrite
 from psotrack.trajectories import GATE_M, UNASSIGNED, Status, Trajectories
 
 #: Longest time to the nearest pose during which a drone coasts without either source, seconds; beyond, it is lost.
 MAX_COASTING_S = 0.5
+#: Words for the values of `FusedTracks.source`.
+_SOURCES = ("none", "inside", "outside", "both")
 
 #: The values of one drone in all frames, by their names.
 _Rows = dict[str, np.ndarray]
@@ -295,3 +299,22 @@ def _free_name(name: str, taken: Mapping[str, _Rows]) -> str:
     while name in taken:
         name += " outside"
     return name
+
+
+def write_fused(path: Path | str, fused: FusedTracks, *, force: bool = False) -> None:
+    """Write a CSV with one row per frame and drone; values that are not known are empty fields.
+
+    Columns: `frame`, `time_s`, `drone`, `x_m` to `z_m`, `vx_m_s` to `vz_m_s`, `qw` to `qz` (camera to world), `cov_xx`
+    to `cov_zz` (the upper triangle), `source` (both, inside, outside or none), `status`. Every command that reads
+    tracks reads the table.
+
+    Raises:
+        OutputError: the file exists and `force` is not set, or it cannot be written.
+    """
+    refuse_to_overwrite(path, force)
+    table = fused.trajectories.to_pandas()
+    table["source"] = np.array(_SOURCES)[fused.source].ravel()
+    names = list(map(str, table.columns))
+    turns, covariances = ([name for name in names if name.startswith(start)] for start in ("q", "cov_"))
+    with atomic_write(Path(path)) as temporary:
+        table[[*names[:9], *turns, *covariances, "source", "status"]].to_csv(temporary, index=False)

@@ -192,35 +192,32 @@ def outside_at(outside: Trajectories, also_s: Iterable[Float[np.ndarray, "_"]]) 
     else:
         step_s = float(np.median(np.concatenate([[1.0], *map(np.diff, times_s)])[1:] or [1.0]))
     first_frame, first_s = outside.frame[0], outside.time_s[0]
-    numbers = np.concatenate(
-        [outside.frame, *(first_frame + np.round((each_s - first_s) / step_s) for each_s in times_s)]
-    )
-    frame = np.unique(numbers[numbers >= 0].astype(np.int64))
+    numbers = [first_frame + np.round((each_s - first_s) / step_s) for each_s in times_s]
+    frame = np.unique(np.maximum(np.concatenate([outside.frame, *numbers]), -1).astype(np.int64))
+    frame = frame[frame >= 0]
     time_s = first_s + step_s * (frame - first_frame)
     rows = np.isin(frame, outside.frame)
     time_s[rows] = outside.time_s
-
-    def at_frames(values: np.ndarray | None, *rest: int) -> np.ndarray:
-        found = np.full((len(frame), outside.num_drones, *rest), np.nan)
-        if values is not None:
-            found[rows] = values
-        return found
-
-    covariance_m2 = outside.covariance_m2
+    covariance_m2, velocity_m_s = outside.covariance_m2, outside.velocity_m_s
     if covariance_m2 is None:
         covariance_m2 = np.broadcast_to(_UNSTATED_M**2 * np.eye(3), (*outside.position_m.shape, 3))
-    own = outside.seen & informative(covariance_m2)
-    status = np.where(
-        own, int(Status.TRACKED) if outside.status is None else outside.status, int(Status.LOST)
-    )
+    if velocity_m_s is None:
+        velocity_m_s = np.full_like(outside.position_m, np.nan)
+    is_informative = informative(covariance_m2)
+    tracked = int(Status.TRACKED) if outside.status is None else outside.status
+
+    def at_frames(values: np.ndarray) -> np.ndarray:
+        found = np.full((len(frame), *values.shape[1:]), np.nan)
+        found[rows] = values
+        return found
+
+    status = at_frames(np.where(outside.seen & is_informative, tracked, int(Status.LOST)))
     return Trajectories(
         frame,
         time_s,
         outside.drones,
-        at_frames(outside.position_m, 3),
-        velocity_m_s=at_frames(outside.velocity_m_s, 3),
-        status=np.nan_to_num(at_frames(status), nan=int(Status.LOST)).astype(int),
-        covariance_m2=at_frames(
-            np.where(informative(covariance_m2)[..., None, None], covariance_m2, np.nan), 3, 3
-        ),
+        at_frames(outside.position_m),
+        velocity_m_s=at_frames(velocity_m_s),
+        status=np.nan_to_num(status, nan=int(Status.LOST)).astype(int),
+        covariance_m2=at_frames(np.where(is_informative[..., None, None], covariance_m2, np.nan)),
     )

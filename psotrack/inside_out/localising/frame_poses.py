@@ -25,17 +25,14 @@ from psotrack.inside_out.filtering import (
     orientations,
     step,
 )
-from psotrack.inside_out.line_time import Detected
 from psotrack.inside_out.localising.records import LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.inside_out.pose import (
-    CameraPose,
-    MarkerPose,
+from psotrack.inside_out.pose import CameraPose, MarkerPose, PoseSettings, estimate_pose
+from psotrack.inside_out.rolling_shutter import (
+    Detected,
     PosesAt,
-    PoseSettings,
     RollingShutter,
     at_middle_row,
-    estimate_pose,
     row_times_s,
     shift_of_rows,
 )
@@ -228,22 +225,34 @@ def _with_rows(
     time_s: float,
     motion: MotionAround | None,
 ) -> MarkerPose:
-    """A pose with covariances by an uncertain motion during the frame, and by an uncertain line time."""
+    """A pose whose rows show the motion during the frame as well, with covariances by it and by the line time.
+
+    The motion is that around the frame and a change, whose six numbers are unknowns with a prior.
+    """
     equations, corners_px = pose.equations, markers.corners_px
     if equations is None or len(equations.fits) < len(corners_px):
         return pose
     gain = equations.gain()
     root = np.diag(_UNKNOWN_RATES) if motion is None else motion.rate_root
 
-    def by_rates(line_time_s: float) -> Float[np.ndarray, "6 6"]:
-        late_s = np.repeat(row_times_s(corners_px, lens, line_time_s).ravel(), 2)[:, None]
-        return gain @ (late_s * equations.slopes[..., :6].reshape(-1, 6)) @ root
+    def by_rates(line_time_s: float) -> Float[np.ndarray, "markers 8 6"]:
+        late_s = np.repeat(row_times_s(corners_px, lens, line_time_s), 2, axis=1)[..., None]
+        return late_s * equations.slopes[..., :6] @ root
 
-    of_motion, of_line_time = by_rates(shutter.line_time_s), by_rates(shutter.std_s)
+    by_motion = by_rates(shutter.line_time_s)
+    squares, products = equations.products(by_motion)
+    spread, of_motion = np.linalg.inv(np.eye(6) + squares), gain @ by_motion.reshape(-1, 6)
+    step = -of_motion @ spread @ products
+    by_line_time = by_rates(shutter.std_s).reshape(-1, 6)
     if motion is not None and shutter.std_s:
         line_times_s = shutter.line_time_s, shutter.line_time_s + shutter.std_s
         shift_px = shift_of_rows(corners_px, corners_m, lens, line_times_s, time_s, motion.poses_at)
-        of_line_time = np.column_stack([of_line_time, gain @ shift_px.ravel()])
-    constant = of_line_time @ of_line_time.T
-    covariance = pose.covariance + of_motion @ of_motion.T + constant
-    return replace(pose, covariance=covariance, constant=pose.constant + constant)
+        by_line_time = np.column_stack([by_line_time, shift_px.ravel()])
+    constant = (gain @ by_line_time) @ (gain @ by_line_time).T
+    return replace(
+        pose,
+        position_m=pose.position_m + step[:3],
+        R_world_cam=pose.R_world_cam @ Rotation.from_rotvec(step[3:6]).as_matrix(),
+        covariance=pose.covariance + of_motion @ spread @ of_motion.T + constant,
+        constant=pose.constant + constant,
+    )

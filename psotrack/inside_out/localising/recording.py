@@ -21,7 +21,6 @@ from psotrack.inside_out.filtering import (
     path_of,
     smoothed_motions,
 )
-from psotrack.inside_out.line_time import Detected, estimate_line_time
 from psotrack.inside_out.localising.frame_poses import (
     FollowedFrame,
     MotionAround,
@@ -31,7 +30,8 @@ from psotrack.inside_out.localising.frame_poses import (
 )
 from psotrack.inside_out.localising.records import LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.inside_out.pose import CornerNoise, RollingShutter, estimate_noise, spline_through
+from psotrack.inside_out.pose import CornerNoise, estimate_noise
+from psotrack.inside_out.rolling_shutter import Detected, RollingShutter, estimate_line_time, spline_through
 
 #: Largest number of frames from which the errors of corners are learned, and number of estimates.
 _NOISE_FRAMES, _NOISE_TURNS = 60, 2
@@ -149,15 +149,14 @@ def _motions_around(
     # the camera moves in the time between the two.
     times_s = sorted(known)
     frame_s = float(np.diff(times).min(initial=1.0))
-    beyond = {}
-    ends = (times_s[0], times_s[:2][-1], -frame_s), (times_s[-1], times_s[-2:][0], frame_s)
-    for end, inside, late_s in ends:
-        velocity_m_s, rate_rad_s = known[end].velocity_m_s, known[end].rate_rad_s
-        as_end = replace(known[inside], velocity_m_s=velocity_m_s, rate_rad_s=rate_rad_s)
-        onwards = constant_motion(as_end, inside)
-        beyond[end + late_s] = onwards(np.array([end + late_s]))
     poses = {time_s: (motion.position_m, motion.R_world_cam) for time_s, motion in known.items()}
-    poses |= {time_s: (position_m[0], R[0]) for time_s, (position_m, R) in beyond.items()}
+    for end, inside, late_s in (
+        (times_s[0], times_s[:2][-1], -frame_s),
+        (times_s[-1], times_s[-2:][0], frame_s),
+    ):
+        rates = {name: getattr(known[end], name) for name in ("velocity_m_s", "rate_rad_s")}
+        position_m, R = constant_motion(replace(known[inside], **rates), inside)(np.array([end + late_s]))
+        poses[end + late_s] = position_m[0], R[0]
     poses_at = spline_through(sorted(poses), [poses[time_s] for time_s in sorted(poses)])
     # A velocity is the difference of the poses before and after, divided by the time between the two.
     scale = np.sqrt(2) / (2 * frame_s)

@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from psotrack.inside_out.camera_path import CameraPath
 from psotrack.inside_out.filtering import PoseFilterParams, smooth
-from psotrack.inside_out.line_time import LineTime
 from psotrack.inside_out.marker_map import MarkerMap
-from psotrack.inside_out.pose import PoseSettings, RollingShutter
+from psotrack.inside_out.pose import PoseSettings
+from psotrack.inside_out.rolling_shutter import LineTime, RollingShutter
 
 #: Stages that each frame passes; the first two run in a thread of their own.
 STAGES = ("decode", "grey", "detect", "locate", "filter")

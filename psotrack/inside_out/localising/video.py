@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -15,11 +14,11 @@ from psotrack.errors import InputError
 from psotrack.foreground.markers import MarkerDetector
 from psotrack.geometry import Camera
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
-from psotrack.inside_out.line_time import Detected
 from psotrack.inside_out.localising.recording import localise_frames
 from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.mapping.from_centres import complete_map
 from psotrack.inside_out.marker_map import MarkerCentres, MarkerMap
+from psotrack.inside_out.rolling_shutter import Detected
 from psotrack.support import Advance, Report, no_progress
 
 #: Number of threads that detect markers, each in a frame of its own; the calling thread has the rest of the work.
@@ -142,6 +141,6 @@ def _grey_frames(source: FrameSource, seconds: dict[str, float]) -> Iterator[_Gr
         seconds["decode"] += decoded_s - start_s
         if frame is None:
             return
-        gray = np.asarray(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        gray = frame.grey()
         seconds["grey"] += time.perf_counter() - decoded_s
         yield frame.number, frame.time_s, gray

@@ -1,14 +1,13 @@
-"""Maps of the markers in a room: built from videos or from measured corners, and checked against a video.
+"""Maps of the markers in a room: built from videos, and checked against a video.
 
-In: videos of a room with lenses, or measured corners, and what is known of a marker. Out: a `MarkerMap` with its
-uncertainty (`BuiltMap`), squares fitted to measured corners (`FittedSquares`), or the faults of a map (`MapCheck`).
-Other rooms use these records with `build_map`, `fit_squares`, `check_map`, `read_measured_corners`, `find_sightings`
-and `corners_in_own_frame`.
+In: videos of a room with lenses, and what is known of a marker. Out: a `MarkerMap` with its uncertainty (`BuiltMap`),
+or the faults of a map (`MapCheck`). Other rooms use these records with `build_map`, `check_map`, `complete_map`,
+`find_sightings` and `corners_in_own_frame`.
 
-Imports go in this order: `sightings` (markers in frames), `square_fitting`, `adjusting` (bundle adjustment),
-`initial_map`, `building`, `checking`.
+Imports go in this order: `sightings` (markers in frames), `adjusting` (bundle adjustment), `initial_map`, `building`,
+`checking`, `from_centres`.
 """
 
-from psotrack.inside_out.mapping.building import BuiltMap, build_map, corners_in_own_frame
+import lazy_loader
 
-__all__ = ["BuiltMap", "build_map", "corners_in_own_frame"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

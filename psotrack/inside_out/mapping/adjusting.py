@@ -55,30 +55,6 @@ _RESIDUALS = 8
 
 
 @dataclass(frozen=True)
-class AdjustedMap:
-    """Result of the adjustment of markers and views.
-
-    Attributes:
-        markers: the markers, by id.
-        T_cam_world: (views, 4, 4), world to camera, metres.
-        inset_px: (videos,), distance by which the sides of squares are found too far inside, pixels.
-        residual_px: (sightings, 4), distances in the image, also of outliers.
-        used: (sightings,), False for outliers.
-        covariance: (markers, 7, 7), in the order of increasing ids: of the centre along the world's axes (m), of a
-            small turn about them (rad), and of the logarithm of the side; 0 for fixed unknowns.
-        noise_px: standard deviation of a corner along x and along y, estimated from the residuals.
-    """
-
-    markers: Mapping[int, PlacedMarker]
-    T_cam_world: Float[np.ndarray, "views 4 4"]
-    inset_px: Float[np.ndarray, " videos"]
-    residual_px: Float[np.ndarray, "sightings 4"]
-    used: Bool[np.ndarray, " sightings"]
-    covariance: Float[np.ndarray, "markers 7 7"]
-    noise_px: float
-
-
-@dataclass(frozen=True)
 class _KnownLens:
     """A lens without unknowns but for the inset, whose derivative the bundle knows."""
 
@@ -142,31 +118,22 @@ def markers_of(sightings: MarkerSightings, bundle: Bundle) -> dict[int, PlacedMa
     return {marker: PlacedMarker(T, side_m) for marker, T, side_m in rows}
 
 
-def adjust(sightings: MarkerSightings, bundle: Bundle) -> AdjustedMap:
+def adjust(sightings: MarkerSightings, bundle: Bundle) -> Bundle:
     """Adjust a rough bundle without outliers, and with the motion during the frames where shutters roll.
 
-    The covariance includes noise that is independent in every frame, and errors that a marker's corner has in all
-    frames and that many frames do not average out. Both are estimated from the residuals.
+    The noise of its problem is the standard deviation of a corner along x and along y by the residuals.
     """
     unknowns = bundle.problem.size + 6 * sightings.num_views
-    bundle, sigma_px = _without_outliers(bundle, unknowns)
+    bundle = _without_outliers(bundle, unknowns)
     rolling = _with_motion(sightings, bundle)
     if rolling is not None:
-        moved, moved_px = _without_outliers(rolling, unknowns + 6 * sightings.num_views)
-        bundle, sigma_px = (moved, moved_px) if moved_px < sigma_px else (bundle, sigma_px)
-    return AdjustedMap(
-        markers_of(sightings, bundle),
-        bundle.state.T_cam_world,
-        np.ravel(bundle.state.lenses),
-        bundle.distance_px,
-        bundle.used[:, 0],
-        _covariance(bundle, sightings),
-        sigma_px,
-    )
+        moved = _without_outliers(rolling, unknowns + 6 * sightings.num_views)
+        bundle = moved if moved.problem.noise_px[0] < bundle.problem.noise_px[0] else bundle
+    return bundle
 
 
-def _without_outliers(bundle: Bundle, unknowns: int) -> tuple[Bundle, float]:
-    """The adjustment with squared residuals without outliers, and the standard deviation of a corner, pixels."""
+def _without_outliers(bundle: Bundle, unknowns: int) -> Bundle:
+    """The adjustment with squared residuals without outliers."""
     # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(_MOST_ROUNDS):
         before, distance_px = bundle, bundle.distance_px
@@ -177,7 +144,7 @@ def _without_outliers(bundle: Bundle, unknowns: int) -> tuple[Bundle, float]:
         bundle = replace(bundle, problem=problem, used=used, is_robust=False).solved()
         if (bundle.used == before.used).all():
             break
-    return bundle, sigma_px
+    return bundle
 
 
 def _with_motion(sightings: MarkerSightings, bundle: Bundle) -> Bundle | None:
@@ -242,11 +209,14 @@ def _is_followed(sightings: MarkerSightings) -> Bool[np.ndarray, " views"]:
     return np.append(step_s < 1.5 * least_s[sightings.lens[:-1]], False)
 
 
-def _covariance(bundle: Bundle, sightings: MarkerSightings) -> Float[np.ndarray, "markers 7 7"]:
-    """(markers, 7, 7), covariance from noise of each frame, from errors that the corners keep, and from the insets.
+def covariance_of(sightings: MarkerSightings, bundle: Bundle) -> Float[np.ndarray, "markers 7 7"]:
+    """(markers, 7, 7), covariance of the markers, in the order of increasing ids.
 
-    Each part is the effect of these errors on the estimate as it is made, which has insets with a strong prior as
-    unknowns: they follow a part of each error, and a camera's own inset counts as far as the prior holds them back.
+    Of the centre along the world's axes (m), of a small turn about them (rad), and of the logarithm of the side; 0 for
+    fixed unknowns. Errors are noise that is independent in every frame, errors that a corner keeps in all frames, both
+    estimated from the residuals, and insets. Each part is the effect of these errors on the estimate as it is made,
+    which has insets with a strong prior as unknowns: they follow a part of each error, and a camera's own inset counts
+    as far as the prior holds them back.
     """
     problem, videos, count = bundle.problem, len(sightings.lenses), len(bundle.problem.free_target)
     reduced = bundle.equations().reduced()

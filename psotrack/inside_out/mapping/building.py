@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from psotrack.calibration import Bundle
 from psotrack.errors import InputError, check_positive
 from psotrack.geometry import cross_matrices
-from psotrack.inside_out.mapping.adjusting import AdjustedMap, adjust, adjusted_roughly
+from psotrack.inside_out.mapping.adjusting import adjust, adjusted_roughly, covariance_of, markers_of
 from psotrack.inside_out.mapping.initial_map import MarkerPlacer
 from psotrack.inside_out.mapping.sightings import MarkerSightings
 from psotrack.inside_out.marker_map import SQUARE, MarkerMap, PlacedMarker, fit_square
@@ -116,13 +117,14 @@ def build_map(
         used, T = _connected(used, placed, T_before)
         rough = adjusted_roughly(used, placed, T, fixed, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
         adjusted = adjust(used, rough)
-        explained = {marker: adjusted.used[used.marker == marker].mean() for marker in used.ids}
+        explained = {marker: adjusted.used[used.marker == marker, 0].mean() for marker in used.ids}
         bad = [marker for marker, share in explained.items() if share < _EXPLAINED and marker not in fixed]
         if not bad:
             return _result(sightings, used, adjusted, fixed)
         # A marker that most of its sightings contradict is placed again, or left out.
-        placed = {marker: one for marker, one in adjusted.markers.items() if marker not in bad}
-        placer, T_before = MarkerPlacer(used, side_m), adjusted.T_cam_world
+        found = markers_of(used, adjusted)
+        placed = {marker: one for marker, one in found.items() if marker not in bad}
+        placer, T_before = MarkerPlacer(used, side_m), adjusted.state.T_cam_world
         views = placer.locate_views(placed, T_before)
         again = {marker: placer.place(marker, views) for marker in bad if marker not in tried}
         placed |= {marker: one for marker, one in again.items() if one is not None}
@@ -163,37 +165,35 @@ def _connected(
     return sightings.select(kept), T[np.unique(sightings.view[kept])]
 
 
-def _result(
-    sightings: MarkerSightings, used: MarkerSightings, adjusted: AdjustedMap, known: list[int]
-) -> BuiltMap:
-    ids = np.array(sorted(adjusted.markers))
+def _result(sightings: MarkerSightings, used: MarkerSightings, bundle: Bundle, known: list[int]) -> BuiltMap:
+    markers, covariance, is_used = markers_of(used, bundle), covariance_of(used, bundle), bundle.used[:, 0]
+    ids = np.array(list(markers))
     of_marker = used.marker == ids[:, None]
-    good = of_marker & adjusted.used
-    squares = (adjusted.residual_px**2).mean(axis=1)
-    stds_m = _std_m(adjusted)
+    squares = (bundle.distance_px**2).mean(axis=1)
+    stds_m = _std_m(np.array([one.corners_m for one in markers.values()]), covariance)
     # A marker that is not determined leaves no covariance known.
-    std_m = dict(zip(ids.tolist(), stds_m.tolist(), strict=True)) if np.isfinite(stds_m).all() else {}
+    std_m = dict(zip(markers, stds_m.tolist(), strict=True)) if np.isfinite(stds_m).all() else {}
     return BuiltMap(
-        MarkerMap({marker: one.corners_m for marker, one in adjusted.markers.items()}, std_m),
+        MarkerMap({marker: one.corners_m for marker, one in markers.items()}, std_m),
         ids,
-        adjusted.covariance,
-        np.array([np.sqrt(squares[rows].mean()) if rows.any() else np.nan for rows in good]),
+        covariance,
+        np.array([np.sqrt(squares[rows].mean()) if rows.any() else np.nan for rows in of_marker & is_used]),
         of_marker.sum(axis=1),
-        (of_marker & ~adjusted.used).sum(axis=1),
+        (of_marker & ~is_used).sum(axis=1),
         np.isin(ids, known),
-        tuple(marker for marker in sightings.ids if marker not in adjusted.markers),
-        adjusted.noise_px,
-        adjusted.inset_px,
+        tuple(marker for marker in sightings.ids if marker not in markers),
+        float(bundle.problem.noise_px[0]),
+        np.ravel(bundle.state.lenses),
         used.num_views,
     )
 
 
-def _std_m(adjusted: AdjustedMap) -> Float[np.ndarray, " markers"]:
+def _std_m(
+    corners_m: Float[np.ndarray, "markers 4 3"], covariance: Float[np.ndarray, "markers 7 7"]
+) -> Float[np.ndarray, " markers"]:
     """(markers,), standard deviations of a corner's position along an axis: root mean squares over corners and axes."""
-    squares = [adjusted.markers[marker] for marker in sorted(adjusted.markers)]
-    arms_m = np.array([one.corners_m - one.T_world_marker[:3, 3] for one in squares])
+    arms_m = corners_m - corners_m.mean(axis=1, keepdims=True)
     # A corner moves with the centre, with a turn w by w x arm, and with the logarithm of the side by its arm.
     by_turn = -cross_matrices(arms_m)
     slopes = np.concatenate([np.broadcast_to(np.eye(3), by_turn.shape), by_turn, arms_m[..., None]], axis=-1)
-    variance = np.einsum("mcif,mfg,mcig->m", slopes, adjusted.covariance, slopes) / 12
-    return np.sqrt(variance)
+    return np.sqrt(np.einsum("mcif,mfg,mcig->m", slopes, covariance, slopes) / 12)

@@ -34,8 +34,8 @@ _SIGNIFICANT = 5.0
 #: Differences below these are expected of a map that was measured by hand or by motion capture, with errors of some
 #: millimetres: of positions (metres), orientations (degrees) and sides (fraction of the side).
 _SHIFT_M, _TURN_DEG, _SIDE_CHANGE = 0.01, 3.0, 0.03
-#: Largest deviation, degrees, from a turn by 90, 180 or 270 degrees at which the order of the corners is the fault.
-_QUARTER_DEG = 15.0
+#: A turn from which on a marker at its place was not hung crookedly: its corners are counted in another order, degrees.
+_REORDERED_DEG = 60.0
 #: Largest distance of two centres that are the same place, in sides.
 _SAME_PLACE = 0.35
 
@@ -157,17 +157,19 @@ def check_map(sightings: MarkerSightings, marker_map: MarkerMap) -> MapCheck:
         known = {marker: marker_map.corners_m[marker] for marker in sound}
         built = build_map(sightings, known, estimate_sides=True)
         rows = {marker: row for row, marker in enumerate(built.ids.tolist())}
-        rows = {
-            one: rows[one] for one in suspects if one in rows and built.sightings[rows[one]] >= _LEAST_FRAMES
-        }
-        placed = {marker: fit_square(built.marker_map.corners_m[marker]) for marker in rows}
-        differences = {
-            marker: _difference(built, row, given[marker], placed[marker]) for marker, row in rows.items()
-        }
-        findings = _find_faults(given, placed, differences, {one: residual_px[one] for one in suspects})
+        for marker in suspects:
+            if marker not in rows or built.sightings[rows[marker]] < _LEAST_FRAMES:
+                message = f"marker {marker}: it is {residual_px[marker]:.1f} px off where the map has it"
+                remedy = "too few frames show it beside others to tell where it is: film it with them"
+                findings.append(MapFinding("disagrees", (marker,), message, remedy))
+                continue
+            found = fit_square(built.marker_map.corners_m[marker])
+            differences[marker] = _difference(built, rows[marker], given[marker], found)
+            findings += _faults(marker, given, found, differences[marker])
     counts = {marker: int((sightings.marker == marker).sum()) for marker in given}
-    found = (tuple(findings), counts, residual_px, differences)
-    return MapCheck(*found, noise_px, sightings.num_views, not_in_map)
+    return MapCheck(
+        tuple(findings), counts, residual_px, differences, noise_px, sightings.num_views, not_in_map
+    )
 
 
 def _distances_by_map(
@@ -181,7 +183,7 @@ def _distances_by_map(
         views = placer.locate_views(markers, T).T[:, 0]
         rough = adjusted_roughly(sightings, markers, views, sightings.ids, noise_px=noise_px)
         T = rough.state.T_cam_world
-    return adjust(sightings, rough).residual_px
+    return adjust(sightings, rough).distance_px
 
 
 def _difference(built: BuiltMap, row: int, given: PlacedMarker, found: PlacedMarker) -> MarkerDifference:
@@ -195,76 +197,29 @@ def _difference(built: BuiltMap, row: int, given: PlacedMarker, found: PlacedMar
     )
 
 
-def _find_faults(
-    given: Mapping[int, PlacedMarker],
-    placed: Mapping[int, PlacedMarker],
-    differences: Mapping[int, MarkerDifference],
-    suspects: Mapping[int, float],
+def _faults(
+    marker: int, given: Mapping[int, PlacedMarker], found: PlacedMarker, by: MarkerDifference
 ) -> list[MapFinding]:
-    """Faults of suspect markers, which have these residuals in pixels; two exchanged markers are one fault."""
-    findings = []
-    at = {
-        marker: next((other for other, one in given.items() if _are_together(found, one)), marker)
-        for marker, found in placed.items()
-    }
-    for marker, off_px in suspects.items():
-        other = at.get(marker)
-        if other is None:
-            message = f"marker {marker}: it is {off_px:.1f} px off where the map has it"
-            remedy = "too few frames show it beside others to tell where it is: film it with them, or measure it again"
-            findings.append(MapFinding("disagrees", (marker,), message, remedy))
-        elif other == marker:
-            findings += _own_fault(marker, given[marker], placed[marker], differences[marker])
-        elif at.get(other) != marker:
-            message = f"marker {marker}: it is where the map has marker {other}"
-            remedy = "correct its id, in the map or on the wall"
-            findings.append(MapFinding("exchanged", (marker, other), message, remedy))
-        elif marker < other:
-            message = f"markers {marker} and {other}: each is where the map has the other one"
-            remedy = "exchange their ids in the map, or on the wall"
-            findings.append(MapFinding("exchanged", (marker, other), message, remedy))
-    return findings
-
-
-def _are_together(one: PlacedMarker, other: PlacedMarker) -> bool:
-    """Whether two squares are at one place and face the same way."""
-    T, T_other = one.T_world_marker, other.T_world_marker
-    is_near = np.linalg.norm(T[:3, 3] - T_other[:3, 3]) < _SAME_PLACE * other.side_m
-    return bool(is_near and T[:3, 2] @ T_other[:3, 2] > 0)
-
-
-def _own_fault(
-    marker: int, given: PlacedMarker, found: PlacedMarker, by: MarkerDifference
-) -> list[MapFinding]:
-    """The fault of a marker that is not at another one's place: its corners' order, or its place, turn or size.
-
-    Empty if the differences are usual.
-    """
-    T = np.linalg.inv(given.T_world_marker) @ found.T_world_marker
-    turn, shift_m = Rotation.from_matrix(T[:3, :3]), float(np.linalg.norm(by.moved_m))
-    if shift_m < _SAME_PLACE * given.side_m:
-        if T[2, 2] < -np.sqrt(0.5):
-            message = f"marker {marker}: the map counts its corners backwards, so that it faces the wall"
-            remedy = "count them clockwise as seen from the room, from the marker's own top left"
-            return [MapFinding("backwards", (marker,), message, remedy)]
-        for quarter in (1, 2, 3):
-            rest = Rotation.from_euler("z", 90 * quarter, degrees=True) * turn
-            if rest.magnitude() < np.deg2rad(_QUARTER_DEG):
-                message = f"marker {marker}: the map counts its corners from another one, {90 * quarter} degrees around"
-                remedy = f"what the map calls corner {quarter + 1} is corner 1, its own top left; or hang it upright"
-                return [MapFinding("corner order", (marker,), message, remedy)]
-    std_m = float(np.linalg.norm(by.std_m))
+    """The fault of a marker whose place, turn or size is not that of the map; empty if the differences are usual."""
+    shift_m, std_m = float(np.linalg.norm(by.moved_m)), float(np.linalg.norm(by.std_m))
     faults = {}
+    remedy = "measure it again; `psotrack onboard map --known` with sound markers builds a map from the video"
     if shift_m > max(_SHIFT_M, _SIGNIFICANT * std_m):
         place = ", ".join(f"{value:.3f}" for value in found.T_world_marker[:3, 3])
         faults["moved"] = (
             f"{_metres(shift_m)} from where the map has it, at ({place}) m, give or take {_metres(std_m)}"
         )
+        for other, one in given.items():
+            apart_m = np.linalg.norm(found.T_world_marker[:3, 3] - one.T_world_marker[:3, 3])
+            if other != marker and apart_m < _SAME_PLACE * one.side_m:
+                faults["moved"] += f", where the map has marker {other}"
+                remedy = "correct its id, in the map or on the wall"
     if by.turned_deg > max(_TURN_DEG, _SIGNIFICANT * by.turn_std_deg):
         faults["turned"] = f"turned by {by.turned_deg:.1f} degrees, give or take {by.turn_std_deg:.1f}"
+        if by.turned_deg > _REORDERED_DEG and "moved" not in faults:
+            remedy = "count its corners clockwise as seen from the room, from the marker's own top left"
     if abs(by.grown - 1) > _SIDE_CHANGE:
-        faults["side"] = f"{1e3 * found.side_m:.0f} mm wide, not {1e3 * given.side_m:.0f} mm"
-    remedy = "measure it again; `psotrack onboard map --known` with sound markers builds a map from the video"
+        faults["side"] = f"{1e3 * found.side_m:.0f} mm wide, not {found.side_m / by.grown * 1e3:.0f} mm"
     message = f"marker {marker}: it is {' and '.join(faults.values())}"
     return [MapFinding(next(iter(faults)), (marker,), message, remedy)] if faults else []
 

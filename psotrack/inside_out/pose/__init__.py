@@ -2,11 +2,10 @@
 
 In: corners of markers in the image (pixels) and in the world (metres), the lens and `PoseSettings`. Out: a
 `MarkerPose` with its covariance and the probability that another pose is the right one. Other rooms use
-`estimate_pose`, `estimate_noise`, `at_middle_row` and these records, and nothing else of this room.
+`estimate_pose`, `estimate_noise` and these records, and nothing else of this room.
 
-Imports go in this order: `records`; `equations` (linear equations of the corners); `fit` (the most likely pose near
-an initial pose); `initial_poses` (poses by closed-form solvers); `estimating` (the complete estimation); `noise` (the
-variances of a recording); `rows` (the rolling shutter).
+Imports go in this order: `records`; `equations` (linear equations of the corners); `estimating` (the estimation);
+`noise` (the variances of a recording).
 """
 
 import lazy_loader

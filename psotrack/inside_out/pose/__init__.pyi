@@ -2,7 +2,6 @@ from .equations import Equations
 from .estimating import estimate_pose
 from .noise import estimate_noise
 from .records import CameraPose, CornerNoise, MarkerPose, PoseSettings
-from .rows import PosesAt, RollingShutter, at_middle_row, row_times_s, shift_of_rows, spline_through
 
 __all__ = [
     "CameraPose",
@@ -10,12 +9,6 @@ __all__ = [
     "Equations",
     "MarkerPose",
     "PoseSettings",
-    "PosesAt",
-    "RollingShutter",
-    "at_middle_row",
     "estimate_noise",
     "estimate_pose",
-    "row_times_s",
-    "shift_of_rows",
-    "spline_through",
 ]

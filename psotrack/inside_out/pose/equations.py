@@ -10,7 +10,7 @@ and focal length are one number each for all corners of a frame: they are unknow
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -44,6 +44,7 @@ class SeenMarkers:
         place_m: standard deviation of a marker's place in this frame along each axis, metres.
         map_std_m: (markers,), the same of a marker's place in the map, which is the same in all frames.
         focal_error: standard deviation of the focal length, as a fraction of it.
+        shift_px: standard deviation of a shift of all corners along x and along y, pixels.
     """
 
     corners_px: Float[np.ndarray, "markers 4 2"]
@@ -54,6 +55,7 @@ class SeenMarkers:
     place_m: float
     map_std_m: Float[np.ndarray, "markers"]
     focal_error: float
+    shift_px: float
 
     @property
     def inward(self) -> Float[np.ndarray, "markers 4 2"]:
@@ -127,11 +129,18 @@ class Equations:
         gains = covariance[:6] @ self.slopes.swapaxes(1, 2) @ self.weight
         return gains.swapaxes(0, 1).reshape(6, -1)
 
-    def products(self, change_px: Float[np.ndarray, "markers 8"]) -> tuple[float, float]:
-        """Weighted squares of changes of the pixels that no pose explains, and their products with the residuals."""
-        step, _ = replace(self, residual_px=change_px).solved(np.zeros(2))
-        weighted = (self.weight @ (change_px - self.slopes @ step)[..., None])[..., 0]
-        return float((weighted * change_px).sum()), float((weighted * self.residual_px).sum())
+    def products(
+        self, change_px: Float[np.ndarray, "markers 8 k"]
+    ) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
+        """Weighted products of changes of the pixels that no pose explains, with each other and with the residuals."""
+        _, covariance = self.solved(np.zeros(2))
+        weighted = self.weight @ change_px
+        step = covariance @ np.einsum("mpu,mpk->uk", self.slopes, weighted)
+        weighted = weighted - self.weight @ self.slopes @ step
+        return (
+            np.einsum("mpk,mpl->kl", change_px, weighted),
+            np.einsum("mpk,mp->k", weighted, self.residual_px),
+        )
 
 
 def linearised(

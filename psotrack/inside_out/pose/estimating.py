@@ -1,27 +1,67 @@
 """Estimation of a camera's pose from the corners of markers in one frame.
 
-The fit starts at the pose of all markers together. Where this pose does not explain most of the markers, some markers
-are wrong, and poses of pairs of markers are fitted too (see `initial_poses`); markers in a plane have a second pose.
-Likelihoods, and the pose that motion predicts, decide which of the fitted poses is returned.
+The fit starts at the pose of all markers together, by SQPnP (Terzakis & Lourakis, ECCV 2020). Where this pose does not
+explain most of the markers, some markers are wrong, and poses of pairs of markers are fitted too, by AP3P (Ke &
+Roumeliotis, CVPR 2017), as in random sample consensus (Fischler & Bolles, CACM 24(6), 1981). Markers in a plane have a
+second, mirrored pose (IPPE; Collins & Bartoli, IJCV 2014). Likelihoods, and the pose that motion predicts, decide which
+of the fitted poses is returned.
+
+A fit is Gauss-Newton steps with the covariances of the corners (`equations`). Studentised residuals, which are
+residuals in units of their own standard deviations, decide which corners and markers fit (Cook & Weisberg, Residuals
+and influence in regression, 1982, section 2.2). The gate widens with the median of the residuals, where a lens, a map
+or a rolling shutter is wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from math import log, pi
+from itertools import combinations
+from math import lgamma, log, pi
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from psotrack.calibration import Solver, solve_pnp
 from psotrack.errors import InputError
-from psotrack.geometry import Camera, undistort
-from psotrack.inside_out.pose.equations import SeenMarkers
-from psotrack.inside_out.pose.fit import fit
-from psotrack.inside_out.pose.initial_poses import mirrored_poses, near_px, pose_of_all, poses_of_pairs
+from psotrack.geometry import NEAR_M, Camera, undistort
+from psotrack.inside_out.pose.equations import Equations, SeenMarkers, linearised
 from psotrack.inside_out.pose.records import CameraPose, CornerNoise, MarkerPose, PoseSettings
 
+#: Position of the camera and rotation from camera to world.
+_InitialPose = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
+
+#: Largest distance of a corner from its projection, in standard deviations of a corner, and smallest value of it in
+#: pixels, at which an initial pose of few markers still explains the corner.
+_LOOSE, _LOOSE_PX = 15.0, 3.0
+#: Largest number of pairs of markers from which poses are computed. With 40 % wrong markers a third of the pairs is
+#: right.
+_MOST_PAIRS = 55
+#: Largest number of markers in a frame for which poses of single markers are computed too.
+_FEW_MARKERS = 3
+#: Largest number of initial poses that are fitted.
+_MOST_INITIAL_POSES = 4
+#: Ratio of the smallest to the largest extent of markers below which they may have a second, mirrored pose.
+_NEARLY_FLAT = 0.1
+#: Angle to a known pose below which an initial pose would end at the known pose, radians.
+_SAME_ANGLE_RAD = np.deg2rad(1.0)
+#: Probability that a good corner, or the mean of a good marker, is rejected as an outlier; and the gate of its squared
+#: residual, which has the chi-square distribution with 2 degrees of freedom. Median of that distribution.
+FALSE_ALARM = 1e-3
+_GATE, _MEDIAN = -2 * log(FALSE_ALARM), 2 * log(2)
+#: Smallest number of corners of a marker that fit; a marker with two bad corners may be anything.
+_MIN_CORNERS = 3
+#: Largest factor of the gate's standard deviations.
+_MOST_SCALE = 30.0
+#: Largest number of steps, and the step from which a rejected corner stays rejected: the gates depend on the fit and
+#: the fit on the gates, and a corner that alternates stays out. Squared length of the last step, standard deviations.
+_MAX_STEPS, _NO_RETURN, _LAST = 20, 8, 1e-2
+#: Longest step, because an initial pose may be far away: rad, and as a fraction of the markers' distance.
+_LONGEST = 0.3
+#: Weight of the stated variance, as a number of residuals, in the density of the residuals; and logarithm of the
+#: density of an outlier's pixel, which may lie anywhere within about 100 x 100 px.
+_PRIOR_RESIDUALS, _LOG_ANYWHERE = 3.0, -2 * log(100.0)
 #: Number of markers that suffices for a pose; in frames of fewer than eight markers, half of the markers suffice.
 _ENOUGH_MARKERS = 4
 #: Standard deviation of a corner whose detection states none, and the smallest that is believed, pixels.
@@ -84,6 +124,7 @@ def estimate_pose(
         noise.place_m,
         map_std_m[shown],
         settings.focal_error,
+        noise.shift_px,
     )
     # One or two of many markers may agree by chance, because every single marker has a pose that explains this marker.
     least = min(_ENOUGH_MARKERS, shown.sum() / 2)
@@ -100,14 +141,14 @@ def estimate_pose(
 
 def _likely_poses(seen: SeenMarkers) -> list[MarkerPose]:
     """Different poses that explain all markers or a part of the markers, the most likely pose first."""
-    found = _distinct(fit(seen, *pose) for pose in pose_of_all(seen))
+    found = _distinct(_fit(seen, *pose) for pose in _pose_of_all(seen))
     # If all markers agree, or at least three markers and more than half of all, no other pose explains an equal number.
     count = len(seen.rays)
     enough = min(max(3, count // 2 + 1), count)
-    if not found or found[0].used.sum() < enough or found[0].reprojection_px > near_px(seen).mean():
-        by_pairs = poses_of_pairs(seen)
-        found = _distinct([*found, *(fit(seen, *pose, fits) for pose, fits in by_pairs)])
-    mirrored = [fit(seen, *pose, best.fits) for best in found for pose in mirrored_poses(seen, best)]
+    if not found or found[0].used.sum() < enough or found[0].reprojection_px > _near_px(seen).mean():
+        by_pairs = _poses_of_pairs(seen)
+        found = _distinct([*found, *(_fit(seen, *pose, fits) for pose, fits in by_pairs)])
+    mirrored = [_fit(seen, *pose, best.fits) for best in found for pose in _mirrored_poses(seen, best)]
     return _distinct([*found, *mirrored])
 
 
@@ -134,3 +175,206 @@ def _log_prior(pose: MarkerPose, expected: CameraPose | None) -> float:
         return 0.0
     square, log_determinant = _mahalanobis2(pose, expected)
     return float(np.logaddexp(-0.5 * (square + log_determinant + 6 * log(2 * pi)), _LOG_UNEXPECTED))
+
+
+def _fit(
+    seen: SeenMarkers,
+    position_m: Float[np.ndarray, "3"],
+    R_world_cam: Float[np.ndarray, "3 3"],
+    fits: Bool[np.ndarray, "markers 4"] | None = None,
+) -> MarkerPose | None:
+    """Fit a pose near an initial pose, and find the corners that fit.
+
+    Args:
+        seen: markers of the frame.
+        position_m: (3,), the camera's centre in the initial pose, world, metres.
+        R_world_cam: (3, 3), camera to world, in the initial pose.
+        fits: (markers, 4), True for corners that fit the initial pose; None for all.
+
+    Returns:
+        The fit; None if the markers do not determine the pose, or no pose explains the markers.
+    """
+    fits = np.ones(seen.corners_px.shape[:2], bool) if fits is None else fits
+    extra, number, settled = np.zeros(2), 0, False
+    try:
+        while not settled:
+            found = linearised(seen, position_m, R_world_cam, extra, fits)
+            step, covariance = found.solved(extra)
+            length = float(step @ np.linalg.solve(covariance, step))
+            still_fits, scale = _explained(found, step, covariance)
+            if number >= _NO_RETURN:
+                still_fits = still_fits & fits
+            # In the first steps the pose is still far away, and a large step says nothing of single corners.
+            settled = length < _LAST and bool((still_fits == fits).all())
+            if number == _MAX_STEPS or not still_fits.any() or scale > _MOST_SCALE:
+                return None
+            distance_m = np.maximum(found.depth_m, NEAR_M).mean()
+            longest = max(np.linalg.norm(step[:3]) / distance_m, np.linalg.norm(step[3:6]), _LONGEST)
+            step = step * (_LONGEST / longest)
+            position_m = position_m + step[:3]
+            R_world_cam = R_world_cam @ Rotation.from_rotvec(step[3:6]).as_matrix()
+            extra, fits, number = extra + step[6:], still_fits, number + 1
+    except np.linalg.LinAlgError:
+        return None
+    found = linearised(seen, position_m, R_world_cam, extra, fits)
+    # The inset is an error of the measurement, so the reported distances are without the inset.
+    off_px = found.residual_px.reshape(-1, 4, 2) + extra[0] * seen.inward
+    by_shift, constant = _other_errors(found, covariance, seen.shift_px)
+    used = np.any(found.fits, axis=1)
+    return MarkerPose(
+        position_m,
+        R_world_cam,
+        covariance[:6, :6] + by_shift,
+        constant,
+        num_markers=int(used.sum()),
+        used=used,
+        reprojection_px=float(np.sqrt(np.mean((off_px[found.fits] ** 2).sum(axis=-1)))),
+        equations=found,
+        log_evidence=_log_evidence(seen, found, covariance[:6, :6]),
+    )
+
+
+def _explained(
+    found: Equations, step: Float[np.ndarray, "8"], covariance: Float[np.ndarray, "8 8"]
+) -> tuple[Bool[np.ndarray, "markers 4"], float]:
+    """Corners whose residuals, and whose marker's mean residual, are in the gate; and the gate's factor, 1 or more."""
+    off_px = found.residual_px - found.slopes @ step
+    of_fit = found.slopes @ covariance @ found.slopes.swapaxes(1, 2)
+    used = np.asarray(found.fits.any(axis=1))
+    # The covariance of a residual is smaller than that of the error for corners that were used, else larger.
+    whole = np.where(used[:, None, None], found.covariance - of_fit, found.covariance + of_fit)
+    corner = whole.reshape(-1, 4, 2, 4, 2)[:, np.arange(4), :, np.arange(4)].swapaxes(0, 1)
+    squares = _squares(off_px.reshape(-1, 4, 2), corner, found.covariance[:, :2, :2][:, None])
+    is_ahead = found.depth_m > NEAR_M
+    of_used = squares[found.fits & is_ahead]
+    scale2 = max(1.0, float(np.median(of_used)) / _MEDIAN) if len(of_used) > 4 else 1.0
+    good = is_ahead & (squares < scale2 * _GATE)
+    averaged = np.zeros((len(good), 2, 8))
+    share = good / np.maximum(good.sum(axis=1, keepdims=True), 1)
+    averaged[:, 0, 0::2], averaged[:, 1, 1::2] = share, share
+    # A mean is gated as if the corners' errors were independent: a lens or a map may be less exact than an edge.
+    independent = np.einsum("mii->mi", found.own)[:, :1, None] * np.eye(2) / 4
+    of_mean = averaged @ whole @ averaged.swapaxes(1, 2) + independent
+    squares = _squares((averaged @ off_px[..., None])[..., 0], of_mean, independent)
+    kept = (squares < scale2 * _GATE) & (good.sum(axis=1) >= _MIN_CORNERS)
+    if used.sum() == 1:
+        # The corners of a single marker give two equations more than unknowns, too few to find a bad corner.
+        good[used], kept[used] = is_ahead[used], True
+    return good & kept[:, None], float(np.sqrt(scale2))
+
+
+def _squares(
+    off_px: Float[np.ndarray, "*items 2"],
+    covariance: Float[np.ndarray, "*items 2 2"],
+    least: Float[np.ndarray, "*#items 2 2"],
+) -> Float[np.ndarray, "*items"]:
+    """Squared residuals by their covariances; a residual without degrees of freedom has no information."""
+    return np.einsum("...i,...ij,...j->...", off_px, np.linalg.inv(covariance + 0.02 * least), off_px)
+
+
+def _other_errors(
+    found: Equations, covariance: Float[np.ndarray, "8 8"], shift_px: float
+) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6 6"]]:
+    """Covariances of the pose by a shift of all corners, and by errors of the map and of the focal length."""
+    gains = covariance[:6] @ found.slopes.swapaxes(1, 2) @ found.weight
+    by_shift = shift_px * gains.reshape(-1, 6, 4, 2).sum(axis=(0, 2))
+    # A marker that is elsewhere moves its pixels as a move of the camera does, in the other direction.
+    by_place = gains @ found.slopes[..., :3] * np.sqrt(found.variances[2])[:, None, None]
+    constant = np.concatenate([*by_place, covariance[:6, 7:]], axis=1)
+    return by_shift @ by_shift.T, constant @ constant.T
+
+
+def _log_evidence(seen: SeenMarkers, found: Equations, covariance: Float[np.ndarray, "6 6"]) -> float:
+    """Logarithm of the density of all corners of a frame.
+
+    Residuals of fitting corners have Student's t distribution, because their variance is not exactly known. Other
+    corners have a uniform density. The poses are integrated out by Laplace's approximation, whose curvature is that of
+    this distribution.
+    """
+    std_px = np.repeat(seen.std_px, 4)[found.fits.ravel()]
+    off = found.residual_px.reshape(-1, 2)[found.fits.ravel()] / std_px[:, None]
+    count, half = off.size, (_PRIOR_RESIDUALS + off.size) / 2
+    of_fitted = lgamma(half) - lgamma(_PRIOR_RESIDUALS / 2) - count / 2 * log(pi * _PRIOR_RESIDUALS)
+    squares = float(np.sum(off**2))
+    of_fitted -= half * log(1 + squares / _PRIOR_RESIDUALS) + 2 * np.log(std_px).sum()
+    of_others = (found.fits.size - len(off)) * _LOG_ANYWHERE
+    of_poses = 3 * log(2 * pi * (_PRIOR_RESIDUALS + squares) / (_PRIOR_RESIDUALS + count))
+    return float(of_fitted + of_others + of_poses + np.linalg.slogdet(covariance)[1] / 2)
+
+
+def _near_px(seen: SeenMarkers) -> Float[np.ndarray, "markers"]:
+    """(markers,), distance of a corner from its projection at which a pose still explains the corner, pixels."""
+    return np.maximum(_LOOSE * seen.std_px, _LOOSE_PX)
+
+
+def _pose_of_all(seen: SeenMarkers) -> list[_InitialPose]:
+    """Poses of all markers together: at most one, if all markers are right."""
+    return _solve(seen.corners_m, seen.rays, "sqpnp")
+
+
+def _poses_of_pairs(seen: SeenMarkers) -> list[tuple[_InitialPose, Bool[np.ndarray, "markers 4"]]]:
+    """Poses of pairs of markers that explain most corners, with these corners; each pose explains other markers."""
+    poses = list(_poses_of_few(seen))
+    if not poses:
+        return []
+    distance = _distances_px(seen, poses) / _near_px(seen)[:, None]
+    fits = (distance < 1).sum(axis=-1) >= _MIN_CORNERS
+    cost = np.minimum(distance, 10.0).sum(axis=(1, 2))
+    chosen: list[tuple[_InitialPose, Bool[np.ndarray, "markers 4"]]] = []
+    for index in np.argsort(cost, kind="stable"):
+        used = fits[index][:, None] & (distance[index] < 1)
+        if used.any() and not any((used.any(axis=1) == other.any(axis=1)).all() for _, other in chosen):
+            chosen.append((poses[index], used))
+    return chosen[:_MOST_INITIAL_POSES]
+
+
+def _mirrored_poses(seen: SeenMarkers, best: MarkerPose) -> list[_InitialPose]:
+    """Second poses of markers that lie nearly in a plane, without those that equal the best pose."""
+    corners_m = seen.corners_m[best.used]
+    extent_m = np.linalg.svd((corners_m - corners_m.mean(axis=(0, 1))).reshape(-1, 3), compute_uv=False)
+    if extent_m[2] > _NEARLY_FLAT * extent_m[0]:
+        return []
+    poses = _solve(corners_m, seen.rays[best.used], "ippe")
+    if not poses:
+        return []
+    rms_px = np.sqrt(np.mean(_distances_px(seen, poses)[:, best.fits] ** 2, axis=1))
+    near = rms_px < max(_near_px(seen)[best.used].mean(), _LOOSE * best.reprojection_px)
+    # The trace of a rotation by an angle is 1 + 2 cos(angle).
+    least_trace = 1 + 2 * np.cos(_SAME_ANGLE_RAD)
+    return [
+        pose
+        for pose, is_near in zip(poses, near, strict=True)
+        if is_near and np.sum(pose[1] * best.R_world_cam) < least_trace
+    ]
+
+
+def _distances_px(seen: SeenMarkers, poses: list[_InitialPose]) -> Float[np.ndarray, "poses markers 4"]:
+    """Distance of each corner from its projection, pixels without distortion; infinite behind the camera."""
+    position_m, R = (np.array(part) for part in zip(*poses, strict=True))
+    x_cam = (seen.corners_m.reshape(-1, 3) - position_m[:, None]) @ R
+    ahead = x_cam[..., 2] > NEAR_M
+    projected = x_cam[..., :2] / np.where(ahead, x_cam[..., 2], 1.0)[..., None]
+    off_px = (projected - seen.rays.reshape(-1, 2)) * np.diag(seen.lens.K)[:2]
+    return np.where(ahead, np.linalg.norm(off_px, axis=-1), np.inf).reshape(len(poses), *seen.rays.shape[:2])
+
+
+def _poses_of_few(seen: SeenMarkers) -> Iterator[_InitialPose]:
+    """Poses of pairs of markers, from two opposite corners of each; in frames of few markers, of single markers too."""
+    count = len(seen.rays)
+    pairs = list(combinations(range(count), 2))
+    if len(pairs) > _MOST_PAIRS:
+        chosen = np.random.default_rng(0).permutation(len(pairs))[:_MOST_PAIRS]
+        pairs = [pairs[index] for index in chosen]
+    for pair in pairs:
+        opposite = [[marker] for marker in pair], [[0, 2], [1, 3]]
+        yield from _solve(seen.corners_m[opposite], seen.rays[opposite], "ap3p")
+    for marker in range(count if count <= _FEW_MARKERS else 0):
+        yield from _solve(seen.corners_m[marker], seen.rays[marker], "ippe")
+
+
+def _solve(
+    corners_m: Float[np.ndarray, "*corners 3"], rays: Float[np.ndarray, "*corners 2"], solver: Solver
+) -> list[_InitialPose]:
+    """Poses that a solver finds for corners on rays, the pose of smallest reprojection error first."""
+    poses = solve_pnp(corners_m.reshape(-1, 3), rays.reshape(-1, 2), solver)
+    return [(-T[:3, :3].T @ T[:3, 3], T[:3, :3].T) for T in poses]

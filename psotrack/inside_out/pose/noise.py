@@ -42,7 +42,7 @@ def estimate_noise(frames: Sequence[Equations], noise: CornerNoise) -> CornerNoi
         most = (_MOST.scale / noise.scale) ** 2, _MOST.place_m**2
         factor = np.clip(factor, least, most)
     own, place_m = np.sqrt(factor)
-    return CornerNoise(float(noise.scale * own), float(place_m))
+    return replace(noise, scale=float(noise.scale * own), place_m=float(place_m))
 
 
 def _observed_and_expected(frame: Equations) -> Float[np.ndarray, "2 2"]:
