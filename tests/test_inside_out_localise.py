@@ -572,7 +572,9 @@ def test_lenses_are_not_scaled_to_other_aspect_ratios(tmp_path):
 
 def test_a_csv_without_sizes_is_refused_where_its_axis_is_far_off_the_middle(tmp_path):
     lens = tmp_path / "cameras_calibration.csv"
-    write_calibration(lens, make_rig({"cam1i": lens_of_view(77.32, 61.93, SIZE_WH)}))
+    K = np.array([[400.0, 0.0, 319.5], [0.0, 400.0, 239.5], [0.0, 0.0, 1.0]])
+    one = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)
+    write_calibration(lens, make_rig({"cam1i": one}))
     assert read_lens(lens, SIZE_WH).K[0, 2] == 319.5
     with pytest.raises(
         InputError, match=r"expected intrinsics for 1920 x 1080.*found an optical axis at \(320, 240\)"
