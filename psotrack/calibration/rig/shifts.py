@@ -20,7 +20,7 @@ from psotrack.geometry import Rig, project, triangulate_linearly, undistort
 _MOST_SHIFT = 60
 #: Distance in the image up to which a moving point's sighting fits, pixels: ten times the error of a usual detector;
 #: and that of a board's corner: a camera that is counted wrongly pulls the boards by some pixels.
-_FITS_PX, _CORNER_FITS_PX = 5.0, 3.0
+_FITS_PX, _CORNER_FITS_PX = 5.0, 2.0
 #: A camera of whose sightings a larger fraction fits is sound.
 _SOUND = 0.6
 #: Least gain of the fraction that fits to tell a shift; clutter fits a few more sightings at any shift.
