@@ -203,14 +203,17 @@ class TestRefusedInput:
         [
             ({"time_s": (3, 0.01)}, "time_s: expected increasing times"),
             ({"time_s": (29, np.inf)}, "time_s: expected increasing times"),
-            ({"measured_m": ((4, 1, 2), np.nan)}, "position_m, row 4, drone 1: expected numbers"),
+            (
+                {"measured_m": ((4, 1, 2), np.nan)},
+                "row 4, drone 1: expected a position and a positive definite",
+            ),
             (
                 {"covariance_m2": ((4, 1, 2), np.inf)},
-                "covariance_m2, row 4, drone 1: expected numbers",
+                "row 4, drone 1: expected a position and a positive definite",
             ),
             (
                 {"covariance_m2": ((5, 0), np.diag([1, 1, -1]))},
-                "covariance_m2, row 5, drone 0: expected a positive definite covariance",
+                "row 5, drone 0: expected a position and a positive definite",
             ),
         ],
     )
