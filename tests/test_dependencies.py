@@ -20,7 +20,7 @@ IMPORT_NAMES = {
 #: Declared for the detector that is trained, which is being built.
 NOT_YET_IMPORTED = {"optax"}
 #: Part of a declared distribution: jax, jinja2, matplotlib; and IPython is there where a notebook shows a result.
-NOT_DECLARED = {"markupsafe", "mpl_toolkits", "IPython"}
+NOT_DECLARED = {"markupsafe", "IPython"}
 #: Functions that import the module whose name they are given.
 IMPORTERS = {"import_module", "_library"}
 
