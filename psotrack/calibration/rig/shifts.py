@@ -113,14 +113,18 @@ def _shift(
     is_seen = np.isfinite(seen[1][:, 0])
     number, rays = seen[0][is_seen], seen[1][is_seen]
     fractions: dict[int, float] = {}
+    least = _LEAST
     for shift in sorted(range(-_MOST_SHIFT, _MOST_SHIFT + 1), key=abs):
         _, here, there = np.intersect1d(number + shift * per_instant, known[0], return_indices=True)
-        if len(here) >= _LEAST:
+        if len(here) >= least:
             some = np.linspace(0, len(here) - 1, min(len(here), _MOST)).astype(np.int64)
             found = solve_pnp_ransac(known[1][there[some]], rays[here[some]], gate)
             fractions[shift] = 0.0 if found is None else float(found[1].mean())
-        if shift == 0 and fractions.get(0, 1.0) >= _SOUND:
-            return []
+        if shift == 0:
+            if fractions.get(0, 1.0) >= _SOUND:
+                return []
+            # The sightings of one instant or two, of a long shift, fit some pose in any case.
+            least = max(_LEAST, len(here) // 2)
     best = max(fractions, key=lambda shift: fractions[shift])
     gain = fractions[best] - fractions[0]
     return [Shift(name, best, fractions[0], fractions[best])] if gain > _LEAST_GAIN else []
