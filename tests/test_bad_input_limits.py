@@ -215,12 +215,6 @@ def test_a_marker_of_thousands_of_digits(header, flight, run_psotrack, tmp_path)
     check_line(output, path)
 
 
-def test_a_label_of_thousands_of_digits(tmp_path):
-    path = write(tmp_path / "m.csv", f"label;x;y;z\nMarker{HUGE[:900]}:1;0;0;0\n")
-    with pytest.raises(InputError, match="expected a label such as Marker7:1"):
-        read_marker_corners(path)
-
-
 @pytest.mark.parametrize(
     "words",
     [

@@ -151,16 +151,6 @@ def long_table(header, corner_names, *, scale=1.0, separator=","):
     return "\n".join(lines) + "\n"
 
 
-def labelled_table(pattern):
-    lines = ["label;x[mm];y[mm];z[mm]"]
-    for marker, corners in ROOM.items():
-        for number, corner in enumerate(1000 * corners, start=1):
-            lines.append(
-                ";".join([pattern.format(marker, number), *(repr(float(value)) for value in corner)])
-            )
-    return "\n".join(lines) + "\n"
-
-
 LAYOUTS = {
     "ours": wide_table(column_names("{axis}{corner}[m]")),
     "millimetres": wide_table(column_names("{axis}{corner}[mm]"), scale=1e3),
@@ -178,9 +168,6 @@ LAYOUTS = {
         ["aruco_id", "corner", "x", "y", "z"], ["Top-left", "TR", "bottom right", "bl"]
     ),
     "long numbers": long_table(None, "1234", separator=";"),
-    "labels": labelled_table("Marker{}:{}"),
-    "short labels": labelled_table("M{}_{}"),
-    "numbers as labels": labelled_table("{}.{}"),
     "a spreadsheet's": "\ufeff" + wide_table(column_names("{axis}{corner}[m]")).replace("\n", ";\r\n"),
     "words in ids": wide_table(column_names("{axis}{corner}[m]")).replace("\n", "\nMarker_")[
         : -len("Marker_")
@@ -326,7 +313,7 @@ BAD_TEXTS = {
     ),
     "corners from 0 to 4": (
         LONG.replace("\n3,1,", "\n3,0,"),
-        r"line 5, column corner: .* because line 10 has corner 0",
+        r"line 5, column corner: expected a corner, 0 to 3, or tl, .* found '4'",
     ),
     "no number": (
         STANDARD.replace("\n3;", "\nthree;"),
@@ -344,10 +331,6 @@ BAD_TEXTS = {
     "no rows": (STANDARD.splitlines()[0], "expected rows below the header, found none"),
     "nothing": ("\n", "expected a table of marker corners, found an empty file"),
     "other numbers": ("1;2;3;4\n5;6;7;8\n", "line 1: expected a header, or numbers in rows of 13"),
-    "another label": (
-        LAYOUTS["labels"].replace("Marker3:2", "Dron3:Dron32"),
-        r"line 11, column label: .* found 'Dron3:Dron32'",
-    ),
 }
 
 

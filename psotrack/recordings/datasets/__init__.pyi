@@ -19,7 +19,7 @@ from ._onboard import (
 )
 from ._poses import pose_file, read_poses, unit_quaternion, write_poses
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
-from .drafting import Draft, DraftOptions, Unclear, Unmatched, draft_recording, unclear_files
+from .drafting import Draft, DraftOptions, draft_recording
 from .opening import find_marker_corners, is_recording, open_recording
 
 __all__ = [
@@ -33,8 +33,6 @@ __all__ = [
     "MarkerRow",
     "MaskWriter",
     "Masks",
-    "Unclear",
-    "Unmatched",
     "detection_files",
     "draft_recording",
     "find_marker_corners",
@@ -54,7 +52,6 @@ __all__ = [
     "read_poses",
     "read_sequence",
     "split_label",
-    "unclear_files",
     "unit_quaternion",
     "videos_in",
     "write_marker_corners",

@@ -9,8 +9,7 @@ The reader accepts all layouts that are unambiguous:
 - columns separated by semicolons, commas or tabs;
 - lengths in metres, centimetres or millimetres, as in `x1[mm]`, `x1 (mm)` or `x1_mm`; without a unit, metres;
 - corners named 1 to 4, 0 to 3, or tl, tr, br, bl, as in `x1`, `corner1_x` or `tl_x`;
-- one row per corner: `id`, `corner`, `x`, `y`, `z`, or `label`, `x`, `y`, `z` with labels such as `Marker7:1`, `M7_1`
-  or `7.1`;
+- one row per corner: `id`, `corner`, `x`, `y`, `z`;
 - tables without a header, with 13 or 5 numbers per row.
 
 A table with one row per marker may have a column `std_m`: the standard deviation of the positions of the marker's
@@ -31,19 +30,20 @@ from jaxtyping import Float
 from psotrack.errors import InputError
 from psotrack.geometry.rig_files import UNITS_M
 from psotrack.recordings.datasets._rows import lengths_of
-from psotrack.support import Column, Table, TextRow, read_rows, read_text, whole_number, write_rows
+from psotrack.support import Column, Table, TextRow, are_numbers, first_line, read_rows, write_rows
 
 _CORNERS = [f"{axis}{corner}" for corner in range(1, 5) for axis in "xyz"]
+#: Names of the columns of a table without header, by their number.
+_UNNAMED = {13: ["id", *_CORNERS], 5: ["id", "corner", *"xyz"]}
 _METRES = UNITS_M | {"": 1.0}
 _UNIT = re.compile(r"(?P<name>.*?)\s*(?:[\[(]\s*(?P<bracketed>[^\])]*?)\s*[\])]|_(?P<plain>mm|cm|m))")
 _IDS = re.compile("(?:id)?(?:marker|aruco|tag)(?:id)?|id|nr|no|number")
-_CORNER = re.compile("(?:corner|vertex|point)(?:id|no|nr|number|index)?|label|name")
+_CORNER = re.compile("(?:corner|vertex|point)(?:id|no|nr|number|index)?")
 _NAMED = {"tl": 1, "topleft": 1, "tr": 2, "topright": 2, "br": 3, "bottomright": 3, "bl": 4, "bottomleft": 4}
-_WHICH = rf"(?:c|corner|p|pt|point|v|vertex)?([0-4]|{'|'.join(_NAMED)})"
-#: x1 and the like, 1x and the like, and x alone.
-_AXIS_FIRST = re.compile(rf"([xyz]){_WHICH}")
-_CORNER_FIRST = re.compile(rf"{_WHICH}([xyz])")
-_ALONE = re.compile(r"(?:pos|position|coord|corner|c|p|point)?([xyz])")
+_WORD = "(?:c|corner|p|pt|point|v|vertex|pos|position|coord)?"
+_WHICH = rf"{_WORD}([0-4]|{'|'.join(_NAMED)})?"
+#: A coordinate: x alone, or x1 and the like, or 1x and the like.
+_COORDINATE = re.compile(rf"{_WHICH}([xyz]){_WHICH}")
 _LABEL = re.compile(
     r"(?:marker|aruco|tag|id|m)?[ _]*(\d{1,9})[ ]?[:_. -][ ]?(?:corner|c)?([0-4])", re.IGNORECASE
 )
@@ -155,30 +155,32 @@ def _rows_by_marker(table: Table) -> dict[int, TextRow]:
 
 def _rows_per_corner(table: Table) -> dict[int, MarkerRow]:
     """Corners from a table with one row per corner."""
-    id_column, corner_column = table.column("id"), table.column("corner")
+    id_column, column = table.column("id"), table.column("corner")
     point_m = lengths_of(table, "xyz", _METRES)
-    first = _first_corner(table, corner_column)
+    # The first corner may have number 0 or 1.
+    first = 0 if any(row.text(column) == "0" for row in table.rows) else 1
+    numbers = _NAMED | {f"{first + index}": 1 + index for index in range(4)}
     rows: dict[int, dict[int, TextRow]] = {}
     for row in table.rows:
-        marker, corner = _marker(row, id_column), _corner(row, corner_column)
-        corner += 1 - first if row.text(corner_column).isdecimal() else 0
-        if corner in rows.setdefault(marker, {}):
-            expected = "each corner of a marker once"
-            raise row.error(
-                corner_column, expected, f"corner {row.text(corner_column)} of marker {marker} again"
-            )
-        rows[marker][corner] = row
+        text, marker = row.text(column), _marker(row, id_column)
+        of_marker = rows.setdefault(marker, {})
+        corner = numbers.get(_bare(text))
+        if corner is None:
+            raise row.error(column, f"a corner, {first} to {first + 3}, or tl, tr, br or bl", repr(text))
+        if corner in of_marker:
+            found_again = f"corner {text} of marker {marker} again"
+            raise row.error(column, "each corner of a marker once", found_again)
+        of_marker[corner] = row
     found = {}
     for marker, of_marker in rows.items():
         lines = [row.line for row in of_marker.values()]
         where = f"{table.path}, line {min(lines)}" + (f" to {max(lines)}" if len(lines) > 1 else "")
-        missing = [corner for corner in range(1, 5) if corner not in of_marker]
+        missing = [f"{corner - 1 + first}" for corner in range(1, 5) if corner not in of_marker]
         if missing:
-            numbers = ", ".join(str(corner - 1 + first) for corner in missing)
             raise InputError(
                 f"{where}, marker {marker}",
                 expected="4 corners",
-                found=f"none of number {numbers}",
+                found=f"none of number {', '.join(missing)}",
                 remedy="add it, or leave the marker out",
             )
         found[marker] = MarkerRow(where, np.array([point_m(of_marker[corner]) for corner in range(1, 5)]))
@@ -192,73 +194,33 @@ def _marker(row: TextRow, column: Column) -> int:
     return int(match["number"])
 
 
-def _corner(row: TextRow, column: Column) -> int:
-    """Number of a corner as in the file; named corners are numbered from 1."""
-    text = row.text(column)
-    number = _NAMED.get(_bare(text), whole_number(text))
-    if number is None or not 0 <= number <= 4:
-        raise row.error(column, "a corner, 1 to 4, or tl, tr, br or bl", repr(text))
-    return number
-
-
-def _first_corner(table: Table, column: Column) -> int:
-    """Number of the first corner in the file, 0 or 1."""
-    zeros = [row for row in table.rows if row.text(column) == "0"]
-    fours = [row for row in table.rows if row.text(column) == "4"]
-    if zeros and fours:
-        raise fours[0].error(column, f"corners 0 to 3, because line {zeros[0].line} has corner 0", "corner 4")
-    return 0 if zeros else 1
-
-
 def _read_normalised(path: Path) -> Table:
     """Read a table and name its columns `id` and `x1` to `z4`, or `id`, `corner`, `x`, `y` and `z`."""
-    lines = [line for line in read_text(path).splitlines() if line.strip(" ;,\t")]
-    if not lines:
+    line = first_line(path)
+    rows = read_rows(path, next((mark for mark in ";\t" if mark in line), ","))
+    if not rows:
         raise InputError(path, expected="a table of marker corners", found="an empty file")
-    separator = next((mark for mark in ";\t" if mark in lines[0]), ",")
-    rows = read_rows(path, separator)
-    if all(map(_is_number, rows[0].cells)):
-        names = {13: ["id", *_CORNERS], 5: ["id", "corner", *"xyz"]}.get(len(rows[0].cells))
-        if names is None:
+    header = rows[0]
+    if are_numbers([*header.cells]):
+        if len(header.cells) not in _UNNAMED:
             expected = "a header, or numbers in rows of 13 (id, 4 corners) or 5 (id, corner, x, y, z)"
-            raise InputError(rows[0].where, expected=expected, found=f"{len(rows[0].cells)} numbers")
+            raise InputError(header.where, expected=expected, found=f"{len(header.cells)} numbers")
+        names = _UNNAMED[len(header.cells)]
         columns = tuple(Column(index, name, "", name) for index, name in enumerate(names))
     else:
-        columns, rows = _columns(rows[0]), rows[1:]
+        columns, rows = _columns(header), rows[1:]
     if not rows:
         raise InputError(path, expected="rows below the header", found="none")
-    full_rows = [_with_last_cell(row, len(columns)) for row in rows]
-    table = Table(path, columns, tuple(full_rows))
-    return table if table.find("id") or not table.find("corner") else _with_split_labels(table)
+    return Table(path, columns, tuple(_with_last_cell(row, len(columns)) for row in rows))
 
 
 def _with_last_cell(row: TextRow, count: int) -> TextRow:
     # `read_rows` drops an empty cell at the end of a line.
     cells = row.cells + ("",) * (len(row.cells) == count - 1)
     if len(cells) != count:
-        raise InputError(
-            row.where,
-            expected=f"{count} values",
-            found=f"{len(row.cells)}",
-            remedy="a marker has four corners of three coordinates" if count >= 13 else "",
-        )
+        remedy = "a marker has four corners of three coordinates" if count >= 13 else ""
+        raise InputError(row.where, expected=f"{count} values", found=f"{len(row.cells)}", remedy=remedy)
     return replace(row, cells=cells)
-
-
-def _with_split_labels(table: Table) -> Table:
-    """The table with the two numbers of its labels in the columns `id` and `corner`."""
-    column, end = table.column("corner"), len(table.columns)
-    rows = []
-    for row in table.rows:
-        numbers = split_label(row.text(column))
-        if numbers is None:
-            raise row.error(
-                column, "a label such as Marker7:1, of marker 7's first corner", repr(row.text(column))
-            )
-        rows.append(replace(row, cells=(*row.cells, *map(str, numbers))))
-    added = (Column(end, "id", "", column.header), Column(end + 1, "corner", "", column.header))
-    others = tuple(other for other in table.columns if other is not column)
-    return Table(table.path, others + added, tuple(rows))
 
 
 def _columns(header: TextRow) -> tuple[Column, ...]:
@@ -269,22 +231,15 @@ def _columns(header: TextRow) -> tuple[Column, ...]:
         match = _UNIT.fullmatch(text)
         name, unit = (match["name"], match["bracketed"] or match["plain"] or "") if match else (text, "")
         columns.append(Column(index, _canonical(_bare(name)), unit.removesuffix("etres"), cell))
-    numbers = {name[1] for name in (column.name for column in columns) if re.fullmatch("[xyz][0-4]", name)}
-    if "0" in numbers and "4" not in numbers:
-        columns = [
-            replace(column, name=f"{column.name[0]}{int(column.name[1]) + 1}")
-            if re.fullmatch("[xyz][0-3]", column.name)
-            else column
-            for column in columns
-        ]
     names = [column.name for column in columns]
-    twice = [column.header for column in columns if names.count(column.name) > 1 and column.name in _KNOWN]
+    if "x0" in names and "x4" not in names:
+        from_1 = {f"{axis}{number}": f"{axis}{number + 1}" for axis in "xyz" for number in range(4)}
+        columns = [replace(column, name=from_1.get(column.name, column.name)) for column in columns]
+    known = {"id", "corner", *"xyz", *_CORNERS}
+    twice = [column.header for column in columns if names.count(column.name) > 1 and column.name in known]
     if twice:
         raise InputError(header.where, expected="each column once", found=f"{' and '.join(twice)}")
     return tuple(columns)
-
-
-_KNOWN = {"id", "corner", *"xyz", *_CORNERS}
 
 
 def _canonical(name: str) -> str:
@@ -292,23 +247,14 @@ def _canonical(name: str) -> str:
         return "id"
     if _CORNER.fullmatch(name):
         return "corner"
-    if match := _AXIS_FIRST.fullmatch(name):
-        return f"{match[1]}{_NAMED.get(match[2], match[2])}"
-    if match := _CORNER_FIRST.fullmatch(name):
-        return f"{match[2]}{_NAMED.get(match[1], match[1])}"
-    match = _ALONE.fullmatch(name)
-    return match[1] if match else name
+    match = _COORDINATE.fullmatch(name)
+    if match is None or (match[1] and match[3]):
+        return name
+    which = match[1] or match[3] or ""
+    return f"{match[2]}{_NAMED.get(which, which)}"
 
 
 def _bare(name: str) -> str:
     """A name without separators; upper and lower are top and bottom, and `left top` is `top left`."""
     name = re.sub(r"[\s_.:\"'-]", "", name.lower()).replace("upper", "top").replace("lower", "bottom")
     return re.sub("(left|right)(top|bottom)", r"\2\1", name)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

@@ -57,7 +57,7 @@ def read_onboard(folder: Path | str) -> dict[str, OnboardVideo]:
         InputError: a file cannot be used. The message names file, line and column.
     """
     files = sorted(Path(folder).iterdir())
-    videos, poses = numbered_files(files, _VIDEO), numbered_files(files, _POSES)
+    videos, poses = _numbered(files, _VIDEO), _numbered(files, _POSES)
     calibration = Path(folder) / ONBOARD_CALIBRATION
     intrinsics = read_onboard_calibration(calibration) if videos and calibration.exists() else {}
     found = {}
@@ -73,7 +73,7 @@ def read_onboard(folder: Path | str) -> dict[str, OnboardVideo]:
         position_m = np.full((video.num_frames, 3), np.nan)
         orientation_wxyz = np.full((video.num_frames, 4), np.nan)
         if number in poses:
-            check_rate(poses[number], _POSES, video.fps)
+            _check_rate(poses[number], video.fps)
             position_m, orientation_wxyz = poses_of_frames(poses[number], video.num_frames)
         found[name] = OnboardVideo(video, K, position_m, orientation_wxyz)
     return found
@@ -119,16 +119,8 @@ def write_onboard_calibration(path: Path | str, intrinsics: Intrinsics) -> None:
     write_rows(path, [header, *rows])
 
 
-def numbered_files(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int, Path]:
-    """Files whose names match a pattern, by the number of the drone.
-
-    Args:
-        files: paths of the files.
-        pattern: pattern with the number of the drone as group `number`.
-
-    Raises:
-        InputError: a drone has two files.
-    """
+def _numbered(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int, Path]:
+    """Files whose names match a pattern, by the number of the drone; raise `InputError` for two files of a drone."""
     found: dict[int, Path] = {}
     for path in files:
         match = pattern.fullmatch(path.name)
@@ -143,15 +135,9 @@ def numbered_files(files: Iterable[Path], pattern: re.Pattern[str]) -> dict[int,
     return dict(sorted(found.items()))
 
 
-def check_rate(path: Path, pattern: re.Pattern[str], fps: float) -> None:
-    """Raise `InputError` if the rate in the name of a file differs from the video's rate.
-
-    Args:
-        path: path of the file.
-        pattern: pattern with the rate as group `rate`.
-        fps: frames per second of the video.
-    """
-    match = pattern.fullmatch(path.name)
+def _check_rate(path: Path, fps: float) -> None:
+    """Raise `InputError` if the rate in the name of a file differs from the video's rate."""
+    match = _POSES.fullmatch(path.name)
     # 0.1 % is the accuracy of rates in containers; a larger difference would drift.
     if match is not None and abs(float(match["rate"]) - fps) > 1e-3 * fps:
         raise InputError(path, expected=f"poses at the {fps:g} Hz of the video", found=f"{match['rate']} Hz")

@@ -22,6 +22,8 @@ from psotrack.trajectories.tum import read_tum
 _logger = logging.getLogger(__name__)
 #: Ending of a pose file's name that states its rate, such as `dron1_pos_25`.
 _RATE = re.compile(r"_(?:pos|cam)_(?P<rate>\d+(?:\.\d+)?)$")
+#: Names of drones in the dataset; `drone_1` is `dron1`.
+_DRONE = re.compile(r"drone?_?(?=\d+$)", re.IGNORECASE)
 _SUFFIXES = (".csv", ".parquet", ".tum", ".txt", ".c3d")
 
 
@@ -123,7 +125,7 @@ def _at_times(
 def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
     suffix = path.suffix.lower()
     if suffix == ".c3d":
-        return marker_bodies(read_c3d(path), path, bodies).at_own_frames()
+        return marker_bodies(read_c3d(path), path, bodies)
     if suffix in (".tum", ".txt"):
         return read_tum(path)
     if suffix == ".parquet" or (suffix == ".csv" and "x_m" in _header(path)):
@@ -140,7 +142,7 @@ def _read_pose_file(path: Path, fps: float) -> Trajectories:
     return Trajectories(
         frame,
         frame / (fps if rate is None else float(rate["rate"])),
-        (path.stem if rate is None else path.stem[: rate.start()],),
+        (_DRONE.sub("dron", path.stem if rate is None else path.stem[: rate.start()]),),
         position_m[:, None],
         orientation_wxyz=None if orientation_wxyz is None else orientation_wxyz[:, None],
     )

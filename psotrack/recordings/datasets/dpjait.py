@@ -11,9 +11,8 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from psotrack.errors import InputError
 from psotrack.geometry import Rig, files_by_camera
@@ -24,13 +23,14 @@ from psotrack.recordings import (
     OnboardVideo,
     Recording,
     Reference,
+    Timeline,
     VideoInfo,
+    natural_key,
     probe,
 )
-from psotrack.recordings.datasets._onboard import check_rate, is_onboard_video, numbered_files, read_onboard
-from psotrack.recordings.datasets._poses import poses_of_frames
-from psotrack.recordings.mocap import NoDronesError, marker_bodies, read_c3d
-from psotrack.trajectories import Trajectories
+from psotrack.recordings.datasets._onboard import is_onboard_video, read_onboard
+from psotrack.recordings.datasets._reference import read_reference
+from psotrack.recordings.mocap import NoDronesError
 
 CALIBRATION = "cameras_calibration.csv"
 #: The folder of the detections, one file per camera.
@@ -41,14 +41,14 @@ _logger = logging.getLogger(__name__)
 _VIDEO_SUFFIXES = {".avi", ".mp4"}
 #: Largest distance of a principal point from the middle of the image, in shares of its width and height.
 _OFF_CENTRE = 0.1
-_POSE_FILE = re.compile(r"drone?_?(?P<number>\d+)_pos_(?P<rate>\d+(?:\.\d+)?)\.csv", re.IGNORECASE)
+_POSE_FILE = re.compile(r"drone?_?\d+_pos_\d+(\.\d+)?\.csv", re.IGNORECASE)
 
 
 def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | None = None) -> Recording:
     """Read a sequence from a folder of the dataset, simulated or real.
 
-    A camera without video gets the image size of most videos. Videos may differ in length; the reference is as long as
-    the longest video. `Recording.usable` is stricter. Videos of cameras on drones that cannot be used are left out with
+    A camera without video gets the image size of most videos. Videos may differ in length. `Recording.usable` is
+    stricter. Videos of cameras on drones that cannot be used are left out with
     a warning, because their published layout is unknown and tracking does not need them. So is a .c3d file without
     drones.
 
@@ -69,7 +69,7 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     detections = files_by_camera(_detection_files(folder / DETECTIONS), names)
     times = _frame_times(videos, detections)
     corners = folder / MARKER_CORNERS
-    return Recording(
+    recording = Recording(
         name=folder.resolve().name,
         folder=folder,
         cameras=tuple(
@@ -82,10 +82,10 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
             )
             for index, name in enumerate(names)
         ),
-        reference=_reference(files, videos, bodies),
         onboard=_onboard(folder),
         marker_corners=corners if corners.exists() else None,
     )
+    return replace(recording, reference=_reference(files, recording.timeline(), bodies))
 
 
 def detection_files(folder: Path | str, cameras: Sequence[str]) -> dict[str, Path]:
@@ -190,44 +190,13 @@ def _check_principal_points(rig: Rig, videos: Mapping[str, VideoInfo]) -> None:
 
 
 def _reference(
-    files: Sequence[Path], videos: Mapping[str, VideoInfo], bodies: Mapping[str, Sequence[str]] | None
+    files: Sequence[Path], timeline: Timeline, bodies: Mapping[str, Sequence[str]] | None
 ) -> Reference | None:
-    """The reference at the frames of the longest video, or None."""
-    fps = next(iter(videos.values())).fps
-    num_frames = max(video.num_frames for video in videos.values())
-    poses = numbered_files(files, _POSE_FILE)
-    recorded = [path for path in files if path.suffix.lower() == ".c3d"]
-    if bodies and (poses or not recorded):
-        raise InputError(
-            f"bodies {', '.join(bodies)}",
-            expected="a .c3d file that holds their markers",
-            found="pose files" if poses else "none",
-        )
-    if poses:
-        for path in poses.values():
-            check_rate(path, _POSE_FILE, fps)
-        return Reference(_simulated_truth(poses, fps, num_frames), files=tuple(poses.values()))
-    if len(recorded) > 1:
-        names = ", ".join(path.name for path in recorded)
-        raise InputError(recorded[0].parent, expected="one .c3d file", found=names)
-    if not recorded:
-        return None
+    """The reference in pose files or else in C3D files, or None."""
+    poses = sorted((path for path in files if _POSE_FILE.fullmatch(path.name)), key=natural_key)
+    found = poses or [path for path in files if path.suffix.lower() == ".c3d"]
     try:
-        found = marker_bodies(read_c3d(recorded[0]), recorded[0], bodies)
+        return read_reference(found, timeline, bodies) if found or bodies else None
     except NoDronesError as error:
         _logger.warning("no reference: %s", error)
         return None
-    return Reference(found.at_frames(fps, num_frames), found.at_own_frames(), tuple(recorded), bodies or {})
-
-
-def _simulated_truth(poses: Mapping[int, Path], fps: float, num_frames: int) -> Trajectories:
-    read = [poses_of_frames(path, num_frames) for path in poses.values()]
-    position_m, orientation_wxyz = (np.stack(each, axis=1) for each in zip(*read, strict=True))
-    frame = np.arange(num_frames)
-    return Trajectories(
-        frame,
-        frame / fps,
-        tuple(f"dron{number}" for number in poses),
-        position_m,
-        orientation_wxyz=None if np.isnan(orientation_wxyz).all() else orientation_wxyz,
-    )

@@ -119,47 +119,25 @@ class Draft:
         return "\n".join([*lines, f"{self.path}: {count} camera{'s' if count > 1 else ''}"])
 
 
-@dataclass(frozen=True)
-class Unmatched:
-    """A file of a camera, whose name does not say of which one.
-
-    Attributes:
-        file: path of the file relative to the folder, as `DraftOptions` takes it.
-        found: what its name says instead.
-        error: what `draft_recording` raises.
-        needed: whether there is no draft without an answer; else the file is not used.
-    """
-
-    file: str
-    found: str
-    error: InputError
-    needed: bool
-
-
-@dataclass(frozen=True)
-class Unclear:
-    """What a user must say of a folder, for all files together.
-
-    Attributes:
-        cameras: names of the cameras.
-        calibration: rig file that has these cameras; None where files give the names, and more may be named.
-        files: the files; each becomes a part of `DraftOptions.match` or of `DraftOptions.leave_out`.
-    """
-
-    cameras: tuple[str, ...]
-    calibration: Path | None
-    files: tuple[Unmatched, ...]
-
-
 @dataclass
 class _Matching:
-    """Files by camera and kind, while they are matched."""
+    """Files by camera and kind, while they are matched.
+
+    Attributes:
+        folder: folder of the files.
+        calibration: rig file, or None.
+        cameras: names of the cameras.
+        files: the files of each camera by their kinds.
+        unused: files that belong to no camera.
+        unclear: files of which a user must say whose they are; what was expected, and what their names say.
+    """
 
     folder: Path
+    calibration: Path | None
     cameras: list[str]
     files: dict[str, dict[Kind, Path | str]] = field(default_factory=dict)
     unused: list[Path] = field(default_factory=list)
-    unmatched: dict[Path, Unmatched] = field(default_factory=dict)
+    unclear: dict[Path, tuple[str, str]] = field(default_factory=dict)
 
     def taken(self, camera: str, kind: Kind) -> Path | str | None:
         """The file of this kind that a camera has already."""
@@ -168,11 +146,6 @@ class _Matching:
     def put(self, camera: str, kind: Kind, file: Path | str) -> None:
         """Give a file to a camera."""
         self.files.setdefault(camera, {})[kind] = file
-
-    def ask(self, file: Path, expected: str, found: str, *, needed: bool = True) -> None:
-        """Keep a file for which the user must say whose it is."""
-        error = _unclear(self.folder, file, expected, found)
-        self.unmatched[file] = Unmatched(os.path.relpath(file, self.folder), found, error, needed)
 
 
 def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions | None = None) -> Draft:
@@ -189,23 +162,30 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         SettingsError: an option names a file or camera that does not exist.
     """
     folder, out, options = Path(folder), Path(out), options or DraftOptions()
-    found, calibration, known, matching = _matched(folder, out, options)
-    for unmatched in matching.unmatched.values():
-        if unmatched.needed:
-            raise unmatched.error
+    _check_by_hand(folder, options)
+    by_hand = [*options.leave_out, *(file for _, file in options.match)]
+    found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
+    calibration = options.calibration or _calibration_of(folder, found)
+    known = _known_cameras(calibration, options.unit)
+    matching = _Matching(folder, calibration, list(known) or _names_of_files(found, options))
+    for name, file in options.match:
+        _put_by_hand(matching, name, file)
+    _match(matching, found)
+    corners = [each.path for each in found if each.kind == "corners"]
+    if len(corners) > 1:
+        matching.unclear[corners[1]] = "one table of marker corners", f"{corners[0].name} as well"
+    if matching.unclear:
+        raise _unclear(folder, matching.unclear)
     tables = {
         name: _table(matching, name, known.get(name), out.parent, options)
         for name in matching.cameras
         if name in matching.files
     }
     if not tables:
-        raise _nothing(folder, matching, calibration)
+        raise _nothing(matching)
     references = [_written(each.path, out.parent) for each in found if each.kind == "reference"]
     if options.bodies and not references:
         raise SettingsError("--body", expected=f"a C3D file in {folder}", found="none")
-    corners = [each.path for each in found if each.kind == "corners"]
-    if len(corners) > 1:
-        raise _unclear(folder, corners[1], "one table of marker corners", f"{corners[0].name} as well")
     content = RecordingFile(
         version=1,
         calibration=None if calibration is None else _written(calibration, out.parent),
@@ -216,45 +196,8 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
     )
     # Paths with `..` in them lead through the folder of the draft.
     out.parent.mkdir(parents=True, exist_ok=True)
-    return Draft(
-        out,
-        content,
-        recording_of(out, content),
-        tuple(name for name in matching.cameras if name not in tables),
-        tuple(matching.unused),
-    )
-
-
-def unclear_files(folder: Path | str, out: Path | str, options: DraftOptions | None = None) -> Unclear:
-    """The files of a folder of which a user must say whose they are, because their names do not.
-
-    Args:
-        folder: folder of the files.
-        out: path at which the draft will be written.
-        options: what the user has said about the files.
-
-    Raises:
-        InputError: the folder, or the rig file in it, cannot be read.
-        SettingsError: an option names a file or camera that does not exist.
-    """
-    _, calibration, _, matching = _matched(Path(folder), Path(out), options or DraftOptions())
-    return Unclear(tuple(matching.cameras), calibration, tuple(matching.unmatched.values()))
-
-
-def _matched(
-    folder: Path, out: Path, options: DraftOptions
-) -> tuple[list[Found], Path | None, dict[str, tuple[int, int] | None], _Matching]:
-    """Files that are not named by hand, the rig file, the sizes of its cameras, and which file is whose."""
-    _check_by_hand(folder, options)
-    by_hand = [*options.leave_out, *(file for _, file in options.match)]
-    found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
-    calibration = options.calibration or _calibration_of(folder, found)
-    known = _known_cameras(calibration, options.unit)
-    matching = _Matching(folder, list(known) or _names_of_files(found, options))
-    for name, file in options.match:
-        _put_by_hand(matching, name, file, calibration)
-    _match(matching, found, calibration)
-    return found, calibration, known, matching
+    without_files = tuple(name for name in matching.cameras if name not in tables)
+    return Draft(out, content, recording_of(out, content), without_files, tuple(matching.unused))
 
 
 def _check_by_hand(folder: Path, options: DraftOptions) -> None:
@@ -316,40 +259,35 @@ def _name_of(file: Found) -> str:
     return "".join("_" if mark in ",=/\\" else mark for mark in stem)
 
 
-def _put_by_hand(matching: _Matching, name: str, file: str, calibration: Path | None) -> None:
+def _put_by_hand(matching: _Matching, name: str, file: str) -> None:
     """Give a file to the camera that the user names."""
     camera = chosen_camera(name, tuple(matching.cameras))
-    if camera is None:
-        expected = f"a camera of {calibration}: {', '.join(matching.cameras)}"
-        raise SettingsError("--match", expected=expected, found=name)
-    if "://" in file:
-        matching.put(camera, "video", file)
-        return
     path = matching.folder / file
-    if not path.exists():
-        raise SettingsError("--match", expected=f"a file in {matching.folder}", found=file)
-    kind = kind_of(path)
-    if kind not in OF_CAMERA:
-        expected = f"a {', a '.join(_WORDS[each] for each in OF_CAMERA)}"
-        raise SettingsError("--match", expected=expected, found=file)
-    if matching.taken(camera, kind) is not None:
-        expected = f"one {_WORDS[kind]} of camera {camera}"
-        raise SettingsError("--match", expected=expected, found="two")
-    matching.put(camera, kind, path)
+    kind = "video" if "://" in file else kind_of(path) if path.exists() else None
+    if camera is None:
+        expected, found = f"a camera of {matching.calibration}: {', '.join(matching.cameras)}", name
+    elif kind is None:
+        expected, found = f"a file in {matching.folder}", file
+    elif kind not in OF_CAMERA:
+        expected, found = f"a {', a '.join(_WORDS[each] for each in OF_CAMERA)}", file
+    elif matching.taken(camera, kind) is not None:
+        expected, found = f"one {_WORDS[kind]} of camera {camera}", "two"
+    else:
+        matching.put(camera, kind, file if "://" in file else path)
+        return
+    raise SettingsError("--match", expected=expected, found=found)
 
 
-def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None) -> None:
+def _match(matching: _Matching, found: Sequence[Found]) -> None:
     """Give each file of a camera to the camera that its name says."""
     by_hand = {file for files in matching.files.values() for file in files.values()}
-    for kind in OF_CAMERA:
-        rest = [each for each in found if each.kind == kind and not _match_by_name(matching, each, by_hand)]
-        of_rig = "" if calibration is None else f" of {calibration.name}"
-        expected = f"the {_WORDS[kind]} of a camera{of_rig}, {', '.join(matching.cameras)}"
-        for each in rest:
-            needed = each.is_video_file and not each.alone_in
-            if needed or any(matching.taken(name, kind) is None for name in matching.cameras):
-                matching.ask(each.path, expected, "none of these names in its name", needed=needed)
-            if not needed:
+    of_rig = "" if matching.calibration is None else f" of {matching.calibration.name}"
+    for each in found:
+        if each.kind in OF_CAMERA and not _match_by_name(matching, each, by_hand):
+            if each.is_video_file and not each.alone_in:
+                expected = f"the video of a camera{of_rig}, {', '.join(matching.cameras)}"
+                matching.unclear[each.path] = expected, "none of these names in its name"
+            else:
                 matching.unused.append(each.path)
     for each in found:
         if each.kind == "other":
@@ -358,35 +296,30 @@ def _match(matching: _Matching, found: Sequence[Found], calibration: Path | None
 
 
 def _match_by_name(matching: _Matching, each: Found, by_hand: Collection[Path | str]) -> bool:
-    """Give a file to the camera that its name says, or keep it for the user; False if it says none, or says in vain."""
+    """Give a file to the camera that its name says; False if it says none, or one that the user gave another file."""
     names = cameras_of(each.name, matching.cameras)
     if len(names) > 1:
-        matching.ask(each.path, "the name of one camera", f"{' and '.join(names)} in its name")
+        matching.unclear[each.path] = "the name of one camera", f"{' and '.join(names)} in its name"
     if len(names) != 1:
         return bool(names)
     taken = matching.taken(names[0], each.kind)
     if taken is None:
         matching.put(names[0], each.kind, each.path)
-        return True
-    if taken in by_hand and not each.is_video_file:
+    elif taken in by_hand and not each.is_video_file:
         return False
-    expected = f"one {_WORDS[each.kind]} of camera {names[0]}"
-    matching.ask(each.path, expected, f"{_short(taken)} as well")
-    if isinstance(taken, Path) and taken not in by_hand:
-        # The user may want the other one.
-        matching.ask(taken, expected, f"{each.path.name} as well")
+    else:
+        expected = f"one {_WORDS[each.kind]} of camera {names[0]}"
+        matching.unclear[each.path] = expected, f"{getattr(taken, 'name', taken)} as well"
     return True
 
 
 def _look_for_videos_of_a_camera(matching: _Matching, found: Found) -> None:
-    """Keep for the user the videos in a folder that has the name of a camera without files."""
+    """The videos in a folder that has the name of a camera without files are unclear."""
     fitting = [name for name in cameras_of(found.name, matching.cameras) if name not in matching.files]
     videos = videos_in(found.path)
-    if len(fitting) != 1 or not videos:
-        return
-    names = ", ".join(video.name for video in videos)
-    for video in videos:
-        matching.ask(video, f"one video of camera {fitting[0]}", f"{names} in {found.path.name}")
+    if len(fitting) == 1 and videos:
+        names = ", ".join(video.name for video in videos)
+        matching.unclear[videos[0]] = f"one video of camera {fitting[0]}", f"{names} in {found.path.name}"
 
 
 def _table(
@@ -421,25 +354,24 @@ def _written(file: Path | str, base: Path) -> str:
         return file.absolute().as_posix()
 
 
-def _unclear(folder: Path, file: Path, expected: str, found: str) -> InputError:
-    name = shlex.quote(os.path.relpath(file, folder))
-    remedy = f"say whose it is with --match CAMERA={name}, or leave it out with --leave-out {name}"
-    return InputError(file, expected=expected, found=found, remedy=remedy)
+def _unclear(folder: Path, files: Mapping[Path, tuple[str, str]]) -> InputError:
+    """Error about the first of some files whose names do not say whose they are; its remedy names all of them."""
+    first, *others = (shlex.quote(os.path.relpath(file, folder)) for file in files)
+    path, (expected, found) = next(iter(files.items()))
+    remedy = f"say whose it is with --match CAMERA={first}, or leave it out with --leave-out {first}"
+    if others:
+        remedy += f"; the same for {', '.join(others)}"
+    return InputError(path, expected=expected, found=found, remedy=remedy)
 
 
-def _short(file: Path | str) -> str:
-    return file if isinstance(file, str) else file.name
-
-
-def _nothing(folder: Path, matching: _Matching, calibration: Path | None) -> InputError:
+def _nothing(matching: _Matching) -> InputError:
+    folder, calibration = matching.folder, matching.calibration
     below = next((path for path in sorted(folder.iterdir()) if videos_in(path)), None)
-    if below is not None:
-        given = "" if calibration is None else f" --calibration {shlex.quote(str(calibration))}"
-        remedy = f"for the videos in {below.name}: psotrack init {shlex.quote(str(below))}{given}"
-    else:
-        remedy = "say which file is whose with --match CAMERA=FILE" if calibration else ""
-    expected = "videos, folders of images, or detections"
+    expected, given, remedy = "videos, folders of images, or detections", "", ""
     if calibration is not None:
-        names = ", ".join(matching.cameras)
-        expected = f"files named like the cameras of {calibration.name}, {names}"
+        expected = f"files named like the cameras of {calibration.name}, {', '.join(matching.cameras)}"
+        given = f" --calibration {shlex.quote(str(calibration))}"
+        remedy = "say which file is whose with --match CAMERA=FILE"
+    if below is not None:
+        remedy = f"for the videos in {below.name}: psotrack init {shlex.quote(str(below))}{given}"
     return InputError(folder, expected=expected, found="none", remedy=remedy)

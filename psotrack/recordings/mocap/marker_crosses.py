@@ -1,8 +1,7 @@
-"""Marker crosses: rigid bodies of a few motion-capture markers, learned from a recording and identified by shape.
+"""Marker crosses: rigid bodies of a few motion-capture markers, whose shape is learned from a recording.
 
-Each drone of the DPJAIT dataset carries four or five markers that form an asymmetric cross, whose arms have different
-lengths on each drone. The distances between the markers identify a cross, even if labels are wrong. Rigid fits are
-least squares (Kabsch 1976; Umeyama 1991, without scale); the shape is a generalised Procrustes mean (Gower 1975).
+Each drone of the DPJAIT dataset carries four or five markers that form an asymmetric cross. Rigid fits are least
+squares (Kabsch 1976; Umeyama 1991, without scale); the shape is a generalised Procrustes mean (Gower 1975).
 """
 
 from __future__ import annotations
@@ -10,17 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError
 
-#: Largest root mean square residual of a fit, metres: about a marker's radius. A larger one means another body.
-TOLERANCE_M = 0.01
 #: Smallest root mean square distance of markers from a line, metres; nearer markers do not determine the turn about it.
 _LINE_M = 0.005
-#: Smallest ratio of the second-best residual to the best residual of a unique solution.
-_UNIQUE_RATIO = 2.0
-#: Noise of a motion-capture system, metres, added where residuals are compared.
+#: Noise of a motion-capture system, metres, added to the usual residual.
 _NOISE_M = 0.001
 #: Smallest number of markers that determines a pose.
 _MIN_MARKERS = 3
@@ -28,30 +23,6 @@ _MIN_MARKERS = 3
 _NUM_ROUNDS = 20
 #: Largest change of a marker in the last iteration of the Procrustes mean, metres.
 _CONVERGED_M = 1e-7
-
-
-@dataclass(frozen=True)
-class Cross:
-    """A rigid body of markers.
-
-    Attributes:
-        name: name of the body.
-        markers_m: (markers, 3), positions of the markers in the body's frame, metres. The origin is the centroid. z is
-            the normal of the plane that fits the markers best and points upwards in flight. x points to the first
-            marker: from the opposite marker in a cross of four markers, otherwise from the centroid.
-    """
-
-    name: str
-    markers_m: Float[np.ndarray, "markers 3"]
-
-    def __post_init__(self) -> None:
-        centroid_m = np.abs(self.markers_m.mean(axis=0)).max() if len(self.markers_m) else np.inf
-        if not centroid_m < 1e-6:
-            raise SettingsError(
-                f"cross {self.name}",
-                expected="markers with their centroid at the origin",
-                found=f"a centroid {centroid_m:g} m away",
-            )
 
 
 @dataclass(frozen=True)
@@ -105,7 +76,9 @@ def fit_rigid(
     )
 
 
-def learn_cross(position_m: Float[np.ndarray, "frames markers 3"], name: str = "") -> Cross:
+def learn_cross(
+    position_m: Float[np.ndarray, "frames markers 3"], name: str = ""
+) -> Float[np.ndarray, "markers 3"]:
     """Learn the shape of a recorded cross: a generalised Procrustes mean over the frames whose markers fit.
 
     The mean starts from the medians of all distances. Swapped labels and stray markers in less than half of the frames
@@ -113,7 +86,12 @@ def learn_cross(position_m: Float[np.ndarray, "frames markers 3"], name: str = "
 
     Args:
         position_m: (frames, markers, 3), positions in the world, metres; NaN if a marker is not seen.
-        name: name of the body.
+        name: name of the body, for messages.
+
+    Returns:
+        (markers, 3), positions of the markers in the body's frame, metres. The origin is the centroid. z is the normal
+        of the plane that fits the markers best and points upwards in flight. x points to the first marker: from the
+        opposite marker in a cross of four markers, otherwise from the centroid.
 
     Raises:
         InputError: two of the markers are never seen together.
@@ -121,7 +99,7 @@ def learn_cross(position_m: Float[np.ndarray, "frames markers 3"], name: str = "
     markers_m = _shape_from_distances(position_m, name)
     fitted = _better_mirror_image(markers_m, position_m)
     if fitted is None:
-        return Cross(name, markers_m)
+        return markers_m
     markers_m, pose = fitted
     for _ in range(_NUM_ROUNDS):
         before_m, markers_m = markers_m, _mean_shape(markers_m, pose, position_m)
@@ -129,77 +107,14 @@ def learn_cross(position_m: Float[np.ndarray, "frames markers 3"], name: str = "
         if np.abs(markers_m - before_m).max() < _CONVERGED_M:
             break
     axes = _axes(markers_m, up=np.nanmean(pose.rotation[:, 2], axis=0))
-    return Cross(name, markers_m @ axes.T)
-
-
-def identify_markers(cross: Cross, points_m: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:
-    """Identify the markers of a cross among points, from the distances alone.
-
-    Args:
-        cross: the cross.
-        points_m: (points, 3), positions in the world, metres, in any order; some may be stray points.
-
-    Returns:
-        (points,), index of the marker of each point, -1 for stray points. All are -1 if no three points fit, or if
-        another solution fits almost as well, as for a symmetric cross.
-    """
-    marker_of_point = np.full(len(points_m), -1)
-    labellings, residual_m = _labellings(cross, points_m)
-    if not len(labellings) or not _is_unique(residual_m):
-        return marker_of_point
-    best = labellings[np.argmin(residual_m)]
-    marker_of_point[best[best >= 0]] = np.flatnonzero(best >= 0)
-    return marker_of_point
-
-
-def _labellings(
-    cross: Cross, points_m: Float[np.ndarray, "points 3"]
-) -> tuple[Int[np.ndarray, "labellings markers"], Float[np.ndarray, "labellings"]]:
-    """All labellings that fit the largest number of markers, and their residuals in metres.
-
-    A labelling holds the index of the point for each marker, or -1 for a marker without point.
-    """
-    num_points, num_markers = len(points_m), len(cross.markers_m)
-    # The last row and column stand for markers without a point, which agree with every other marker.
-    no_point = num_points
-    agree = np.ones((num_markers, num_markers, num_points + 1, num_points + 1), bool)
-    off_m = _distances(cross.markers_m)[:, :, None, None] - _distances(points_m)
-    agree[:, :, :no_point, :no_point] = (np.abs(off_m) <= 2 * TOLERANCE_M) & ~np.eye(num_points, dtype=bool)
-    found = np.zeros((1, 0), int)
-    for marker in range(num_markers):
-        fits = np.ones((len(found), num_points + 1), bool)
-        for other in range(marker):
-            fits &= agree[other, marker, found[:, other]]
-        rows, points = np.nonzero(fits)
-        found = np.column_stack([found[rows], points])
-        left = num_markers - marker - 1
-        found = found[(found != no_point).sum(axis=1) + left >= min(_MIN_MARKERS, num_markers)]
-    points_or_none = np.vstack([points_m, np.full((1, 3), np.nan)])
-    residual_m = fit_rigid(cross.markers_m, points_or_none[found]).residual_m
-    fitting = residual_m <= TOLERANCE_M
-    found, residual_m = np.where(found == no_point, -1, found)[fitting], residual_m[fitting]
-    count = (found >= 0).sum(axis=1)
-    most = count == count.max(initial=0)
-    return found[most], residual_m[most]
-
-
-def _is_unique(residual_m: Float[np.ndarray, "candidates"]) -> bool:
-    """Whether the best candidate is much better than the second-best candidate."""
-    if len(residual_m) < 2:
-        return True
-    best, second = np.sort(residual_m)[:2]
-    return bool(second > _UNIQUE_RATIO * best + _NOISE_M)
-
-
-def _distances(points_m: Float[np.ndarray, "*frames points 3"]) -> Float[np.ndarray, "*frames points points"]:
-    return np.linalg.norm(points_m[..., :, None, :] - points_m[..., None, :, :], axis=-1)
+    return markers_m @ axes.T
 
 
 def _shape_from_distances(
     position_m: Float[np.ndarray, "frames markers 3"], name: str
 ) -> Float[np.ndarray, "markers 3"]:
     """Shape with the median distances, by classical scaling (Torgerson 1952); it may be a mirror image."""
-    distances_m = _distances(position_m)
+    distances_m = np.linalg.norm(position_m[:, :, None] - position_m[:, None], axis=-1)
     together = np.isfinite(distances_m).any(axis=0)
     if not together.all():
         first, second = np.argwhere(~together)[0] + 1
