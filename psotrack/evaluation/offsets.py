@@ -20,8 +20,9 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from psotrack.errors import InputError, SettingsError
+from psotrack.geometry import rotation_matrices
 from psotrack.support import block_jackknife, standard_error, time_blocks, widening
-from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values, rotations_of
+from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values
 from psotrack.trajectories.resampling import interpolated
 
 #: An offset counts only if at least this fraction of the largest number of comparable positions is compared at it.
@@ -148,7 +149,9 @@ class ShiftedPair:
         if estimate.num_frames < 2:
             raise refused("an estimate of two frames or more", f"{estimate.num_frames}")
         video_s = estimate.time_s.astype(np.float64)
-        turned = None if orientation_wxyz is None else interpolated(time_s, rotations_of(orientation_wxyz))
+        turned = (
+            None if orientation_wxyz is None else interpolated(time_s, rotation_matrices(orientation_wxyz))
+        )
         return ShiftedPair(
             video_s,
             np.where(estimate.seen[..., None], estimate.position_m, np.nan).astype(np.float64),

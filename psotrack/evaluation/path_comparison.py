@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.evaluation.offsets import ShiftedPair, refused
+from psotrack.geometry import rotation_matrices
 from psotrack.support import finite_or_none
 from psotrack.trajectories import (
     GATE_M,
@@ -28,7 +29,6 @@ from psotrack.trajectories import (
     Trajectories,
     resample,
     roll_pitch_yaw_deg,
-    rotations_of,
 )
 
 #: Number of neighbouring frames whose median position shows jumps.
@@ -212,7 +212,7 @@ def compare_paths(
         # Orientations that do not depend on the offset turn the arm.
         turned = pose_wxyz if turns is None else _at_frames(turns, path, turn_offset_s or 0.0)
         if turned is not None:
-            rotation = rotations_of(turned)[:, None]
+            rotation = rotation_matrices(turned)[:, None]
             placed = replace(placed, rotation=lambda _: rotation)
     std_s = np.nan
     if offset_s is None:
@@ -371,4 +371,4 @@ def _seen_orientations(path: Trajectories) -> Float[np.ndarray, "frames 4"] | No
 
 def _axes(orientation_wxyz: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
     """The axes of each frame in the world, one per row."""
-    return rotations_of(orientation_wxyz).swapaxes(-1, -2)
+    return rotation_matrices(orientation_wxyz).swapaxes(-1, -2)

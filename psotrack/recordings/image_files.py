@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import re
 import zlib
@@ -14,7 +15,7 @@ from jaxtyping import Shaped, UInt8
 
 from psotrack.errors import InputError
 from psotrack.recordings.image_headers import PNG, claimed_size_wh
-from psotrack.recordings.opencv_messages import decode_image
+from psotrack.recordings.opencv_messages import silence_opencv
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -141,10 +142,11 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
         found = "a file that is no PNG, JPEG, BMP, TIFF, WebP or PNM"
         raise InputError(where, expected="an image", found=found)
     check_pixels(where, *size_wh)
-    image = decode_image(coded, flags, where)
-    if image is None:
-        raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
-    return image
+    with contextlib.suppress(cv2.error), silence_opencv():
+        image = cv2.imdecode(coded, flags)
+        if image is not None:
+            return np.asarray(image)
+    raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
 
 
 def check_pixels(where: object, width: int, height: int) -> None:

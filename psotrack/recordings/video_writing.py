@@ -9,7 +9,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -48,7 +48,7 @@ class VideoEncoder:
         image_size_wh: tuple[int, int],
         settings: Sequence[int] = (),
     ) -> None:
-        self.num_frames = 0
+        self.num_frames, self._size_wh = 0, image_size_wh
         with silence_opencv():
             # An absolute path, because FFmpeg reads the text before a colon as a protocol.
             self._writer = cv2.VideoWriter(
@@ -64,6 +64,10 @@ class VideoEncoder:
 
     def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
         """Append one frame, (height, width, 3)."""
+        width, height = self._size_wh
+        # OpenCV drops such a frame without an error.
+        if bgr.shape != (height, width, 3):
+            raise SettingsError("frame", expected=f"shape {(height, width, 3)}", found=f"{bgr.shape}")
         with silence_opencv():
             self._writer.write(bgr)
         self.num_frames += 1
@@ -141,30 +145,13 @@ class VideoWriter:
                 expected="even numbers of pixels, because the codec halves the resolution of colours",
                 found=f"{image_size_wh[0]} x {image_size_wh[1]}",
             )
-        self._path = path
-        self._fps = fps
-        self._size_wh = image_size_wh
-        self._open_until_exit = contextlib.ExitStack()
+        self._video = encoded_video(path, _CODEC, fps, image_size_wh)
 
-    def __enter__(self) -> VideoWriter:
-        video = encoded_video(self._path, _CODEC, self._fps, self._size_wh)
-        self._encoder = self._open_until_exit.enter_context(video)
-        return self
+    def __enter__(self) -> VideoEncoder:
+        return self._video.__enter__()
 
-    def write(self, bgr: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Append one frame, (height, width, 3)."""
-        width, height = self._size_wh
-        if bgr.shape != (height, width, 3):
-            raise SettingsError("frame", expected=f"shape {(height, width, 3)}", found=f"{bgr.shape}")
-        self._encoder.write(bgr)
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._open_until_exit.__exit__(kind, error, traceback)
+    def __exit__(self, *error: Any) -> None:
+        self._video.__exit__(*error)
 
 
 def join_videos(path: Path | str, parts: Sequence[Path | str]) -> None:

@@ -155,8 +155,7 @@ def _draw_segment(
     """Write the video of a segment; of a static camera, masks and detections too."""
     found = []
     with contextlib.ExitStack() as stack:
-        video = VideoWriter(folder / _VIDEO, work.scene.scenario.fps, artist.size_wh)
-        stack.enter_context(video)
+        video = stack.enter_context(VideoWriter(folder / _VIDEO, work.scene.scenario.fps, artist.size_wh))
         masks = None
         if work.masks and not work.stream.onboard:
             masks = stack.enter_context(MaskWriter(folder / _MASKS))

@@ -1,22 +1,14 @@
-"""Orientations as matrices, and as roll, pitch and yaw."""
+"""Orientations as roll, pitch and yaw."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+
+from psotrack.geometry import rotation_matrices
 
 #: Columns: the axes of a body (x ahead, y left, z up) in the axes of a camera (x right, y down, z ahead).
 _BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-
-
-def rotations_of(orientation_wxyz: Float[np.ndarray, "*shape 4"]) -> Float[np.ndarray, "*shape 3 3"]:
-    """Rotation matrices of quaternions; NaN where an orientation is not known."""
-    found = np.full((*orientation_wxyz.shape[:-1], 3, 3), np.nan)
-    known = np.isfinite(orientation_wxyz).all(axis=-1)
-    if known.any():
-        found[known] = Rotation.from_quat(orientation_wxyz[known], scalar_first=True).as_matrix()
-    return found
 
 
 def roll_pitch_yaw_deg(
@@ -36,7 +28,7 @@ def roll_pitch_yaw_deg(
     Returns:
         (*frames, 3): roll, pitch, yaw, degrees.
     """
-    body = rotations_of(orientation_wxyz) @ (_BODY_IN_CAMERA if is_camera else np.eye(3))
+    body = rotation_matrices(orientation_wxyz) @ (_BODY_IN_CAMERA if is_camera else np.eye(3))
     roll = np.arctan2(body[..., 2, 1], body[..., 2, 2])
     pitch = -np.arcsin(np.clip(body[..., 2, 0], -1.0, 1.0))
     yaw = np.arctan2(body[..., 1, 0], body[..., 0, 0])

@@ -25,26 +25,6 @@ _WORDS = {
 }  # fmt: skip
 
 
-class _Loader(yaml.SafeLoader):
-    """Loader for plain data and OpenCV's matrices."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose a node that is no reference."""
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
-            raise yaml.MarkedYAMLError(problem="a reference", problem_mark=event.start_mark)
-        return super().compose_node(parent, index)
-
-    def construct_object(self, node: Any, deep: bool = False) -> Any:
-        """Plain data of a node, whatever its tag."""
-        if isinstance(node, yaml.ScalarNode):
-            return node.value if node.style else _scalar(node.value)
-        if isinstance(node, yaml.SequenceNode):
-            return [self.construct_object(item) for item in node.value]
-        pairs = [(str(key.value), self.construct_object(value)) for key, value in node.value]
-        return as_matrix(dict(pairs))
-
-
 def parse_yaml(path: Path, text: str) -> dict[str, Any]:
     """The top level of a YAML or JSON file; maps with rows, cols and data become arrays.
 
@@ -58,7 +38,11 @@ def parse_yaml(path: Path, text: str) -> dict[str, Any]:
     place = ""
     try:
         is_json = text.startswith("{")
-        content = json.loads(text, object_hook=as_matrix) if is_json else yaml.load(text, _Loader)
+        content = (
+            json.loads(text, object_hook=as_matrix)
+            if is_json
+            else _plain(yaml.compose(text, yaml.SafeLoader), set())
+        )
         return content if isinstance(content, dict) else {}
     except json.JSONDecodeError as error:
         place, reason = f", line {error.lineno}", error.msg
@@ -69,6 +53,20 @@ def parse_yaml(path: Path, text: str) -> dict[str, Any]:
     except (RecursionError, ValueError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
     raise InputError(f"{path}{place}", expected="valid YAML or JSON", found=f"an error ({reason})") from None
+
+
+def _plain(node: yaml.Node | None, seen: set[int]) -> Any:
+    """Plain data of a node, whatever its tag, and OpenCV's matrices; a node that was seen before is a reference."""
+    if node is None:
+        return None
+    if id(node) in seen:
+        raise yaml.MarkedYAMLError(problem="a reference", problem_mark=node.start_mark)
+    seen.add(id(node))
+    if isinstance(node, yaml.ScalarNode):
+        return node.value if node.style else _scalar(node.value)
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(item, seen) for item in node.value]
+    return as_matrix({str(key.value): _plain(value, seen) for key, value in node.value})
 
 
 def as_matrix(values: dict[str, Any]) -> Any:

@@ -23,7 +23,7 @@ VIDEO_SUFFIXES = {
 }  # fmt: skip
 #: Names of rig files, without suffix.
 _CALIBRATIONS = {"rig", "calibration", "calib", "camera_array", Path(CALIBRATION).stem}
-_CALIBRATION_SUFFIXES = {".toml", ".csv", ".yml", ".yaml", ".json", ".xml", ".txt", ".xcp"}
+_CALIBRATION_SUFFIXES = {".toml", ".csv", ".yml", ".yaml", ".json", ".xml", ".txt"}
 _IGNORE_WORDS = ("ignore", "mask")
 #: Names of folders whose files belong to the recording.
 _FOLDERS = {DETECTIONS, "detections", "boxes"}
