@@ -251,7 +251,9 @@ def test_missing_poses_are_nan(simulated_folder):
     replace_in_file(simulated_folder / "dron2_pos_25.csv", "\n3;", "\n12;")
     truth = read_sequence(simulated_folder).truth
     assert truth.seen[:, 0].tolist() == [False, True, True, False, False]
-    assert truth.seen[:, 1].tolist() == [False, True, True, False, True]
+    # One missing row is interpolated.
+    assert truth.seen[:, 1].tolist() == [False, True, True, True, True]
+    assert truth.position_m[3, 1, 0] == pytest.approx(1.3, abs=0.02)
 
 
 def test_ten_drones_are_in_the_order_of_their_numbers(simulated_folder):

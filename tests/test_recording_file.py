@@ -380,7 +380,7 @@ class TestFaults:
             ('detections = "nothing.csv"', ("cameras.left.detections", "a file that exists")),
             ('model = "fish"', ("cameras.left.model", "one of fisheye, opencv", "did you mean fisheye?")),
             ("distortion = [0.1, 0.2, 0.3]", ("cameras.left.distortion", "coefficients", "found 3")),
-            ("rvec = [0, 0, 0]", ("cameras.left.tvec", "a place needs rvec and tvec")),
+            ("rvec = [0, 0, 0]", ("cameras.left.K", "3 x 3 numbers")),
             ("K = [[1, 0, 0], [0, 1]]", ("cameras.left.K", "a list of length 3")),
             ("K = [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]", ("cameras.left.K", "fx and fy above 0")),
         ],

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError
 from psotrack.trajectories import Status, Trajectories, read_trajectories, write_trajectories
-from psotrack.trajectories.columns import COLUMNS
+from psotrack.trajectories.columns import ALL_COLUMNS
 from psotrack.trajectories.tum import read_tum, write_tum
 
 SUFFIXES = (".csv", ".parquet")
@@ -137,8 +137,10 @@ class TestWriting:
         pd.testing.assert_frame_equal(frame, pd.read_csv(tmp_path / "tracks.csv"), check_dtype=False)
         metadata = pq.read_schema(tmp_path / "tracks.parquet").metadata
         assert metadata[b"psotrack.schema_version"] == b"1"
-        assert json.loads(metadata[b"psotrack.units"]) == COLUMNS
-        assert list(COLUMNS) == HEADER.split(",")
+        assert json.loads(metadata[b"psotrack.units"]) == {
+            name: ALL_COLUMNS[name] for name in HEADER.split(",")
+        }
+        assert list(ALL_COLUMNS)[:12] == HEADER.split(",")
 
     def test_covariances_add_six_columns(self, tmp_path):
         covariance_m2 = np.full((3, 2, 3, 3), np.nan)
@@ -151,7 +153,7 @@ class TestWriting:
         assert lines[1].endswith(",tracked,,,,,,")
         assert lines[2].endswith(",tracked,1.0,2.0,3.0,5.0,6.0,9.0")
         units = json.loads(pq.read_schema(tmp_path / "tracks.parquet").metadata[b"psotrack.units"])
-        assert units == COLUMNS | dict.fromkeys(lines[0].split(",")[12:], "m2")
+        assert units == {name: ALL_COLUMNS[name] for name in lines[0].split(",")}
         np.testing.assert_array_equal(read_trajectories(tmp_path / "tracks.csv").covariance_m2, covariance_m2)
 
     @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -154,12 +154,7 @@ def read_recording_file(path: Path | str) -> RecordingFile:
     _check_names(path, tables)
     # Each table is converted by itself, because msgspec's messages do not name the key of a mapping.
     cameras = {name: _read_camera(path, name, table) for name, table in tables.items()}
-    if data.get("calibration") is None:
-        for name, camera in cameras.items():
-            _check_place(path, name, camera)
-    content = convert(
-        {**data, "cameras": {}}, RecordingFile, lambda *parts: _error(path, *_in_words(data, *parts))
-    )
+    content = convert({**data, "cameras": {}}, RecordingFile, lambda *parts: _error(path, *parts))
     if content.calibration_unit is not None and content.calibration is None:
         raise _error(path, "calibration", "a rig file, because there is a calibration_unit", "none")
     _check_bounds(path, content.world)
@@ -170,40 +165,18 @@ def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
     place = f"cameras.{name}"
     if not isinstance(table, dict):
         raise _error(path, place, f"a table [{place}]", f"{table!r}")
-    camera = convert(
-        table,
-        CameraTable,
-        lambda field, *parts: _error(path, f"{place}.{field}" if field else place, *parts),
-    )
+    camera = convert(table, CameraTable, lambda field, *parts: _error(path, f"{place}.{field}", *parts))
     for one, other in _EXCLUSIVE:
         if table.get(one) is not None and table.get(other) is not None:
             raise _error(path, place, f"{one} or {other}", "both")
     if camera.fps is not None:
         check_rate(f"{path}, {place}.fps", camera.fps)
-    filmed = camera.video is not None or camera.images is not None
-    if not filmed and camera.fps is None and camera.timestamps is None:
-        raise _error(path, f"{place}.fps", "frames per second, because the camera has no video", "none")
-    if camera.images is not None and camera.fps is None and camera.timestamps is None:
-        raise _error(path, f"{place}.fps", "frames per second of the images, or timestamps", "none")
+    if camera.video is None and camera.fps is None and camera.timestamps is None:
+        why = (
+            ", because the camera has no video" if camera.images is None else " of the images, or timestamps"
+        )
+        raise _error(path, f"{place}.fps", f"frames per second{why}", "none")
     return camera
-
-
-def _check_place(path: Path, name: str, camera: CameraTable) -> None:
-    turned = camera.rvec is not None or camera.R is not None
-    if turned != (camera.tvec is not None):
-        missing = "tvec" if camera.tvec is None else "rvec"
-        turn = "rvec" if camera.R is None else "R"
-        expected = f"three numbers, because a place needs {turn} and tvec"
-        raise _error(path, f"cameras.{name}.{missing}", expected, "none")
-
-
-def _in_words(
-    data: Mapping[str, Any], field: str, expected: str, found: str, remedy: str
-) -> tuple[str, str, str, str]:
-    """Parts of a message; a missing or unknown version gets words of its own."""
-    if field == "version":
-        return field, "1, the version of this layout", f"{data.get('version', 'none')}", ""
-    return field, expected, found, remedy
 
 
 def _check_keys(path: Path, data: Mapping[str, Any]) -> None:
@@ -258,11 +231,8 @@ def recording_file_text(content: RecordingFile) -> str:
     """Text of a `recording.toml`."""
     tables: dict[tuple[str, ...], dict[str, Any]] = {(): _values(content)}
     tables |= {("cameras", name): _values(camera) for name, camera in content.cameras.items()}
-    for name, table in (
-        ("world", content.world),
-        ("reference", content.reference),
-        ("markers", content.markers),
-    ):
+    for name in ("world", "reference", "markers"):
+        table = getattr(content, name)
         if table is not None and (values := _values(table)):
             tables[(name,)] = values
     if content.reference is not None and content.reference.bodies:

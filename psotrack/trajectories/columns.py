@@ -14,39 +14,31 @@ if TYPE_CHECKING:
 
     from psotrack.trajectories.trajectories import Trajectories
 
-#: Columns and their units, in written order.
-COLUMNS = {
-    "frame": "1",
-    "time_s": "s",
-    "drone": "name",
-    "x_m": "m",
-    "y_m": "m",
-    "z_m": "m",
-    "vx_m_s": "m/s",
-    "vy_m_s": "m/s",
-    "vz_m_s": "m/s",
-    "fitness": "1",
-    "num_cameras": "1",
-    "status": "tracked, coasting or lost",
-}
-
-#: Further columns if covariances of the positions are known: the upper triangle, row by row.
-COVARIANCE_COLUMNS = dict.fromkeys(("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "m2")
-#: The same of covariances without the error that is constant for a drone, if they are known.
-RELATIVE_COLUMNS = dict.fromkeys((f"rel_{name}" for name in COVARIANCE_COLUMNS), "m2")
-#: The unit quaternion that turns body coordinates into world coordinates, if orientations are known.
-ORIENTATION_COLUMNS = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
-#: Columns of each quantity of `Trajectories`, in written order.
+_COVARIANCE = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+#: Columns of each quantity of `Trajectories`, in written order. Covariances are the upper triangle, row by row.
 PARTS = {
     "position_m": ("x_m", "y_m", "z_m"),
     "velocity_m_s": ("vx_m_s", "vy_m_s", "vz_m_s"),
     "fitness": ("fitness",),
     "num_cameras": ("num_cameras",),
     "status": ("status",),
-    "covariance_m2": tuple(COVARIANCE_COLUMNS),
-    "relative_covariance_m2": tuple(RELATIVE_COLUMNS),
-    "orientation_wxyz": tuple(ORIENTATION_COLUMNS),
+    "covariance_m2": _COVARIANCE,
+    "relative_covariance_m2": tuple(f"rel_{name}" for name in _COVARIANCE),
+    "orientation_wxyz": ("qw", "qx", "qy", "qz"),
 }
+_UNITS = {
+    "position_m": "m",
+    "velocity_m_s": "m/s",
+    "status": "tracked, coasting or lost",
+    "covariance_m2": "m2",
+    "relative_covariance_m2": "m2",
+}
+#: All columns and their units, in written order.
+ALL_COLUMNS = {"frame": "1", "time_s": "s", "drone": "name"} | {
+    name: _UNITS.get(quantity, "1") for quantity, names in PARTS.items() for name in names
+}
+#: Quantities whose columns are always written; the others are written if they are known.
+ALWAYS = ("position_m", "velocity_m_s", "fitness", "num_cameras", "status")
 _UPPER = np.triu_indices(3)
 
 
@@ -64,7 +56,7 @@ def columns_of(trajectories: Trajectories) -> dict[str, Shaped[np.ndarray, "rows
     }
     for quantity, names in PARTS.items():
         values = getattr(trajectories, quantity)
-        if values is None and names[0] not in COLUMNS:
+        if values is None and quantity not in ALWAYS:
             continue
         if values is None:
             values = unknown.get(quantity, np.full((*shape, len(names)), np.nan, np.float32))

@@ -1,9 +1,8 @@
 """Trajectory files: CSV and Parquet tables with one row per frame and drone.
 
-Written files always have the columns of `COLUMNS` in this order, followed by the columns of `COVARIANCE_COLUMNS`,
-`RELATIVE_COLUMNS` and `ORIENTATION_COLUMNS` if these are known, so that other programs can rely on them.
-A file to be read needs only `frame`, `drone` and the position; rows and columns may have any order, and further columns
-are ignored.
+Written files have the columns of `columns.ALL_COLUMNS` in this order, those of covariances and orientations only if
+these are known, so that other programs can rely on them. A file to be read needs only `frame`, `drone` and the
+position; rows and columns may have any order, and further columns are ignored.
 """
 
 from __future__ import annotations
@@ -31,15 +30,7 @@ from psotrack.support import (
     has_negative_eigenvalue,
     refuse_to_overwrite,
 )
-from psotrack.trajectories.columns import (
-    COLUMNS,
-    COVARIANCE_COLUMNS,
-    ORIENTATION_COLUMNS,
-    PARTS,
-    RELATIVE_COLUMNS,
-    columns_of,
-    is_known,
-)
+from psotrack.trajectories.columns import ALL_COLUMNS, PARTS, columns_of, is_known
 from psotrack.trajectories.status import Status
 from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 
@@ -51,7 +42,6 @@ SCHEMA_VERSION = 1
 
 #: Numbers of frames times drones that are never refused, and per row of a file.
 _LEAST_CELLS, _CELLS_PER_ROW = 1_000_000, 100
-_READ = COLUMNS | COVARIANCE_COLUMNS | RELATIVE_COLUMNS | ORIENTATION_COLUMNS
 _REQUIRED = ("frame", "drone", "x_m", "y_m", "z_m")
 _WORDS = ("drone", "status")
 #: Index of the covariance column for each element of the matrix.
@@ -213,7 +203,7 @@ def parquet_schema(names: Sequence[str]) -> pa.Schema:
     import pyarrow as pa
 
     types = {"frame": pa.int64(), "drone": pa.string(), "num_cameras": pa.int32(), "status": pa.string()}
-    units = {name: _READ[name] for name in names}
+    units = {name: ALL_COLUMNS[name] for name in names}
     metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
     return pa.schema([(name, types.get(name, pa.float64())) for name in names], metadata)
 
@@ -251,7 +241,7 @@ def _read_csv(path: Path) -> DroneRows:
             raise InputError(f"{path}, line {line}", expected=f"a number in {name}", found=found) from None
 
     columns: dict[str, np.ndarray] = {}
-    for name in [name for name in _READ if name in header]:
+    for name in [name for name in ALL_COLUMNS if name in header]:
         words = [row[header.index(name)].strip() for row in rows]
         if name in _WORDS:
             columns[name] = np.array(words, object)
@@ -283,7 +273,7 @@ def _read_parquet(path: Path) -> DroneRows:
     except (pa.ArrowException, OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(path, expected="a Parquet file", found=f"{error}".partition("\n")[0]) from error
     _check_columns(path, names)
-    columns = {name: _parquet_column(path, table, name) for name in _READ if name in names}
+    columns = {name: _parquet_column(path, table, name) for name in ALL_COLUMNS if name in names}
     return DroneRows(columns, lambda row: f"{path}, row {row + 1}")
 
 
@@ -303,7 +293,7 @@ def _parquet_column(path: Path, table: pa.Table, name: str) -> Shaped[np.ndarray
 
 def _check_columns(path: Path, names: list[str]) -> None:
     missing = [name for name in _REQUIRED if name not in names]
-    twice = [name for name in _READ if names.count(name) > 1]
+    twice = [name for name in ALL_COLUMNS if names.count(name) > 1]
     if missing or twice:
         raise InputError(
             path,
@@ -343,7 +333,7 @@ def from_rows(path: Path, rows: DroneRows, fps: float | None = None) -> Trajecto
         values = np.full((len(frame) * len(drones), len(parts)), Status.LOST if name == "status" else np.nan)
         words = [_STATUS[word] for word in columns["status"]] if name == "status" else None
         values[cell] = np.stack([columns[part] if words is None else words for part in parts], axis=-1)
-        quantities[name] = values[:, _PLACES] if len(parts) == len(COVARIANCE_COLUMNS) else values
+        quantities[name] = values[:, _PLACES] if QUANTITIES[name] == (3, 3) else values
         quantities[name] = quantities[name].reshape(*shape, *QUANTITIES[name])
     for name in {"num_cameras", "status"} & quantities.keys():
         quantities[name] = np.nan_to_num(quantities[name]).astype(np.int64)
@@ -372,18 +362,19 @@ def _check_values(rows: DroneRows) -> None:
             wrong, expected = np.abs(values) > LARGEST, f"{MODERATE}, or nothing"
         if (row := first_true(wrong)) is not None:
             raise rows.error(row, expected=f"{expected} in {name}", found=repr(values.tolist()[row]))
-    for names in (ORIENTATION_COLUMNS, COVARIANCE_COLUMNS, RELATIVE_COLUMNS):
+    for quantity in ("orientation_wxyz", "covariance_m2", "relative_covariance_m2"):
+        names = PARTS[quantity]
         if not all(name in columns for name in names):
             continue
         together = np.stack([columns[name] for name in names], axis=-1)
         length = np.linalg.norm(together, axis=-1)
-        if names is ORIENTATION_COLUMNS:
+        if quantity == "orientation_wxyz":
             wrong, expected = np.abs(length - 1) > LENGTH_TOLERANCE, "a unit quaternion"
         else:
             wrong, expected = has_negative_eigenvalue(together[:, _PLACES]), "a covariance"
         if (row := first_true(wrong)) is not None:
             found = f"length {length[row]:g}"
-            if names is not ORIENTATION_COLUMNS:
+            if quantity != "orientation_wxyz":
                 found = f"a matrix with a negative eigenvalue, {together[row].tolist()}"
             raise rows.error(row, expected=f"{expected} in {', '.join(names)}", found=found)
 

@@ -6,7 +6,7 @@ The fields are the same for all methods. A number that a method does not compute
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -88,15 +88,8 @@ class Tracks:
 
 
 #: Names of the arrays of `Tracks` with axes (frames, drones, ...).
-ARRAYS = (
-    "position_m",
-    "velocity_m_s",
-    "covariance_m2",
-    "measured_m",
-    "measured_covariance_m2",
-    "fitness",
-    "num_cameras",
-    "status",
+ARRAYS = tuple(
+    field.name for field in fields(Tracks) if field.name not in ("size_m", "size_frames", "arrivals")
 )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from psotrack.errors import InputError
 from psotrack.recordings import IMAGE_SUFFIXES, image_files, natural_key
 from psotrack.recordings.datasets._onboard import is_onboard_video
 from psotrack.recordings.datasets.dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS
+from psotrack.support import are_numbers
 
 #: Kinds of files of a recording; "other" is none of them. A folder of pictures is a video.
 Kind = Literal["video", "ignore", "detections", "timestamps", "reference", "corners", "calibration", "other"]
@@ -121,9 +121,9 @@ def _kind_of_text(path: Path) -> Kind:
     if len(values) == 1 and values[0].isdecimal():
         # The first frames may have no detection: numbers of frames alone.
         values = _cells(_first_line(path, lambda line: len(_cells(line)) > 1))
-    if len(values) > 1 and (len(values) - 1) % _DETECTION_VALUES == 0 and all(map(_is_number, values)):
+    if len(values) > 1 and (len(values) - 1) % _DETECTION_VALUES == 0 and are_numbers(values):
         return "detections"
-    if len(line.split()) == 8 and all(map(_is_number, line.split())):
+    if len(line.split()) == 8 and are_numbers(line.split()):
         return "reference"
     # No frame of a file of detections may have one.
     return "detections" if path.suffix.lower() == ".csv" and path.parent.name.lower() in _FOLDERS else "other"
@@ -144,10 +144,3 @@ def _cells(line: str) -> list[str]:
     while cells and not cells[-1]:
         cells.pop()
     return cells
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False

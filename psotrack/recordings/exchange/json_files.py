@@ -13,20 +13,11 @@ from psotrack.recordings import Recording
 from psotrack.recordings.exchange.camera_boxes import Footage
 from psotrack.support import Report, read_json
 from psotrack.trajectories import QUANTITIES, Status, Trajectories, check_cells
+from psotrack.trajectories.columns import ALL_COLUMNS, PARTS
 
 #: Value of the key `format`, and version of the keys' meaning.
 NAME, VERSION = "psotrack tracks", 1
-#: Units of the quantities of a drone.
-UNITS = {
-    "position_m": "m",
-    "velocity_m_s": "m/s",
-    "orientation_wxyz": "unit quaternion, body to world",
-    "fitness": "1",
-    "num_cameras": "1",
-    "status": "tracked, coasting or lost",
-    "covariance_m2": "m2",
-    "relative_covariance_m2": "m2",
-}
+_TURN = "unit quaternion, body to world"
 _STATUS = {status.label: int(status) for status in Status}
 
 
@@ -39,7 +30,7 @@ def write_json_tracks(
         "format": NAME,
         "version": VERSION,
         "axes": "world of the calibration, z up",
-        "units": {"frame": "1", "time_s": "s"} | {name: UNITS[name] for name in known},
+        "units": {"frame": "1", "time_s": "s"} | {name: _unit(name) for name in known},
         "frame": trajectories.frame.tolist(),
         "time_s": trajectories.time_s.tolist(),
         "drones": [
@@ -84,6 +75,11 @@ def read_json_tracks(path: Path, recording: Recording | None) -> Trajectories:
         ) from error
 
 
+def _unit(name: str) -> str:
+    """Unit of a quantity of a drone."""
+    return _TURN if name == "orientation_wxyz" else ALL_COLUMNS[PARTS[name][0]]
+
+
 def _plain(name: str, values: np.ndarray) -> list[Any]:
     """One value per frame: a number, lists of numbers, or a word; None where any of its numbers is NaN."""
     if name == "status":
@@ -99,16 +95,15 @@ def _stacked(name: str, drones: list[dict[str, Any]], frames: int) -> np.ndarray
             raise KeyError(name)
         return None
     whole = name in ("status", "num_cameras")
-    stacked = np.full(
-        (frames, len(drones), *QUANTITIES[name]), -1 if whole else np.nan, np.int64 if whole else float
-    )
+    unknown = np.full(QUANTITIES[name], -1 if whole else np.nan).tolist()
+    stacked = np.empty((frames, len(drones), *QUANTITIES[name]), np.int64 if whole else float)
     for index, drone in enumerate(drones):
         values = drone[name]
         if len(values) != frames:
             raise ValueError(f"{len(values)} values of {name} for {frames} frames")
-        for row, value in enumerate(values):
-            if value is not None:
-                stacked[row, index] = _STATUS[value] if name == "status" else value
+        if name == "status":
+            values = [_STATUS[value or Status.LOST.label] for value in values]
+        stacked[:, index] = [unknown if value is None else value for value in values]
     if np.isinf(stacked).any():
         raise ValueError(f"an infinite number in {name}")
     return stacked
