@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 IMPORT_NAMES = {
     "mcap-ros2-support": "mcap_ros2",
     "opencv-python-headless": "cv2",
+    "pillow": "PIL",
     "pyyaml": "yaml",
     "rerun-sdk": "rerun",
 }

@@ -39,7 +39,6 @@ ARGUMENTS = {"allow_pickle", "shell"}
 LOADERS = {"load", "load_all", "full_load", "unsafe_load", "FullLoader", "UnsafeLoader", "Loader"}
 
 
-#: Where it is right, and why.
 def suspects(tree: ast.AST) -> set[str]:
     """What in a module could run code from data."""
     found = set()

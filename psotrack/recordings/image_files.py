@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import io
 import re
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
+from PIL import Image
 
 from psotrack.errors import InputError
-from psotrack.recordings.image_headers import PNG, claimed_size_wh
 from psotrack.recordings.opencv_messages import silence_opencv
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-#: Largest number of pixels of an image, ten times that of a large camera.
-MOST_PIXELS = 2**28
+#: Formats that are read, by Pillow's names.
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
+#: Largest number of pixels of an image, seven times that of a large camera: Pillow refuses more.
+MOST_PIXELS = 178_956_970
 #: Longest side of an image, pixels: OpenCV warps no larger ones.
 MOST_SIDE = 2**15 - 2
-#: Least size of a part of a PNG: length, name and checksum.
-_PNG_PART = 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -133,14 +133,7 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
     Raises:
         InputError: the content is no image of a format that psotrack reads, or would take gigabytes.
     """
-    data = coded.tobytes()
-    if data.startswith(PNG) and not _is_whole_png(data):
-        raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
-    size_wh = claimed_size_wh(data)
-    if size_wh is None:
-        # Of the other formats that OpenCV decodes, a few bytes can take gigabytes.
-        found = "a file that is no PNG, JPEG, BMP, TIFF, WebP or PNM"
-        raise InputError(where, expected="an image", found=found)
+    size_wh = _claimed_size_wh(coded.tobytes(), where)
     check_pixels(where, *size_wh)
     with contextlib.suppress(cv2.error), silence_opencv():
         image = cv2.imdecode(coded, flags)
@@ -160,24 +153,21 @@ def check_pixels(where: object, width: int, height: int) -> None:
     raise InputError(where, expected=expected, found=f"{width} x {height} pixels")
 
 
-def _is_whole_png(data: bytes) -> bool:
-    """Whether a PNG's parts up to its end are there, and those that an image needs fit their checksums.
-
-    libpng writes about parts that do not straight to the terminal, which no setting of OpenCV prevents.
-    """
-    at, name = len(PNG), b""
-    while name != b"IEND":
-        end = at + _PNG_PART + int.from_bytes(data[at : at + 4])
-        if end > len(data):
-            return False
-        name = data[at + 4 : at + 8]
-        # The name of a part that an image needs begins with a capital letter.
-        if name[:1].isupper() and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(
-            data[end - 4 : end]
-        ):
-            return False
-        at = end
-    return True
+def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
+    """Width and height that the header of an image states, before OpenCV asks for the memory that they take."""
+    try:
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+            # libpng writes about a damaged file straight to the terminal, which no setting of OpenCV prevents.
+            if image.format == "PNG":
+                image.verify()
+            return image.size
+    except Image.DecompressionBombError as error:
+        found = "".join(re.findall(r"\d+ pixels", str(error)))
+        raise InputError(where, expected=f"images of at most {MOST_PIXELS} pixels", found=found) from error
+    # Of the other formats that OpenCV decodes, a few bytes can take gigabytes. A damaged header leads to any error.
+    except Exception as error:
+        found = f"a file that is no {', '.join(_FORMATS)}, or a damaged one"
+        raise InputError(where, expected="an image", found=found) from error
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:
