@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import msgspec
 
 from psotrack.errors import InputError
-from psotrack.support import digest_record
+from psotrack.support import digest_record, read_json
 
 #: Name of the description in the folder of a zarr array.
 ARRAY_FILE = "zarr.json"
@@ -45,11 +45,8 @@ class StoredSilhouettes:
         return digest_record({**self.made_of, "first_frames": self.num_frames})
 
 
-class _Model(msgspec.Struct, frozen=True):
-    """Identity of a background model, as of `identify`."""
-
-    name: str = msgspec.field(name="class")
-    key: dict[str, Any]
+#: Identity of a background model, as of `identify`.
+_Model = TypedDict("_Model", {"class": str, "key": dict[str, Any]})
 
 
 class _MadeOf(msgspec.Struct, frozen=True):
@@ -58,15 +55,6 @@ class _MadeOf(msgspec.Struct, frozen=True):
     num_frames: int
     settings: dict[str, Any]
     background: _Model
-
-
-class _Attributes(msgspec.Struct, frozen=True):
-    made_of: _MadeOf
-
-
-class _Array(msgspec.Struct, frozen=True):
-    shape: tuple[int, int, int]
-    attributes: _Attributes
 
 
 def probe_silhouettes(path: Path | str) -> StoredSilhouettes:
@@ -79,22 +67,17 @@ def probe_silhouettes(path: Path | str) -> StoredSilhouettes:
         InputError: the folder holds no silhouettes, or they do not say what they were made of.
     """
     path = Path(path)
+    file, remedy = path / ARRAY_FILE, "silhouettes of an archive, and those that this version stores, say it"
+    expected = "the description of silhouettes that say what they were made of"
+    if not file.is_file():
+        raise InputError(path, expected="a folder with stored silhouettes", found=f"no {ARRAY_FILE}")
+    content = read_json(file, expected, remedy)
     try:
-        text = (path / ARRAY_FILE).read_bytes()
-        described, array = msgspec.json.decode(text), msgspec.json.decode(text, type=_Array)
-    except OSError as error:
-        found = f"no {ARRAY_FILE}: {(error.strerror or str(error)).lower()}"
-        raise InputError(path, expected="a folder with stored silhouettes", found=found) from error
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            path / ARRAY_FILE,
-            expected="the description of silhouettes that say what they were made of",
-            found=f"{error}",
-            remedy="silhouettes of an archive, and those that this version stores, say it",
-        ) from error
-    made_of = described["attributes"][MADE_OF]
-    if array.shape[0] != made_of["num_frames"]:
-        raise InputError(
-            path / ARRAY_FILE, expected=f"{made_of['num_frames']} frames", found=f"{array.shape[0]}"
-        )
-    return StoredSilhouettes(path, array.shape[0], made_of)
+        made_of, shape = content["attributes"][MADE_OF], content["shape"]
+        num_frames = msgspec.convert(made_of, _MadeOf).num_frames
+        stored = msgspec.convert(shape, tuple[int, int, int])[0]
+    except (KeyError, TypeError, msgspec.ValidationError) as error:
+        raise InputError(file, expected=expected, found=f"{error}", remedy=remedy) from error
+    if stored != num_frames:
+        raise InputError(file, expected=f"{num_frames} frames", found=f"{stored}")
+    return StoredSilhouettes(path, stored, made_of)
