@@ -51,46 +51,28 @@ def _heading(content: dict[str, Any]) -> str:
 def _rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     """Cells of each camera, and of each camera on a drone."""
     for name, camera in content["cameras"].items():
-        yield (
-            name,
-            _shown(camera),
-            "" if camera["frames"] is None else f"{camera['frames']}{_begin(camera['begins_s'])}",
-            "" if camera["fps"] is None else f"{camera['fps']:g}",
-            _size(camera["image_size_wh"]),
-            "" if camera["focal_length_px"] is None else f"{camera['focal_length_px']:.1f}",
-            "no place" if not camera["placed"] else " ".join(f"{value:.2f}" for value in camera["centre_m"]),
-            "" if camera["detections"] is None else f"{camera['detections']}",
-        )
+        images = "no video" if camera["silhouettes"] is None else "silhouettes only"
+        place = "no place"
+        if camera["placed"]:
+            place = " ".join(f"{value:.2f}" for value in camera["centre_m"])
+        yield _row(name, camera, camera["video"] or images, place, camera["detections"])
     for name, camera in (content["onboard"] or {}).items():
-        focal_length_px = camera["focal_length_px"]
-        yield (
-            f"on {name}",
-            _name(camera["video"]),
-            f"{camera['frames']}",
-            f"{camera['fps']:g}",
-            _size(camera["image_size_wh"]),
-            "" if focal_length_px is None else f"{focal_length_px:.1f}",
-            f"{camera['frames_with_pose']} poses",
-            "",
-        )
+        yield _row(f"on {name}", camera, camera["video"], f"{camera['frames_with_pose']} poses", None)
 
 
-def _shown(camera: dict[str, Any]) -> str:
-    """What there is of a camera's images."""
-    if camera["video"] is not None:
-        return _name(camera["video"])
-    return "no video" if camera["silhouettes"] is None else "silhouettes only"
-
-
-def _name(video: str) -> str:
-    """Name of a file; a stream's address as it is."""
-    return video if "://" in video else video.replace("\\", "/").rpartition("/")[2]
-
-
-def _begin(begins_s: float | None) -> str:
-    """When a camera begins, where this is not at time 0."""
-    return f" from {begins_s:.3f} s" if begins_s else ""
-
-
-def _size(size_wh: list[int] | None) -> str:
-    return "" if size_wh is None else f"{size_wh[0]} x {size_wh[1]}"
+def _row(
+    name: str, camera: dict[str, Any], video: str, place: str, detections: int | None
+) -> tuple[str, ...]:
+    """Cells of a camera; what is not known is empty. Of a file the name is shown, a stream's address as it is."""
+    begins_s, size_wh = camera.get("begins_s"), camera["image_size_wh"]
+    begin = f" from {begins_s:.3f} s" if begins_s else ""
+    return (
+        name,
+        video if "://" in video else video.replace("\\", "/").rpartition("/")[2],
+        "" if camera["frames"] is None else f"{camera['frames']}{begin}",
+        "" if camera["fps"] is None else f"{camera['fps']:g}",
+        "" if size_wh is None else f"{size_wh[0]} x {size_wh[1]}",
+        "" if camera["focal_length_px"] is None else f"{camera['focal_length_px']:.1f}",
+        place,
+        "" if detections is None else f"{detections}",
+    )

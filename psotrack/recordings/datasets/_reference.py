@@ -15,7 +15,7 @@ from psotrack.errors import InputError
 from psotrack.recordings import Reference, Timeline
 from psotrack.recordings.datasets._poses import read_poses
 from psotrack.recordings.mocap import marker_bodies, read_c3d
-from psotrack.support import read_text
+from psotrack.support import first_line
 from psotrack.trajectories import Trajectories, read_trajectories, resample
 from psotrack.trajectories.tum import read_tum
 
@@ -99,12 +99,7 @@ def _at_times(
         time_s: (frames,), times of the frames, seconds.
         later_s: the clock of the references shows t + `later_s` at time t, seconds.
     """
-    parts = [
-        resample(reference, frame, time_s, later_s=later_s)
-        if reference.num_frames > 1
-        else _nowhere(reference, frame, time_s)
-        for reference in references
-    ]
+    parts = [resample(reference, frame, time_s, later_s=later_s) for reference in references]
     unknown = np.full((len(frame), 1, 4), np.nan)
     turned = any(part.orientation_wxyz is not None for part in parts)
     orientations = [
@@ -128,7 +123,7 @@ def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:
         return marker_bodies(read_c3d(path), path, bodies)
     if suffix in (".tum", ".txt"):
         return read_tum(path)
-    if suffix == ".parquet" or (suffix == ".csv" and "x_m" in _header(path)):
+    if suffix == ".parquet" or (suffix == ".csv" and "x_m" in first_line(path)):
         return read_trajectories(path, fps=fps)
     if suffix == ".csv":
         return _read_pose_file(path, fps)
@@ -146,15 +141,3 @@ def _read_pose_file(path: Path, fps: float) -> Trajectories:
         position_m[:, None],
         orientation_wxyz=None if orientation_wxyz is None else orientation_wxyz[:, None],
     )
-
-
-def _header(path: Path) -> str:
-    lines = read_text(path).splitlines()
-    return lines[0] if lines else ""
-
-
-def _nowhere(
-    reference: Trajectories, frame: Int[np.ndarray, "frames"], time_s: Float[np.ndarray, "frames"]
-) -> Trajectories:
-    position_m = np.full((len(frame), reference.num_drones, 3), np.nan)
-    return replace(Trajectories(frame, time_s, reference.drones, position_m), orientation_wxyz=None)

@@ -48,9 +48,8 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     """Read a sequence from a folder of the dataset, simulated or real.
 
     A camera without video gets the image size of most videos. Videos may differ in length. `Recording.usable` is
-    stricter. Videos of cameras on drones that cannot be used are left out with
-    a warning, because their published layout is unknown and tracking does not need them. So is a .c3d file without
-    drones.
+    stricter. Videos of cameras on drones that cannot be used are left out with a warning, because their published
+    layout is unknown and tracking does not need them. So is a .c3d file without drones.
 
     Args:
         folder: the folder.
@@ -66,7 +65,7 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     videos = _videos(folder, files, names)
     rig = read_rig(calibration, _image_sizes(names, videos), file_format="dpjait")
     _check_principal_points(rig, videos)
-    detections = files_by_camera(_detection_files(folder / DETECTIONS), names)
+    detections = files_by_camera((folder / DETECTIONS).glob("*.csv"), names)
     times = _frame_times(videos, detections)
     corners = folder / MARKER_CORNERS
     recording = Recording(
@@ -109,21 +108,6 @@ def detection_files(folder: Path | str, cameras: Sequence[str]) -> dict[str, Pat
             found="no such file" if folder.is_dir() else "no such folder",
         )
     return found
-
-
-def _detection_files(folder: Path) -> list[Path]:
-    """The files of a sequence's detections; none without such a folder.
-
-    Raises:
-        InputError: there is a file of the folder's name, or the folder cannot be read.
-    """
-    try:
-        return sorted(path for path in folder.iterdir() if path.suffix == ".csv")
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        found = (error.strerror or str(error)).lower()
-        raise InputError(folder, expected="a folder of detections, or none", found=found) from error
 
 
 def _onboard(folder: Path) -> Mapping[str, OnboardVideo]:

@@ -112,11 +112,15 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
     Raises:
         InputError: the file cannot be read, has boxes only, has a drone twice in a frame, or there is no rate.
     """
-    read = read_numbers(path, 7, f"at least 7 numbers: {_COLUMNS}", more=True)
+    read = read_numbers(path, 10, f"positions in MOT15's 3D columns: {_COLUMNS}", more=True)
     number = read.values[:, :2]
     wrong = (number[:, 0] < 1) | ((number != np.floor(number)) | (np.abs(number) > _LARGEST)).any(axis=1)
     if (row := first_true(wrong)) is not None:
         raise read.error(row, expected="whole frame numbers from 1", found=f"{number[row, 0]:g}")
+    if (read.values[:, 7:] == -1).all():
+        found = "boxes alone: x, y and z are -1 in every row"
+        remedy = "name a file with 3D columns, or the folder that `psotrack export --to mot` wrote"
+        raise InputError(path, expected="positions in MOT15's 3D columns", found=found, remedy=remedy)
     # Drones have the order of their first rows: here that of their numbers.
     order = np.argsort(number[:, 1], kind="stable")
     frame, identity = number[order, 0] - 1, number[order, 1].astype(int)
@@ -124,21 +128,9 @@ def read_mot_positions(path: Path, recording: Recording | None) -> Trajectories:
         "frame": frame,
         "time_s": _times(path, frame, recording),
         "drone": identity.astype(str).astype(object),
-        **dict(zip(("x_m", "y_m", "z_m"), _positions(path)[order].T, strict=True)),
+        **dict(zip(("x_m", "y_m", "z_m"), read.values[order, 7:].T, strict=True)),
     }
     return from_rows(path, DroneRows(columns, lambda row: f"{path}, line {read.lines[order[row]]}"))
-
-
-def _positions(path: Path) -> Float[np.ndarray, "rows 3"]:
-    try:
-        position_m = read_numbers(path, 10, f"10 numbers: {_COLUMNS}", more=True).values[:, 7:]
-        found = "boxes alone: x, y and z are -1 in every row" if (position_m == -1).all() else ""
-    except InputError as error:
-        found = f"boxes alone ({error})"
-    if found:
-        remedy = "name a file with 3D columns, or the folder that `psotrack export --to mot` wrote"
-        raise InputError(path, expected="positions in MOT15's 3D columns", found=found, remedy=remedy)
-    return position_m
 
 
 def _times(

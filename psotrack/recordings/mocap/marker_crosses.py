@@ -90,8 +90,7 @@ def learn_cross(
 
     Returns:
         (markers, 3), positions of the markers in the body's frame, metres. The origin is the centroid. z is the normal
-        of the plane that fits the markers best and points upwards in flight. x points to the first marker: from the
-        opposite marker in a cross of four markers, otherwise from the centroid.
+        of the plane that fits the markers best and points upwards in flight. x points to the first marker.
 
     Raises:
         InputError: two of the markers are never seen together.
@@ -173,24 +172,6 @@ def _axes(markers_m: Float[np.ndarray, "markers 3"], up: Float[np.ndarray, "3"])
     z = np.linalg.svd(markers_m)[2][2]
     z = z if z @ up >= 0 else -z
     flat_m = markers_m - np.outer(markers_m @ z, z)
-    first = int(np.argmax(np.linalg.norm(flat_m, axis=1) > _LINE_M))
-    opposite = _opposite(flat_m, z, first)
-    x = flat_m[first] if opposite is None else flat_m[first] - flat_m[opposite]
+    x = flat_m[np.argmax(np.linalg.norm(flat_m, axis=1) > _LINE_M)]
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
-
-
-def _opposite(flat_m: Float[np.ndarray, "markers 3"], z: Float[np.ndarray, "3"], first: int) -> int | None:
-    """The marker opposite to the first marker in a cross of four, where two beams cross; None for other crosses."""
-
-    def separates(start: int, end: int, left: int, right: int) -> bool:
-        """Whether the line from `start` to `end` runs between the markers `left` and `right`."""
-        sides = np.cross(flat_m[end] - flat_m[start], flat_m[[left, right]] - flat_m[start]) @ z
-        return bool(sides[0] * sides[1] < 0)
-
-    others = [marker for marker in range(len(flat_m)) if marker != first]
-    for opposite in others if len(flat_m) == 4 else ():
-        left, right = (marker for marker in others if marker != opposite)
-        if separates(first, opposite, left, right) and separates(left, right, first, opposite):
-            return opposite
-    return None

@@ -97,22 +97,21 @@ def is_unlabelled(label: str) -> bool:
 def _named_markers(markers: Markers, where: Path | str, name: str, labels: Sequence[str]) -> list[int]:
     """Indices of the markers that the user names; a label may leave out the body before its colon."""
     columns: list[int] = []
+    known = {index: each for index, each in enumerate(markers.labels) if not is_unlabelled(each)}
     for label in labels:
-        fitting = [index for index, each in enumerate(markers.labels) if each == label]
-        if not fitting:
-            fitting = [index for index, each in enumerate(markers.labels) if each.rpartition(":")[2] == label]
         whole = label.endswith(":")
         if whole:
-            fitting = [
-                index
-                for index, each in enumerate(markers.labels)
-                if each.lower().startswith(label.lower()) and not is_unlabelled(each)
-            ]
+            fitting = [index for index, each in known.items() if each.lower().startswith(label.lower())]
+        else:
+            fitting = [index for index, each in enumerate(markers.labels) if each == label]
+            own = [index for index, each in enumerate(markers.labels) if each.rpartition(":")[2] == label]
+            fitting = fitting or own
         if not fitting or (len(fitting) > 1 and not whole):
-            known = [each for each in markers.labels if not is_unlabelled(each)]
             raise SettingsError(
                 f"body {name}, {where}",
-                expected=f"one marker called {label!r}" if fitting else f"labels of {', '.join(known)}",
+                expected=f"one marker called {label!r}"
+                if fitting
+                else f"labels of {', '.join(known.values())}",
                 found=f"{len(fitting)}" if fitting else repr(label),
             )
         columns += [index for index in fitting if index not in columns]
