@@ -29,7 +29,6 @@ from psotrack.geometry.rig_files import (
     read_lenses,
     read_rig,
     write_calibration,
-    write_lenses,
     write_rig,
 )
 from psotrack.inside_out import write_camera_path
@@ -235,7 +234,7 @@ def flight():
 #: Functions that write a file, by the name of the file.
 WRITERS = {
     "rig.toml": lambda path, force: write_rig(path, ring_rig(2), force=force),
-    "lenses.toml": lambda path, force: write_lenses(path, ring_rig(2), force=force),
+    "lenses.toml": lambda path, force: write_rig(path, ring_rig(2), force=force, placed=False),
     "tracks.csv": lambda path, force: write_trajectories(path, flight(), force=force),
     "tracks.parquet": lambda path, force: write_trajectories(path, flight(), force=force),
     "dron1.tum": lambda path, force: write_tum(path.parent, flight(), force=force),

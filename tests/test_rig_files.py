@@ -7,7 +7,7 @@ from helpers import LENSES, assert_same, ring_rig
 
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, make_rig, project
-from psotrack.geometry.rig_files import KEYS, read_lenses, read_rig, write_lenses, write_rig
+from psotrack.geometry.rig_files import KEYS, read_lenses, read_rig, write_rig
 from psotrack.recordings import CameraTable
 
 #: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
@@ -198,12 +198,12 @@ def test_a_camera_of_a_rig_toml_without_a_place_is_left_out(tmp_path, caplog):
 
 def test_lenses_are_written_without_poses(tmp_path):
     rig = ring_rig(2, coefficients=5)
-    write_lenses(tmp_path / "lenses.toml", rig)
+    write_rig(tmp_path / "lenses.toml", rig, placed=False)
     np.testing.assert_array_equal(read_lenses(tmp_path / "lenses.toml").cameras.K, rig.cameras.K)
     with pytest.raises(InputError, match="expected the poses of cameras, found none"):
         read_rig(tmp_path / "lenses.toml")
     with pytest.raises(InputError, match=r"ends in \.toml, for lenses without poses"):
-        write_lenses(tmp_path / "lenses.yml", rig)
+        write_rig(tmp_path / "lenses.yml", rig, placed=False)
 
 
 def test_the_cameras_of_a_recording_are_a_rig(tmp_path):

@@ -52,7 +52,7 @@ def convert(
         undistorted: set the distortion to zero: the videos are undistorted already.
     """
     from psotrack.geometry import Rig
-    from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_lenses, write_rig
+    from psotrack.geometry.rig_files import UNITS_M, read_lenses, read_rig, write_rig
 
     if units is not None and units not in UNITS_M:
         raise SettingsError("--units", expected=f"one of {', '.join(UNITS_M)}", found=units)
@@ -63,10 +63,7 @@ def convert(
         rig = read_rig(source, size, metres_per_unit=metres, file_format=format)
     if undistorted:
         rig = Rig(rig.names, replace(rig.cameras, dist=rig.cameras.dist[:, :0], fisheye=None))
-    if lenses:
-        write_lenses(out, rig, force=output.force)
-    else:
-        write_rig(out, rig, force=output.force, file_format=to)
+    write_rig(out, rig, force=output.force, file_format=to, placed=not lenses)
     _show(output, rig, out, placed=not lenses)
 
 

@@ -7,7 +7,6 @@ from .formats import (
     read_cameras,
     read_lenses,
     read_rig,
-    write_lenses,
     write_rig,
 )
 from .rig_toml import KEYS, fields_of_table
@@ -27,6 +26,5 @@ __all__ = [
     "read_lenses",
     "read_rig",
     "write_calibration",
-    "write_lenses",
     "write_rig",
 ]

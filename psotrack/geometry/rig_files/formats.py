@@ -194,7 +194,9 @@ def entries_of(
     return found
 
 
-def write_rig(path: Path | str, rig: Rig, *, force: bool = False, file_format: str | None = None) -> None:
+def write_rig(
+    path: Path | str, rig: Rig, *, force: bool = False, file_format: str | None = None, placed: bool = True
+) -> None:
     """Write a rig to a file, in metres.
 
     Args:
@@ -203,6 +205,7 @@ def write_rig(path: Path | str, rig: Rig, *, force: bool = False, file_format: s
         rig: the cameras.
         force: replace an existing file.
         file_format: one of `WRITTEN_RIG_FORMATS`.
+        placed: whether the poses are written; only a rig.toml can leave them out.
 
     Raises:
         InputError: the path has another suffix.
@@ -210,33 +213,15 @@ def write_rig(path: Path | str, rig: Rig, *, force: bool = False, file_format: s
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
     path = Path(path)
-    name = file_format or _format_of_name(path)
+    if not placed and path.suffix.lower() != ".toml":
+        expected = "a file that ends in .toml, for lenses without poses"
+        raise InputError(path, expected=expected, found=path.name)
+    name = (file_format or _format_of_name(path)) if placed else "rig"
     write = _FORMATS[name].write if name in _FORMATS else None
     if write is None:
         raise SettingsError("format", expected=f"one of {', '.join(WRITTEN_RIG_FORMATS)}", found=name)
     refuse_to_overwrite(path, force)
-    write(path, rig)
-
-
-def write_lenses(path: Path | str, rig: Rig, *, force: bool = False) -> None:
-    """Write the lenses of cameras to a rig.toml, without poses.
-
-    Args:
-        path: path that ends in .toml.
-        rig: the cameras.
-        force: replace an existing file.
-
-    Raises:
-        InputError: the path has another suffix.
-        OutputError: see `write_rig`.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".toml":
-        raise InputError(
-            path, expected="a file that ends in .toml, for lenses without poses", found=path.name
-        )
-    refuse_to_overwrite(path, force)
-    rig_toml.write(path, rig, placed=False)
+    write(path, rig) if placed else rig_toml.write(path, rig, placed=False)
 
 
 def _format_of_name(path: Path) -> str:
