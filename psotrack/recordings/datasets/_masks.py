@@ -1,8 +1,8 @@
 """`drone_masks.zip` of the DPJAIT dataset: silhouettes of drones, one binary image per camera, drone and frame.
 
 The names in the published archives are unknown. The writer names images `cam1i/dron1/000000.png` and so on; they are
-1-bit PNGs, white where the drone is seen, one for every frame, black images included. The reader accepts any archive or
-folder of images whose paths name a camera (`cam1i` or a serial number), a drone (`dron1`, `drone_1`) and a frame (the
+1-bit PNGs, white where the drone is seen, one for every frame, black images included. The reader accepts any archive
+of images whose paths name a camera (`cam1i` or a serial number), a drone (`dron1`, `drone_1`) and a frame (the
 last remaining number).
 """
 
@@ -13,7 +13,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 
@@ -118,7 +118,7 @@ def _opened(path: Path, expected: str) -> zipfile.ZipFile:
 
 
 class Masks:
-    """Masks in an archive or a folder, each decoded when it is requested; a context manager.
+    """Masks in an archive, each decoded when it is requested; a context manager.
 
     Attributes:
         cameras: names of the cameras, without `_s`.
@@ -126,11 +126,10 @@ class Masks:
         frames: numbers of the frames with masks.
     """
 
-    def __init__(
-        self, path: Path, names: Mapping[tuple[str, int, int], str], archive: zipfile.ZipFile | None
-    ) -> None:
-        self._path, self._names, self._archive = path, names, archive
-        cameras, drones, frames = (sorted(set(column)) for column in zip(*names, strict=True))
+    def __init__(self, path: Path) -> None:
+        self._path, self._archive = path, _opened(path, "a ZIP archive of masks")
+        self._names = _index_images(path, self._archive.namelist())
+        cameras, drones, frames = (sorted(set(column)) for column in zip(*self._names, strict=True))
         self.cameras: tuple[str, ...] = tuple(cameras)
         self.drones: tuple[int, ...] = tuple(drones)
         self.frames: tuple[int, ...] = tuple(frames)
@@ -152,11 +151,11 @@ class Masks:
             raise InputError(
                 self._path, expected=f"a mask of dron{drone} in frame {frame} of {camera}", found="none"
             )
-        if self._archive and (size := self._archive.getinfo(name).file_size) > _MOST_IMAGE:
+        if (size := self._archive.getinfo(name).file_size) > _MOST_IMAGE:
             expected = f"an image of at most {_MOST_IMAGE} bytes"
             raise InputError(f"{self._path}: {name}", expected=expected, found=f"{size} bytes")
         try:
-            data = self._archive.read(name) if self._archive else (self._path / name).read_bytes()
+            data = self._archive.read(name)
         except (OSError, *_ZIP_ERRORS) as error:
             found = str(error) or type(error).__name__
             raise InputError(f"{self._path}: {name}", expected="an image", found=found) from error
@@ -166,28 +165,21 @@ class Masks:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._archive:
-            self._archive.close()
+        self._archive.close()
 
 
 def read_masks(path: Path | str) -> Masks:
-    """Open the masks in an archive or an unpacked folder.
+    """Open the masks in an archive.
 
     Args:
-        path: path of the archive, of the unpacked folder, or of a sequence's folder with `drone_masks.zip`.
+        path: path of the archive, or of a sequence's folder with `drone_masks.zip`.
 
     Raises:
         InputError: the path cannot be read, the path of an image does not name camera, drone and frame, or two images
             belong to one camera, drone and frame.
     """
     path = Path(path)
-    if (path / MASKS).exists():
-        path = path / MASKS
-    if path.is_dir():
-        files = sorted(file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file())
-        return Masks(path, _index_images(path, files), None)
-    archive = _opened(path, "a ZIP archive or a folder of masks")
-    return Masks(path, _index_images(path, archive.namelist()), archive)
+    return Masks(path / MASKS if path.is_dir() else path)
 
 
 def _index_images(path: Path, files: list[str]) -> dict[tuple[str, int, int], str]:
