@@ -264,7 +264,7 @@ def test_cameras_on_the_network_stop_and_come_back(
     [
         (["--replay"], "--out: expected --out FILE, --lines, --udp, --websocket or --view"),
         (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
-        (["--replay", "--out", "tracks.txt"], "ends in .csv or .parquet"),
+        (["--replay", "--out", "tracks.txt"], "ends in .csv"),
         (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
         (["--replay", "--websocket", "nowhere"], "--websocket: expected PORT or HOST:PORT"),
     ],
@@ -392,7 +392,7 @@ def test_without_two_cameras_that_film_the_command_ends(
     videos = {"cam1": f"http://127.0.0.1:{port}/", "cam3": address, "cam5": 63}
     laboratory = laboratory_of(tmp_path, sequence, videos)
     done = psotrack(
-        "live", laboratory, "--out", tmp_path / "live.parquet", "--record", tmp_path / "kept", "--cache", cache, *EFFORT
+        "live", laboratory, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept", "--cache", cache, *EFFORT
     )  # fmt: skip
     assert done.returncode == 2
     *lines, last = done.stderr.splitlines()

@@ -79,7 +79,7 @@ def live(
       psotrack live data/Simulated_Data/S02_D4_A --replay --speed 0.5 --lines | head
 
     Options:
-        out: file of the tracks; it ends in .csv, which grows row by row, or in .parquet, which appears at the end.
+        out: file of the tracks, which grows row by row; it ends in .csv.
         lines: write each row as a line of JSON to stdout.
         udp: send each row as a line of JSON by UDP.
         websocket: send each row as a message of JSON to all clients of a WebSocket server at PORT of this computer;
@@ -106,7 +106,7 @@ def live(
         expected = "--out FILE, --lines, --udp, --websocket or --view"
         raise SettingsError("--out", expected=expected, found="none of them")
     if out is not None:
-        check_suffix("--out", out, ".csv", ".parquet")
+        check_suffix("--out", out, ".csv")
         output.refuse(out, out.with_suffix(".json"))
     if view is not None:
         _check_viewer(view)

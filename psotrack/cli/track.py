@@ -88,7 +88,8 @@ def track(
     from psotrack.trajectories import RowStream, read_trajectories
 
     out = out or beside(sequence, "tracks.csv")
-    check_suffix("--out", out, ".csv", ".parquet")
+    # Rows that come one by one are those of a CSV file.
+    check_suffix("--out", out, ".csv", *([] if how.causal else [".parquet"]))
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
     output.refuse(out, record_path, *([] if causal else [ambiguity_path]))
     chosen = chosen_settings(settings)

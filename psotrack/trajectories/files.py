@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -191,21 +191,14 @@ def _write_parquet(path: Path, columns: Mapping[str, Shaped[np.ndarray, "rows"]]
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = parquet_schema(list(columns))
+    types = {"frame": pa.int64(), "drone": pa.string(), "num_cameras": pa.int32(), "status": pa.string()}
+    units = {name: ALL_COLUMNS[name] for name in columns}
+    metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
+    schema = pa.schema([(name, types.get(name, pa.float64())) for name in columns], metadata)
     arrays = [
         pa.array(columns[field.name], field.type, mask=~is_known(columns[field.name])) for field in schema
     ]
     pq.write_table(pa.table(arrays, schema=schema), path)
-
-
-def parquet_schema(names: Sequence[str]) -> pa.Schema:
-    """Types of some columns, with units and schema version."""
-    import pyarrow as pa
-
-    types = {"frame": pa.int64(), "drone": pa.string(), "num_cameras": pa.int32(), "status": pa.string()}
-    units = {name: ALL_COLUMNS[name] for name in names}
-    metadata = {"psotrack.schema_version": str(SCHEMA_VERSION), "psotrack.units": json.dumps(units)}
-    return pa.schema([(name, types.get(name, pa.float64())) for name in names], metadata)
 
 
 # Reading
