@@ -1,7 +1,7 @@
 """Drafts of `recording.toml`: the files of a folder, matched to cameras by their names, with nothing guessed.
 
 A file belongs to a camera by the rules of `psotrack.geometry.camera_names`. Where two files or two cameras fit equally
-well, or a video fits no camera, the user is asked to say so.
+well, or a video fits no camera, an error asks the user to say so by an option.
 """
 
 from __future__ import annotations
