@@ -104,7 +104,8 @@ def test_a_recording_has_onboard_cameras_beside_its_fixed_cameras(folder):
     assert list(recording.videos) == ["cam1i", "cam2i"]
     assert recording.truth.drones == ("dron1", "dron2")
     # The reference holds the poses of the drones, not of the on-board cameras 0.1 m in front.
-    np.testing.assert_array_equal(recording.truth.position_m[1:, 0], np.add(POSITION_M, [0.0, 1.0, 0.0])[1:])
+    of_drone_m = np.add(POSITION_M, [0.0, 1.0, 0.0])[1:]
+    np.testing.assert_allclose(recording.truth.position_m[1:, 0], of_drone_m, rtol=0, atol=1e-12)
     assert list(recording.onboard) == ["dron1", "dron2"]
     assert recording.usable(num_frames=3).onboard == recording.onboard
 

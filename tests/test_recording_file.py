@@ -432,7 +432,7 @@ class TestFaults:
         [
             (
                 "0,0\n1,0.04\n2,0.03\n3,0.12\n4,0.16\n5,0.2\n",
-                ("line 4, column time_s", "after 0.04 s", "0.03"),
+                ("times that increase", "found 0.03 s for frame 2 after 0.04 s"),
             ),
             ("0,0\n1,0.04\n", ("times of the 6 frames of the video", "found 2")),
             ("0,0\n2,0.08\n", ("line 3, column frame", "frame 1: every frame once", "found 2")),

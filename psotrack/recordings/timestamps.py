@@ -20,7 +20,7 @@ def read_timestamps(path: Path | str, num_frames: int | None = None) -> FrameTim
 
     Raises:
         InputError: the file cannot be read, a frame is missing, there is not one time per frame, or times do not
-            increase. The message names the line.
+            increase. The message names the line or the frame.
     """
     path = Path(path)
     table = read_table(path, ",")
