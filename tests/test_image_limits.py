@@ -98,7 +98,7 @@ def test_an_image_that_claims_to_be_huge(make, size_wh, tmp_path, little_memory)
     path.write_bytes(make(*size_wh))
     width, height = size_wh
     found = rf"a\.png: expected images of at most 178956970 pixels, found {width * height} pixels"
-    with pytest.raises(InputError, match=found):
+    with pytest.raises(InputError, match=f"{found}$"):
         read_image(path)
 
 
@@ -250,7 +250,7 @@ def test_commands_that_read_images(words, flight, run_psotrack, tmp_path, monkey
         "out": tmp_path / "out",
     }
     output = run_psotrack(*(word.format(**places) for word in words))
-    check_line(output, image.name, "30000 x 30000 pixels")
+    check_line(output, image.name, "found 900000000 pixels\n")
     assert set(tmp_path.rglob("*")) == before
 
 

@@ -89,7 +89,7 @@ def track(
 
     out = out or beside(sequence, "tracks.csv")
     # Rows that come one by one are those of a CSV file.
-    check_suffix("--out", out, ".csv", *([] if how.causal else [".parquet"]))
+    check_suffix("--out", out, ".csv", *([] if causal else [".parquet"]))
     record_path, ambiguity_path = out.with_suffix(".json"), out.with_suffix(".ambiguity.csv")
     output.refuse(out, record_path, *([] if causal else [ambiguity_path]))
     chosen = chosen_settings(settings)

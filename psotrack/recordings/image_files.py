@@ -162,7 +162,7 @@ def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
                 image.verify()
             return image.size
     except Image.DecompressionBombError as error:
-        found = "".join(re.findall(r"\d+ pixels", str(error)))
+        found = str(error).partition("(")[2].partition(")")[0]
         raise InputError(where, expected=f"images of at most {MOST_PIXELS} pixels", found=found) from error
     # Of the other formats that OpenCV decodes, a few bytes can take gigabytes. A damaged header leads to any error.
     except Exception as error:

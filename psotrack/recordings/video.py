@@ -137,7 +137,7 @@ def read_frames(
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Yield frames 0, step, 2 step, ... below `video.num_frames`, in order: BGR, (height, width, 3), uint8.
 
-    The codec must decode the frames in between, unless they are many, but they are not converted to BGR.
+    The codec must decode the frames in between, but they are not converted to BGR.
 
     Args:
         video: the video.
@@ -150,12 +150,29 @@ def read_frames(
     """
     if step < 1:
         raise SettingsError("step", expected="1 or more", found=f"{step}")
-    for _, frame in read_frames_at(video, range(0, video.num_frames, step), into_one=into_one):
-        yield frame
+    if video.images:
+        for path in video.images[: video.num_frames : step]:
+            frame = read_image(path, video.depth_bits)
+            _check_size(path, video, frame)
+            yield frame
+        return
+    place: UInt8[np.ndarray, "height width 3"] | None = None
+    with open_capture(video.path) as capture:
+        for index in range(video.num_frames):
+            if not capture.grab():
+                raise TruncatedVideoError(video, index)
+            if index % step:
+                continue
+            decoded, frame = capture.retrieve(place)
+            place = frame if into_one else None
+            if not decoded:
+                raise TruncatedVideoError(video, index)
+            _check_size(video.path, video, frame, f" in frame {index}")
+            yield frame
 
 
 def read_frames_at(
-    video: VideoInfo, numbers: Sequence[int], *, into_one: bool = False
+    video: VideoInfo, numbers: Sequence[int]
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
     """Yield chosen frames of a video and their numbers: BGR, (height, width, 3), uint8.
 
@@ -165,7 +182,6 @@ def read_frames_at(
     Args:
         video: the video.
         numbers: numbers of frames, ascending, below `video.num_frames`.
-        into_one: whether each frame of a video file is written over the one before, which is faster.
 
     Raises:
         InputError: the file ends or is damaged before a frame, or a frame has another size.
@@ -176,7 +192,7 @@ def read_frames_at(
             _check_size(video.images[number], video, frame)
             yield number, frame
         return
-    following, place = 0, None
+    following = 0
     with open_capture(video.path) as capture:
         for number in numbers:
             if number - following > _WORTH_SEEKING and video.is_finished:
@@ -187,8 +203,7 @@ def read_frames_at(
                 if not capture.grab():
                     raise TruncatedVideoError(video, following)
                 following += 1
-            decoded, frame = capture.retrieve(place)
-            place = frame if into_one else None
+            decoded, frame = capture.retrieve()
             if not decoded:
                 raise TruncatedVideoError(video, number)
             _check_size(video.path, video, frame, f" in frame {number}")
