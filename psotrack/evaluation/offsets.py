@@ -20,9 +20,8 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import rotation_matrices
 from psotrack.support import block_jackknife, standard_error, time_blocks, widening
-from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values
+from psotrack.trajectories import GATE_M, UNASSIGNED, Trajectories, fixed_partner_values, rotation_matrices
 from psotrack.trajectories.resampling import interpolated
 
 #: An offset counts only if at least this fraction of the largest number of comparable positions is compared at it.

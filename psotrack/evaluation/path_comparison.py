@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
 from psotrack.evaluation.offsets import ShiftedPair, refused
-from psotrack.geometry import rotation_matrices
 from psotrack.support import finite_or_none
 from psotrack.trajectories import (
     GATE_M,
@@ -29,6 +28,7 @@ from psotrack.trajectories import (
     Trajectories,
     resample,
     roll_pitch_yaw_deg,
+    rotation_matrices,
 )
 
 #: Number of neighbouring frames whose median position shows jumps.

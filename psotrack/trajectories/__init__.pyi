@@ -1,6 +1,6 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import DroneRows, check_cells, from_rows, read_trajectories, write_ambiguity, write_trajectories
-from .orientations import roll_pitch_yaw_deg
+from .orientations import roll_pitch_yaw_deg, rotation_matrices
 from .resampling import resample
 from .row_streams import RowStream
 from .status import Status
@@ -27,6 +27,7 @@ __all__ = [
     "read_trajectories",
     "resample",
     "roll_pitch_yaw_deg",
+    "rotation_matrices",
     "summary_columns",
     "write_ambiguity",
     "write_trajectories",

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 from jaxtyping import Int
 
-from psotrack.geometry.rotations import rotation_matrices
+from psotrack.geometry import rotation_matrices
 from psotrack.recordings import OnboardVideo, Recording, read_detections
 from psotrack.show.flights import FlightTracks, TrackedFlight, ellipse_outlines_px, view_in_images
 from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSource, encode_images
