@@ -1,13 +1,17 @@
 """Files of other programs, made after the documents of their formats; each is projected by a formula of its own."""
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
-from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry import look_at, make_camera, make_rig, project, undistort
 from psotrack.geometry.rig_files import RIG_FORMATS, read_lenses, read_rig, write_rig
 
 #: Points in front of all cameras of this file, metres.
@@ -250,6 +254,110 @@ def test_a_camera_that_qualisys_did_not_calibrate_is_left_out(tmp_path, caplog):
     assert read_lenses(path).names == ("26578", "26579")
 
 
+# --------------------------------------------------------------------------------------------------- Vicon
+
+
+def vicon_file(path, radial, *, video="VideoInputDevice:Blackfly", moved=""):
+    cameras = []
+    for device, (R, t) in zip((2121, 2122), poses(), strict=True):
+        centre_mm = " ".join(repr(float(value)) for value in -1e3 * R.T @ t)
+        quaternion = " ".join(repr(float(value)) for value in Rotation.from_matrix(R).as_quat())
+        cameras.append(
+            f'<Camera DEVICEID="{device}" PIXEL_ASPECT_RATIO="{float(K[0, 0] / K[1, 1])!r}" SKEW="0" '
+            f'SENSOR_SIZE="1280 720" TYPE="{video}"><KeyFrames><KeyFrame '
+            f'FOCAL_LENGTH="{K[0, 0]}" FRAME="0" ORIENTATION="{quaternion}" '
+            f'POSITION="{centre_mm}" PRINCIPAL_POINT="{K[0, 2]} {K[1, 2]}" {radial}/>{moved}</KeyFrames></Camera>'
+        )
+    path.write_text(
+        f'<?xml version="1.0" encoding="UTF-8" standalone="no" ?>\n<Cameras>{"".join(cameras)}</Cameras>'
+    )
+
+
+@pytest.mark.parametrize(
+    ("radial", "centre_px", "per_focal"),
+    [
+        # Per square pixel; Vicon's principal point is the centre.
+        (f'VICON_RADIAL="{0.11 / 900**2!r} {-0.02 / 900**4!r}"', K[:2, 2], (0.11, -0.02)),
+        ('VICON_RADIAL2="ViconRadial2 650.5 350.25 0.11 -0.02 0.004"', K[:2, 2], (0.11, -0.02, 0.004)),
+        ('VICON_RADIAL2="ViconRadial2 653.5 349.25 0.06 -0.01"', np.array([653.5, 349.25]), (0.06, -0.01)),
+    ],
+)
+def test_a_calibration_of_vicon(tmp_path, radial, centre_px, per_focal):
+    path = tmp_path / "session.xcp"
+    vicon_file(path, radial)
+    rig = read_rig(path)
+    assert rig.names == ("2121", "2122")
+    for index, (R, t) in enumerate(poses()):
+        pixels = project(rig.cameras[index], POINTS_M)[0]
+        # Vicon's formula, from the distorted to the undistorted point. Distances along y are in pixels of x.
+        scale = K[[0, 1], [0, 1]]
+        arm = (pixels - centre_px) / scale
+        r2 = (arm**2).sum(-1, keepdims=True)
+        gain = 1 + sum(k * r2 ** (power + 1) for power, k in enumerate(per_focal))
+        straight = by_opencv(R, t, K, np.zeros(4))
+        # The fit's error is at most a tenth of a pixel, or there is a warning.
+        np.testing.assert_allclose(centre_px + arm * gain * scale, straight, rtol=0, atol=0.1)
+
+
+def test_cameras_of_vicon_that_record_no_video_or_were_not_calibrated(tmp_path, caplog):
+    path = tmp_path / "session.xcp"
+    vicon_file(path, 'VICON_RADIAL="0 0"')
+    text = path.read_text().replace('TYPE="VideoInputDevice:Blackfly"', 'TYPE="VantageV5"', 1)
+    path.write_text(text)
+    assert read_rig(path).names == ("2122",)
+    assert "1 cameras that record no video are left out" in caplog.text
+    lone = '<Camera DEVICEID="9" SENSOR_SIZE="1280 720"/></Cameras>'
+    path.write_text(text.replace('TYPE="VideoInputDevice:Blackfly"', 'TYPE=""').replace("</Cameras>", lone))
+    assert read_rig(path).names == ("2121", "2122")
+    assert "no lens: camera 9" in caplog.text
+
+
+def test_a_quaternion_that_was_rounded_is_one_everywhere(tmp_path):
+    """One tolerance for all files: two decimals change the length by up to 1 %."""
+    path = tmp_path / "session.xcp"
+    vicon_file(path, 'VICON_RADIAL="0 0"')
+    turn = [0.34, 0.35, 0.72, 0.49]  # its length is 0.9983
+    text = re.sub('ORIENTATION="[^"]*"', f'ORIENTATION="{" ".join(map(str, turn))}"', path.read_text())
+    path.write_text(text)
+    expected = Rotation.from_quat(turn).as_matrix()
+    np.testing.assert_allclose(read_rig(path).cameras.T_cam_world[0, :3, :3], expected, atol=1e-12)
+    path.write_text(text.replace(f"{turn[0]}", f"{turn[0] + 0.1}"))
+    with pytest.raises(InputError, match="ORIENTATION: expected a quaternion of length 1"):
+        read_rig(path)
+
+
+def test_a_correction_that_folds_the_image_is_refused(tmp_path):
+    path = tmp_path / "session.xcp"
+    vicon_file(path, 'VICON_RADIAL2="ViconRadial2 650.5 350.25 -1.5 0"')
+    with pytest.raises(
+        InputError, match=r"Camera 2121, KeyFrame\.VICON_RADIAL2: expected a correction that keeps"
+    ):
+        read_rig(path)
+
+
+@settings(max_examples=20, deadline=None)
+@given(k1=st.floats(-0.1, 0.25), k2=st.floats(-0.03, 0.03), shift=st.floats(-2, 2))
+def test_the_fit_reaches_the_error_that_it_states(k1, k2, shift):
+    """OpenCV's own undistortion of the corners and edges agrees with the formula within the stated error."""
+    from psotrack.geometry.rig_files.radial_fit import fit_distortion
+
+    centre = K[:2, 2] + shift
+    fit = fit_distortion(K, SIZE_WH, centre, np.array([k1, k2]))
+    if fit is None:
+        return
+    coefficients, error_px = fit
+    camera = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, dist=coefficients.tolist(), image_size_wh=SIZE_WH)
+    pixels = np.array([[0.0, 0.0], [1279, 719], [640, 0], [0, 360], [300, 500], [1279, 0]])
+    arm = (pixels - centre) / K[[0, 1], [0, 1]]
+    r2 = (arm**2).sum(-1, keepdims=True)
+    offset = (centre - K[:2, 2]) / K[[0, 1], [0, 1]]
+    straight = offset + arm * (1 + k1 * r2 + k2 * r2**2)
+    bent = cv2.projectPoints(np.c_[straight, np.ones(6)], np.zeros(3), np.zeros(3), K, coefficients)[0][:, 0]
+    # Points between those of the fit's grid may be a little worse.
+    assert np.abs(bent - pixels).max() <= 1.2 * error_px + 1e-6
+    np.testing.assert_allclose(undistort(camera, bent), straight, atol=1e-6)
+
+
 # --------------------------------------------------------------------------------------------------- EasyMocap
 
 
@@ -371,7 +479,7 @@ def test_a_gap_in_the_chain_leaves_the_camera_out(tmp_path, caplog):
         read_rig(path)
 
 
-# --------------------------------------------------------------------------------------------------- DLT
+# --------------------------------------------------------------------------------------------------- DLT, Argus
 
 
 def dlt_columns(*, upwards, skew=0.0):
@@ -437,6 +545,21 @@ def test_dlt_coefficients_of_no_camera_are_refused(tmp_path, text, message):
     (tmp_path / "dlt.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read_rig(tmp_path / "dlt.csv", SIZE_WH, metres_per_unit=1.0)
+
+
+def test_the_lenses_of_argus(tmp_path):
+    path = tmp_path / "cameras-profile.txt"
+    path.write_text(
+        "1 1165.5 1920 1080 960 540 1 -0.2 0.05 0.001 0.002 0.01\n2 800 1280 720 640 360 1.01 0 0 0 0 0\n"
+    )
+    lenses = read_lenses(path)
+    assert lenses.names == ("cam1", "cam2")
+    np.testing.assert_array_equal(lenses.cameras.K[0], [[1165.5, 0, 960], [0, 1165.5, 540], [0, 0, 1]])
+    assert lenses.cameras.K[1, 1, 1] == 808
+    np.testing.assert_array_equal(lenses.cameras.dist[0], [-0.2, 0.05, 0.001, 0.002, 0.01])
+    np.testing.assert_array_equal(lenses.cameras.image_size_wh, [[1920, 1080], [1280, 720]])
+    with pytest.raises(InputError, match="expected the poses of cameras, found none"):
+        read_rig(path)
 
 
 # --------------------------------------------------------------------------------------------------- handpose3d

@@ -102,6 +102,7 @@ def _text(file: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / file).write_text(text, encoding="utf-8")
 
 
+_VICON = 'VICON_RADIAL2="ViconRadial2 650.5 350.25 0.06 -0.01"'
 _CALIBRATIONS = {
     "rig.toml": _written("rig.toml"),
     "opencv-yaml": _written("rig.yml"),
@@ -121,6 +122,7 @@ _CALIBRATIONS = {
     "ros": _only_lenses("head.yaml", rigs.ros_text()),
     "pose2sim": _calibration(lambda folder: rigs.pose2sim_file(folder / "calib.toml"), "calib.toml"),
     "qualisys": _calibration(lambda folder: rigs.qualisys_file(folder / "a.qca.txt"), "a.qca.txt"),
+    "vicon": _calibration(lambda folder: rigs.vicon_file(folder / "a.xcp", _VICON), "a.xcp"),
     "easymocap-lenses": _calibration(rigs.easymocap_files, "intri.yml"),
     "easymocap-poses": _calibration(rigs.easymocap_files, "extri.yml"),
     "kalibr": _calibration(lambda folder: rigs.kalibr_file(folder / "camchain.yaml"), "camchain.yaml"),
@@ -129,6 +131,10 @@ _CALIBRATIONS = {
     ),
     "handpose-lenses": _calibration(rigs.handpose_files, "c0.dat", "m"),
     "handpose-poses": _calibration(rigs.handpose_files, "rot_trans_c1.dat", "m"),
+    "argus": _only_lenses(
+        "profile.txt",
+        "1 1165.5 1920 1080 960 540 1 -0.2 0.05 0.001 0.002 0.01\n2 800 1280 720 640 360 1 0 0 0 0 0\n",
+    ),
 }
 
 

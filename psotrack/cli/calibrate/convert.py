@@ -32,8 +32,8 @@ def convert(
     """Convert the calibration IN, of any program in the list below, to OUT.
 
     \b
-    Read:    rig (rig.toml), dpjait, anipose, caliscope, pose2sim, opencv, qualisys, easymocap, kalibr, dlt,
-             handpose3d
+    Read:    rig (rig.toml), dpjait, anipose, caliscope, pose2sim, opencv, qualisys, vicon, easymocap, kalibr,
+             dlt, argus, handpose3d
     Written: rig (OUT ends in .toml), dpjait (.csv), opencv (.yml), anipose, caliscope (--to)
 
     Cameras that IN does not place are left out, with a warning.

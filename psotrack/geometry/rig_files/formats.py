@@ -19,14 +19,15 @@ from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import Rig, make_rig
 from psotrack.geometry.rig_files import (
     camera_tables,
-    dlt,
     dpjait_calibration,
     easymocap,
     kalibr,
+    number_tables,
     opencv_storage,
     qualisys,
     rig_toml,
     text_blocks,
+    vicon,
 )
 from psotrack.geometry.rig_files.dpjait_calibration import write_calibration
 from psotrack.geometry.rig_files.fields import UNITS_M, CameraFields, Entry
@@ -64,10 +65,12 @@ _OF_TOML: Mapping[str, _Format] = {
 }
 _OF_TEXT: Mapping[str, _Format] = {
     "qualisys": _Format(qualisys.read, qualisys.recognises),
+    "vicon": _Format(vicon.read, vicon.recognises),
     "easymocap": _Format(easymocap.read, easymocap.recognises),
     "kalibr": _Format(kalibr.read, kalibr.recognises),
     "handpose3d": _Format(text_blocks.read, text_blocks.recognises),
-    "dlt": _Format(dlt.read, dlt.recognises),
+    "argus": _Format(number_tables.read_argus, number_tables.is_argus),
+    "dlt": _Format(number_tables.read_dlt, number_tables.is_dlt),
     "opencv": _Format(opencv_storage.read, opencv_storage.recognises, opencv_storage.write),
     "dpjait": _Format(dpjait_calibration.read, dpjait_calibration.recognises, write_calibration),
 }

@@ -20,8 +20,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from psotrack.geometry.rig_files.fields import CameraFields, quoted
-from psotrack.geometry.rig_files.xml_text import parse_xml
+from psotrack.geometry.rig_files.fields import CameraFields
+from psotrack.geometry.rig_files.xml_text import attributes, number, parse_xml
 
 _logger = logging.getLogger(__name__)
 
@@ -60,15 +60,15 @@ def _lens(path: Path, place: str, element: ElementTree.Element) -> dict[str, Any
     lens = element.find("intrinsic")
     if lens is None:
         return {}
-    fields = _attributes(path, f"{place}, intrinsic", lens)
+    fields = attributes(path, f"{place}, intrinsic", lens)
     (left, top), size = _field_of_view(path, place, element, fields)
     names = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-    fu, fv, cu, cv = (_number(fields, name) / _PARTS for name in names)
+    fu, fv, cu, cv = (number(fields, name) / _PARTS for name in names)
     # The skew's unit is not documented, and all known files have none.
-    if "skew" in fields.values and _number(fields, "skew"):
-        raise fields.error("skew", "0", f"{_number(fields, 'skew'):g}")
+    if "skew" in fields.values and number(fields, "skew"):
+        raise fields.error("skew", "0", f"{number(fields, 'skew'):g}")
     k1, k2, k3, p1, p2 = (
-        _number(fields, name) if name in fields.values else 0.0 for name in (*_RADIAL, *_TANGENTIAL)
+        number(fields, name) if name in fields.values else 0.0 for name in (*_RADIAL, *_TANGENTIAL)
     )
     return {
         "size": size,
@@ -84,10 +84,10 @@ def _field_of_view(
     view = element.find("fov_video")
     if view is None:
         # The last part of a pixel, or the last pixel itself: in either case its number is the size less one.
-        width, height = (int(_number(lens, f"sensorMax{axis}") // _PARTS) + 1 for axis in "UV")
+        width, height = (int(number(lens, f"sensorMax{axis}") // _PARTS) + 1 for axis in "UV")
         return (0.0, 0.0), (width, height)
-    fields = _attributes(path, f"{place}, fov_video", view)
-    left, top, right, bottom = (_number(fields, side) for side in ("left", "top", "right", "bottom"))
+    fields = attributes(path, f"{place}, fov_video", view)
+    left, top, right, bottom = (number(fields, side) for side in ("left", "top", "right", "bottom"))
     return (left, top), (int(right - left) + 1, int(bottom - top) + 1)
 
 
@@ -96,27 +96,7 @@ def _pose(path: Path, place: str, element: ElementTree.Element) -> dict[str, Any
     pose = element.find("transform")
     if pose is None or element.get("calibrated", "true").lower() == "false":
         return {}
-    fields = _attributes(path, f"{place}, transform", pose)
-    turn = np.array([[_number(fields, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)])
+    fields = attributes(path, f"{place}, transform", pose)
+    turn = np.array([[number(fields, f"r{row}{column}") for column in (1, 2, 3)] for row in (1, 2, 3)])
     R = _TURN @ fields.rotation_matrix(turn, "r11 to r33")
-    return {"R": R, "t": -R @ [_number(fields, axis) for axis in "xyz"]}
-
-
-def _attributes(path: Path, place: str, element: ElementTree.Element) -> CameraFields:
-    """The attributes of an element, as lists of the numbers that they hold; other texts stay texts."""
-    return CameraFields(path, place, {key: _numbers(text) for key, text in element.attrib.items()})
-
-
-def _number(fields: CameraFields, name: str) -> float:
-    """A number of an attribute."""
-    values = fields.values.get(name)
-    if not isinstance(values, list) or len(values) != 1:
-        raise fields.error(name, "a number", "none" if values is None else quoted(values))
-    return float(fields.array((name,), (1,))[0])
-
-
-def _numbers(text: str) -> list[float] | str:
-    try:
-        return [float(word) for word in text.split()] or text
-    except ValueError:
-        return text
+    return {"R": R, "t": -R @ [number(fields, axis) for axis in "xyz"]}

@@ -1,4 +1,4 @@
-"""Coefficients of direct linear transformation (DLT), as tables of nothing but numbers.
+"""Tables of nothing but numbers: DLT coefficients, and Argus's profile of lenses.
 
 Direct linear transformation (DLT) has 11 coefficients per camera, as DLTdv, easyWand and Argus write them:
 
@@ -16,6 +16,12 @@ count (`DLCclicker.py` and `frameFinderPyglet.py` of https://github.com/backyard
 counts columns from 1 (and DLTdv8 rows, too; `dlt_invert.m` of https://github.com/tlhedrick/dltdv changes from one
 origin to the other). Places from its files are therefore shown 1 pixel too far to the right (and below): a file does
 not say which program wrote it. There is no lens distortion: pixels must be undistorted ones.
+
+Argus's profile has a line `camera fx w h cx cy AR k1 k2 t1 t2 k3` per camera and no poses. AR is fy / fx; k1, k2, t1,
+t2, k3 are OpenCV's k1, k2, p1, p2, k3. The format: `docs/user-guide.md` of the same repository (there k1, k2, k3 are
+r2, r4, r6). Argus takes cy and t1 for pixels counted upwards where it undistorts clicked points
+(`tools.undistort_pts`), but estimates them on images, downwards (`patterns`). Here they are those of images; the two
+differ only if cy is not in the middle or t1 is not 0. Argus undistorts with fx alone; AR is 1 in its profiles.
 """
 
 from __future__ import annotations
@@ -35,14 +41,35 @@ from psotrack.support import are_numbers
 _COEFFICIENTS = 11
 #: Largest condition number of the 3 x 3 part. That of a camera is below the square of its focal length in pixels.
 _LARGEST_CONDITION = 1e12
+_ARGUS = ("camera", "fx", "w", "h", "cx", "cy", "AR", "k1", "k2", "t1", "t2", "k3")
 
 
-def recognises(text: str) -> bool:
+def is_dlt(text: str) -> bool:
     """Whether a text is a table of 11 numbers per camera."""
     return _COEFFICIENTS in _numbers(text)[0].shape
 
 
-def read(path: Path, text: str) -> Iterator[CameraFields]:
+def is_argus(text: str) -> bool:
+    """Whether a text is a table of 12 numbers per line, with an image size where Argus has it."""
+    values = _numbers(text)[0]
+    if values.shape[1] != len(_ARGUS):
+        return False
+    sizes = values[:, 2:4]
+    return bool((sizes >= 1).all() and (sizes == np.round(sizes)).all())
+
+
+def read_argus(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read the lenses; no camera is placed."""
+    values = _numbers(text)[0]
+    if values.shape[1] != len(_ARGUS):
+        raise InputError(path, expected=f"lines of {' '.join(_ARGUS)}", found="other text")
+    for number, fx, width, height, cx, cy, aspect, *dist in values.tolist():
+        K = [[fx, 0, cx], [0, fx * aspect, cy], [0, 0, 1]]
+        name = f"cam{number:.9g}"
+        yield CameraFields(path, name, {"size": [width, height], "K": K, "D": dist}, name)
+
+
+def read_dlt(path: Path, text: str) -> Iterator[CameraFields]:
     """Read DLT coefficients; the unit of length is open."""
     values, header = _numbers(text)
     if _COEFFICIENTS not in values.shape:

@@ -1,0 +1,122 @@
+"""Calibrations of Vicon (`.xcp`, XML).
+
+A `KeyFrame` has the camera's centre C in millimetres (`POSITION`), the rotation from world to camera as quaternion
+(x, y, z, w) (`ORIENTATION`), with x right, y down and z forward, the focal length in pixels, and the lens:
+
+- `VICON_RADIAL` "k1 k2": a point at distance r of the principal point, in pixels, belongs at r (1 + k1 r² + k2 r⁴);
+- `VICON_RADIAL2` "ViconRadial2 cx cy k1 k2 k3": the same about (cx, cy), with r in pixels or in focal lengths.
+
+The order and the direction of the quaternion are those of Pose2Sim's reader (`calibration.py`, `calib_vicon_fun`: the
+scalar last, and a matrix from world to camera after its two transpositions), as is fy = focal length / aspect ratio.
+
+The formulae map distorted to undistorted points, the opposite of OpenCV's. `fit_distortion` finds OpenCV's
+coefficients.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from psotrack.geometry import LENGTH_TOLERANCE
+from psotrack.geometry.rig_files.fields import CameraFields, quoted
+from psotrack.geometry.rig_files.radial_fit import fit_distortion
+from psotrack.geometry.rig_files.xml_text import attributes, number, parse_xml
+
+_logger = logging.getLogger(__name__)
+
+#: A smaller |k1| is per square pixel: in focal lengths it would be no distortion at all, below 0.1 px in every image.
+_PER_PIXEL = 1e-4
+#: Largest error of OpenCV's coefficients that is accepted without a word, pixels.
+_ACCEPTED_PX = 0.1
+
+
+def recognises(text: str) -> bool:
+    """Whether a text is a calibration of Vicon."""
+    return "<Cameras" in text[:4096] and "DEVICEID" in text
+
+
+def read(path: Path, text: str) -> Iterator[CameraFields]:
+    """Read an .xcp; lengths are millimetres. If it has video cameras, cameras for markers are left out."""
+    cameras = parse_xml(path, text).findall("Camera")
+    videos = [one for one in cameras if _is_video(one)]
+    if videos and len(videos) < len(cameras):
+        _logger.warning("%s: %d cameras that record no video are left out", path, len(cameras) - len(videos))
+    for index, element in enumerate(videos or cameras):
+        name = element.get("DEVICEID")
+        if not name:
+            raise CameraFields(path, f"Camera[{index}]", {}).error("DEVICEID", "a number", "none")
+        place = f"Camera {name}"
+        yield CameraFields(path, place, _values(path, place, element), name, unit_m=1e-3)
+
+
+def _is_video(element: ElementTree.Element) -> bool:
+    return "video" in element.get("TYPE", "").lower() or element.get("ISDV") == "1"
+
+
+def _values(path: Path, place: str, element: ElementTree.Element) -> dict[str, Any]:
+    """Lens and place of a camera; none of a camera that was not calibrated."""
+    frames = element.findall("KeyFrames/KeyFrame")
+    if not frames:
+        return {}
+    if len(frames) > 1:
+        _logger.warning("%s, %s: it moves; its first place is used", path, place)
+    outer = attributes(path, place, element)
+    fields = attributes(path, f"{place}, KeyFrame", frames[0])
+    width, height = outer.array(("SENSOR_SIZE",), (2,))
+    aspect = number(outer, "PIXEL_ASPECT_RATIO") if "PIXEL_ASPECT_RATIO" in outer.values else 1.0
+    focal = number(fields, "FOCAL_LENGTH")
+    if not (focal > 0 and aspect > 0 and width >= 1 and height >= 1):
+        raise fields.error("FOCAL_LENGTH", "focal length, aspect and size above 0", f"{focal:g}")
+    cx, cy = fields.array(("PRINCIPAL_POINT",), (2,))
+    K = np.array([[focal, 0.0, cx], [0.0, focal / aspect, cy], [0.0, 0.0, 1.0]])
+    size = (int(width), int(height))
+    quaternion = fields.array(("ORIENTATION",), (4,))
+    if abs(np.linalg.norm(quaternion) - 1) > LENGTH_TOLERANCE:
+        raise fields.error("ORIENTATION", "a quaternion of length 1", quoted(quaternion.tolist()))
+    R = Rotation.from_quat(quaternion).as_matrix()
+    t = -R @ fields.array(("POSITION",), (3,))
+    return {"size": size, "K": K, "D": _distortion(fields, K, size), "R": R, "t": t}
+
+
+def _distortion(fields: CameraFields, K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> list[float]:
+    """OpenCV's coefficients for the radial correction of a key frame."""
+    name, centre, radial = "VICON_RADIAL", K[:2, 2], np.zeros(0)
+    if isinstance(text := fields.values.get("VICON_RADIAL2"), str):
+        name = "VICON_RADIAL2"
+        values = _words(fields, text.split()[1:])
+        if len(values) not in (4, 5):
+            raise fields.error(name, "cx, cy and two or three coefficients", quoted(text))
+        centre, radial = values[:2], values[2:]
+    elif name in fields.values:
+        radial = fields.array((name,), (2,))
+    if not radial.any():
+        return []
+    # `fit_distortion` measures distances in focal lengths.
+    if abs(radial[0]) < _PER_PIXEL:
+        radial = radial * K[0, 0] ** (2.0 * np.arange(1, len(radial) + 1))
+    fit = fit_distortion(K, size, centre, radial)
+    if fit is None:
+        expected = "a correction that keeps the order of points up to the corners"
+        raise fields.error(name, expected, quoted(radial.tolist()))
+    coefficients, error_px = fit
+    if error_px > _ACCEPTED_PX:
+        _logger.warning(
+            "%s, %s: OpenCV's lens model differs from Vicon's by up to %.2g pixels",
+            fields.path, fields.place, error_px,
+        )  # fmt: skip
+    return coefficients.tolist()
+
+
+def _words(fields: CameraFields, words: list[str]) -> Float[np.ndarray, " words"]:
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError:
+        raise fields.error("VICON_RADIAL2", "numbers after the name", quoted(" ".join(words))) from None
