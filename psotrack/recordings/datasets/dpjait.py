@@ -65,7 +65,10 @@ def read_sequence(folder: Path | str, *, bodies: Mapping[str, Sequence[str]] | N
     videos = _videos(folder, files, names)
     rig = read_rig(calibration, _image_sizes(names, videos), file_format="dpjait")
     _check_principal_points(rig, videos)
-    detections = files_by_camera((folder / DETECTIONS).glob("*.csv"), names)
+    boxes = folder / DETECTIONS
+    if boxes.exists() and not boxes.is_dir():
+        raise InputError(boxes, expected="a folder of detections, or none", found="a file")
+    detections = files_by_camera(boxes.glob("*.csv"), names)
     times = _frame_times(videos, detections)
     corners = folder / MARKER_CORNERS
     recording = Recording(
