@@ -97,7 +97,7 @@ def test_an_image_that_claims_to_be_huge(make, size_wh, tmp_path, little_memory)
     path = tmp_path / "a.png"  # OpenCV goes by the content.
     path.write_bytes(make(*size_wh))
     width, height = size_wh
-    found = rf"a\.png: expected images of at most 178956970 pixels, found {width * height} pixels"
+    found = rf"a\.png: expected images of at most 178956970 pixels, found ({width} x {height}|{width * height}) pixels"
     with pytest.raises(InputError, match=f"{found}$"):
         read_image(path)
 
@@ -115,7 +115,7 @@ def test_an_image_that_is_longer_than_opencv_warps(make, tmp_path):
 def test_sides_of_more_than_16_bits(make, tmp_path, little_memory):
     path = tmp_path / "a.png"
     path.write_bytes(make(100_000, 100_000))
-    with pytest.raises(InputError, match="found 10000000000 pixels"):
+    with pytest.raises(InputError, match=r"found (100000 x 100000|10000000000) pixels"):
         read_image(path)
 
 

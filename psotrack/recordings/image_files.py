@@ -6,6 +6,8 @@ import contextlib
 import glob
 import io
 import re
+import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,12 +21,14 @@ from psotrack.recordings.opencv_messages import silence_opencv
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-#: Formats that are read, by Pillow's names.
-_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
+#: Formats that are read beside PNG, by Pillow's names.
+_FORMATS = ("JPEG", "BMP", "TIFF", "WEBP", "PPM")
 #: Largest number of pixels of an image, seven times that of a large camera: Pillow refuses more.
 MOST_PIXELS = 178_956_970
 #: Longest side of an image, pixels: OpenCV warps no larger ones.
 MOST_SIDE = 2**15 - 2
+#: First bytes of a PNG, and least size of one of its parts: length, name and checksum.
+_PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -155,19 +159,41 @@ def check_pixels(where: object, width: int, height: int) -> None:
 
 def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
     """Width and height that the header of an image states, before OpenCV asks for the memory that they take."""
+    # Pillow refuses a PNG whose notes are damaged, too.
+    if data.startswith(_PNG):
+        if not _is_whole_png(data):
+            raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
+        return struct.unpack_from(">II", data, 16)
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
-            # libpng writes about a damaged file straight to the terminal, which no setting of OpenCV prevents.
-            if image.format == "PNG":
-                image.verify()
             return image.size
     except Image.DecompressionBombError as error:
         found = str(error).partition("(")[2].partition(")")[0]
         raise InputError(where, expected=f"images of at most {MOST_PIXELS} pixels", found=found) from error
     # Of the other formats that OpenCV decodes, a few bytes can take gigabytes. A damaged header leads to any error.
     except Exception as error:
-        found = f"a file that is no {', '.join(_FORMATS)}, or a damaged one"
+        found = f"a file that is no PNG, {', '.join(_FORMATS)}, or a damaged one"
         raise InputError(where, expected="an image", found=found) from error
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether a PNG's parts up to its end are there, and those that an image needs fit their checksums.
+
+    libpng writes about parts that do not straight to the terminal, which no setting of OpenCV prevents.
+    """
+    at, name = len(_PNG), b""
+    while name != b"IEND":
+        end = at + _PNG_PART + int.from_bytes(data[at : at + 4])
+        if end > len(data):
+            return False
+        name = data[at + 4 : at + 8]
+        checksum = int.from_bytes(data[end - 4 : end])
+        # The name of a part that an image needs begins with a capital letter.
+        if name[:1].isupper() and zlib.crc32(memoryview(data)[at + 4 : end - 4]) != checksum:
+            return False
+        at = end
+    # The size is in the first part.
+    return len(data) >= len(_PNG) + 2 * _PNG_PART
 
 
 def find_images(folder: Path, pattern: str, where: str) -> tuple[Path, ...]:
