@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from psotrack.geometry import rotation_matrices
+from psotrack.geometry import rotation_matrices as rotation_matrices  # also a name of this room
 
 #: Columns: the axes of a body (x ahead, y left, z up) in the axes of a camera (x right, y down, z ahead).
 _BODY_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
