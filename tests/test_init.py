@@ -1,9 +1,15 @@
 """`psotrack init`: files of a folder are matched to cameras by their names, and nothing is guessed."""
 
+import contextlib
 import json
+import os
+import pty
 import re
 import shutil
+import signal
 import string
+import subprocess
+import sys
 import unicodedata
 
 import click
@@ -77,6 +83,12 @@ def refusal(folder, *arguments):
     assert "\n" not in str(error.value)
     assert not (folder / "recording.toml").exists()
     return str(error.value)
+
+
+def videos_of(folder):
+    """The video of each camera that has one."""
+    cameras = read_recording_file(folder / "recording.toml").cameras
+    return {name: each.video for name, each in cameras.items()}
 
 
 @pytest.mark.parametrize(
@@ -245,6 +257,90 @@ def test_all_files_that_are_unclear_are_named_together(folder):
     init(path, "--match", "a=GX01.avi", "--match", "b=GX 02.avi", "--leave-out", "take_a_b.avi")
 
 
+#: `psotrack`, also where the tests run in the background, which ignores Ctrl-C.
+HEEDS_CTRL_C = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from psotrack.__main__ import main
+main()
+"""
+
+
+class TestQuestions:
+    """At a terminal, `init` and `run` ask once whose the files are that their names do not say."""
+
+    @pytest.fixture
+    def ask(self):
+        """Return a function that runs a command at a terminal, and answers its questions; None is Ctrl-C."""
+
+        def run(folder, *answers, command="init"):
+            ours, theirs = pty.openpty()
+            program = [sys.executable, "-c", HEEDS_CTRL_C, command, str(folder)]
+            shown = ""
+            with subprocess.Popen(program, stdin=theirs, stdout=theirs, stderr=theirs) as process:
+                os.close(theirs)
+                rest = iter(answers)
+                # The end of a terminal is an error on Linux, and no bytes elsewhere.
+                with contextlib.suppress(OSError):
+                    while part := os.read(ours, 4096).decode():
+                        shown += part
+                        if not shown.endswith("): "):
+                            continue
+                        answer = next(rest)
+                        if answer is None:
+                            process.send_signal(signal.SIGINT)
+                        else:
+                            os.write(ours, f"{answer}\n".encode())
+            os.close(ours)
+            return process.returncode, shown.replace("\r\n", "\n")
+
+        return run
+
+    @pytest.fixture
+    def unclear(self, folder):
+        path = folder("GX01.avi", "GX02.avi", "test.avi", cameras=("left", "right"))
+        (path / "boxes").mkdir()
+        (path / "boxes" / "first.csv").write_text("0\n2,0,0,9,9,4,5,0.5\n")
+        return path
+
+    def test_all_files_are_asked_for_together(self, ask, unclear):
+        code, shown = ask(unclear, "right", "nobody", "1", "-", "2")
+        assert code == 0, shown
+        assert "1  left\n  2  right" in shown
+        assert "expected a camera of rig.toml, or -, found nobody" in shown
+        cameras = read_recording_file(unclear / "recording.toml").cameras
+        assert cameras == {
+            "left": CameraTable(video="GX02.avi"),
+            "right": CameraTable(video="GX01.avi", detections="boxes/first.csv"),
+        }
+
+    @pytest.mark.parametrize(
+        ("command", "typed", "code"), [("init", "", 2), ("init", None, 130), ("run", "", 2)]
+    )
+    def test_an_empty_answer_and_ctrl_c_leave_everything_as_it_was(self, ask, unclear, command, typed, code):
+        before = sorted(unclear.iterdir())
+        ended, shown = ask(unclear, "1", typed, command=command)
+        assert ended == code, shown
+        assert "Whose are these 4 files?" in shown
+        assert ("the same for GX02.avi, test.avi" in shown) == (typed == "")
+        assert sorted(unclear.iterdir()) == before
+
+    def test_cameras_that_only_their_files_name(self, ask, folder):
+        path = folder("cam1.avi", "cam_1.avi")
+        code, shown = ask(path, "1", "second")
+        assert code == 0, shown
+        assert set(read_recording_file(path / "recording.toml").cameras) == {"cam1", "second"}
+
+    def test_several_videos_in_the_folder_of_a_camera(self, ask, folder):
+        path = folder("left/a.avi", "left/b.avi", "right/a.avi", cameras=("left", "right"))
+        code, shown = ask(path, "-", "1")
+        assert code == 0, shown
+        assert videos_of(path) == {"left": "left/b.avi", "right": "right/a.avi"}
+
+    def test_nothing_is_asked_without_a_terminal(self, unclear):
+        assert "GX01.avi: expected the video of a camera of rig.toml, left, right" in refusal(unclear)
+
+
 class TestRefusals:
     def test_a_video_of_no_camera(self, folder):
         line = refusal(folder("cam1.avi", "cam10.avi", cameras=("cam1", "cam2")))
@@ -273,10 +369,9 @@ class TestRefusals:
             in line
         )
         init(path, "--match", "left=left/b.avi")
-        videos = {
-            name: each.video for name, each in read_recording_file(path / "recording.toml").cameras.items()
-        }
-        assert videos == {"left": "left/b.avi", "right": "right/a.avi"}
+        assert videos_of(path) == {"left": "left/b.avi", "right": "right/a.avi"}
+        init(path, "--leave-out", "left/a.avi", "--leave-out", "left/b.avi", "--force")
+        assert videos_of(path) == {"right": "right/a.avi"}
 
     def test_videos_in_a_folder_below(self, folder):
         path = folder("videos/left.avi", "videos/right.avi", cameras=("left",))

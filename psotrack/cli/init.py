@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import click
 from msgspec import Meta
 
 from psotrack.cli.commands import command
 from psotrack.cli.options import Bodies
 from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.types import SequencePath, Words, says
+
+if TYPE_CHECKING:
+    from psotrack.recordings.datasets import DraftOptions, Matching
 
 
 def _pair(match: str) -> tuple[str, str]:
@@ -41,8 +46,8 @@ def init(
     """Write the recording.toml of the videos, images and detections in FOLDER, or show what a recording contains.
 
     Files belong to cameras by their names: cam1i_s.avi to cam1, cam_60881257.mp4 to 60881257, gopro3_clip.MP4 to
-    GoPro 3. Nothing is guessed: where names do not say whose files are, an error names the files, and --match and
-    --leave-out say it.
+    GoPro 3. Nothing is guessed: where names do not say whose files are, the command asks once on a terminal, for all
+    files; --match and --leave-out answer before.
     Detections, frame times (frame,time_s), images of what is ignored (a name with "ignore" or "mask"), references and
     marker corners are found by name and content.
 
@@ -80,7 +85,7 @@ def init(
     options = DraftOptions(
         calibration, unit=unit, match=match, leave_out=leave_out, fps=fps, size_wh=size_wh, bodies=bodies
     )
-    draft = draft_recording(folder, out, options)
+    draft = draft_recording(folder, out, asked(folder, out, options) if output.can_ask else options)
     older = draft.write()
     content = draft.to_dict()
     output.json(content)
@@ -106,3 +111,57 @@ def _show(output: Output, sequence: Path, bodies: dict[str, tuple[str, ...]]) ->
     content = recording.to_dict()
     output.json(content)
     output.show(inventory_table(content), wide=True)
+
+
+def asked(folder: Path, out: Path, options: DraftOptions) -> DraftOptions:
+    """The options with what the user answers of the files whose names do not say whose they are.
+
+    Raises:
+        InputError: a line is empty: the error that names these files.
+    """
+    from dataclasses import replace
+
+    from psotrack.recordings.datasets import match_files
+
+    matching = match_files(folder, out, options)
+    questions = matching.questions()
+    if not questions:
+        return options
+    # Numbers of a list beside cameras that are numbers would be read wrongly.
+    numbered = not any(name.isdecimal() for name in matching.cameras)
+    numbers = {f"{number}": name for number, name in enumerate(matching.cameras, 1)} if numbered else {}
+    click.echo("cameras:")
+    for number, name in enumerate(matching.cameras, 1):
+        click.echo(f"  {number}  {name}" if numbered else f"  {name}")
+    click.echo(
+        f"Whose are these {len(questions)} files? A camera's {'number or ' if numbered else ''}name; "
+        "- leaves a file out; an empty line ends without any change."
+    )
+    matched, left_out = [*options.match], [*options.leave_out]
+    for path, (_, found) in questions.items():
+        file = os.path.relpath(path, folder)
+        answer = _answer(f"  {file} ({found}): ", matching, numbers)
+        if answer == "-":
+            left_out.append(file)
+        else:
+            matched.append((answer, file))
+    return replace(options, match=matched, leave_out=left_out)
+
+
+def _answer(question: str, matching: Matching, numbers: dict[str, str]) -> str:
+    """The camera of a file, or "-"."""
+    from psotrack.geometry import chosen_camera
+
+    while True:
+        try:
+            answer = input(question).strip()
+        except EOFError:
+            answer = ""
+        if not answer:
+            raise matching.error()
+        camera = numbers.get(answer) or chosen_camera(answer, matching.cameras)
+        if answer == "-" or camera is not None:
+            return camera or answer
+        if matching.calibration is None:
+            return answer
+        click.echo(f"  expected a camera of {matching.calibration.name}, or -, found {answer}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -105,6 +106,11 @@ class Output:
     def shows(self) -> bool:
         """Whether people get sentences and tables on stdout."""
         return not self.quiet and not self._json_on_stdout
+
+    @property
+    def can_ask(self) -> bool:
+        """Whether somebody at a terminal reads questions and answers them."""
+        return self.shows and sys.stdin.isatty() and sys.stdout.isatty()
 
     @property
     def report(self) -> Report:

@@ -40,8 +40,14 @@ def run(
         again: do all steps again, also those that are done.
     """
     from psotrack import api
+    from psotrack.cli.init import asked
+    from psotrack.recordings import RECORDING_FILE
+    from psotrack.recordings.datasets import DraftOptions, videos_in
     from psotrack.support import keep_compiled
 
+    files = DraftOptions()
+    if output.can_ask and videos_in(folder) and not (folder / RECORDING_FILE).exists():
+        files = asked(folder, folder / RECORDING_FILE, files)
     keep_compiled(compiled_folder(None))
     summary = api.run(
         folder,
@@ -51,5 +57,7 @@ def run(
         again=again,
         progress=output.report,
         say=lambda words: output.say(*words.splitlines()),
+        match=files.match,
+        leave_out=files.leave_out,
     )
     output.result(summary)

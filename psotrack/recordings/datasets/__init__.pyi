@@ -19,7 +19,7 @@ from ._onboard import (
 )
 from ._poses import pose_file, read_poses, unit_quaternion, write_poses
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
-from .drafting import Draft, DraftOptions, draft_recording
+from .drafting import Draft, DraftOptions, Matching, draft_recording, match_files
 from .opening import find_marker_corners, is_recording, open_recording
 
 __all__ = [
@@ -33,11 +33,13 @@ __all__ = [
     "MarkerRow",
     "MaskWriter",
     "Masks",
+    "Matching",
     "detection_files",
     "draft_recording",
     "find_marker_corners",
     "is_recording",
     "join_archives",
+    "match_files",
     "mocap_markers_file",
     "onboard_pose_file",
     "onboard_video_file",

@@ -120,24 +120,30 @@ class Draft:
 
 
 @dataclass
-class _Matching:
-    """Files by camera and kind, while they are matched.
+class Matching:
+    """The files of a folder, by camera and kind.
 
     Attributes:
         folder: folder of the files.
-        calibration: rig file, or None.
+        found: files that the user does not name.
+        calibration: rig file that has the cameras; None where files give the names, and more may be named.
+        known: sizes of the cameras of the rig file by name, pixels; None where it states none.
         cameras: names of the cameras.
         files: the files of each camera by their kinds.
         unused: files that belong to no camera.
         unclear: files of which a user must say whose they are; what was expected, and what their names say.
+        rivals: files that fit as well as the unclear ones, likewise.
     """
 
     folder: Path
+    found: list[Found]
     calibration: Path | None
+    known: dict[str, tuple[int, int] | None]
     cameras: list[str]
     files: dict[str, dict[Kind, Path | str]] = field(default_factory=dict)
     unused: list[Path] = field(default_factory=list)
     unclear: dict[Path, tuple[str, str]] = field(default_factory=dict)
+    rivals: dict[Path, tuple[str, str]] = field(default_factory=dict)
 
     def taken(self, camera: str, kind: Kind) -> Path | str | None:
         """The file of this kind that a camera has already."""
@@ -146,6 +152,28 @@ class _Matching:
     def put(self, camera: str, kind: Kind, file: Path | str) -> None:
         """Give a file to a camera."""
         self.files.setdefault(camera, {})[kind] = file
+
+    def nameless(self, kind: Kind) -> tuple[str, str]:
+        """What was expected of a file with the name of no camera, and what its name says."""
+        of_rig = "" if self.calibration is None else f" of {self.calibration.name}"
+        expected = f"the {_WORDS[kind]} of a camera{of_rig}, {', '.join(self.cameras)}"
+        return expected, "none of these names in its name"
+
+    def questions(self) -> dict[Path, tuple[str, str]]:
+        """Files of which a user may say whose they are: unclear ones, and unused ones that some camera lacks."""
+        lacking = {kind for kind in OF_CAMERA for name in self.cameras if self.taken(name, kind) is None}
+        unused = {file: self.nameless(kind) for file in self.unused if (kind := kind_of(file)) in lacking}
+        return self.unclear | self.rivals | unused
+
+    def error(self) -> InputError:
+        """Error about the first of the unclear files; its remedy names all of them."""
+        files = self.unclear or self.questions()
+        first, *others = (shlex.quote(os.path.relpath(file, self.folder)) for file in files)
+        path, (expected, found) = next(iter(files.items()))
+        remedy = f"say whose it is with --match CAMERA={first}, or leave it out with --leave-out {first}"
+        if others:
+            remedy += f"; the same for {', '.join(others)}"
+        return InputError(path, expected=expected, found=found, remedy=remedy)
 
 
 def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions | None = None) -> Draft:
@@ -162,22 +190,15 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
         SettingsError: an option names a file or camera that does not exist.
     """
     folder, out, options = Path(folder), Path(out), options or DraftOptions()
-    _check_by_hand(folder, options)
-    by_hand = [*options.leave_out, *(file for _, file in options.match)]
-    found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
-    calibration = options.calibration or _calibration_of(folder, found)
-    known = _known_cameras(calibration, options.unit)
-    matching = _Matching(folder, calibration, list(known) or _names_of_files(found, options))
-    for name, file in options.match:
-        _put_by_hand(matching, name, file)
-    _match(matching, found)
+    matching = match_files(folder, out, options)
+    found, calibration = matching.found, matching.calibration
     corners = [each.path for each in found if each.kind == "corners"]
     if len(corners) > 1:
         matching.unclear[corners[1]] = "one table of marker corners", f"{corners[0].name} as well"
     if matching.unclear:
-        raise _unclear(folder, matching.unclear)
+        raise matching.error()
     tables = {
-        name: _table(matching, name, known.get(name), out.parent, options)
+        name: _table(matching, name, out.parent, options)
         for name in matching.cameras
         if name in matching.files
     }
@@ -198,6 +219,30 @@ def draft_recording(folder: Path | str, out: Path | str, options: DraftOptions |
     out.parent.mkdir(parents=True, exist_ok=True)
     without_files = tuple(name for name in matching.cameras if name not in tables)
     return Draft(out, content, recording_of(out, content), without_files, tuple(matching.unused))
+
+
+def match_files(folder: Path, out: Path, options: DraftOptions) -> Matching:
+    """Match the files of a folder to cameras, as far as the user and their names say.
+
+    Args:
+        folder: folder of the files.
+        out: path at which the draft will be written.
+        options: what the user says about the files.
+
+    Raises:
+        InputError: the folder, or the rig file in it, cannot be read.
+        SettingsError: an option names a file or camera that does not exist.
+    """
+    _check_by_hand(folder, options)
+    by_hand = [*options.leave_out, *(file for _, file in options.match)]
+    found = _without(folder, look_into(folder), [*by_hand, os.path.relpath(out, folder), RECORDING_FILE])
+    calibration = options.calibration or _calibration_of(folder, found)
+    known = _known_cameras(calibration, options.unit)
+    matching = Matching(folder, found, calibration, known, list(known) or _names_of_files(found, options))
+    for name, file in options.match:
+        _put_by_hand(matching, name, file)
+    _match(matching, {folder / name for name in options.leave_out})
+    return matching
 
 
 def _check_by_hand(folder: Path, options: DraftOptions) -> None:
@@ -259,7 +304,7 @@ def _name_of(file: Found) -> str:
     return "".join("_" if mark in ",=/\\" else mark for mark in stem)
 
 
-def _put_by_hand(matching: _Matching, name: str, file: str) -> None:
+def _put_by_hand(matching: Matching, name: str, file: str) -> None:
     """Give a file to the camera that the user names."""
     camera = chosen_camera(name, tuple(matching.cameras))
     path = matching.folder / file
@@ -278,24 +323,22 @@ def _put_by_hand(matching: _Matching, name: str, file: str) -> None:
     raise SettingsError("--match", expected=expected, found=found)
 
 
-def _match(matching: _Matching, found: Sequence[Found]) -> None:
+def _match(matching: Matching, left_out: Collection[Path]) -> None:
     """Give each file of a camera to the camera that its name says."""
     by_hand = {file for files in matching.files.values() for file in files.values()}
-    of_rig = "" if matching.calibration is None else f" of {matching.calibration.name}"
-    for each in found:
+    for each in matching.found:
         if each.kind in OF_CAMERA and not _match_by_name(matching, each, by_hand):
             if each.is_video_file and not each.alone_in:
-                expected = f"the video of a camera{of_rig}, {', '.join(matching.cameras)}"
-                matching.unclear[each.path] = expected, "none of these names in its name"
+                matching.unclear[each.path] = matching.nameless("video")
             else:
                 matching.unused.append(each.path)
-    for each in found:
+    for each in matching.found:
         if each.kind == "other":
-            _look_for_videos_of_a_camera(matching, each)
+            _look_for_videos_of_a_camera(matching, each, left_out)
             matching.unused.append(each.path)
 
 
-def _match_by_name(matching: _Matching, each: Found, by_hand: Collection[Path | str]) -> bool:
+def _match_by_name(matching: Matching, each: Found, by_hand: Collection[Path | str]) -> bool:
     """Give a file to the camera that its name says; False if it says none, or one that the user gave another file."""
     names = cameras_of(each.name, matching.cameras)
     if len(names) > 1:
@@ -310,21 +353,23 @@ def _match_by_name(matching: _Matching, each: Found, by_hand: Collection[Path | 
     else:
         expected = f"one {_WORDS[each.kind]} of camera {names[0]}"
         matching.unclear[each.path] = expected, f"{getattr(taken, 'name', taken)} as well"
+        if isinstance(taken, Path) and taken not in by_hand:
+            matching.rivals[taken] = expected, f"{each.path.name} as well"
     return True
 
 
-def _look_for_videos_of_a_camera(matching: _Matching, found: Found) -> None:
+def _look_for_videos_of_a_camera(matching: Matching, found: Found, left_out: Collection[Path]) -> None:
     """The videos in a folder that has the name of a camera without files are unclear."""
     fitting = [name for name in cameras_of(found.name, matching.cameras) if name not in matching.files]
-    videos = videos_in(found.path)
+    videos = [video for video in videos_in(found.path) if video not in left_out]
     if len(fitting) == 1 and videos:
         names = ", ".join(video.name for video in videos)
-        matching.unclear[videos[0]] = f"one video of camera {fitting[0]}", f"{names} in {found.path.name}"
+        fault = f"one video of camera {fitting[0]}", f"{names} in {found.path.name}"
+        matching.unclear[videos[0]] = fault
+        matching.rivals.update(dict.fromkeys(videos[1:], fault))
 
 
-def _table(
-    matching: _Matching, name: str, size_wh: tuple[int, int] | None, base: Path, options: DraftOptions
-) -> CameraTable:
+def _table(matching: Matching, name: str, base: Path, options: DraftOptions) -> CameraTable:
     """Table of one camera."""
     files = matching.files[name]
     fps = size = None
@@ -336,7 +381,7 @@ def _table(
             expected = f"frames per second of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --fps")
     if not isinstance(video, Path):
-        size = size_wh or options.size_wh
+        size = matching.known.get(name) or options.size_wh
         if size is None:
             expected = f"width and height of the images of camera {name}, which has no video"
             raise InputError(matching.folder, expected=expected, found="none", remedy="pass --size")
@@ -354,17 +399,7 @@ def _written(file: Path | str, base: Path) -> str:
         return file.absolute().as_posix()
 
 
-def _unclear(folder: Path, files: Mapping[Path, tuple[str, str]]) -> InputError:
-    """Error about the first of some files whose names do not say whose they are; its remedy names all of them."""
-    first, *others = (shlex.quote(os.path.relpath(file, folder)) for file in files)
-    path, (expected, found) = next(iter(files.items()))
-    remedy = f"say whose it is with --match CAMERA={first}, or leave it out with --leave-out {first}"
-    if others:
-        remedy += f"; the same for {', '.join(others)}"
-    return InputError(path, expected=expected, found=found, remedy=remedy)
-
-
-def _nothing(matching: _Matching) -> InputError:
+def _nothing(matching: Matching) -> InputError:
     folder, calibration = matching.folder, matching.calibration
     below = next((path for path in sorted(folder.iterdir()) if videos_in(path)), None)
     expected, given, remedy = "videos, folders of images, or detections", "", ""
