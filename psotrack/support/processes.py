@@ -154,7 +154,8 @@ def _serve(function: Callable[..., Any], connection: Connection) -> None:
             index, task = connection.recv()
             try:
                 result = function(task, advance)
-                connection.send(steps)
+                if steps:
+                    connection.send(steps)
                 steps = 0
             except Exception as error:
                 if not isinstance(error, PsotrackError):
