@@ -16,8 +16,6 @@ NESTED = {
     "archive-manifest": b"[" * 20_000,
     "stored-silhouettes": b'{"a":' * 20_000,
     "run-record": b"[" * 20_000,
-    "sweep-manifest": b"[" * 20_000,
-    "calibration-record": b"[" * 20_000,
     "grid": b"a = " + b"[" * 20_000,
     "recording.toml": b"a = " + b"[" * 20_000,
     "marker-centres": b"a = " + b"[" * 20_000,

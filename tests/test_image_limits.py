@@ -1,5 +1,6 @@
 """Images and videos whose headers claim gigapixels are refused in one line, before they take memory."""
 
+import os
 import struct
 from pathlib import Path
 
@@ -156,6 +157,31 @@ def test_headers_that_are_cut_short(make, tmp_path):
         path.write_bytes(data[:length])
         with pytest.raises(InputError, match=r"a\.png: expected an image, found"):
             read_image(path)
+
+
+def test_what_others_write_while_an_image_is_decoded_stays_theirs(tmp_path, monkeypatch, capfd, caplog):
+    """Found: the process's stderr was taken for each image, so that the line of another thread became a warning."""
+    path, decode = tmp_path / "a.jpg", cv2.imdecode
+    path.write_bytes(encoded(".jpg"))
+
+    def decode_beside_another_thread(*arguments):
+        os.write(2, b"a line of another thread\n")
+        return decode(*arguments)
+
+    monkeypatch.setattr(cv2, "imdecode", decode_beside_another_thread)
+    read_image(path)
+    assert capfd.readouterr().err == "a line of another thread\n"
+    assert not caplog.records
+
+
+def test_a_photograph_with_damaged_data_is_named(tmp_path, capfd, caplog):
+    """libjpeg's own line, which does not name the file, is not shown."""
+    path, data = tmp_path / "a.jpg", bytearray(encoded(".jpg"))
+    data[-len(data) // 4 : -len(data) // 4 + 2] = b"\xff\xd5"
+    path.write_bytes(data)
+    assert read_image(path).shape == PICTURE.shape
+    assert capfd.readouterr().err == ""
+    assert f"{path} is damaged (Corrupt JPEG data" in caplog.text
 
 
 @pytest.mark.parametrize("kept", [0.3, 0.9])

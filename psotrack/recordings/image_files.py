@@ -17,7 +17,7 @@ from jaxtyping import Shaped, UInt8
 from PIL import Image
 
 from psotrack.errors import InputError
-from psotrack.recordings.opencv_messages import silence_opencv
+from psotrack.recordings.opencv_messages import decode_jpeg, silence_opencv
 
 #: Endings of files that are read as images.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -27,7 +27,8 @@ _FORMATS = ("JPEG", "BMP", "TIFF", "WEBP", "PPM")
 MOST_PIXELS = 178_956_970
 #: Longest side of an image, pixels: OpenCV warps no larger ones.
 MOST_SIDE = 2**15 - 2
-#: First bytes of a PNG, and least size of one of its parts: length, name and checksum.
+#: First bytes of a JPEG and of a PNG, and least size of a PNG's parts: length, name and checksum.
+_JPEG = b"\xff\xd8"
 _PNG, _PNG_PART = b"\x89PNG\r\n\x1a\n", 12
 #: Numbers of bits that cameras use.
 _DEPTHS = (8, 10, 12, 14, 16)
@@ -139,11 +140,15 @@ def image_of(coded: UInt8[np.ndarray, " bytes"], flags: int, where: object) -> S
     """
     size_wh = _claimed_size_wh(coded.tobytes(), where)
     check_pixels(where, *size_wh)
-    with contextlib.suppress(cv2.error), silence_opencv():
-        image = cv2.imdecode(coded, flags)
-        if image is not None:
-            return np.asarray(image)
-    raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
+    image: Shaped[np.ndarray, "..."] | None = None
+    if coded[: len(_JPEG)].tobytes() == _JPEG:
+        image = decode_jpeg(coded, flags, where)
+    else:
+        with contextlib.suppress(cv2.error), silence_opencv():
+            image = cv2.imdecode(coded, flags)
+    if image is None:
+        raise InputError(where, expected="an image", found="a file that OpenCV cannot decode")
+    return np.asarray(image)
 
 
 def check_pixels(where: object, width: int, height: int) -> None:
