@@ -42,7 +42,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
         remove_poses(replace(raw, covariance=np.tile(covariance, (frames, 1, 1))), slice(5, 8)),
         slice(5, 8),
     )
-    agility = choose_agility(raw.time_s, poses_of(raw), PoseFilterParams())
+    agility = choose_agility(raw.time_s.tolist(), poses_of(raw), PoseFilterParams())
     path = smooth(raw)
     assert (path.flags == 0).all()
 
@@ -81,7 +81,7 @@ def test_a_camera_that_does_not_turn_is_smoothed_as_by_least_squares_over_all_fr
 
 def test_agility_distinguishes_calm_from_violent_flights() -> None:
     calm, violent = (
-        choose_agility(raw.time_s, poses_of(raw), PoseFilterParams())
+        choose_agility(raw.time_s.tolist(), poses_of(raw), PoseFilterParams())
         for raw, _, _ in (flight(100, acceleration=size, shake=size, seed=33) for size in (0.5, 25.0))
     )
     assert violent.acceleration_std_m_s2 > 8 * calm.acceleration_std_m_s2
