@@ -1,4 +1,6 @@
-"""Marker crosses: learning of shapes, poses by least squares."""
+"""Marker crosses: learning of shapes, identification by distances, poses by least squares, bridging of gaps."""
+
+import itertools
 
 import numpy as np
 import pytest
@@ -7,16 +9,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
-from psotrack.recordings.mocap.marker_bodies import cross_poses
+from psotrack.recordings.mocap.marker_cross_poses import correct_labels, cross_poses, identify_markers
 from psotrack.recordings.mocap.marker_crosses import fit_rigid, learn_cross
 
 #: Positions of the markers A (front), B (left), C (back), D (right), metres; `FIVE_M` has a fifth marker on a mast.
 FOUR_M = np.array([[0.055, 0, 0.1], [0, 0.085, 0.1], [-0.115, 0, 0.1], [0, -0.105, 0.1]])
 FIVE_M = np.vstack([FOUR_M, [0.03, 0.02, 0.15]])
-OTHERS_M = (
-    np.array([[0.115, 0, 0], [0, 0.120, 0], [-0.095, 0, 0], [0, -0.060, 0]]),
-    np.array([[0.085, 0, 0], [0, 0.140, 0], [-0.040, 0, 0], [0, -0.050, 0]]),
-)
+SQUARE_M = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0]])
 NOISE_M = 0.0003
 RATE_HZ = 100.0
 
@@ -74,19 +73,16 @@ def test_three_markers_give_the_pose_of_four(unseen):
     cross = learn_cross(record_markers(FOUR_M))
     markers_m = record_markers(FOUR_M)
     markers_m[50:, unseen] = np.nan
-    position_m, _ = cross_poses(cross, markers_m)
+    position_m, _, bridged = cross_poses(cross, markers_m, RATE_HZ)
+    assert not bridged.any()
     # Exact in double precision. The mean of three markers would have an error of at least 18 mm.
     np.testing.assert_allclose(position_m, centroids(FOUR_M, 120), rtol=0, atol=1e-9)
 
 
 def test_a_quarter_turn_by_hand():
-    square = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, -0.1, 0]])
-    quarter_m = square[[1, 2, 3, 0]] + [
-        1.0,
-        2.0,
-        3.0,
-    ]  # each marker is at the place of the next marker: 90 degrees about z
-    found = fit_rigid(square, quarter_m[None])
+    # Each marker is at the place of the next marker: 90 degrees about z.
+    quarter_m = SQUARE_M[[1, 2, 3, 0]] + [1.0, 2.0, 3.0]
+    found = fit_rigid(SQUARE_M, quarter_m[None])
     np.testing.assert_allclose(found.rotation[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
     np.testing.assert_allclose(found.position_m[0], [1, 2, 3], atol=1e-15)
 
@@ -107,17 +103,20 @@ def test_markers_on_a_line_have_a_position_but_no_rotation(num_markers):
     line_m = np.array([[0.1, 0.1, 0.1]]) * np.arange(num_markers)[:, None]
     markers_m = record_markers(line_m, 20)
     markers_m[10:15, 0] = np.nan
-    position_m, orientation_wxyz = cross_poses(learn_cross(markers_m), markers_m)
+    position_m, orientation_wxyz, bridged = cross_poses(learn_cross(markers_m), markers_m, RATE_HZ)
     assert np.isnan(orientation_wxyz).all()
-    assert np.isnan(position_m[:, 0]).tolist() == [False] * 10 + [True] * 5 + [False] * 5
+    assert np.isfinite(position_m).all()
+    assert bridged.tolist() == [False] * 10 + [True] * 5 + [False] * 5
     np.testing.assert_allclose(position_m[:10], markers_m[:10].mean(axis=1), rtol=0, atol=1e-12)
 
 
 def test_no_frames_and_no_markers_seen():
     cross = learn_cross(record_markers(FOUR_M))
-    assert cross_poses(cross, np.zeros((0, 4, 3)))[0].shape == (0, 3)
-    for unseen in cross_poses(cross, np.full((5, 4, 3), np.nan)):
-        assert np.isnan(unseen).all()
+    assert cross_poses(cross, np.zeros((0, 4, 3)), RATE_HZ)[0].shape == (0, 3)
+    position_m, orientation_wxyz, bridged = cross_poses(cross, np.full((5, 4, 3), np.nan), RATE_HZ)
+    assert np.isnan(position_m).all()
+    assert np.isnan(orientation_wxyz).all()
+    assert not bridged.any()
 
 
 # --- learning the shape
@@ -174,15 +173,125 @@ def test_every_cross_has_its_origin_at_its_centroid():
     np.testing.assert_allclose(learn_cross(record_markers(FIVE_M)).mean(axis=0), 0, atol=1e-12)
 
 
-def test_frames_with_wrong_labels_and_stray_markers_have_no_pose():
+# --- identification of markers
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(4))))
+def test_every_permutation_is_found(order):
+    cross = learn_cross(record_markers(FOUR_M))
+    points_m = record_markers(FOUR_M, 1, seed=3, noise_m=NOISE_M)[0]
+    np.testing.assert_array_equal(identify_markers(cross, points_m[list(order)]), points_m)
+    without_m = points_m.copy()
+    without_m[order[3]] = np.nan
+    np.testing.assert_array_equal(identify_markers(cross, points_m[list(order[:3])]), without_m)
+
+
+def test_markers_among_stray_points():
+    cross = learn_cross(record_markers(FIVE_M))
+    points_m = record_markers(FIVE_M, 1, seed=3, noise_m=NOISE_M)[0]
+    strays_m = points_m[0] + np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    mixed_m = np.vstack([strays_m[:7], points_m[[3, 0]], strays_m[7:], points_m[[4, 1, 2]]])
+    np.testing.assert_array_equal(identify_markers(cross, mixed_m), points_m)
+
+
+def test_a_mirror_image_is_not_identified():
+    """All distances of a mirror image fit, but no rotation does."""
+    body_m = np.array([[0.1, 0, 0], [0, 0.13, 0], [-0.07, 0, 0], [0.01, 0.02, 0.12]])
+    cross = learn_cross(record_markers(body_m))
+    np.testing.assert_array_equal(identify_markers(cross, body_m), body_m)
+    assert np.isnan(identify_markers(cross, body_m * [1, 1, -1])).any()
+
+
+@pytest.mark.parametrize(
+    "points_m",
+    [np.zeros((0, 3)), FOUR_M[:2], FOUR_M * 1.5, SQUARE_M * 3],
+    ids=["none", "two", "larger", "another"],
+)
+def test_points_that_are_not_the_cross(points_m):
+    assert np.isnan(identify_markers(learn_cross(record_markers(FOUR_M)), points_m)).all()
+
+
+def test_the_markers_of_a_symmetric_cross_are_not_identified():
+    assert np.isnan(identify_markers(SQUARE_M, SQUARE_M + 1.0)).all()
+
+
+def test_a_body_of_many_markers_is_identified_at_once():
+    """All subsets of the right labelling fit too: a million of 20 markers."""
+    body_m = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3))
+    cross = body_m - body_m.mean(axis=0)
+    order = np.random.default_rng(1).permutation(20)
+    np.testing.assert_array_equal(identify_markers(cross, body_m[order]), body_m)
+
+
+# --- poses over time
+
+
+def test_swapped_labels_change_no_pose():
+    cross = learn_cross(record_markers(FOUR_M))
     markers_m = record_markers(FOUR_M, noise_m=NOISE_M)
+    expected_m, expected_wxyz, _ = cross_poses(cross, markers_m, RATE_HZ)
+    swapped_m = markers_m.copy()
+    swapped_m[30:40, [0, 1]] = markers_m[30:40, [1, 0]]
+    swapped_m[60, [0, 1, 2, 3]] = markers_m[60, [3, 0, 1, 2]]
+    swapped_m[70, [0, 1]], swapped_m[70, 3] = markers_m[70, [1, 0]], np.nan
+    position_m, orientation_wxyz, bridged = cross_poses(cross, swapped_m, RATE_HZ)
+    others = np.arange(120) != 70  # in frame 70, the fourth marker is missing too
+    assert not bridged.any()
+    np.testing.assert_array_equal(position_m[others], expected_m[others])
+    np.testing.assert_array_equal(orientation_wxyz[others], expected_wxyz[others])
+    # Without one marker with noise of 0.3 mm the centroid moves by less than a millimetre.
+    np.testing.assert_allclose(position_m[70], expected_m[70], rtol=0, atol=1e-3)
+
+
+def test_a_marker_that_jumps_to_another_body_is_left_out():
+    markers_m = record_markers(FIVE_M)
     cross = learn_cross(markers_m)
-    expected = cross_poses(cross, markers_m)
-    markers_m[30:40, [0, 1]] = markers_m[30:40, [1, 0]]
-    markers_m[50, 2] = [3.0, 3.0, 1.0]
-    markers_m[60:65] = np.random.default_rng(0).uniform(-1, 1, (5, 4, 3))
-    wrong = np.zeros(120, bool)
-    wrong[[*range(30, 40), 50, *range(60, 65)]] = True
-    for found, known in zip(cross_poses(cross, markers_m), expected, strict=True):
-        assert np.isnan(found[wrong]).all()
-        np.testing.assert_array_equal(found[~wrong], known[~wrong])
+    markers_m[20:30, 2] = [3.0, 3.0, 1.0]
+    position_m, _, bridged = cross_poses(cross, markers_m, RATE_HZ)
+    assert not bridged.any()
+    np.testing.assert_allclose(position_m, centroids(FIVE_M, 120), rtol=0, atol=1e-9)
+
+
+def test_frames_in_which_nothing_fits_are_gaps():
+    markers_m = record_markers(FOUR_M)
+    cross = learn_cross(markers_m)
+    markers_m[20:25] = np.random.default_rng(0).uniform(-1, 1, (5, 4, 3))
+    assert np.isnan(correct_labels(cross, markers_m)[20:25]).all()
+    assert np.flatnonzero(cross_poses(cross, markers_m, RATE_HZ)[2]).tolist() == [20, 21, 22, 23, 24]
+
+
+@pytest.mark.parametrize(("gap", "short"), [(1, True), (20, True), (50, True), (51, False)])
+def test_gaps_are_bridged_to_half_a_second(gap, short):
+    cross, markers_m = learn_cross(record_markers(FOUR_M)), record_markers(FOUR_M, 300)
+    markers_m[100 : 100 + gap, :2] = np.nan  # two markers are left, which is no pose
+    position_m, orientation_wxyz, bridged = cross_poses(cross, markers_m, RATE_HZ)
+    inside = np.zeros(300, bool)
+    inside[100 : 100 + gap] = True
+    assert bridged.tolist() == (inside & short).tolist()
+    assert np.isnan(position_m[:, 0]).tolist() == (inside & (not short)).tolist()
+    assert np.isnan(orientation_wxyz[:, 0]).tolist() == (inside & (not short)).tolist()
+    if short:
+        turn, _ = make_flight(300)
+        off_m = np.linalg.norm(position_m - centroids(FOUR_M, 300), axis=1)
+        # The error of a cubic over the time T is T^4 / 384 times the fourth derivative, 1.5 m (1.5 / s)^4: 1.2 mm in
+        # half a second. The error of its slopes, a tenth of the jerk of 5 m/s^3 times (0.1 s)^2, adds T / 8 times that:
+        # 0.5 mm. The error of a straight line would be 104 mm.
+        assert off_m.max() < 0.003
+        body = Rotation.from_quat(orientation_wxyz, scalar_first=True)
+        off_deg = np.degrees((turn[0].inv() * body[0] * body.inv() * turn).magnitude())
+        assert off_deg.max() < 1.0  # T^2 / 8 times the tilt acceleration of 0.34 rad/s^2, about two axes
+
+
+def test_gaps_at_the_ends_are_not_bridged():
+    cross, markers_m = learn_cross(record_markers(FOUR_M)), record_markers(FOUR_M, 100)
+    markers_m[:5] = markers_m[95:] = np.nan
+    position_m, _, bridged = cross_poses(cross, markers_m, RATE_HZ)
+    assert not bridged.any()
+    assert np.flatnonzero(np.isnan(position_m[:, 0])).tolist() == [*range(5), *range(95, 100)]
+
+
+def test_a_single_pose_between_gaps():
+    cross, markers_m = learn_cross(record_markers(FOUR_M)), record_markers(FOUR_M, 3, rate_hz=20.0)
+    markers_m[1] = np.nan
+    position_m, _, _ = cross_poses(cross, markers_m, 20.0)
+    np.testing.assert_allclose(position_m[1], position_m[[0, 2]].mean(axis=0), rtol=0, atol=1e-12)

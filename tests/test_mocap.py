@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError, OutputError, SettingsError
 from psotrack.recordings.mocap import Markers, NoDronesError, marker_bodies, read_c3d, write_c3d
-from psotrack.trajectories import Trajectories, resample
+from psotrack.trajectories import Status, Trajectories, resample
 
 #: Positions of the markers of an asymmetric cross in the body's frame, metres.
 CROSS_M = np.array([[0.2, 0, 0.05], [-0.15, 0, 0.05], [0, 0.18, 0.05], [0, -0.12, 0.05], [0.05, 0.05, 0.09]])
@@ -164,17 +164,31 @@ def test_the_cross_turns_with_its_body():
     assert (turn[0].inv() * turn).magnitude().max() < 1e-7
 
 
-def test_short_gaps_are_interpolated_and_long_gaps_remain():
-    """dron2 has a gap of 0.08 s; dron10 has a gap of 0.6 s, because two of its five markers determine no pose."""
+def test_short_gaps_are_bridged_and_flagged_and_long_gaps_remain():
+    """dron2 has a gap of 0.3 s; dron10 has a gap of 0.6 s, because two of its five markers determine no pose."""
     markers, centroid_m = make_markers(num_frames=141)
-    markers.position_m[41:49, :5] = np.nan
+    markers.position_m[40:70, :5] = np.nan
     markers.position_m[40:100, 5:8] = np.nan
+    status = marker_bodies(markers, WHERE).status
+    assert np.flatnonzero(status[:, 0] == Status.COASTING).tolist() == [*range(40, 70)]
+    assert np.flatnonzero(status[:, 1] == Status.LOST).tolist() == [*range(40, 100)]
+    assert (status == Status.TRACKED).sum() == 2 * 141 - 30 - 60
     truth = at_frames(markers, num_frames=36)
     assert truth.seen[:, 0].all()
     assert np.flatnonzero(~truth.seen[:, 1]).tolist() == [*range(10, 25)]
     assert np.isnan(truth.orientation_wxyz[10:25, 1]).all()
-    # The error of a cubic over the time T is T^4 / 384 times 16 m/s^4: a few micrometres.
-    np.testing.assert_allclose(truth.position_m[:, 0], centroid_m[::4, 0], rtol=0, atol=1e-5)
+    # The error of a cubic is T^4 / 384 times 16 m/s^4 plus T / 8 times the error of its slopes, 0.01 s^2 / 10 times
+    # 8 m/s^3: 0.6 mm in total.
+    np.testing.assert_allclose(truth.position_m[:, 0], centroid_m[::4, 0], rtol=0, atol=1e-3)
+
+
+def test_swapped_labels():
+    markers, centroid_m = make_markers()
+    markers.position_m[8, [0, 1]] = markers.position_m[8, [1, 0]]
+    markers.position_m[12:20, [5, 6, 7]] = markers.position_m[12:20, [7, 5, 6]]
+    truth = marker_bodies(markers, WHERE)
+    np.testing.assert_allclose(truth.position_m, centroid_m, rtol=0, atol=1e-9)
+    assert (truth.status == Status.TRACKED).all()
 
 
 def test_a_drone_whose_markers_are_never_seen_together_is_lost(caplog):

@@ -7,19 +7,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+from jaxtyping import Bool, Float
 
 from psotrack.errors import InputError
 from psotrack.recordings.mocap.c3d import Markers
-from psotrack.recordings.mocap.marker_crosses import fit_rigid, learn_cross, within_usual_residual
+from psotrack.recordings.mocap.marker_cross_poses import cross_poses
+from psotrack.recordings.mocap.marker_crosses import learn_cross
 from psotrack.recordings.mocap.marker_groups import drone_markers
-from psotrack.trajectories import Trajectories
+from psotrack.trajectories import Status, Trajectories
 
 _logger = logging.getLogger(__name__)
-#: Largest root mean square residual of a fit, metres: about a marker's radius. A larger one, where it is unusual, is
-#: that of markers with wrong labels.
-_TOLERANCE_M = 0.01
 
 
 def marker_bodies(
@@ -28,9 +25,11 @@ def marker_bodies(
     """The drones of a motion-capture recording, at its frames.
 
     The position of a body is the centroid of its whole marker cross, whose shape is learned from the recording. Three
-    seen markers determine the pose, and the position does not jump when a marker appears or disappears; with fewer
-    markers, or with labels that do not fit the shape, the pose is NaN. Markers that were never seen are ignored.
-    Orientations refer to the cross's own frame (`learn_cross`); they are unknown if all markers lie on a line.
+    seen markers determine the pose, and the position does not jump when a marker appears or disappears. Labels that do
+    not fit the shape are corrected from the distances. A gap is a time with fewer markers, or without labels that fit:
+    gaps up to half a second are bridged and `coasting`; in longer gaps the position is NaN and `lost`. Markers that
+    were never seen are ignored. Orientations refer to the cross's own frame (`learn_cross`); they are unknown if all
+    markers lie on a line.
 
     Args:
         markers: a recording at any rate.
@@ -44,46 +43,26 @@ def marker_bodies(
     """
     bodies = drone_markers(markers, where, named)
     poses = [_body_poses(markers, name, columns, where) for name, columns in bodies.items()]
-    position_m, orientation_wxyz = (np.stack(each, axis=1) for each in zip(*poses, strict=True))
+    position_m, orientation_wxyz, bridged = (np.stack(each, axis=1) for each in zip(*poses, strict=True))
     if np.isnan(position_m).all():
         raise InputError(where, expected="three markers of a drone in some frame", found="none")
     frame = np.arange(len(position_m))
     turned = not np.isnan(orientation_wxyz).all()
+    status = np.where(bridged, Status.COASTING, Status.TRACKED)
     return Trajectories(
         frame,
         frame / markers.rate_hz,
         tuple(bodies),
         position_m,
         orientation_wxyz=orientation_wxyz if turned else None,
+        status=np.where(np.isnan(position_m).any(axis=-1), Status.LOST, status),
     )
-
-
-def cross_poses(
-    markers_m: Float[np.ndarray, "markers 3"], position_m: Float[np.ndarray, "frames markers 3"]
-) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
-    """Poses of a cross in every frame of a recording, by least squares; three seen markers are enough.
-
-    Args:
-        markers_m: (markers, 3), the cross, from `learn_cross`.
-        position_m: (frames, markers, 3), positions in the world, metres; NaN if a marker is not seen.
-
-    Returns:
-        (frames, 3), centroids of the cross in the world, metres; and (frames, 4), unit quaternions from cross to world;
-        NaN where unknown.
-    """
-    fits = fit_rigid(markers_m, position_m)
-    wrong = (fits.residual_m > _TOLERANCE_M) & ~within_usual_residual(fits.residual_m)
-    orientation_wxyz = np.full((len(position_m), 4), np.nan)
-    known = np.isfinite(fits.rotation[:, 0, 0]) & ~wrong
-    if known.any():
-        orientation_wxyz[known] = Rotation.from_matrix(fits.rotation[known]).as_quat(scalar_first=True)
-    return np.where(wrong[:, None], np.nan, fits.position_m), orientation_wxyz
 
 
 def _body_poses(
     markers: Markers, name: str, columns: list[int], where: Path | str
-) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"]]:
-    """Poses of one body in every frame of the recording; NaN if the shape of its cross cannot be learned."""
+) -> tuple[Float[np.ndarray, "frames 3"], Float[np.ndarray, "frames 4"], Bool[np.ndarray, "frames"]]:
+    """Poses of one body in every frame, and which are bridged; NaN if the shape of its cross cannot be learned."""
     ever_seen = np.isfinite(markers.position_m).all(axis=-1).any(axis=0)
     used = [column for column in columns if ever_seen[column]]
     if len(used) < len(columns):
@@ -91,8 +70,8 @@ def _body_poses(
     try:
         if used:
             position_m = markers.position_m[:, used]
-            return cross_poses(learn_cross(position_m, name), position_m)
+            return cross_poses(learn_cross(position_m, name), position_m, markers.rate_hz)
     except InputError as error:
         _logger.warning("%s: no reference for %s: %s", where, name, error)
     frames = len(markers.position_m)
-    return np.full((frames, 3), np.nan), np.full((frames, 4), np.nan)
+    return np.full((frames, 3), np.nan), np.full((frames, 4), np.nan), np.zeros(frames, bool)

@@ -15,10 +15,10 @@ from psotrack.errors import InputError
 
 #: Smallest root mean square distance of markers from a line, metres; nearer markers do not determine the turn about it.
 _LINE_M = 0.005
-#: Noise of a motion-capture system, metres, added to the usual residual.
-_NOISE_M = 0.001
+#: Noise of a motion-capture system, metres, added where residuals are compared.
+NOISE_M = 0.001
 #: Smallest number of markers that determines a pose.
-_MIN_MARKERS = 3
+MIN_MARKERS = 3
 #: Largest number of iterations of the Procrustes mean.
 _NUM_ROUNDS = 20
 #: Largest change of a marker in the last iteration of the Procrustes mean, metres.
@@ -65,7 +65,7 @@ def fit_rigid(
     rotation = left @ right
     # The second eigenvalue of the seen markers' covariance is their mean squared distance from a line.
     width_m2 = np.linalg.eigvalsh(np.einsum("fm,fmi,fmj->fij", share, body, body))[:, 1]
-    turned = (count >= _MIN_MARKERS) & (width_m2 > _LINE_M**2)
+    turned = (count >= MIN_MARKERS) & (width_m2 > _LINE_M**2)
     off_m2 = ((world - np.einsum("fij,fmj->fmi", rotation, body)) ** 2).sum(axis=-1)
     position = middle_world - np.einsum("fij,fj->fi", rotation, middle_body)
     placed = turned | (count == len(markers_m))
@@ -160,7 +160,7 @@ def _mean_shape(
 def within_usual_residual(residual_m: Float[np.ndarray, "frames"]) -> Bool[np.ndarray, "frames"]:
     """True where a residual is at most three times the recording's median plus noise; False where it is NaN."""
     known = residual_m[np.isfinite(residual_m)]
-    limit_m = 3 * np.median(known) + _NOISE_M if len(known) else 0.0
+    limit_m = 3 * np.median(known) + NOISE_M if len(known) else 0.0
     return np.isfinite(residual_m) & (residual_m <= limit_m)
 
 
