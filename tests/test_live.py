@@ -323,7 +323,8 @@ def test_a_device_without_permission(tmp_path: Path) -> None:
     file.touch(mode=0)
     # The worker's folder, the run's and the user's, which pytest opens to this user alone.
     for folder in (tmp_path, *tmp_path.parents[:3]):
-        folder.chmod(folder.stat().st_mode | stat.S_IXOTH)
+        if not folder.stat().st_mode & stat.S_IXOTH:
+            folder.chmod(folder.stat().st_mode | stat.S_IXOTH)
     # Root may open every file: a process of root becomes another user, when everything is imported.
     script = """
         import os, sys, time
