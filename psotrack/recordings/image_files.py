@@ -7,6 +7,7 @@ import glob
 import io
 import re
 import struct
+import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -170,8 +171,11 @@ def _claimed_size_wh(data: bytes, where: object) -> tuple[int, int]:
             raise InputError(where, expected="an image", found="a PNG that is cut short or damaged")
         return struct.unpack_from(">II", data, 16)
     try:
-        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
-            return image.size
+        with warnings.catch_warnings():
+            # OpenCV decides whether the rest of a damaged file can be read.
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+                return image.size
     except Image.DecompressionBombError as error:
         found = str(error).partition("(")[2].partition(")")[0]
         raise InputError(where, expected=f"images of at most {MOST_PIXELS} pixels", found=found) from error
