@@ -137,7 +137,10 @@ def test_one_row_per_cell_and_run(swept: Path) -> None:
     # three significant digits, so half a unit of the third one is at most 0.5 %; 0.1 % is for the rounded seconds.
     share_s = rows["seconds.batch"] / rows["runs_in_batch"]
     np.testing.assert_allclose(rows["real_time_factor"], 6 / 25 / share_s, rtol=0.006)
-    assert (rows["real_time_factor_running"] > rows["real_time_factor"]).all()
+    # The cells that need a new program wait for its compilation; the others use a program that was compiled before.
+    compiled = rows["seconds.compile"] > 0.05 * rows["seconds.batch"]
+    assert (rows["real_time_factor_running"] >= rows["real_time_factor"]).all()
+    assert (rows["real_time_factor_running"] > rows["real_time_factor"])[compiled].all()
     # The folder is one Parquet data set, with failures and the grids that were run in it.
     # Files are in the order of digests, rows in that of the settings.
     order = ["method", "settings.swarm.iterations", "seed"]
