@@ -60,7 +60,7 @@ def find_lens(
         Vector of the lens, or None if no view fits.
     """
     usable = views_px[np.isfinite(views_px[..., 0]).sum(axis=1) >= board.least_corners]
-    chosen = usable[:: max(1, -(-len(usable) // _MOST_VIEWS))]
+    chosen = usable[np.linspace(0, len(usable) - 1, min(len(usable), _MOST_VIEWS)).round().astype(np.int64)]
     found: list[tuple[float, np.ndarray]] = []
     starts_px = [
         widths * image_size_wh[0] for widths in (_FOCAL_WIDTHS_FISHEYE if model.fisheye else _FOCAL_WIDTHS)
