@@ -55,10 +55,9 @@ def test_doctor_says_how_far_the_reference_is_and_names_nothing_else(sequence):
     (finding,) = json.loads(run_command("doctor", sequence, "--json", "-").stdout)["findings"]
     assert finding["kind"] == "reference"
     # The clock is 9 frames late, and the drones fly at about 1.4 m/s; with tracks, the next test finds the clock.
-    found = re.search(
-        r"it is ([0-9.]+) m from what the cameras see.*`psotrack doctor --tracks`", finding["message"]
-    )
+    found = re.match(r"the reference: it is ([0-9.]+) m from what the cameras see", finding["message"])
     assert found is not None
+    assert "`psotrack doctor --tracks`" in finding["remedy"]
     assert 0.36 < float(found[1]) < 0.72
 
 
