@@ -21,7 +21,7 @@ def test_from_videos_to_tracks(tmp_path_factory: pytest.TempPathFactory, tmp_pat
     done = subprocess.run(map(str, command), capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     (row,) = pd.read_csv(tmp_path / "end_to_end.csv").to_dict("records")
-    # So few and small frames do not show both drones.
+    # Six frames at a small size do not show both drones.
     assert (row["drones"] >= 1, row["cameras"], row["video_s"]) == (True, 8, 0.24)
     assert 0 < row["real_time_factor"] < row["real_time_factor_running"]
     assert row["decode_s"] > 0

@@ -2,7 +2,7 @@ from .board_corners import BoardFinder
 from .board_page import save_board
 from .board_recognition import describe_board, detect_board
 from .boards import Board
-from .bundle import Bundle, BundleProblem, BundleState, summed
+from .bundle import Bundle, BundleProblem, BundleState, KnownLens, summed
 from .extrinsics import Located, locate_camera
 from .image_points import (
     ImagePoints,
@@ -57,6 +57,7 @@ __all__ = [
     "FoundBoards",
     "GivenWorld",
     "ImagePoints",
+    "KnownLens",
     "LensChoice",
     "LensModel",
     "LensSettings",

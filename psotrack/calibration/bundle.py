@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from psotrack.geometry import NEAR_M, cross_matrices
+from psotrack.geometry import NEAR_M, Camera, cross_matrices, to_pixels_with_jacobian
 from psotrack.geometry.estimation import (
     NormalEquations,
     Step,
@@ -43,6 +43,17 @@ class Projection(Protocol):
 
     def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels of points in the camera's axes, and their derivatives by the points and by the lens."""
+
+
+@dataclass(frozen=True)
+class KnownLens:
+    """A `Projection` of a lens that is known: its unknowns, if there are any, do not change it."""
+
+    camera: Camera
+
+    def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Projection`."""
+        return *to_pixels_with_jacobian(self.camera, points_m), np.zeros((len(points_m), 2, len(lens)))
 
 
 @dataclass(frozen=True)

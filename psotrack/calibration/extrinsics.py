@@ -13,16 +13,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import log
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from psotrack.calibration.bundle import Bundle, BundleState
+from psotrack.calibration.bundle import Bundle, BundleState, KnownLens
 from psotrack.calibration.pnp import MIN_POINTS, Solver, solve_pnp, solve_pnp_ransac
 from psotrack.calibration.residuals import GATE, centre_by_pose, inflation, spread_px
 from psotrack.errors import InputError, check_positive
-from psotrack.geometry import Camera, to_pixels_with_jacobian, undistort
+from psotrack.geometry import Camera, undistort
 from psotrack.geometry.estimation import covariance_from_information
 
 #: Largest median residual of a usable pose, in units of the stated σ; points within it may be inliers.
@@ -110,17 +109,6 @@ def locate_camera(
     return Located(T, covariance, by_pose @ covariance @ by_pose.T, fit.distance_px[0], fit.used[0])
 
 
-@dataclass(frozen=True)
-class _KnownLens:
-    """A lens without unknowns, `bundle.Projection`."""
-
-    camera: Camera
-
-    def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels of points, and their derivatives."""
-        return *to_pixels_with_jacobian(self.camera, points_m), np.zeros((len(points_m), 2, 0))
-
-
 def _likely_poses(
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points 2"],
@@ -142,7 +130,7 @@ def _likely_poses(
     # The points are the corners of one target that stands still.
     free, seen_px = (np.ones(1, bool), np.zeros(1, bool)), points_px[None, None]
     fits = [
-        Bundle.of_views((_KnownLens(lens),), state, points_m, seen_px, free=free, noise_px=noise_px).solved()
+        Bundle.of_views((KnownLens(lens),), state, points_m, seen_px, free=free, noise_px=noise_px).solved()
         for state in states
     ]
     found: list[Bundle] = []

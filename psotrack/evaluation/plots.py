@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _AXES = "xyz"
 #: Margin around the references, as a fraction of their largest extent, and its least size, metres.
 _MARGIN, _LEAST_M = 0.15, 0.1
-#: The scale of values is logarithmic where the largest is more than so many times the median.
+#: Ratio of the largest value to the median above which the scale of values is logarithmic.
 _FAR_ABOVE = 30
 
 

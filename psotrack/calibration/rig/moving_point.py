@@ -356,10 +356,8 @@ def adjust(rig: Rig, points_px: Float[np.ndarray, "points cameras 2"], noise_px:
     _check_seen(rig, placed)
     seen_px = np.where(placed[..., None], points_px, np.nan)
     bundle = _start(rig, start_m, seen_px, noise_px).solved()
-    seen, unknowns = (
-        (bundle.problem.target, bundle.problem.camera),
-        6 * len(rig) - 7 + 3 * int(placed.any(axis=1).sum()),
-    )
+    seen = bundle.problem.target, bundle.problem.camera
+    unknowns = 6 * len(rig) - 7 + 3 * int(placed.any(axis=1).sum())
     used = placed
     # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
@@ -389,10 +387,8 @@ def _start(
     points = np.tile(np.eye(4), (len(points_m), 1, 1))
     points[:, :3, 3] = points_m
     state = BundleState(lenses, np.asarray(rig.cameras.T_cam_world), points, np.ones(len(points)))
-    free, views_px = (
-        (np.arange(len(rig)) > 0, np.ones(len(points), bool)),
-        points_px.swapaxes(0, 1)[:, :, None],
-    )
+    free = np.arange(len(rig)) > 0, np.ones(len(points), bool)
+    views_px = points_px.swapaxes(0, 1)[:, :, None]
     return Bundle.of_views(models, state, np.zeros((1, 3)), views_px, free=free, noise_px=noise_px)
 
 

@@ -19,15 +19,13 @@ errors of the lens look like a motion that no pose shows.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.calibration import GATE, Bundle, BundleProblem, BundleState, spread_px, summed
-from psotrack.geometry import Camera, to_pixels_with_jacobian
+from psotrack.calibration import GATE, Bundle, BundleProblem, BundleState, KnownLens, spread_px, summed
 from psotrack.geometry.estimation import covariance_from_information
 from psotrack.inside_out.mapping.sightings import MarkerSightings, outward
 from psotrack.inside_out.marker_map import SQUARE, PlacedMarker
@@ -54,18 +52,6 @@ _STILL = 1e-7
 _RESIDUALS = 8
 
 
-@dataclass(frozen=True)
-class _KnownLens:
-    """A lens without unknowns but for the inset, whose derivative the bundle knows."""
-
-    camera: Camera
-
-    def project(self, lens: Any, points_m: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `calibration.bundle.Projection`."""
-        pixels, slopes = to_pixels_with_jacobian(self.camera, points_m)
-        return pixels, slopes, np.zeros((len(points_m), 2, 1))
-
-
 def adjusted_roughly(
     sightings: MarkerSightings,
     markers: Mapping[int, PlacedMarker],
@@ -90,7 +76,7 @@ def adjusted_roughly(
     free[np.isin(ids, list(fixed))] = False
     views = np.bincount(sightings.lens, minlength=videos)
     problem = BundleProblem(
-        models=tuple(map(_KnownLens, sightings.lenses)),
+        models=tuple(map(KnownLens, sightings.lenses)),
         priors=tuple((np.zeros(1), np.array([[max(count, 1) / _INSET_PX**2]])) for count in views.tolist()),
         corners_m=SQUARE,
         lens=sightings.lens[sightings.view],
