@@ -176,8 +176,9 @@ def test_poses_of_a_rolling_shutter_are_as_good_as_stated(seed, num_frames):
         assert 0.6 < np.mean(squares_of(path, hand, 6)) / 6 < 1.3
 
 
-# The last frame of 40 of seed 3 is 12 mm off, with a covariance that is too small; before it was 5 mm off.
-@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
+# Seed 3: the last of 40 frames was 12 mm off and 26 to 30 of six degrees of freedom, because the motion was learned
+# from poses by a global shutter, whose covariances do not contain the motion.
+@pytest.mark.parametrize("seed", [0, 3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 7))])
 @pytest.mark.parametrize("num_frames", [12, 40])
 def test_the_ends_of_a_recording_know_their_motion(seed, num_frames):
     """Found: 4 to 7 mm off in the first frame, whose motion only the next frames showed, and not its own rows."""

@@ -35,8 +35,8 @@ from psotrack.inside_out.rolling_shutter import Detected, RollingShutter, estima
 
 #: Largest number of frames from which the errors of corners are learned, and number of estimates.
 _NOISE_FRAMES, _NOISE_TURNS = 60, 2
-#: Number of times that the motion of a rolling shutter and its poses are estimated by turns.
-_ROLLING_TURNS = 3
+#: Number of times that the motion of a rolling shutter and its poses are estimated by turns, first as of a stream.
+_ROLLING_TURNS = 2
 #: A marker is wrong if it disagrees in more than this fraction of the poses of its frames; smallest number of these
 #: poses that decides.
 _WRONG, _LEAST_FRAMES = 0.5, 3
@@ -104,10 +104,8 @@ def _recording(
         settings = replace(settings, shutter=line_time.shutter(settings.shutter))
     shutter = settings.shutter or RollingShutter(0.0)
     params, agility, around = settings.filter or PoseFilterParams(), Agility(), None
-    for turn in range(_ROLLING_TURNS if shutter.line_time_s or shutter.std_s else 0):
-        # Poses by a shutter that is taken as global are wrong, but their errors change as little as the motion.
-        known = settings if turn else replace(settings, shutter=RollingShutter(0.0))
-        found = list(follow(detected, marker_map, lens, known, agility, around, seconds))
+    for _ in range(_ROLLING_TURNS if shutter.line_time_s or shutter.std_s else 0):
+        found = list(follow(detected, marker_map, lens, settings, agility, around, seconds))
         around = _motions_around(found, params)
     if settings.pose.noise is None:
         noise = CornerNoise()
