@@ -394,8 +394,9 @@ def test_a_stream_gives_the_path_of_its_file(room, tmp_path):
     (file, _), (stream, name) = (read_camera_path(tmp_path / f"{name}.csv") for name in ("file", "stream"))
     assert name == "camera"
     np.testing.assert_allclose(stream.time_s, file.time_s, atol=1e-6)
-    # A stream is not searched for the correlation of corners either: weights differ, and its covariances are larger.
-    np.testing.assert_allclose(stream.position_m, file.position_m, atol=1e-3)
+    # A stream does not learn the errors of its corners: weights differ, and its covariances are larger.
+    off_m = np.linalg.norm(stream.position_m - file.position_m, axis=1)
+    assert (off_m < np.sqrt(np.trace(stream.covariance[:, :3, :3], axis1=1, axis2=2))).all()
     assert np.trace(stream.covariance.mean(axis=0)) > np.trace(file.covariance.mean(axis=0))
 
 

@@ -154,7 +154,7 @@ def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
     )
     assert found.used.all()
 
-    def best_for(corners_px, start):
+    def best_for(corners_px, start, factor=1.0):
         def residuals(x):
             turned = found.R_world_cam @ Rotation.from_rotvec(x[3:6]).as_matrix()
             T = np.eye(4)
@@ -163,7 +163,8 @@ def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
             pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * inward(corners_px)
             off = (corners_px - pixels).reshape(count, 8)
             white = np.concatenate([own_whitener(std) @ one for std, one in zip(std_px, off, strict=True)])
-            return np.concatenate([white, x[8:] / 0.003, [x[6] / INSET_STD_PX, x[7]]])
+            place = x[8:] / np.hypot(0.0024 * np.sqrt(factor), 0.0018)
+            return np.concatenate([white / np.sqrt(factor), place, [x[6] / INSET_STD_PX, x[7]]])
 
         return least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12)
 
@@ -171,6 +172,9 @@ def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
     deviation = np.sqrt(np.diag(found.covariance))
     # Derivatives are those at the markers' positions in the map, 3 mm from their fitted positions at 5 m.
     np.testing.assert_allclose(result.x[:6] / deviation, 0, atol=0.03)
+    # For the covariances, the stated variances weigh as much as 20 residuals of the frame.
+    factor = (20 + 2 * result.cost) / (20 + 8 * count - 6)
+    result = best_for(corners_px, result.x, factor)
     expected = np.linalg.inv(result.jac.T @ result.jac)[:6, :6]
     # A shift of all corners by 0.015 px, which no residual shows, adds a little to the turn.
     np.testing.assert_allclose(
@@ -186,7 +190,7 @@ def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
         there = longer_lens(view, focal_error * off_m[-1])
         moved = project(there, corners_m + 0.0018 * off_m[:-1].reshape(count, 1, 3))[0]
         by_px = moved - project(view, corners_m)[0]
-        by_errors.append(best_for(corners_px + by_px, result.x).x[:6] - result.x[:6])
+        by_errors.append(best_for(corners_px + by_px, result.x, factor).x[:6] - result.x[:6])
     constant = np.transpose(by_errors) @ np.array(by_errors)
     np.testing.assert_allclose(
         found.constant / np.outer(deviation, deviation), constant / np.outer(deviation, deviation), atol=0.05
