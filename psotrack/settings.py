@@ -136,7 +136,7 @@ class MotionSettings(_Settings, frozen=True, kw_only=True, forbid_unknown_fields
         velocity_std_m_s, acceleration_std_m_s2: standard deviations of a new track's velocity and acceleration.
         error_share: share of the measured positions' variance that lasts from frame to frame, because what silhouettes
             show of a drone changes only as the drone turns.
-        error_time_s: time constant of these lasting errors, seconds.
+        error_time_s: time constant of these correlated errors, seconds.
 
     Raises:
         SettingsError: a value is not allowed.

@@ -1,7 +1,8 @@
 """Simulated flights with white jerk, and a textbook filter and smoother in float64 NumPy, as oracles for `motion`.
 
-The textbook's state is position, velocity and acceleration, (9,), or with a lasting error of the measurements, (12,).
-A measurement observes position plus lasting error. The state of `psotrack.tracking.motion` contains this sum instead.
+The textbook's state is position, velocity and acceleration, (9,), or with a correlated error of the measurements,
+(12,). A measurement observes position plus correlated error. The state of `psotrack.tracking.motion` contains this sum
+instead.
 """
 
 from dataclasses import dataclass, replace
@@ -36,16 +37,16 @@ class Model:
     def start(self, measured_m, covariance_m2):
         """Initial mean and covariance from the first measurement z = p + b + w.
 
-        The position p has no prior; the lasting error b has its stationary prior; w is white noise.
+        The position p has no prior; the correlated error b has its stationary prior; w is white noise.
         """
         rest = np.diag(np.repeat([self.velocity_std**2, self.acceleration_std**2], 3))
         spread = block_diag(covariance_m2, rest)
         mean = np.concatenate([measured_m, np.zeros(len(self.H.T) - 3)])
         if self.error_share:
-            lasting = self.error_share * covariance_m2
-            spread = block_diag(spread, lasting)
+            correlated = self.error_share * covariance_m2
+            spread = block_diag(spread, correlated)
             # p = z - b - w.
-            spread[:3, 9:] = spread[9:, :3] = -lasting
+            spread[:3, 9:] = spread[9:, :3] = -correlated
         return mean, spread
 
     def transition(self, dt_s, covariance_m2):
@@ -205,18 +206,18 @@ def simulate_flight(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False
         shape[:] = shape[0]
     white = np.einsum("tdij,tdj->tdi", shape, rng.normal(size=(frames, drones, 3)))
     left, begun = decay(dt_s, model.error_time_s)
-    # The new part of the lasting error has the covariance of the previous measurement.
+    # The new part of the correlated error has the covariance of the previous measurement.
     share = np.full(frames, begun * model.error_share)
     share[0] = model.error_share
-    lasting = np.sqrt(share)[:, None, None] * np.einsum(
+    correlated = np.sqrt(share)[:, None, None] * np.einsum(
         "tdij,tdj->tdi", shape[[0, *range(frames - 1)]], rng.normal(size=(frames, drones, 3))
     )
     for k in range(1, frames):
-        lasting[k] += left * lasting[k - 1]
+        correlated[k] += left * correlated[k - 1]
     return SimulatedFlight(
         time_s=time_s,
         state=states,
-        measured_m=states[..., :3] + lasting + np.sqrt(1 - model.error_share) * white,
+        measured_m=states[..., :3] + correlated + np.sqrt(1 - model.error_share) * white,
         # The added term keeps every covariance positive definite.
         covariance_m2=shape @ np.swapaxes(shape, -1, -2) + 1e-12 * np.eye(3),
         was_measured=np.ones((frames, drones), bool),

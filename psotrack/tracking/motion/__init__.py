@@ -1,4 +1,4 @@
-"""The motion of drones: a Kalman filter with white jerk and lasting measurement errors, and its smoother.
+"""The motion of drones: a Kalman filter with white jerk and correlated measurement errors, and its smoother.
 
 In: measured positions with covariances. Out: filtered (`kalman`) and smoothed (`smoothing`) states with covariances.
 The functions of `kalman` are pure and run inside the tracker's compiled scan; other filters of the package use its

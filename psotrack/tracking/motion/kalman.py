@@ -8,9 +8,9 @@ grows. All functions are pure and batched over drones. They avoid LAPACK, whose 
 
 Measurement errors are similar in neighbouring frames, because a drone's silhouette changes only as the drone turns. A
 filter that treats such errors as white becomes overconfident. Therefore a share of each measurement's covariance is
-modelled as a lasting error: a first-order Gauss-Markov process that is part of the state (autocorrelated measurement
+modelled as a correlated error: a first-order Gauss-Markov process that is part of the state (autocorrelated measurement
 noise: Bar-Shalom et al. 2001, chapter 8). The rest of the covariance is white noise. The state holds the apparent
-position, which is the drone's position plus the lasting error. Measurements observe the apparent position directly.
+position, which is the drone's position plus the correlated error. Measurements observe the apparent position directly.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ACCELERATION_TIME_S = 0.5
 #: Smallest variance that is kept, in rounding units (machine epsilon) of the largest variance in its computation.
 _ROUNDINGS = 8
 
-#: Largest variance of a lasting error, summed over the axes, m². Larger values would cost float32 positions their
+#: Largest variance of a correlated error, summed over the axes, m². Larger values would cost float32 positions their
 #: millimetres by rounding.
 _LARGEST_ERROR_M2 = 3e2
 
@@ -52,9 +52,9 @@ class MotionParams:
             standard deviation of the change of acceleration is sqrt(density * t).
         velocity_std_m_s: standard deviation of the initial velocity along each axis, m/s.
         acceleration_std_m_s2: standard deviation of the initial acceleration along each axis, m/s²; its mean is 0.
-        error_share: share of a measurement's covariance that belongs to the lasting error: from 0 (all errors are
+        error_share: share of a measurement's covariance that belongs to the correlated error: from 0 (all errors are
             white) to below 1.
-        error_time_s: time constant of the lasting error's exponential decay, seconds, above 0.
+        error_time_s: time constant of the correlated error's exponential decay, seconds, above 0.
     """
 
     jerk_density_m2_s5: Float[Array, "drones"]
@@ -81,12 +81,12 @@ class MotionState:
     """The filter's state of every drone at one time.
 
     Attributes:
-        apparent_m: (drones, 3), mean apparent position, which is the position plus the lasting error, world, metres.
+        apparent_m: (drones, 3), mean apparent position, which is the position plus the correlated error, world, metres.
         velocity_m_s, acceleration_m_s2: (drones, 3), mean velocity and acceleration, world.
-        error_m: (drones, 3), mean lasting error, world, metres.
+        error_m: (drones, 3), mean correlated error, world, metres.
         covariance: (drones, 12, 12), joint covariance of these four vectors in this order.
-        noise_m2: (drones, 3, 3), covariance of the last measurement, white noise and lasting error together, limited
-            in size. New lasting errors get a share of this covariance.
+        noise_m2: (drones, 3, 3), covariance of the last measurement, white noise and correlated error together, limited
+            in size. New correlated errors get a share of this covariance.
     """
 
     apparent_m: Float[Array, "*frames drones 3"]
@@ -98,7 +98,7 @@ class MotionState:
 
     @property
     def position_m(self) -> Float[Array, "*frames drones 3"]:
-        """(drones, 3), positions of the drones without the lasting error, world, metres."""
+        """(drones, 3), positions of the drones without the correlated error, world, metres."""
         return self.apparent_m - self.error_m
 
     @property
@@ -107,7 +107,7 @@ class MotionState:
         apparent, error = self.covariance[..., :3, :3], self.covariance[..., 9:, 9:]
         both = self.covariance[..., :3, 9:]
         largest = apparent.trace(axis1=-2, axis2=-1) + error.trace(axis1=-2, axis2=-1)
-        # This is a small difference of large numbers if the position is known well and the lasting error is not.
+        # This is a small difference of large numbers if the position is known well and the correlated error is not.
         return _above_rounding(apparent + error - (both + both.swapaxes(-1, -2)), largest)
 
     @property
@@ -131,7 +131,7 @@ def init(
 ) -> MotionState:
     """Make the initial state of drones from their first positions and velocities.
 
-    The position is treated as a measurement: a share of its covariance belongs to the lasting error.
+    The position is treated as a measurement: a share of its covariance belongs to the correlated error.
 
     Args:
         position_m: (drones, 3), world, metres.
@@ -140,10 +140,10 @@ def init(
         params: parameters of the motion model.
     """
     covariance_m2 = _with_variance_floor(position_covariance_m2)
-    lasting_weight = _lasting_weight(covariance_m2)
-    error_m2 = params.error_share * lasting_weight * covariance_m2
-    # The rest of the covariance is an error of the apparent position that is independent of the lasting error.
-    rest_m2 = (1 - params.error_share * lasting_weight) * covariance_m2
+    correlated_weight = _correlated_weight(covariance_m2)
+    error_m2 = params.error_share * correlated_weight * covariance_m2
+    # The rest of the covariance is an error of the apparent position that is independent of the correlated error.
+    rest_m2 = (1 - params.error_share * correlated_weight) * covariance_m2
     known = jnp.pad(rest_m2, ((0, 0), (0, 9), (0, 9))) + jnp.pad(error_m2, ((0, 0), (9, 0), (9, 0)))
     zero = jnp.zeros_like(params.error_share)
     spread = jnp.stack([zero, params.velocity_std_m_s, params.acceleration_std_m_s2, zero])
@@ -153,7 +153,7 @@ def init(
         acceleration_m_s2=jnp.zeros_like(position_m),
         error_m=jnp.zeros_like(position_m),
         covariance=known + jnp.diag(jnp.repeat(spread**2, 3)),
-        noise_m2=lasting_weight * covariance_m2,
+        noise_m2=correlated_weight * covariance_m2,
     )
 
 
@@ -182,10 +182,10 @@ def apply_transition(
 def process_noise(
     noise_m2: Covariances, dt_s: Float[Array, ""], params: MotionParams
 ) -> Float[Array, "drones 12 12"]:
-    """(drones, 12, 12), process noise Q of `dt_s` seconds: white jerk, and the new part of the lasting error."""
+    """(drones, 12, 12), process noise Q of `dt_s` seconds: white jerk, and the new part of the correlated error."""
     jerk = params.jerk_density_m2_s5[:, None, None] * jnp.kron(white_jerk_noise(dt_s), jnp.eye(3))
     new_error = -jnp.expm1(-2 * dt_s / params.error_time_s) * params.error_share * noise_m2
-    # The lasting error is a part of the apparent position too.
+    # The correlated error is a part of the apparent position too.
     both = jnp.array([1.0, 0.0, 0.0, 1.0])
     return jnp.pad(jerk, ((0, 0), (0, 3), (0, 3))) + jnp.kron(jnp.outer(both, both), new_error)
 
@@ -252,7 +252,7 @@ def update(
     least = _ROUNDINGS * jnp.finfo(before.dtype).eps * jnp.diag(other_rows)
     after = after + least * before
 
-    corrected = state_from_mean(state.mean + correction, after, _lasting_weight(noise_m2) * noise_m2)
+    corrected = state_from_mean(state.mean + correction, after, _correlated_weight(noise_m2) * noise_m2)
     return select_drones(was_measured, corrected, state), jnp.where(was_measured, nis, jnp.nan)
 
 
@@ -327,10 +327,10 @@ def _with_variance_floor(covariance: Covariances) -> Covariances:
     return _above_rounding(covariance, covariance.trace(axis1=-2, axis2=-1))
 
 
-def _lasting_weight(covariance: Covariances) -> Float[Array, "drones 1 1"]:
-    """(drones, 1, 1), factor up to 1 that limits the part of a covariance from which lasting errors are drawn.
+def _correlated_weight(covariance: Covariances) -> Float[Array, "drones 1 1"]:
+    """(drones, 1, 1), factor up to 1 that limits the part of a covariance from which correlated errors are drawn.
 
-    Without the limit, a measurement of almost no information would leave a lasting error of kilometres.
+    Without the limit, a measurement of almost no information would leave a correlated error of kilometres.
     """
     return jnp.minimum(1.0, _LARGEST_ERROR_M2 / covariance.trace(axis1=-2, axis2=-1))[:, None, None]
 

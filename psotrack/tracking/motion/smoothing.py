@@ -1,6 +1,6 @@
 """Smoothed tracks: every frame estimated from all measurements, before and after the frame.
 
-A Rauch-Tung-Striebel smoother (`psotrack.geometry.estimation`) over the motion model of `kalman` with its lasting
+A Rauch-Tung-Striebel smoother (`psotrack.geometry.estimation`) over the motion model of `kalman` with its correlated
 errors, and an estimate of the jerk density from the measurements. All computations are in float64, unlike in the
 tracker, because the backward pass inverts covariances and its time is not critical.
 """
@@ -190,7 +190,7 @@ def _filtered(measured: _Measured, params: MotionParams) -> tuple[MotionState, M
 
 
 def _without_error(states: MotionState) -> tuple[Array, ...]:
-    """The values of `Smoothed`: states without the lasting error."""
+    """The values of `Smoothed`: states without the correlated error."""
     return states.position_m, states.velocity_m_s, states.acceleration_m_s2, states.position_covariance_m2
 
 
