@@ -13,7 +13,7 @@ from enum import IntFlag
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, errors_name
 from psotrack.geometry import rotation_matrices
@@ -31,12 +31,10 @@ from psotrack.trajectories import Status, Trajectories, read_trajectories, roll_
 #: Axes of the covariance: the world's axes, in metres, then small turns about the camera's axes, in radians.
 _AXES = "xyzabc"
 _UPPER = np.triu_indices(6)
-_POSITION = ("x_m", "y_m", "z_m")
-_VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ROTATION = tuple(f"r{row}{column}" for row, column in itertools.product("123", repeat=2))
 _ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
-_COVARIANCE = tuple(_AXES[row] + _AXES[column] for row, column in zip(*_UPPER, strict=True))
+_COVARIANCE = tuple(f"cov_{_AXES[row]}{_AXES[column]}" for row, column in zip(*_UPPER, strict=True))
 
 
 class Flag(IntFlag):
@@ -141,30 +139,23 @@ def write_camera_path(path: Path | str, camera_path: CameraPath, name: str, *, f
     Raises:
         OutputError: the file exists and `force` is not set, or it cannot be written.
     """
-    import pandas as pd
-
     path = Path(path)
     refuse_to_overwrite(path, force)
-    count = camera_path.num_frames
-    velocity_m_s = camera_path.velocity_m_s
-    columns: dict[str, Shaped[np.ndarray, "frames"]] = {
-        "frame": camera_path.frame,
-        "time_s": camera_path.time_s,
-        "drone": np.full(count, name),
-        **_split(_POSITION, camera_path.position_m),
-        **_split(_VELOCITY, np.full((count, 3), np.nan) if velocity_m_s is None else velocity_m_s),
-        **_split(_QUATERNION, camera_path.orientation_wxyz),
-        **_split(_ROTATION, rotation_matrices(camera_path.orientation_wxyz).reshape(count, 9)),
-        **_split(_ANGLES, roll_pitch_yaw_deg(camera_path.orientation_wxyz)),
-        **_split([f"cov_{axes}" for axes in _COVARIANCE], camera_path.covariance[:, *_UPPER]),
+    tracks = camera_path.trajectories(name).to_pandas()
+    wxyz = camera_path.orientation_wxyz
+    others = {
+        **_split(_ROTATION, rotation_matrices(wxyz).reshape(-1, 9)),
+        **_split(_ANGLES, roll_pitch_yaw_deg(wxyz)),
+        **_split(_COVARIANCE, camera_path.covariance[:, *_UPPER]),
         "num_markers": camera_path.num_markers,
         "reprojection_px": camera_path.reprojection_px,
         "ambiguity": camera_path.ambiguity,
-        "flags": np.array([Flag(int(flags)).label for flags in camera_path.flags], str),
-        "status": np.array([Status(int(status)).label for status in camera_path.status], str),
+        "flags": [Flag(int(flags)).label for flags in camera_path.flags],
     }
+    places = tracks.columns[:9]
     with atomic_write(path) as temporary:
-        pd.DataFrame(columns).to_csv(temporary, index=False)
+        table = tracks.assign(**others)[[*places, *_QUATERNION, *others, "status"]]
+        table.to_csv(temporary, index=False)
 
 
 def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
@@ -192,7 +183,7 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
     # Tracks have the order of frames.
     rows = sorted(table.rows, key=lambda row: row.count(table.column("frame")))
     covariance = np.zeros((len(rows), 6, 6))
-    covariance[:, *_UPPER] = _numbers(table, rows, *(f"cov_{axes}" for axes in _COVARIANCE))
+    covariance[:, *_UPPER] = _numbers(table, rows, *_COVARIANCE)
     covariance += np.triu(covariance, 1).swapaxes(-1, -2)
     for row in np.flatnonzero(has_negative_eigenvalue(covariance)):
         expected, found = "a covariance in cov_xx to cov_cc", "a matrix with a negative eigenvalue"
@@ -215,7 +206,7 @@ def read_camera_path(path: Path | str) -> tuple[CameraPath, str]:
     return camera_path, tracks.drones[0]
 
 
-def _split(names: tuple[str, ...] | list[str], values: Float[np.ndarray, "frames columns"]) -> Mapping:
+def _split(names: tuple[str, ...], values: Float[np.ndarray, "frames columns"]) -> Mapping:
     return dict(zip(names, values.T, strict=True))
 
 

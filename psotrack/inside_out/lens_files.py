@@ -15,7 +15,7 @@ from psotrack.geometry.rig_files import read_lenses
 from psotrack.recordings.datasets import read_onboard_calibration
 from psotrack.support import read_table
 
-#: Largest distance of the optical axis from the middle of the image, as a share of its size, for files that do not
+#: Largest distance of the optical axis from the middle of the image, as a fraction of its size, for files that do not
 #: state the size of the images.
 _OFF_MIDDLE = 0.2
 #: Largest relative difference of two equal aspect ratios; sizes are whole pixels.
@@ -101,6 +101,17 @@ def read_lens(
         )
         raise InputError(path, expected=expected, found=found, remedy=remedy)
     return scale_lens(lens, image_size_wh)
+
+
+def check_size(where: Path | str, lens: Camera, image_size_wh: Size) -> None:
+    """Raise `InputError` if images, which `where` names, are of another size than the lens is for."""
+    width, height = (int(side) for side in lens.image_size_wh)
+    if (width, height) != image_size_wh:
+        raise InputError(
+            where,
+            expected=f"{width} x {height} pixels as the lens is for",
+            found="{} x {}".format(*image_size_wh),
+        )
 
 
 def scale_lens(lens: Camera, image_size_wh: Size) -> Camera:

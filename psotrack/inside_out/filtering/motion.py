@@ -32,7 +32,8 @@ Matrix = Float[np.ndarray, "n n"]
 
 #: Size of the error state: position, velocity, acceleration, turn, turn rate (3 each), and the correlated error u (6).
 SIZE = 21
-_ACCELERATION, _TURN, _RATE, _CORRELATED = slice(6, 9), slice(9, 12), slice(12, 15), slice(15, 21)
+_POSITION, _VELOCITY, _ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
+_TURN, _RATE, _CORRELATED = slice(9, 12), slice(12, 15), slice(15, 21)
 #: Indices of position and turn in the error state, and of velocity and turn rate.
 POSE, RATES = np.r_[0:3, 9:12], np.r_[3:6, 12:15]
 
@@ -65,19 +66,15 @@ class Motion:
     """State of the filter at one time.
 
     Attributes:
-        position_m, velocity_m_s, acceleration_m_s2: (3,), world.
+        mean: (21,), in the order of the error state: position, velocity and acceleration along the world's axes; 0 for
+            the turn, which is in `R_world_cam`; turn rate about the camera's axes; correlated error u, in standard
+            deviations.
         R_world_cam: (3, 3), camera to world.
-        rate_rad_s: (3,), turn rate about the camera's axes.
-        correlated: (6,), correlated error u, in standard deviations.
         covariance: (21, 21), covariance of the error state.
     """
 
-    position_m: Float[np.ndarray, "3"]
-    velocity_m_s: Float[np.ndarray, "3"]
-    acceleration_m_s2: Float[np.ndarray, "3"]
+    mean: Float[np.ndarray, "n"]
     R_world_cam: Float[np.ndarray, "3 3"]
-    rate_rad_s: Float[np.ndarray, "3"]
-    correlated: Float[np.ndarray, "6"]
     covariance: Float[np.ndarray, "n n"]
 
 
@@ -129,8 +126,9 @@ def initial_motion(pose: CameraPose, agility: Agility) -> Motion:
     )
     others = np.r_[3:9, 12:21]
     spread[others, others] = np.square(np.repeat(of_others, 3))
-    zero = np.zeros(3)
-    return Motion(pose.position_m, zero, zero, pose.R_world_cam, zero, np.zeros(6), spread)
+    mean = np.zeros(SIZE)
+    mean[_POSITION] = pose.position_m
+    return Motion(mean, pose.R_world_cam, spread)
 
 
 def predict(motion: Motion, dt_s: float, agility: Agility) -> tuple[Motion, Matrix, Matrix]:
@@ -140,33 +138,24 @@ def predict(motion: Motion, dt_s: float, agility: Agility) -> tuple[Motion, Matr
         The motion; and (21, 21) twice: transition F and process noise Q of the error state.
     """
     model = _model(round(dt_s, 9))
-    turn = motion.rate_rad_s * dt_s
-    there, F, along = _rotation(turn), model.F.copy(), model.F[:9:3, :9:3]
+    mean, F = model.F @ motion.mean, model.F.copy()
+    turn = mean[_TURN].copy()
+    there = _rotation(turn)
     F[_TURN, _TURN] = there.T
     F[_TURN, _RATE] = dt_s * right_jacobian(turn)
     Q = model.of_correlated + agility.acceleration_std_m_s2**2 * model.by_acceleration
     Q = Q + agility.rate_change_std_rad_s**2 * model.by_turns
-    position_m, velocity_m_s, acceleration_m_s2 = along @ np.stack(
-        [motion.position_m, motion.velocity_m_s, motion.acceleration_m_s2]
-    )
-    later = Motion(
-        position_m,
-        velocity_m_s,
-        acceleration_m_s2,
-        motion.R_world_cam @ there,
-        motion.rate_rad_s,
-        model.F[-1, -1] * motion.correlated,
-        F @ motion.covariance @ F.T + Q,
-    )
+    mean[_TURN] = 0.0
+    later = Motion(mean, motion.R_world_cam @ there, F @ motion.covariance @ F.T + Q)
     return later, F, Q
 
 
 def turning(motion: Motion, agility: Agility) -> Motion:
     """The motion with an acceleration that may be any: what it was before the turn says nothing about it."""
-    spread = motion.covariance.copy()
-    spread[_ACCELERATION], spread[:, _ACCELERATION] = 0.0, 0.0
+    mean, spread = motion.mean.copy(), motion.covariance.copy()
+    mean[_ACCELERATION], spread[_ACCELERATION], spread[:, _ACCELERATION] = 0.0, 0.0, 0.0
     spread[_ACCELERATION, _ACCELERATION] = agility.acceleration_std_m_s2**2 * np.eye(3)
-    return replace(motion, acceleration_m_s2=np.zeros(3), covariance=spread)
+    return replace(motion, mean=mean, covariance=spread)
 
 
 def innovation(motion: Motion, pose: CameraPose) -> Innovation:
@@ -179,7 +168,7 @@ def innovation(motion: Motion, pose: CameraPose) -> Innovation:
     H[np.arange(6), POSE] = 1.0
     H[:, _CORRELATED] = by_noise @ _correlated_root(pose.varying)
     white = (1 - CORRELATED_FRACTION) * by_noise @ pose.varying @ by_noise.T
-    off = np.append(pose.position_m - motion.position_m, turn) - H[:, _CORRELATED] @ motion.correlated
+    off = np.append(pose.position_m, turn) - H @ motion.mean
     cross = motion.covariance @ H.T
     return Innovation(off, _symmetric(H @ cross + white), cross)
 
@@ -204,15 +193,9 @@ def moved(motion: Motion, change: Float[np.ndarray, "n"]) -> Motion:
     """Add an error state to a motion, and express its covariance about the axes of the turned camera."""
     J = np.eye(SIZE)
     J[_TURN, _TURN] = right_jacobian(change[_TURN])
-    return Motion(
-        motion.position_m + change[:3],
-        motion.velocity_m_s + change[3:6],
-        motion.acceleration_m_s2 + change[6:9],
-        motion.R_world_cam @ _rotation(change[_TURN]),
-        motion.rate_rad_s + change[_RATE],
-        motion.correlated + change[_CORRELATED],
-        J @ motion.covariance @ J.T,
-    )
+    mean = motion.mean + change
+    mean[_TURN] = 0.0
+    return Motion(mean, motion.R_world_cam @ _rotation(change[_TURN]), J @ motion.covariance @ J.T)
 
 
 def smoothed(now: Motion, predicted: Motion, F: Matrix, Q: Matrix, later: Motion) -> Motion:
@@ -236,25 +219,19 @@ def smoothed(now: Motion, predicted: Motion, F: Matrix, Q: Matrix, later: Motion
 
 def difference(motion: Motion, other: Motion) -> Float[np.ndarray, "n"]:
     """(21,), error state that takes `motion` to `other`."""
-    parts = [
-        other.position_m - motion.position_m,
-        other.velocity_m_s - motion.velocity_m_s,
-        other.acceleration_m_s2 - motion.acceleration_m_s2,
-        turn_between(motion.R_world_cam, other.R_world_cam),
-        other.rate_rad_s - motion.rate_rad_s,
-        other.correlated - motion.correlated,
-    ]
-    return np.concatenate(parts)
+    apart = other.mean - motion.mean
+    apart[_TURN] = turn_between(motion.R_world_cam, other.R_world_cam)
+    return apart
 
 
 def estimate(motion: Motion) -> MotionEstimate:
     """Pose and motion of a state."""
     return MotionEstimate(
-        motion.position_m,
+        motion.mean[_POSITION],
         motion.R_world_cam,
         motion.covariance[np.ix_(POSE, POSE)],
-        velocity_m_s=motion.velocity_m_s,
-        rate_rad_s=motion.rate_rad_s,
+        velocity_m_s=motion.mean[_VELOCITY],
+        rate_rad_s=motion.mean[_RATE],
         rate_covariance=motion.covariance[np.ix_(RATES, RATES)],
     )
 

@@ -101,24 +101,21 @@ def weigh(
         )
     gross = _wrong_source(np.stack([inside.pose_m, middle_m], axis=1), both & ~agree)
     known &= ~gross
-    first_m, second_m = inside.position_m, middle_m - at_arm_m
-    first_m2, second_m2 = inside.at_variance_m2(variances[0]), variances[1] * middle_m2 + arm_m2
-    if point == "middle":
-        first_m, second_m = first_m + at_arm_m, middle_m
-        first_m2, second_m2 = first_m2 + arm_m2, second_m2 - arm_m2
-    position_m = np.where(known[:, :1], first_m, second_m)
-    covariance_m2 = np.where(known[:, :1, None], first_m2, second_m2)
-    both = np.asarray(known.all(axis=1))
-    gain = first_m2[both] @ np.linalg.inv(first_m2[both] + second_m2[both])
-    rest = np.eye(3) - gain
-    position_m[both] += np.matvec(gain, (second_m - first_m)[both])
-    covariance_m2[both] = rest @ first_m2[both] @ rest.mT + gain @ second_m2[both] @ gain.mT
+    # One of the two sources is moved along the arm, to the point that the other one tracks.
+    moved = 1 if point == "camera" else 0
+    parts_m = np.stack([inside.position_m, middle_m], axis=1)
+    parts_m2 = np.stack([inside.at_variance_m2(variances[0]), variances[1] * middle_m2], axis=1)
+    parts_m[:, moved] += -at_arm_m if point == "camera" else at_arm_m
+    parts_m2[:, moved] += arm_m2
+    used = known[..., None, None]
+    weight = np.where(used, np.linalg.inv(np.where(used, parts_m2, np.eye(3))), 0.0)
+    somewhere = np.asarray(known.any(axis=1))
+    covariance_m2 = np.full_like(arm_m2, np.nan)
+    covariance_m2[somewhere] = np.linalg.inv(weight[somewhere].sum(axis=1))
+    gain = covariance_m2[:, None] @ weight
+    position_m = np.matvec(gain, np.where(known[..., None], parts_m, 0.0)).sum(axis=1)
     # The error of the arm is the same in all frames, and its standard error itself is uncertain.
-    arm_part = np.where(known[:, :1, None], 0.0, np.eye(3))
-    arm_part[both] = gain if point == "camera" else rest
-    covariance_m2 += (_ERRORS**2 - 1) * arm_std_m**2 * arm_part @ arm_part.mT
-    unknown = ~known.any(axis=1)
-    position_m[unknown], covariance_m2[unknown] = np.nan, np.nan
+    covariance_m2 += (_ERRORS**2 - 1) * arm_std_m**2 * gain[:, moved] @ gain[:, moved].mT
     return Weighted(position_m, covariance_m2, known, gross, np.sqrt(variances), arm_m, arm_std_m)
 
 

@@ -14,6 +14,7 @@ from psotrack.errors import InputError
 from psotrack.foreground.markers import MarkerDetector
 from psotrack.geometry import Camera
 from psotrack.inside_out.frames import Frame, FrameSource, map_ahead, read_ahead
+from psotrack.inside_out.lens_files import check_size
 from psotrack.inside_out.localising.recording import localise_frames
 from psotrack.inside_out.localising.records import STAGES, LocalisedVideo, LocaliseSettings
 from psotrack.inside_out.mapping.from_centres import complete_map
@@ -61,7 +62,7 @@ def localise_video(
         SettingsError: there is no dictionary of this name, or it has none of the map's markers.
     """
     settings = settings or LocaliseSettings()
-    _check_size(source, lens)
+    check_size(source.name, lens, source.image_size_wh)
     detector = MarkerDetector(settings.dictionary, lens, ids=marker_map.ids.tolist())
     seconds, unknown = dict.fromkeys(STAGES, 0.0), tuple[int, ...]()
     began_s = time.perf_counter()
@@ -92,10 +93,11 @@ def _completed(
             remedy="give a table of corners",
         )
     found = [markers for _, _, markers in detected]
-    completed = complete_map(found, centres, lens, side_m=side_m, name=str(source.name))
-    known = completed.marker_map.ids
+    marker_map = complete_map(found, centres, lens, side_m=side_m, name=str(source.name))
+    known = marker_map.ids
     frames = [(number, time_s, each.select(np.isin(each.ids, known))) for number, time_s, each in detected]
-    return completed.marker_map, completed.left_out, frames
+    seen = {int(marker) for markers in found for marker in markers.ids}
+    return marker_map, tuple(sorted(seen - set(known.tolist()))), frames
 
 
 def _counted(detected: Iterable[Detected], done: Advance) -> Iterator[Detected]:
@@ -120,16 +122,6 @@ def _detect_markers(
     for detected, spent_s in map_ahead(found, frames, workers):
         seconds["detect"] += spent_s
         yield detected
-
-
-def _check_size(source: FrameSource, lens: Camera) -> None:
-    size_wh = (int(lens.image_size_wh[0]), int(lens.image_size_wh[1]))
-    if size_wh != source.image_size_wh:
-        raise InputError(
-            source.name,
-            expected=f"{size_wh[0]} x {size_wh[1]} pixels as the lens is for",
-            found=f"{source.image_size_wh[0]} x {source.image_size_wh[1]}",
-        )
 
 
 def _grey_frames(source: FrameSource, seconds: dict[str, float]) -> Iterator[_GreyFrame]:

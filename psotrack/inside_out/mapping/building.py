@@ -24,7 +24,7 @@ from psotrack.inside_out.marker_map import SQUARE, MarkerMap, PlacedMarker, fit_
 _FIRST_VIEWS = 100
 #: Standard deviation of a corner along x and along y, pixels, before it is estimated from residuals.
 _NOISE_PX = 0.3
-#: Smallest share of a marker's sightings that its position must explain.
+#: Smallest fraction of a marker's sightings that its position must explain.
 _EXPLAINED = 0.5
 
 
@@ -118,7 +118,7 @@ def build_map(
         rough = adjusted_roughly(used, placed, T, fixed, noise_px=_NOISE_PX, estimate_sides=estimate_sides)
         adjusted = adjust(used, rough)
         explained = {marker: adjusted.used[used.marker == marker, 0].mean() for marker in used.ids}
-        bad = [marker for marker, share in explained.items() if share < _EXPLAINED and marker not in fixed]
+        bad = [marker for marker, part in explained.items() if part < _EXPLAINED and marker not in fixed]
         if not bad:
             return _result(sightings, used, adjusted, fixed)
         # A marker that most of its sightings contradict is placed again, or left out.
@@ -160,7 +160,7 @@ def _connected(
     """Sightings of placed markers in views that show at least two of them; and the poses of these views."""
     kept = np.isin(sightings.marker, list(placed))
     counts = np.bincount(sightings.view[kept], minlength=sightings.num_views)
-    T = MarkerPlacer(sightings, 1.0).locate_views(placed, before).T[:, 0]
+    T = MarkerPlacer(sightings, 1.0).locate_views(placed, before)[0][:, 0]
     kept &= ((counts >= 2) & np.isfinite(T[:, 0, 0]))[sightings.view]
     return sightings.select(kept), T[np.unique(sightings.view[kept])]
 

@@ -180,7 +180,7 @@ def _distances_by_map(
     markers = {marker: given[marker] for marker in sightings.ids}
     for noise_px in (*_NOISES_PX, _NOISES_PX[-1]):
         # Near the end, a view in a wrong pose may find a better one.
-        views = placer.locate_views(markers, T).T[:, 0]
+        views = placer.locate_views(markers, T)[0][:, 0]
         rough = adjusted_roughly(sightings, markers, views, sightings.ids, noise_px=noise_px)
         T = rough.state.T_cam_world
     return adjust(sightings, rough).distance_px

@@ -7,7 +7,6 @@ those of the table gives the turns and the sides. Each marker is then moved to i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -27,19 +26,6 @@ _LEAST_CENTRES = 4
 _TRIPLES = 200
 
 
-@dataclass(frozen=True)
-class MapFromCentres:
-    """A map that a video completes.
-
-    Attributes:
-        marker_map: markers whose corners were found.
-        left_out: ids of markers that are seen, but in too few frames beside others, or that do not fit.
-    """
-
-    marker_map: MarkerMap
-    left_out: tuple[int, ...]
-
-
 def complete_map(
     frames: Sequence[DetectedMarkers],
     centres: MarkerCentres,
@@ -47,7 +33,7 @@ def complete_map(
     *,
     side_m: float | None = None,
     name: str = "video",
-) -> MapFromCentres:
+) -> MarkerMap:
     """Find the corners of markers whose centres are known, from the frames of a video.
 
     Args:
@@ -56,6 +42,9 @@ def complete_map(
         lens: intrinsics of the camera.
         side_m: side of all markers, metres; None estimates each marker's side.
         name: name of the video, for messages.
+
+    Returns:
+        The markers whose corners were found: not those that are seen in too few frames beside others, or do not fit.
 
     Raises:
         InputError: too few markers of the table are seen beside one another, or they do not fit.
@@ -93,8 +82,7 @@ def complete_map(
         ids[row]: to_m[row] + scale * (built.marker_map.corners_m[ids[row]] - centre_m[row]) @ R.T
         for row in np.flatnonzero(fits).tolist()
     }
-    seen = {int(marker) for one in known for marker in one.ids}
-    return MapFromCentres(MarkerMap(corners_m), tuple(sorted(seen - set(corners_m))))
+    return MarkerMap(corners_m)
 
 
 def _fit(

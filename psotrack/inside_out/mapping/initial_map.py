@@ -8,7 +8,6 @@ many frames.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -26,17 +25,9 @@ _ROUGH_PX = 3.0
 _SIDE_FACTORS = np.geomspace(0.2, 5.0, 41)
 
 
-@dataclass(frozen=True)
-class ViewPoses:
-    """Possible poses of the cameras of views, world to camera: two per view, which are equal where one is certain.
-
-    Attributes:
-        T: (views, 2, 4, 4), NaN where the view shows no placed marker.
-        count: (views,), number of placed markers in the view.
-    """
-
-    T: Float[np.ndarray, "views 2 4 4"]
-    count: Int[np.ndarray, " views"]
+#: Possible poses of the cameras of views, world to camera, (views, 2, 4, 4): two per view, which are equal where one is
+#: certain, and NaN where the view shows no placed marker; and (views,), the number of placed markers in the view.
+ViewPoses = tuple[Float[np.ndarray, "views 2 4 4"], Int[np.ndarray, " views"]]
 
 
 class MarkerPlacer:
@@ -78,20 +69,20 @@ class MarkerPlacer:
             loss[~np.isfinite(loss)] = np.inf
             best = int(loss.argmin())
             T[view] = tried[[0, 1 if np.isfinite(loss[1]) else 0] if len(rows) == 1 else [best, best]]
-        return ViewPoses(T, count)
+        return T, count
 
     def place(self, marker: int, views: ViewPoses) -> PlacedMarker | None:
         """The position of a marker that fits most sightings; None if no view shows the marker."""
-        at = self.sightings.view
-        seen = np.isfinite(views.T[at, 0, 0, 0]) & np.isfinite(self._T[:, 0, 0, 0])
+        at, (T_views, count) = self.sightings.view, views
+        seen = np.isfinite(T_views[at, 0, 0, 0]) & np.isfinite(self._T[:, 0, 0, 0])
         rows = np.flatnonzero((self.sightings.marker == marker) & seen)
         if not len(rows):
             return None
         # Views with more markers come first, because they are surer; then views are spread over time.
-        surest = rows[np.argsort(-np.minimum(views.count[at[rows]], 3), kind="stable")]
+        surest = rows[np.argsort(-np.minimum(count[at[rows]], 3), kind="stable")]
         surest = np.sort(surest[: max(_COMPARED_SIGHTINGS, len(rows) // 2)])
         rows = surest[np.linspace(0, len(surest) - 1, min(_COMPARED_SIGHTINGS, len(surest))).astype(int)]
-        T_cam = views.T[at[rows]]
+        T_cam = T_views[at[rows]]
         # (views, two poses of the camera, two of the marker, sides)
         T = np.linalg.inv(T_cam)[:, :, None, None] @ _scaled(self._T[rows][:, None, :, None], self._sides_m)
         sides = np.broadcast_to(self._sides_m, T.shape[:-2]).ravel()
@@ -113,37 +104,34 @@ class MarkerPlacer:
         placed, T = dict(known), None
         unreachable: set[int] = set()
         while True:
-            views = self.locate_views(placed, T)
-            marker = self._next_marker(views, set(placed) | unreachable)
-            if marker is None:
-                return placed
-            found = self.place(marker, views)
-            if found is None:
-                unreachable.add(marker)
-                continue
-            placed[marker] = found
-            views = self.locate_views(placed, T)
-            T = np.full_like(views.T[:, 0], np.nan)
-            kept = np.isin(self.sightings.marker, list(placed)) & (views.count[self.sightings.view] >= 2)
+            T_views, count = self.locate_views(placed, T)
+            several = count >= 2
+            kept = np.isin(self.sightings.marker, list(placed)) & several[self.sightings.view]
             if kept.any():
-                part, rows = self.sightings.select(kept), np.unique(self.sightings.view[kept])
+                part = self.sightings.select(kept)
                 bundle = adjusted_roughly(
                     part,
                     placed,
-                    views.T[rows, 0],
+                    T_views[several, 0],
                     known,
                     noise_px=noise_px,
                     estimate_sides=self._estimate_sides,
                 )
-                better, T[rows] = markers_of(part, bundle), bundle.state.T_cam_world
+                T_views[several] = bundle.state.T_cam_world[:, None]
+                better = markers_of(part, bundle)
                 placed |= {marker: one for marker, one in better.items() if marker not in known}
-
-    def _next_marker(self, views: ViewPoses, done: set[int]) -> int | None:
-        """The marker that most views show beside placed markers; None if there is none."""
-        sure = np.minimum(views.count, 3)[self.sightings.view]
-        weight = np.bincount(self.sightings.marker, sure)
-        weight[list(done & set(self.sightings.ids))] = 0
-        return int(weight.argmax()) if weight.any() else None
+            # The marker that most views show beside placed markers is the next one.
+            weight = np.bincount(self.sightings.marker, np.minimum(count, 3)[self.sightings.view])
+            weight[list((set(placed) | unreachable) & set(self.sightings.ids))] = 0
+            if not weight.any():
+                return placed
+            marker = int(weight.argmax())
+            found = self.place(marker, (T_views, count))
+            if found is None:
+                unreachable.add(marker)
+            else:
+                placed[marker] = found
+            T = np.where(several[:, None, None], T_views[:, 0], np.nan)
 
     def _losses(
         self,

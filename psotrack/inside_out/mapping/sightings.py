@@ -14,6 +14,7 @@ from psotrack.calibration import solve_pnp
 from psotrack.errors import InputError
 from psotrack.foreground.markers import DetectedMarkers, MarkerDetector
 from psotrack.geometry import Camera, undistort
+from psotrack.inside_out.lens_files import check_size
 from psotrack.inside_out.marker_map import SQUARE
 from psotrack.recordings import VideoInfo, read_frames_at
 from psotrack.support import Report, no_progress
@@ -97,13 +98,7 @@ def find_sightings(
         SettingsError: there is no dictionary of this name.
     """
     for video, lens in videos:
-        width, height = (int(side) for side in lens.image_size_wh)
-        if (width, height) != video.image_size_wh:
-            raise InputError(
-                video.path,
-                expected=f"{width} x {height} pixels as the lens is for",
-                found="{} x {}".format(*video.image_size_wh),
-            )
+        check_size(video.path, lens, video.image_size_wh)
     detectors = [MarkerDetector(dictionary, lens=lens) for _, lens in videos]
     seen = []
     numbers = [_searched(video.num_frames, most_frames) for video, _ in videos]

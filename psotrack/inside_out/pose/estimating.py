@@ -44,8 +44,6 @@ _FEW_MARKERS = 3
 _MOST_INITIAL_POSES = 4
 #: Ratio of the smallest to the largest extent of markers below which they may have a second, mirrored pose.
 _NEARLY_FLAT = 0.1
-#: Angle to a known pose below which an initial pose would end at the known pose, radians.
-_SAME_ANGLE_RAD = np.deg2rad(1.0)
 #: Probability that a good corner, or the mean of a good marker, is rejected as an outlier; and the gate of its squared
 #: residual, which has the chi-square distribution with 2 degrees of freedom. Median of that distribution.
 FALSE_ALARM = 1e-3
@@ -146,7 +144,7 @@ def estimate_pose(
 
 def _likely_poses(seen: SeenMarkers) -> list[MarkerPose]:
     """Different poses that explain all markers or a part of the markers, the most likely pose first."""
-    found = _distinct(_fit(seen, *pose) for pose in _pose_of_all(seen))
+    found = _distinct(_fit(seen, *pose) for pose in _solve(seen.corners_m, seen.rays, "sqpnp"))
     # If all markers agree, or at least three markers and more than half of all, no other pose explains an equal number.
     count = len(seen.rays)
     enough = min(max(3, count // 2 + 1), count)
@@ -271,8 +269,8 @@ def _explained(
     scale2 = max(1.0, float(np.median(of_used)) / _MEDIAN) if len(of_used) > 4 else 1.0
     good = is_ahead & (squares < scale2 * _GATE)
     averaged = np.zeros((len(good), 2, 8))
-    share = good / np.maximum(good.sum(axis=1, keepdims=True), 1)
-    averaged[:, 0, 0::2], averaged[:, 1, 1::2] = share, share
+    weight = good / np.maximum(good.sum(axis=1, keepdims=True), 1)
+    averaged[:, 0, 0::2], averaged[:, 1, 1::2] = weight, weight
     # A mean is gated as if the corners' errors were independent: a lens or a map may be less exact than an edge.
     independent = np.einsum("mii->mi", found.own)[:, :1, None] * np.eye(2) / 4
     of_mean = averaged @ whole @ averaged.swapaxes(1, 2) + independent
@@ -328,11 +326,6 @@ def _near_px(seen: SeenMarkers) -> Float[np.ndarray, "markers"]:
     return np.maximum(_LOOSE * seen.std_px, _LOOSE_PX)
 
 
-def _pose_of_all(seen: SeenMarkers) -> list[_InitialPose]:
-    """Poses of all markers together: at most one, if all markers are right."""
-    return _solve(seen.corners_m, seen.rays, "sqpnp")
-
-
 def _poses_of_pairs(seen: SeenMarkers) -> list[tuple[_InitialPose, Bool[np.ndarray, "markers 4"]]]:
     """Poses of pairs of markers that explain most corners, with these corners; each pose explains other markers."""
     poses = list(_poses_of_few(seen))
@@ -350,23 +343,12 @@ def _poses_of_pairs(seen: SeenMarkers) -> list[tuple[_InitialPose, Bool[np.ndarr
 
 
 def _mirrored_poses(seen: SeenMarkers, best: MarkerPose) -> list[_InitialPose]:
-    """Second poses of markers that lie nearly in a plane, without those that equal the best pose."""
+    """Both poses of markers that lie nearly in a plane; one of them is near the best pose."""
     corners_m = seen.corners_m[best.used]
     extent_m = np.linalg.svd((corners_m - corners_m.mean(axis=(0, 1))).reshape(-1, 3), compute_uv=False)
     if extent_m[2] > _NEARLY_FLAT * extent_m[0]:
         return []
-    poses = _solve(corners_m, seen.rays[best.used], "ippe")
-    if not poses:
-        return []
-    rms_px = np.sqrt(np.mean(_distances_px(seen, poses)[:, best.fits] ** 2, axis=1))
-    near = rms_px < max(_near_px(seen)[best.used].mean(), _LOOSE * best.reprojection_px)
-    # The trace of a rotation by an angle is 1 + 2 cos(angle).
-    least_trace = 1 + 2 * np.cos(_SAME_ANGLE_RAD)
-    return [
-        pose
-        for pose, is_near in zip(poses, near, strict=True)
-        if is_near and np.sum(pose[1] * best.R_world_cam) < least_trace
-    ]
+    return _solve(corners_m, seen.rays[best.used], "ippe")
 
 
 def _distances_px(seen: SeenMarkers, poses: list[_InitialPose]) -> Float[np.ndarray, "poses markers 4"]:
