@@ -42,8 +42,13 @@ def choose_agility(
         steps = abs(along), abs(about)
         if max(steps) > _MOST_STEPS:
             return -np.inf
-        found = (_log_likelihood(window, params, _agility(along, about)) for window in windows)
-        return sum(found) - _STEP_COST * sum(steps)
+        total = -_STEP_COST * sum(steps)
+        for window in windows:
+            run = FilterRun()
+            for at_s, pose in window:
+                run = step(run, float(at_s), pose, params, _agility(along, about))
+            total += run.log_likelihood
+        return total
 
     best = (0, 0)
     for stride in _STRIDES:
@@ -65,12 +70,3 @@ def _agility(along: int, about: int) -> Agility:
         float(default.acceleration_std_m_s2 * _FACTOR**along),
         float(default.rate_change_std_rad_s * _FACTOR**about),
     )
-
-
-def _log_likelihood(
-    poses: Sequence[tuple[float, CameraPose | None]], params: PoseFilterParams, agility: Agility
-) -> float:
-    run = FilterRun()
-    for time_s, pose in poses:
-        run = step(run, float(time_s), pose, params, agility)
-    return run.log_likelihood

@@ -73,10 +73,8 @@ class Inside:
 
 def nearest_index(sorted_values: np.ndarray, wanted: np.ndarray) -> Int[np.ndarray, "wanted"]:
     """(wanted,), index of the value that is nearest to each wanted one; of two equally near ones the earlier."""
-    after = np.clip(np.searchsorted(sorted_values, wanted), 1, max(len(sorted_values) - 1, 1))
-    after = np.minimum(after, len(sorted_values) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(wanted - sorted_values[before] <= sorted_values[after] - wanted + _SAME_S, before, after)
+    middles = (sorted_values[:-1] + sorted_values[1:]) / 2
+    return np.searchsorted(middles, wanted - _SAME_S / 2)
 
 
 def informative(covariance_m2: Float[np.ndarray, "*rows 3 3"]) -> Bool[np.ndarray, "*rows"]:
