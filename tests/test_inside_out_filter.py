@@ -282,14 +282,14 @@ def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses(restar
     assert np.linalg.norm(path.position_m[believed:] - moved_m, axis=1).max() < 0.03
 
 
-def test_an_unpredicted_turn_is_followed_after_one_frame() -> None:
+def test_an_unpredicted_turn_is_followed_after_one_frame_or_at_once() -> None:
     """A hovering camera accelerates by 40 m/s2 from one frame to the next."""
     position_m = np.zeros((60, 3))
     position_m[50:, 0] = 40.0 / 2 * (np.arange(1, 11) / FPS) ** 2
     rng = np.random.default_rng(13)
     raw = raw_path(position_m + rng.normal(scale=0.002, size=(60, 3)), Rotation.identity(60))
     path = filter_path(raw)
-    assert (path.status[50:] == Status.COASTING).sum() == 1
+    assert (path.status[50:] == Status.COASTING).sum() <= 1
     assert np.linalg.norm(path.position_m[52:] - position_m[52:], axis=1).max() < 0.03
 
 

@@ -40,6 +40,9 @@ _TURN_POSES = 2
 _WILDEST = Agility(50.0, 20.0)
 #: Smallest number of markers that agree beyond chance: two more than the one that has a pose by itself.
 _BEYOND_CHANCE = 3
+#: Ambiguity of a pose below which no other pose explains its markers, and how many times denser poses of a motion must
+#: be than outliers.
+_UNLIKELY = 1e-3
 #: Standard deviation of the wrong one of two poses from the right one, along each axis (m) and about each axis (rad).
 _OTHER_POSE_STD = 1.0
 #: Degrees of freedom of the Student distribution of an innovation: heavy tails, so that a single wild pose does not
@@ -54,7 +57,7 @@ class PoseFilterParams:
     """Parameters of the pose filter.
 
     Attributes:
-        false_alarm: probability that a good pose is gated.
+        false_alarm: probability that a good pose is gated, if errors are normal; those of videos are more often large.
         longest_gap_s: time without a fitting pose after which no pose is returned until poses are confirmed again,
             seconds.
         confirm: number of poses that must agree before the first pose is returned, unless the markers of one pose agree
@@ -64,7 +67,7 @@ class PoseFilterParams:
             beyond chance.
     """
 
-    false_alarm: float = 1e-3
+    false_alarm: float = 1e-4
     longest_gap_s: float = 0.5
     confirm: int = 3
     restart_after: int = 10
@@ -195,12 +198,12 @@ def step(
         where = f"covariance at {time_s:g} s"
         raise InputError(where, expected="a positive definite matrix", found="another")
     if track is None:
-        first = _first_track(time_s, pose, params, agility)
+        first = _first_track(time_s, pose, agility)
         return replace(run, track=first, restarted_s=time_s, jumped=True, used=True)
     updated = _updated(track, time_s, pose, params, run.agility_at(time_s, agility))
     run = replace(run, log_likelihood=run.log_likelihood + updated.log_density)
     is_fresh = time_s - track.seen_s <= params.longest_gap_s
-    accepts = updated.fits and (is_fresh or _is_predicted(updated, params))
+    accepts = updated.fits and (is_fresh or _is_predicted(updated))
     rival = run.rival
     if rival is not None and time_s - rival.seen_s <= params.longest_gap_s:
         rivalling = _updated(rival, time_s, pose, params, _WILDEST if run.turns else agility)
@@ -212,10 +215,10 @@ def step(
     if is_fresh:
         anew = replace(track, motion=turning(track.motion, _WILDEST))
         turned = _updated(anew, time_s, pose, params, _WILDEST)
-        if turned.fits and _is_predicted(turned, params) and confirmed(run, params):
+        if turned.fits and _is_predicted(turned) and confirmed(run, params):
             turn = replace(turned.track, began_s=time_s)
             return _rivalled(run, turn, track.support + _TURN_POSES, True)
-    first = _first_track(time_s, pose, params, _WILDEST)
+    first = _first_track(time_s, pose, _WILDEST)
     needed = params.restart_after if track.sure else min(params.restart_after, track.support + 1)
     if not is_fresh:
         needed = 1 if updated.fits and first.sure else max(params.confirm, params.restart_after)
@@ -237,15 +240,15 @@ def _rivalled(run: FilterRun, rival: Track, needed: int, turns: bool) -> FilterR
     )
 
 
-def _first_track(time_s: float, pose: CameraPose, params: PoseFilterParams, agility: Agility) -> Track:
+def _first_track(time_s: float, pose: CameraPose, agility: Agility) -> Track:
     """The track of a single pose."""
     motion = initial_motion(pose, agility)
-    return Track(motion, time_s, time_s, 1, pose.ambiguity, _is_sure(pose, params), pose.constant)
+    return Track(motion, time_s, time_s, 1, pose.ambiguity, _is_sure(pose), pose.constant)
 
 
-def _is_sure(pose: CameraPose, params: PoseFilterParams) -> bool:
+def _is_sure(pose: CameraPose) -> bool:
     """Whether the markers of a pose agree beyond chance, and no other pose explains them."""
-    return pose.num_markers >= _BEYOND_CHANCE and pose.ambiguity < params.false_alarm
+    return pose.num_markers >= _BEYOND_CHANCE and pose.ambiguity < _UNLIKELY
 
 
 def _updated(
@@ -269,7 +272,7 @@ def _updated(
         time_s,
         track.support + 1,
         min(track.ambiguity, pose.ambiguity),
-        track.sure or _is_sure(pose, params),
+        track.sure or _is_sure(pose),
         pose.constant,
     )
     return _Updated(more, bool(nis <= chdtri(6, params.false_alarm)), robust)
@@ -296,13 +299,13 @@ def probability_right(
     return float(1 / (1 + ambiguity / (1 - ambiguity) * np.exp(min(other - fits, 700.0))))
 
 
-def _is_predicted(updated: _Updated, params: PoseFilterParams) -> bool:
+def _is_predicted(updated: _Updated) -> bool:
     """Whether the last pose is predicted by the motion rather than an outlier.
 
     The density of the pose must exceed the density of an outlier within a metre and a radian by the factor
-    1 / `false_alarm`: then outliers are accepted less often than good poses are rejected.
+    1 / `_UNLIKELY`.
     """
-    return bool(updated.log_density > -np.log(params.false_alarm))
+    return bool(updated.log_density > -np.log(_UNLIKELY))
 
 
 def poses_of(
