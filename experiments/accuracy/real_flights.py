@@ -4,7 +4,7 @@
 
 Flights that other people recorded (OWNER/NAME in --real): wordbomb/PoseFree-GeoLocator (3 cameras, RTK),
 cvlab-epfl/multiview_calib (drone_rolex, 5 cameras, GPS) and christofhapp/batflight3D_publication (2 thermal cameras,
-GPS). Their cameras' poses are not published: `psotrack calibrate extrinsics` finds them from the drone and its track in
+GPS). Their cameras' poses are not published: `psotrack calibrate rig` finds them from the drone and its track in
 the first half of the flight (the bats' flights: see `bat_flights`). The detections are tracked with defaults; tracks
 are kept in DATA/real_flights, because what changes is the covariance.
 
@@ -189,12 +189,12 @@ def make_recording(folder: Path, views: dict[str, View], time_s: np.ndarray, pla
     words = (
         "--pairs",
         str(folder / "pairs.csv"),
-        "--intrinsics",
+        "--lenses",
         str(folder / "lenses.toml"),
         "--noise",
         "10",
     )
-    refused = psotrack("calibrate", "extrinsics", *words, "--out", str(folder / "rig.toml"), "--force")
+    refused = psotrack("calibrate", "rig", *words, "--out", str(folder / "rig.toml"), "--force")
     assert not refused, refused
 
 
