@@ -340,9 +340,6 @@ class TestCameraOffsets:
         np.testing.assert_allclose(found.offset_frames, OFFSET_FRAMES, atol=0.03)
         assert found.offset_frames.mean() == pytest.approx(0, abs=1e-12)
         assert (found.std_frames < 0.02).all()
-        assert found.rms_before_px > 2 * found.rms_after_px
-        # Noise of 1 px in x and y is √2 px. The fitted points take up a part of the noise, and so does interpolation.
-        assert found.rms_after_px < np.sqrt(2)
 
     def test_without_noise(self):
         points_px = detected_points(RIG, DRONES, OFFSET_FRAMES, noise_px=0, missed=0, wrong=0)
@@ -383,7 +380,6 @@ class TestCameraOffsets:
     def test_offsets_of_zero_are_found(self):
         found = camera_offsets(RIG, detected_points(RIG, DRONES, np.zeros(8)), FPS)
         assert np.abs(found.offset_frames).max() < 0.03
-        assert found.rms_before_px == pytest.approx(found.rms_after_px, rel=0.02)
 
     @pytest.mark.parametrize("num_cameras", [2, 3])
     def test_few_cameras_and_large_offsets(self, num_cameras):
@@ -421,7 +417,6 @@ class TestCameraOffsets:
     def test_without_detections_all_offsets_are_zero(self, shape):
         found = camera_offsets(RIG, np.full((*shape, 8, 2), np.nan), FPS)
         assert (found.offset_frames == 0).all()
-        assert np.isnan([found.rms_before_px, found.rms_after_px]).all()
 
     def test_invalid_arguments_are_refused(self):
         with pytest.raises(SettingsError, match="points_px: expected 8 cameras, found 5"):

@@ -44,6 +44,8 @@ _REACH_S = 0.25
 _CLEARLY = 3.0
 #: Smallest curvature of the robust cost, as a share of the curvature of weighted least squares.
 _MIN_CURVATURE = 0.3
+#: An offset is shown if its standard deviation is below this fraction of that of its prior distribution.
+_SHOWN = 0.1
 #: Smallest number of degrees of freedom of the jackknife: of fewer, standard deviations are infinite.
 _LEAST_FREEDOM = 0.5
 
@@ -54,20 +56,15 @@ class CameraOffsets:
 
     Attributes:
         offset_frames: (cameras,), frames: a camera exposed its frame k at time k + offset of the common clock, as a
-            `time_offset_s` says it. The mean of the offsets is 0.
+            `time_offset_s` says it. The mean of the offsets that the detections show is 0.
         std_frames: (cameras,), standard deviations of the offsets, frames; near `max_offset_frames` for a camera whose
             detections do not show its offset.
         white_std_frames: (cameras,), the same if the errors of all detections were independent.
-        rms_before_px: weighted root mean square distance of the detections from the projections if all offsets are 0,
-            pixels; NaN if no point is seen by two cameras.
-        rms_after_px: the same distance with the estimated offsets, pixels.
     """
 
     offset_frames: Float[np.ndarray, "cameras"]
     std_frames: Float[np.ndarray, "cameras"]
     white_std_frames: Float[np.ndarray, "cameras"]
-    rms_before_px: float
-    rms_after_px: float
 
 
 def camera_offsets(
@@ -100,20 +97,17 @@ def camera_offsets(
     check_positive("max_offset_frames", max_offset_frames)
     if points_px.shape[2] != len(rig):
         raise SettingsError("points_px", expected=f"{len(rig)} cameras", found=f"{points_px.shape[2]}")
-    reach, zero_frames = max(1, round(_REACH_S * fps)), np.zeros(len(rig))
-    weights = np.ones(points_px.shape[:-1])
-    # Offsets are not changed before the weights have excluded the outliers.
-    for _ in range(_WEIGHT_ROUNDS):
-        before = _linearise(rig.cameras, points_px, reach, zero_frames, weights)
-        weights = before.weights
-    after = _linearise(rig.cameras, points_px, reach, zero_frames, weights)
-    for _ in range(_MAX_STEPS):
-        last_frames, moved_frames = after.offset_frames, after.moved_frames(max_offset_frames)
-        after = _linearise(rig.cameras, points_px, reach, moved_frames, after.weights)
-        if np.abs(moved_frames - last_frames).max() < _SETTLED:
+    reach, offset_frames = max(1, round(_REACH_S * fps)), np.zeros(len(rig))
+    system = _linearise(rig.cameras, points_px, reach, offset_frames, np.ones(points_px.shape[:-1]))
+    for step in range(_WEIGHT_ROUNDS + _MAX_STEPS):
+        # Offsets are not changed before the weights have excluded the outliers.
+        if step >= _WEIGHT_ROUNDS:
+            offset_frames = system.moved_frames(max_offset_frames)
+        change_frames = np.abs(offset_frames - system.offset_frames).max()
+        system = _linearise(rig.cameras, points_px, reach, offset_frames, system.weights)
+        if step >= _WEIGHT_ROUNDS and change_frames < _SETTLED:
             break
-    stds_frames = _standard_deviations(after, max_offset_frames)
-    return CameraOffsets(after.offset_frames, *stds_frames, before.rms_px, after.rms_px)
+    return CameraOffsets(offset_frames, *_standard_deviations(system, max_offset_frames))
 
 
 @dataclass(frozen=True)
@@ -126,7 +120,6 @@ class _System:
         gradient: (frames, drones, cameras), right side of each drone, squared pixels per frame.
         weights: (frames, drones, cameras), weights of the detections; 0 where there is no detection.
         variance_px2: variance of one coordinate of a detection, squared pixels.
-        rms_px: weighted root mean square distance of the detections from the projections, pixels.
     """
 
     offset_frames: Float[np.ndarray, "cameras"]
@@ -134,7 +127,13 @@ class _System:
     gradient: Float[np.ndarray, "frames drones cameras"]
     weights: Float[np.ndarray, "frames drones cameras"]
     variance_px2: float
-    rms_px: float
+
+    def mean_of(self, limit_frames: float) -> Float[np.ndarray, "cameras"]:
+        """(cameras,), weights of the mean of the offsets: alike for the cameras whose offsets the detections show."""
+        information = np.einsum("fdcc->c", self.normal) / self.variance_px2
+        shown = information * (_SHOWN * limit_frames) ** 2 > 1
+        shown |= ~shown.any()
+        return shown / shown.sum()
 
     def moved_frames(self, limit_frames: float) -> Float[np.ndarray, "cameras"]:
         """Offsets after a step with the prior, within their limit, and with a mean of 0."""
@@ -143,7 +142,7 @@ class _System:
         right = self.gradient.sum(axis=(0, 1)) - stiffness * self.offset_frames
         offset_frames = self.offset_frames + np.linalg.solve(normal, right)
         offset_frames = np.clip(offset_frames, -limit_frames, limit_frames)
-        return offset_frames - offset_frames.mean()
+        return offset_frames - self.mean_of(limit_frames) @ offset_frames
 
 
 def _linearise(
@@ -191,8 +190,7 @@ def _linearise(
     normal[:, :, index, index] += np.einsum("fdc,fdci,fdci->fdc", weights, u, u)
     gradient = np.einsum("fdc,fdci,fdci->fdc", weights, u, e)
     gradient -= np.einsum("fdlc,fdl->fdc", gain, np.einsum("fdc,fdcik,fdci->fdk", weights, J, e))
-    rms_px = np.sqrt(squares / total) if total else np.nan
-    return _System(offset_frames, normal, gradient, weights, variance_px2, rms_px)
+    return _System(offset_frames, normal, gradient, weights, variance_px2)
 
 
 def _robust_weights(
@@ -268,16 +266,16 @@ def _standard_deviations(
     used = weight > 1e-6 * weight.sum()
     total = block_normal.sum(axis=0) + prior
     left_out = np.linalg.solve(total - block_normal[used], -block_gradient[used][..., None])[..., 0]
-    left_out -= left_out.mean(axis=1, keepdims=True)
+    mean = system.mean_of(max_offset_frames)
+    left_out -= (left_out @ mean)[:, None]
     variance = np.zeros(len(prior))
     if used.sum() > 1:
         freedom = information.sum(axis=0) ** 2 / np.maximum((information**2).sum(axis=0), 1e-300) - 1
         spread = np.diag(block_jackknife(np.zeros(len(prior)), left_out, weight[used]))
         variance = spread * widening(np.maximum(freedom, _LEAST_FREEDOM)) ** 2
     # Where nothing moves, the prior alone is known. The mean of the offsets is 0.
-    inverse = np.linalg.inv(total)
-    inverse -= inverse.mean(axis=0)
-    inverse -= inverse.mean(axis=1, keepdims=True)
+    centred = np.eye(len(mean)) - mean
+    inverse = centred @ np.linalg.inv(total) @ centred.T
     white = np.diag(inverse)
     by_prior = np.einsum("kb,bc,kc->k", inverse, prior, inverse)
     # Few blocks know the variance of one camera badly: how far errors are correlated is the mean of all cameras.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,6 +18,7 @@ from psotrack.calibration.clocks.camera_clocks import camera_offsets
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import NEAR_M, Camera, Rig, project
 from psotrack.recordings import FrameTimes, Timeline
+from psotrack.support import finite_or_none
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings
 from psotrack.trajectories import Status, Tracks, Trajectories
 from psotrack.trajectories.resampling import interpolated
@@ -38,8 +38,6 @@ _CHUNK_FRAMES = 25
 _LEAST_INSTANTS, _MOST_STRETCHES = 60, 12
 #: A drift counts only beyond this multiple of its standard deviation: over seconds all clocks run alike.
 _CLEARLY = 5.0
-#: Least number of places that a camera must show in a stretch.
-_LEAST_PLACES = 10
 #: An offset counts only if its standard deviation is below this share of an interval between instants.
 _KNOWN = 0.25
 
@@ -74,32 +72,18 @@ class CameraClocks:
         self, frame_times: Mapping[str, FrameTimes], cameras: Sequence[str]
     ) -> dict[str, FrameTimes]:
         """Frame times with the corrections of these cameras, in the order of the estimate."""
-        changes = dict(
-            zip(cameras, zip(self.offset_s.tolist(), self.drift.tolist(), strict=True), strict=True)
-        )
-        return {
-            name: times.corrected(changes[name][0] - changes[name][1] * self.middle_s, changes[name][1])
-            if name in changes
-            else times
-            for name, times in frame_times.items()
-        }
+        changed = dict(frame_times)
+        for name, offset_s, drift in zip(cameras, self.offset_s.tolist(), self.drift.tolist(), strict=True):
+            if name in changed:
+                changed[name] = changed[name].corrected(offset_s - drift * self.middle_s, drift)
+        return changed
 
     def record(self, cameras: Sequence[str]) -> dict[str, dict[str, float | None]]:
         """Corrections by camera name, fit for JSON; None for a standard deviation that is not known."""
-
-        def rows() -> Any:
-            values = (self.offset_s, self.late_s, self.offset_std_s, self.drift, self.drift_std)
-            return zip(cameras, *values, strict=True)
-
+        keys = "offset_s", "late_s", "offset_std_s", "drift", "drift_std"
         return {
-            name: {
-                "offset_s": float(offset_s),
-                "late_s": float(late_s),
-                "offset_std_s": float(offset_std_s) if np.isfinite(offset_std_s) else None,
-                "drift": float(drift),
-                "drift_std": float(drift_std) if np.isfinite(drift_std) else None,
-            }
-            for name, offset_s, late_s, offset_std_s, drift, drift_std in rows()
+            name: {key: finite_or_none(getattr(self, key)[index]) for key in keys}
+            for index, name in enumerate(cameras)
         }
 
     def is_certain(self, least_s: float, multiple: float = 5.0) -> Bool[np.ndarray, "cameras"]:
@@ -268,41 +252,19 @@ def estimate_clocks(
     """
     num_stretches = int(np.clip(len(points_px) // _LEAST_INSTANTS, 1, _MOST_STRETCHES))
     parts = np.array_split(np.arange(len(points_px)), num_stretches)
-    estimates = [_offsets_of_stretch(rig, points_px[part], timeline.rate_hz) for part in parts]
+    estimates = [
+        camera_offsets(rig, points_px[part], timeline.rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
+        for part in parts
+    ]
     time_s = np.array([timeline.time_s[part].mean() for part in parts])
-    offset_s, std_s, white_s = (
-        np.array(values) / timeline.rate_hz for values in zip(*estimates, strict=True)
-    )
+    offset_s = np.array([one.offset_frames for one in estimates]) / timeline.rate_hz
+    ratio = np.array([one.std_frames / one.white_std_frames for one in estimates])
+    white_s = np.array([one.white_std_frames for one in estimates]) / timeline.rate_hz
+    seen = white_s < MAX_OFFSET_FRAMES / 10 / timeline.rate_hz
     # One stretch of one camera shows badly how far its errors are correlated: all tell it together.
-    seen = np.isfinite(white_s)
-    squares = (std_s[seen] / white_s[seen]) ** 2
-    std_s = white_s * np.sqrt(max(float(squares.mean()), 1.0) if seen.any() else 1.0)
+    larger = np.sqrt(max(float(np.mean(ratio[seen] ** 2)), 1.0)) if seen.any() else 1.0
+    std_s = np.where(seen, larger * white_s, np.inf)
     return fit_clocks(time_s, offset_s, std_s, known_s=_KNOWN / timeline.rate_hz)
-
-
-def _offsets_of_stretch(
-    rig: Rig, points_px: Float[np.ndarray, "instants drones cameras 2"], rate_hz: float
-) -> tuple[Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"], Float[np.ndarray, "cameras"]]:
-    """Offsets, their standard deviations, and these for independent errors, intervals between instants.
-
-    They are 0 and infinite for cameras that show nothing.
-
-    Offsets are relative to the mean of all cameras, so a camera that shows nothing must not be one of them.
-    """
-    offset, (std, white) = np.zeros(len(rig)), np.full((2, len(rig)), np.inf)
-    left = np.flatnonzero(np.isfinite(points_px).all(axis=-1).sum(axis=(0, 1)) >= _LEAST_PLACES)
-    while len(left) >= 2:
-        part = rig.select([rig.names[camera] for camera in left])
-        found = camera_offsets(part, points_px[:, :, left], rate_hz, max_offset_frames=MAX_OFFSET_FRAMES)
-        if found.std_frames.max() < MAX_OFFSET_FRAMES / 10:
-            offset[left], std[left], white[left] = (
-                found.offset_frames,
-                found.std_frames,
-                found.white_std_frames,
-            )
-            break
-        left = np.delete(left, found.std_frames.argmax())
-    return offset, std, white
 
 
 def fit_clocks(

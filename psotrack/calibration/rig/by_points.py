@@ -97,7 +97,7 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     given = None if settings.world is None else read_world(settings.world)
 
     def world_of(found: PointRig) -> tuple[Similarity, str]:
-        rig = found.adjusted.rig
+        rig = found.rig
         if given is not None:
             change, left_m = fit_world(rig, given, _numbered(found), with_scale=True)
             return change, world_in_words(given.path, left_m)
@@ -112,12 +112,12 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
     with errors_name(settings.world or sources[0]):
         change, place = world_of(found)
     covariance_m2 = covariance_of_centres(found, lambda found: world_of(found)[0])
-    rig, adjusted, fits = change.rig(found.adjusted.rig), found.adjusted, {}
+    rig, fits = change.rig(found.rig), {}
     for index, name in enumerate(rig.names):
-        seen = np.isfinite(adjusted.residual_px[:, index])
-        residual_px, used = adjusted.residual_px[seen, index], adjusted.used[seen, index]
+        seen = np.isfinite(found.residual_px[:, index])
+        residual_px, used = found.residual_px[seen, index], found.used[seen, index]
         fits[name] = PointFit(found.views.number[seen].tolist(), covariance_m2[index], residual_px, used)
-    shifts = map(str, find_point_shifts(adjusted.rig, views))
+    shifts = map(str, find_point_shifts(found.rig, views))
     notes = [*_left_out(found, views), f"the world is {place}", *shifts, *_weak(found, rig, covariance_m2)]
     return _calibration(rig, fits, notes)
 
@@ -170,7 +170,7 @@ def calibrate_by_known_points(
 def _numbered(found: PointRig) -> dict[int, np.ndarray]:
     """Positions of the moving point, of the first end of a stick, by the number of the instant."""
     first = found.views.point == 0
-    return dict(zip(found.views.number[first].tolist(), found.adjusted.points_m[first], strict=True))
+    return dict(zip(found.views.number[first].tolist(), found.points_m[first], strict=True))
 
 
 def _left_out(found: PointRig, views: PointViews) -> list[str]:
@@ -185,7 +185,7 @@ def _left_out(found: PointRig, views: PointViews) -> list[str]:
 def _weak(found: PointRig, rig: Rig, covariance_m2: Float[np.ndarray, "cameras 3 3"]) -> list[str]:
     """Sentences on sightings that the rig does not explain, and on cameras that they hardly determine."""
     sentences = []
-    used, seen = int(found.adjusted.used.any(axis=1).sum()), len(found.views.number)
+    used, seen = int(found.used.any(axis=1).sum()), len(found.views.number)
     if used < _FEW_USED * seen:
         sentences.append(
             f"only {used} of {seen} sightings by two cameras fit the rig: check that frames of equal number are of "

@@ -30,11 +30,13 @@ from psotrack.calibration.pnp import solve_pnp_ransac
 from psotrack.calibration.residuals import GATE, spread_px
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError
-from psotrack.geometry import NEAR_M, Camera, Rig, to_camera, triangulate_linearly, undistort
+from psotrack.geometry import Rig, triangulate_linearly, undistort
 from psotrack.support import block_jackknife
 
 #: Distance in the image up to which a detection may be of the point, while the cameras are not yet adjusted, pixels.
 _WIDE_PX = 15.0
+#: Standard deviation of a detection before any adjustment, pixels: such a gate of 5 deviations is the wide one.
+_FIRST_PX = _WIDE_PX / GATE
 #: Distance in the image of sightings that give the first pair of cameras, pixels: the error of a usual detector.
 _NARROW_PX = 2.0
 #: Smallest number of instants that a pair of cameras must share, and of known points for a further camera.
@@ -75,36 +77,23 @@ class PointViews:
 
 
 @dataclass(frozen=True)
-class AdjustedRig:
-    """Result of an adjustment.
-
-    Attributes:
-        rig: the adjusted cameras.
-        points_m: (points, 3), world, in the rig's unit of length; NaN where fewer than two cameras see a point.
-        residual_px: (points, cameras), distances in the image, also of outliers; NaN where a camera does not see a
-            point.
-        used: (points, cameras), False for outliers and for unseen points.
-    """
-
-    rig: Rig
-    points_m: Float[np.ndarray, "points 3"]
-    residual_px: Float[np.ndarray, "points cameras"]
-    used: Bool[np.ndarray, "points cameras"]
-
-
-@dataclass(frozen=True)
 class PointRig:
     """A rig from a moving point; its unit of length is open until `world` sets it.
 
     Attributes:
-        adjusted: the adjusted rig, with the positions of the point.
-        views: the sightings that were used.
-        noise_px: standard deviation of a sighting along x and along y.
+        rig: the cameras.
+        views: the sightings.
+        points_m: (sightings, 3), world, in the rig's unit of length; NaN where fewer than two cameras see a point.
+        residual_px: (sightings, cameras), distances in the image, also of outliers; NaN where a camera does not see a
+            point.
+        used: (sightings, cameras), False for outliers and for unseen points.
     """
 
-    adjusted: AdjustedRig
+    rig: Rig
     views: PointViews
-    noise_px: float
+    points_m: Float[np.ndarray, "sightings 3"]
+    residual_px: Float[np.ndarray, "sightings cameras"]
+    used: Bool[np.ndarray, "sightings cameras"]
 
 
 def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
@@ -120,23 +109,18 @@ def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
         InputError: no pair of cameras sees the point often enough, or a camera cannot be joined to the others.
     """
     views = _thinned(views)
-    rays = np.stack(
-        [undistort(lenses.cameras[index], views.points_px[:, index]) for index in range(len(lenses))], axis=1
-    )
-    first, second, T = _best_pair(lenses, views, rays)
+    first, second, T = _best_pair(lenses, views)
     placed = {first: np.eye(4), second: T}
-    points_px = views.points_px
-    rig = _rig_of(lenses, placed)
-    adjusted = _adjusted(rig, points_px[:, sorted(placed)], _WIDE_PX / 5)
-    while len(placed) < len(lenses):
-        index, T = _next_camera(lenses, views, adjusted.points_m, placed)
-        placed = dict(zip(sorted(placed), np.asarray(adjusted.rig.cameras.T_cam_world), strict=True))
-        placed[index] = T
-        adjusted = _adjusted(_rig_of(lenses, placed), points_px[:, sorted(placed)], _WIDE_PX / 5)
-    noise_px = _noise_px(adjusted)
-    used_px = np.where(adjusted.used[..., None], points_px, np.nan)
-    adjusted = _adjust_near(adjusted.rig, used_px, noise_px)
-    return PointRig(adjusted, views, _noise_px(adjusted))
+    while True:
+        some = sorted(placed)
+        names = tuple(views.names[index] for index in some)
+        cameras = replace(lenses.cameras[np.array(some)], T_cam_world=np.array([placed[one] for one in some]))
+        seen = replace(views, names=names, points_px=views.points_px[:, some])
+        found = _adjust_near(Rig(names, cameras), seen)
+        if len(placed) == len(lenses):
+            return found
+        placed = dict(zip(some, np.asarray(found.rig.cameras.T_cam_world), strict=True))
+        index, placed[index] = _next_camera(lenses, views, found.points_m, placed)
 
 
 def covariance_of_centres(
@@ -152,7 +136,7 @@ def covariance_of_centres(
         InputError: the sightings without a part of the recording do not determine the cameras or the world.
     """
     near = _jackknife(found, world_of, is_anew=False)
-    centres = world_of(found).points(np.asarray(found.adjusted.rig.cameras.centre_world))
+    centres = world_of(found).points(np.asarray(found.rig.cameras.centre_world))
     apart = np.linalg.norm(centres[:, None] - centres, axis=-1).max(axis=1)
     if (np.sqrt(np.trace(near, axis1=1, axis2=2)) < LOOSE * apart).all():
         return near
@@ -166,21 +150,19 @@ def _jackknife(
     """Covariances of the centres from adjustments without a part of the recording, from this rig or from nothing."""
     part = np.unique(found.views.number, return_inverse=True)[1]
     part = part * _PARTS // (part.max() + 1)
-    used_px = np.where(found.adjusted.used[..., None], found.views.points_px, np.nan)
-    centres = []
+    used_px = np.where(found.used[..., None], found.views.points_px, np.nan)
+    rigs = [found]
     for left_out in range(_PARTS):
-        kept_px = np.where((part != left_out)[:, None, None], used_px, np.nan)
+        kept = replace(found.views, points_px=np.where((part != left_out)[:, None, None], used_px, np.nan))
         again = None
         if is_anew:
             # None where the rest determines no rig: then from this rig.
             with contextlib.suppress(InputError):
-                again = calibrate_by_point(found.adjusted.rig, replace(found.views, points_px=kept_px))
-        if again is None:
-            again = replace(found, adjusted=_adjust_near(found.adjusted.rig, kept_px, found.noise_px))
-        centres.append(world_of(again).points(np.asarray(again.adjusted.rig.cameras.centre_world)))
-    own = world_of(found).points(np.asarray(found.adjusted.rig.cameras.centre_world))
-    covariance = block_jackknife(own.ravel(), np.reshape(centres, (_PARTS, -1)))
-    return np.einsum("cicj->cij", covariance.reshape(len(own), 3, len(own), 3))
+                again = calibrate_by_point(found.rig, kept)
+        rigs.append(_adjust_near(found.rig, kept) if again is None else again)
+    own, *others = [world_of(each).points(np.asarray(each.rig.cameras.centre_world)).ravel() for each in rigs]
+    covariance = block_jackknife(own, np.array(others))
+    return np.einsum("cicj->cij", covariance.reshape(-1, 3, len(own) // 3, 3))
 
 
 def _thinned(views: PointViews) -> PointViews:
@@ -193,10 +175,11 @@ def _thinned(views: PointViews) -> PointViews:
     return replace(views, point=views.point[kept], number=views.number[kept], points_px=views.points_px[kept])
 
 
-def _best_pair(
-    lenses: Rig, views: PointViews, rays: Float[np.ndarray, "sightings cameras 2"]
-) -> tuple[int, int, Float[np.ndarray, "4 4"]]:
+def _best_pair(lenses: Rig, views: PointViews) -> tuple[int, int, Float[np.ndarray, "4 4"]]:
     """The pair that sees most points at wide angles, and the transform from its first to its second camera."""
+    rays = np.stack(
+        [undistort(lenses.cameras[index], views.points_px[:, index]) for index in range(len(lenses))], axis=1
+    )
     best: tuple[float, int, int, np.ndarray] | None = None
     most = (0, 0, 1)
     for first, second in combinations(range(len(lenses)), 2):
@@ -287,36 +270,19 @@ def _next_camera(
     )
 
 
-def _rig_of(lenses: Rig, placed: dict[int, Float[np.ndarray, "4 4"]]) -> Rig:
-    """Rig of the cameras that have a place."""
-    rows = np.array(sorted(placed))
-    cameras = replace(lenses.cameras[rows], T_cam_world=np.array([placed[index] for index in rows.tolist()]))
-    return Rig(tuple(lenses.names[index] for index in rows.tolist()), cameras)
-
-
-def _adjusted(rig: Rig, points_px: Float[np.ndarray, "sightings cameras 2"], noise_px: float) -> AdjustedRig:
-    """Adjust some of the cameras, and know all points again that these cameras see."""
-    adjusted = _adjust_near(rig, points_px, noise_px)
-    adjusted = _adjust_near(adjusted.rig, points_px, _noise_px(adjusted))
-    used = np.where(adjusted.used[..., None], points_px, np.nan)
-    return replace(adjusted, points_m=triangulate_linearly(adjusted.rig.cameras, used))
-
-
-def _adjust_near(
-    rig: Rig, points_px: Float[np.ndarray, "sightings cameras 2"], noise_px: float
-) -> AdjustedRig:
+def _adjust_near(rig: Rig, views: PointViews) -> PointRig:
     """Adjust without the sightings whose rays are nearly parallel: their point may be anywhere far away.
 
     Raises:
         InputError: the sightings do not determine the cameras.
     """
     centres = np.asarray(rig.cameras.centre_world)
-    far = np.linalg.norm(triangulate_linearly(rig.cameras, points_px) - centres.mean(axis=0), axis=-1)
+    far = np.linalg.norm(triangulate_linearly(rig.cameras, views.points_px) - centres.mean(axis=0), axis=-1)
     typical = float(np.nanmedian(far)) if np.isfinite(far).any() else 0.0
     for multiple in _FAR:
-        near_px = np.where((far < multiple * typical)[:, None, None], points_px, np.nan)
+        near_px = np.where((far < multiple * typical)[:, None, None], views.points_px, np.nan)
         try:
-            return adjust(rig, near_px, noise_px)
+            return replace(adjust(rig, replace(views, points_px=near_px)), views=views)
         except np.linalg.LinAlgError:
             # A point went to infinity: points that are not so far away stay.
             continue
@@ -328,59 +294,53 @@ def _adjust_near(
     )
 
 
-def _noise_px(adjusted: AdjustedRig) -> float:
-    """Standard deviation of a sighting along each axis, from the residuals."""
-    residual_px = adjusted.residual_px[adjusted.used]
-    unknowns = 3 * int(adjusted.used.any(axis=1).sum()) + 6 * len(adjusted.rig)
-    return max(_LEAST_NOISE_PX, spread_px(residual_px, unknowns))
-
-
-def adjust(rig: Rig, points_px: Float[np.ndarray, "points cameras 2"], noise_px: float) -> AdjustedRig:
+def adjust(rig: Rig, views: PointViews) -> PointRig:
     """Adjust the cameras of a rig, and triangulate the points, so that projections agree with measured pixels.
 
     Args:
         rig: approximate cameras; the first one stays.
-        points_px: (points, cameras, 2), pixels of the same points in all cameras; NaN where a camera does not see a
-            point.
-        noise_px: standard deviation of a pixel along x and along y.
+        views: pixels of the same points in all cameras.
 
     Raises:
         InputError: the points do not determine the cameras; the message names a camera that sees too few points.
         SettingsError: a lens has skew.
         numpy.linalg.LinAlgError: a point went to infinity.
     """
+    points_px = views.points_px
     placed = np.isfinite(points_px).all(axis=-1)
     placed &= (placed.sum(axis=1) >= 2)[:, None]
     start_m = triangulate_linearly(rig.cameras, np.where(placed[..., None], points_px, np.nan))
-    placed &= (np.isfinite(start_m).all(axis=-1) & _is_in_front(rig.cameras, start_m))[:, None]
+    placed &= np.isfinite(start_m).all(axis=-1)[:, None]
     _check_seen(rig, placed)
-    seen_px = np.where(placed[..., None], points_px, np.nan)
-    bundle = _start(rig, start_m, seen_px, noise_px).solved()
+    bundle = _start(rig, start_m, np.where(placed[..., None], points_px, np.nan)).solved()
     seen = bundle.problem.target, bundle.problem.camera
     unknowns = 6 * len(rig) - 7 + 3 * int(placed.any(axis=1).sum())
-    used = placed
+    noise_px = max(_LEAST_NOISE_PX, spread_px(bundle.distance_px[:, 0], unknowns))
+    problem = replace(bundle.problem, noise_px=np.full(len(seen[0]), noise_px))
+    bundle = replace(bundle, problem=problem).solved()
+    used, residual_px = placed, np.full(placed.shape, np.nan)
     # The gate depends on the fit and the fit on the gate. The loop ends if they alternate.
     for _ in range(5):
-        distance_px = _distances(bundle, placed.shape)
-        inliers = distance_px <= GATE * max(noise_px, spread_px(distance_px[used], unknowns))
+        residual_px[seen] = bundle.distance_px[:, 0]
+        inliers = residual_px <= GATE * max(_LEAST_NOISE_PX, spread_px(residual_px[used], unknowns))
         # A point that only one camera sees has no position.
         inliers &= (inliers.sum(axis=1) >= 2)[:, None]
         before, used = used, inliers
         bundle = replace(bundle, used=used[seen][:, None], is_robust=False).solved()
         if (used == before).all():
             break
+    residual_px[seen] = bundle.distance_px[:, 0]
     _check_seen(rig, used)
     _check_connected(bundle)
     cameras = replace(rig.cameras, T_cam_world=bundle.state.T_cam_world)
     points_m = np.where(used.any(axis=1)[:, None], bundle.state.T_world_target[:, :3, 3], np.nan)
-    return AdjustedRig(Rig(rig.names, cameras), points_m, _distances(bundle, placed.shape), used)
+    return PointRig(Rig(rig.names, cameras), views, points_m, residual_px, used)
 
 
 def _start(
     rig: Rig,
     points_m: Float[np.ndarray, "points 3"],
     points_px: Float[np.ndarray, "points cameras 2"],
-    noise_px: float,
 ) -> Bundle:
     """The adjustment's first state, with a robust loss."""
     models, lenses = zip(*known_lenses(rig).values(), strict=True)
@@ -389,14 +349,7 @@ def _start(
     state = BundleState(lenses, np.asarray(rig.cameras.T_cam_world), points, np.ones(len(points)))
     free = np.arange(len(rig)) > 0, np.ones(len(points), bool)
     views_px = points_px.swapaxes(0, 1)[:, :, None]
-    return Bundle.of_views(models, state, np.zeros((1, 3)), views_px, free=free, noise_px=noise_px)
-
-
-def _distances(bundle: Bundle, shape: tuple[int, ...]) -> Float[np.ndarray, "points cameras"]:
-    """Distances in the image, NaN where a camera does not see a point."""
-    distance_px = np.full(shape, np.nan)
-    distance_px[bundle.problem.target, bundle.problem.camera] = bundle.distance_px[:, 0]
-    return distance_px
+    return Bundle.of_views(models, state, np.zeros((1, 3)), views_px, free=free, noise_px=_FIRST_PX)
 
 
 def _check_seen(rig: Rig, seen: Bool[np.ndarray, "points cameras"]) -> None:
@@ -421,8 +374,3 @@ def _check_connected(bundle: Bundle) -> None:
             expected="points that connect all cameras",
             found="cameras that share no points with the others",
         )
-
-
-def _is_in_front(cameras: Camera, points_m: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, " points"]:
-    """(points,), True where a point is in front of most cameras."""
-    return np.median(to_camera(cameras, points_m[:, None, :])[..., 2], axis=-1) > NEAR_M

@@ -127,7 +127,7 @@ def stick_length(point_rig: PointRig) -> float:
     Raises:
         InputError: the two ends are never known at one instant.
     """
-    views, points_m = point_rig.views, point_rig.adjusted.points_m
+    views, points_m = point_rig.views, point_rig.points_m
     first, second = (
         dict(zip(views.number[views.point == end].tolist(), points_m[views.point == end], strict=True))
         for end in (0, 1)
