@@ -17,7 +17,7 @@ from psotrack.calibration import (
     open_images,
     parse_lens_model,
 )
-from psotrack.calibration.rig.board_poses import find_lens, fit_boards
+from psotrack.calibration.rig.lenses import find_lens, fit_boards
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import make_camera, project
 from psotrack.recordings import VideoWriter

@@ -19,7 +19,7 @@ from psotrack.calibration import (
     find_board_shifts,
     known_lenses,
 )
-from psotrack.calibration.rig.board_poses import find_board_poses, fit_boards
+from psotrack.calibration.rig.lenses import find_board_poses, fit_boards
 from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import project
 

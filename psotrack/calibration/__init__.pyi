@@ -16,6 +16,7 @@ from .rig.adjustment import CalibratedRig, LensChoice, calibrate_rig
 from .rig.by_board import calibrate_by_board
 from .rig.by_points import calibrate_by_known_points, calibrate_by_moving_point
 from .rig.findings import (
+    RigCalibration,
     advise,
     coverage,
     figures_of,
@@ -25,7 +26,7 @@ from .rig.findings import (
     worst_views,
 )
 from .rig.images import CameraImages, instants_of_numbers, open_images, open_recorded
-from .rig.lens_choice import choose_lens_model
+from .rig.lenses import choose_lens_model
 from .rig.moving_point import LOOSE, PointRig, PointViews, calibrate_by_point, covariance_of_centres
 from .rig.point_files import (
     GivenWorld,
@@ -36,7 +37,6 @@ from .rig.point_files import (
     stick_length,
     views_of_detections,
 )
-from .rig.result import RigCalibration
 from .rig.settings import BoardSettings, LensSettings, PointSettings, RigSettings
 from .rig.shifts import Shift, find_board_shifts, find_point_shifts
 from .rig.views import BoardViews, FoundBoards, find_views

@@ -1,6 +1,6 @@
 """Lenses and places of all cameras, and the board's place at each instant, in one adjustment.
 
-First each camera's lens alone (`board_poses`), then the cameras' places through the views that they share (`chain`),
+First each camera's lens alone (`lenses`), then the cameras' places through the views that they share (`chain`),
 then all together: with a robust loss to find the places, and with squared residuals without outliers.
 
 **Slips.** The corners of a view agree with each other far better than with the corners of other cameras, if the board
@@ -37,9 +37,8 @@ from psotrack.calibration.bundle import (
 )
 from psotrack.calibration.lens_models import LensModel
 from psotrack.calibration.residuals import GATE, centre_by_pose
-from psotrack.calibration.rig.board_poses import find_lens
 from psotrack.calibration.rig.chain import Chain, check_joined, join_cameras
-from psotrack.calibration.rig.lens_choice import LEAST_VIEWS, MOST_FITS, choose_lens_model
+from psotrack.calibration.rig.lenses import LEAST_VIEWS, MOST_FITS, choose_lens_model, find_lens
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.calibration.rig.world import Similarity
 from psotrack.errors import InputError

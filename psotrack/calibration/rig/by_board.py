@@ -11,10 +11,16 @@ from psotrack.calibration.board_recognition import describe_board, detect_board
 from psotrack.calibration.boards import Board
 from psotrack.calibration.lens_models import known_lenses, parse_lens_model
 from psotrack.calibration.rig.adjustment import CalibratedRig, LensChoice, calibrate_rig, in_new_world
-from psotrack.calibration.rig.findings import advise, figures_of, say_print, say_searched, worst_views
+from psotrack.calibration.rig.findings import (
+    RigCalibration,
+    advise,
+    figures_of,
+    say_print,
+    say_searched,
+    worst_views,
+)
 from psotrack.calibration.rig.images import first_images, instants_of_numbers, open_images, open_recorded
 from psotrack.calibration.rig.point_files import fit_world, read_world, world_in_words
-from psotrack.calibration.rig.result import RigCalibration
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.views import find_views
 from psotrack.errors import errors_name

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from psotrack.calibration.extrinsics import locate_camera
 from psotrack.calibration.image_points import find_markers, read_image_points
 from psotrack.calibration.lens_models import lens_of_view
+from psotrack.calibration.rig.findings import RigCalibration
 from psotrack.calibration.rig.images import open_images
 from psotrack.calibration.rig.moving_point import (
     LOOSE,
@@ -22,7 +23,6 @@ from psotrack.calibration.rig.moving_point import (
     covariance_of_centres,
 )
 from psotrack.calibration.rig.point_files import (
-    check_two_cameras,
     distance_between,
     fit_world,
     read_point_views,
@@ -31,7 +31,6 @@ from psotrack.calibration.rig.point_files import (
     views_of_detections,
     world_in_words,
 )
-from psotrack.calibration.rig.result import RigCalibration
 from psotrack.calibration.rig.settings import RigSettings
 from psotrack.calibration.rig.shifts import find_point_shifts
 from psotrack.calibration.rig.world import Similarity, world_of_camera
@@ -85,12 +84,9 @@ def calibrate_by_moving_point(sources: Sequence[Path], settings: RigSettings) ->
             found="none" if not lengths else f"{lengths}",
         )
     views = _read_views(sources)
-    with errors_name(sources[0]):
-        if distance is not None:
-            check_two_cameras(views.names, *distance[:2])
-        if stick_m is not None and not views.point.any():
-            expected = "the two ends of a stick, told apart by a column named point"
-            raise InputError(sources[0], expected=expected, found="one point")
+    if stick_m is not None and not views.point.any():
+        expected = "the two ends of a stick, told apart by a column named point"
+        raise InputError(sources[0], expected=expected, found="one point")
     lenses = _lenses_of(views.names, settings)
     with errors_name(sources[0]):
         found = calibrate_by_point(lenses, views)

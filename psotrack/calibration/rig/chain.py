@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from psotrack.calibration.boards import Board
 from psotrack.calibration.lens_models import LensModel
-from psotrack.calibration.rig.board_poses import find_board_poses
+from psotrack.calibration.rig.lenses import find_board_poses
 from psotrack.calibration.rig.views import BoardViews
 from psotrack.errors import InputError
 

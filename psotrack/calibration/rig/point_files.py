@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -140,23 +140,14 @@ def stick_length(point_rig: PointRig) -> float:
     return float(np.nanmedian(lengths))
 
 
-def check_two_cameras(names: Sequence[str], first: str, second: str) -> None:
-    """Check the names of two cameras.
-
-    Raises:
-        SettingsError: a camera is unknown, or is named twice.
-    """
-    if first == second or not {first, second} <= set(names):
-        raise SettingsError("distance", expected=f"two of {', '.join(names)}", found=f"{first},{second}")
-
-
 def distance_between(rig: Rig, first: str, second: str) -> float:
     """Distance between two cameras' centres, in the rig's unit of length.
 
     Raises:
         SettingsError: a camera is not in the rig, or is named twice.
     """
-    check_two_cameras(rig.names, first, second)
+    if first == second or not {first, second} <= set(rig.names):
+        raise SettingsError("distance", expected=f"two of {', '.join(rig.names)}", found=f"{first},{second}")
     centres = np.asarray(rig.cameras.centre_world)
     return float(np.linalg.norm(centres[rig.names.index(first)] - centres[rig.names.index(second)]))
 

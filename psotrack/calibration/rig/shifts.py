@@ -64,61 +64,62 @@ def find_point_shifts(rig: Rig, views: PointViews) -> list[Shift]:
         views: all sightings, of which instants follow each other at one rate.
     """
     key, shifts = 2 * views.number + views.point, []
-    for index, name in enumerate(views.names if len(views.names) > 2 else ()):
+    for index in range(len(rig) if len(rig) > 2 else 0):
         # Positions of the point by the other cameras, where these agree.
         others_px = views.points_px.copy()
         others_px[:, index] = np.nan
         points_m = triangulate_linearly(rig.cameras, others_px)
         distance_px = np.linalg.norm(project(rig.cameras, points_m[:, None])[0] - others_px, axis=-1)
-        known = np.isfinite(points_m[:, 0]) & ~(distance_px > _FITS_PX).any(axis=1)
-        rays = undistort(rig.cameras[index], views.points_px[:, index])
-        gate = _FITS_PX / float(rig.cameras.K[index, 0, 0])
-        shifts += _shift(name, (key, rays), (key[known], points_m[known]), 2, gate)
+        points_m[(distance_px > _FITS_PX).any(axis=1)] = np.nan
+        shifts += _shift(rig, index, key, views.points_px[:, index], points_m, 2, _FITS_PX)
     return shifts
 
 
 def find_board_shifts(calibrated: CalibratedRig) -> list[Shift]:
     """The same for cameras that see a board: the board is where the other cameras have it."""
-    views, shifts, corners_m = calibrated.views, [], calibrated.board.corners_m
-    corners = np.arange(len(corners_m))
-    key = (views.number[:, None] * len(corners) + corners).ravel()
+    views, rig, shifts, corners_m = calibrated.views, calibrated.rig, [], calibrated.board.corners_m
+    key = (views.number[:, None] * len(corners_m) + np.arange(len(corners_m))).ravel()
     T = calibrated.T_world_board
     points_m = np.einsum("vij,nj->vni", T[:, :3, :3], corners_m) + T[:, None, :3, 3]
-    for index, name in enumerate(views.names):
+    for index in range(len(rig)):
         known = np.delete(calibrated.used, index, axis=0).any(axis=(0, 2))
-        camera = calibrated.rig.cameras[index]
-        rays = undistort(camera, views.corners_px[index].reshape(-1, 2))
-        placed = key.reshape(-1, len(corners))[known].ravel(), points_m[known].reshape(-1, 3)
-        gate = _CORNER_FITS_PX / float(camera.K[0, 0])
-        shifts += _shift(name, (key, rays), placed, len(corners), gate)
+        known_m = np.where(known[:, None, None], points_m, np.nan).reshape(-1, 3)
+        corners_px = views.corners_px[index].reshape(-1, 2)
+        shifts += _shift(rig, index, key, corners_px, known_m, len(corners_m), _CORNER_FITS_PX)
     return shifts
 
 
 def _shift(
-    name: str,
-    seen: tuple[Int[np.ndarray, " sightings"], Float[np.ndarray, "sightings 2"]],
-    known: tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"]],
+    rig: Rig,
+    index: int,
+    key: Int[np.ndarray, " points"],
+    points_px: Float[np.ndarray, "points 2"],
+    points_m: Float[np.ndarray, "points 3"],
     per_instant: int,
-    gate: float,
+    gate_px: float,
 ) -> list[Shift]:
     """The shift of a camera, if it has one; the camera is placed anew for each shift.
 
     Args:
-        name: name of the camera.
-        seen: numbers of sightings, `per_instant` of them for each instant, and their rays.
-        known: numbers of points, counted alike, and their positions by the other cameras.
+        rig: the cameras.
+        index: index of the camera.
+        key: numbers of points, `per_instant` of them for each instant.
+        points_px: the camera's pixels of the points; NaN where it does not see one.
+        points_m: their positions by the other cameras; NaN where they do not know one.
         per_instant: how many numbers an instant has.
-        gate: largest distance of a ray from its point's projection, at a focal length of 1.
+        gate_px: largest distance of a sighting from its point's projection, pixels.
     """
-    is_seen = np.isfinite(seen[1][:, 0])
-    number, rays = seen[0][is_seen], seen[1][is_seen]
+    gate = gate_px / float(rig.cameras.K[index, 0, 0])
+    rays, known = undistort(rig.cameras[index], points_px), np.isfinite(points_m[:, 0])
+    is_seen = np.isfinite(rays[:, 0])
+    rays, known_m = rays[is_seen], points_m[known]
     fractions: dict[int, float] = {}
     least = _LEAST
     for shift in sorted(range(-_MOST_SHIFT, _MOST_SHIFT + 1), key=abs):
-        _, here, there = np.intersect1d(number + shift * per_instant, known[0], return_indices=True)
+        _, here, there = np.intersect1d(key[is_seen] + shift * per_instant, key[known], return_indices=True)
         if len(here) >= least:
             some = np.linspace(0, len(here) - 1, min(len(here), _MOST)).astype(np.int64)
-            found = solve_pnp_ransac(known[1][there[some]], rays[here[some]], gate)
+            found = solve_pnp_ransac(known_m[there[some]], rays[here[some]], gate)
             fractions[shift] = 0.0 if found is None else float(found[1].mean())
         if shift == 0:
             if fractions.get(0, 1.0) >= _SOUND:
@@ -127,4 +128,4 @@ def _shift(
             least = max(_LEAST, len(here) // 2)
     best = max(fractions, key=lambda shift: fractions[shift])
     gain = fractions[best] - fractions[0]
-    return [Shift(name, best, fractions[0], fractions[best])] if gain > _LEAST_GAIN else []
+    return [Shift(rig.names[index], best, fractions[0], fractions[best])] if gain > _LEAST_GAIN else []
