@@ -218,28 +218,16 @@ def _relative_pose(
 
     Random sampling with local optimisation (O. Chum, J. Matas & J. Kittler, Locally optimized RANSAC, 2003).
     """
-    E, _ = cv2.findEssentialMat(
+    E, good = cv2.findEssentialMat(
         here, there, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.9999, threshold=_NARROW_PX / focal_px
     )
     if E is None or E.shape != (3, 3):
         return None
-    _, R, t, mask = cv2.recoverPose(E, here, there, np.eye(3), mask=np.ones((len(here), 1), np.uint8))
+    # A point behind a camera cannot be seen, however well the rays meet there.
+    _, R, t, good = cv2.recoverPose(E, here, there, np.eye(3), mask=good)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, np.ravel(t)
-    # A point behind a camera cannot be seen, however well the rays meet there.
-    is_near = focal_px * _sampson_distance(E, here, there) < _WIDE_PX
-    return T, is_near & (np.ravel(mask) > 0)
-
-
-def _sampson_distance(
-    E: Float[np.ndarray, "3 3"], here: Float[np.ndarray, "shared 2"], there: Float[np.ndarray, "shared 2"]
-) -> Float[np.ndarray, " shared"]:
-    """Distances of directions x / z, y / z from rays that meet, to first order (P. D. Sampson, 1982)."""
-    first, second = (np.column_stack([part, np.ones(len(part))]) for part in (here, there))
-    lines_there, lines_here = first @ E.T, second @ E
-    slopes = np.sum(lines_there[:, :2] ** 2, axis=1) + np.sum(lines_here[:, :2] ** 2, axis=1)
-    distances: np.ndarray = np.abs(np.vecdot(second, lines_there)) / np.sqrt(np.maximum(slopes, 1e-300))
-    return distances
+    return T, np.ravel(good) > 0
 
 
 def _next_camera(
