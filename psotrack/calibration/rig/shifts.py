@@ -70,7 +70,8 @@ def find_point_shifts(rig: Rig, views: PointViews) -> list[Shift]:
         others_px[:, index] = np.nan
         points_m = triangulate_linearly(rig.cameras, others_px)
         distance_px = np.linalg.norm(project(rig.cameras, points_m[:, None])[0] - others_px, axis=-1)
-        points_m[(distance_px > _FITS_PX).any(axis=1)] = np.nan
+        disagree = np.any(distance_px > _FITS_PX, axis=1)
+        points_m = np.where(disagree[:, None], np.nan, points_m)
         shifts += _shift(rig, index, key, views.points_px[:, index], points_m, 2, _FITS_PX)
     return shifts
 
@@ -82,7 +83,7 @@ def find_board_shifts(calibrated: CalibratedRig) -> list[Shift]:
     T = calibrated.T_world_board
     points_m = np.einsum("vij,nj->vni", T[:, :3, :3], corners_m) + T[:, None, :3, 3]
     for index in range(len(rig)):
-        known = np.delete(calibrated.used, index, axis=0).any(axis=(0, 2))
+        known = np.any(np.delete(calibrated.used, index, axis=0), axis=(0, 2))
         known_m = np.where(known[:, None, None], points_m, np.nan).reshape(-1, 3)
         corners_px = views.corners_px[index].reshape(-1, 2)
         shifts += _shift(rig, index, key, corners_px, known_m, len(corners_m), _CORNER_FITS_PX)
