@@ -22,7 +22,6 @@ from psotrack.recordings.datasets import (
     MARKER_CORNERS,
     ONBOARD_CALIBRATION,
     onboard_pose_file,
-    onboard_video_file,
     pose_file,
     write_marker_corners,
     write_onboard_calibration,
@@ -111,7 +110,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         unit="m",
     )
     with (
-        VideoWriter(folder / onboard_video_file(1), FPS, SIZE_WH) as video,
+        VideoWriter(folder / "dron1_cam_s.avi", FPS, SIZE_WH) as video,
         VideoWriter(folder / "cam1i_s.avi", FPS, (64, 48)) as still,
     ):
         for centre_m, R_cam_world in zip(camera_m, turns.inv().as_matrix(), strict=True):

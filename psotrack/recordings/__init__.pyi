@@ -1,6 +1,5 @@
 from .camera_recording import CameraRecording
 from .detections import Detections, read_detections, write_detections
-from .filmed import recording_of_video, with_all_videos
 from .image_files import (
     IMAGE_SUFFIXES,
     find_images,
@@ -15,7 +14,7 @@ from .image_files import (
 from .inventory import inventory_table
 from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
-from .recording import OnboardVideo, Recording, Reference, Timing
+from .recording import OnboardVideo, Recording, Reference, Timing, recording_of_video, with_all_videos
 from .recording_file import (
     RECORDING_FILE,
     CameraTable,
@@ -28,8 +27,16 @@ from .recording_file import (
     write_recording_file,
 )
 from .stored_silhouettes import ARRAY_FILE, MADE_OF, StoredSilhouettes, probe_silhouettes
-from .timestamps import read_timestamps
-from .timing import MOST_INSTANTS, REACH, FrameTimes, Timeline, check_rate, make_timeline, nearest_frames
+from .timing import (
+    MOST_INSTANTS,
+    REACH,
+    FrameTimes,
+    Timeline,
+    check_rate,
+    make_timeline,
+    nearest_frames,
+    read_timestamps,
+)
 from .video import (
     TruncatedVideoError,
     VideoInfo,

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.errors import InputError, SettingsError, check_positive
-from psotrack.support import first_repeat, short_repr
+from psotrack.support import first_repeat, read_table, short_repr
 
 #: Largest distance of a frame from an instant at which the frame is shown, in intervals of the frame's camera: half an
 #: interval, and a tenth for times that jitter.
@@ -137,6 +138,32 @@ class FrameTimes:
         same_rate = abs(self.fps - other.fps) * max(self.num_frames, other.num_frames) < 1e-3 * self.fps
         apart_s = abs(self.time_offset_s - other.time_offset_s)
         return bool(same_rate and apart_s * self.fps < _SAME)
+
+
+def read_timestamps(path: Path | str, num_frames: int | None = None) -> FrameTimes:
+    """Read the times of a camera's frames.
+
+    Args:
+        path: CSV file with the columns `frame`, which counts from 0, and `time_s`, seconds.
+        num_frames: number of frames that the camera has; None is not known.
+
+    Raises:
+        InputError: the file cannot be read, a frame is missing, there is not one time per frame, or times do not
+            increase. The message names the line or the frame.
+    """
+    path = Path(path)
+    table = read_table(path, ",")
+    frame_column, time_column = table.column("frame"), table.column("time_s")
+    for number, row in enumerate(table.rows):
+        if row.count(frame_column) != number:
+            expected = f"frame {number}: every frame once, in order, from 0"
+            raise row.error(frame_column, expected, row.text(frame_column))
+    time_s = np.array([row.number(time_column) for row in table.rows])
+    if num_frames is not None and len(time_s) != num_frames:
+        raise InputError(
+            path, expected=f"times of the {num_frames} frames of the video", found=f"{len(time_s)}"
+        )
+    return FrameTimes.listed(time_s, path)
 
 
 @dataclass(frozen=True, repr=False)

@@ -2,7 +2,6 @@ from .flights.piloting import flight_space
 from .flights.recordings import write_recorded_flight
 from .generate import simulate
 from .imaging.renderer import CameraRenderer
-from .listing import catalogue
 from .own_cameras import OWN_CAMERAS, simulate_own_cameras
 from .scenarios import (
     RESTLESS,
@@ -14,7 +13,7 @@ from .scenarios import (
     preset_text,
     scenario,
 )
-from .scene import Scene, build
+from .scene import Scene, build, catalogue
 
 __all__ = [
     "OWN_CAMERAS",

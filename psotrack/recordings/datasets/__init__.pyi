@@ -8,16 +8,21 @@ from ._marker_corners import (
     write_marker_corners,
 )
 from ._masks import MASKS, Masks, MaskWriter, join_archives, read_masks
-from ._mocap_markers import mocap_markers_file, write_mocap_markers
 from ._onboard import (
     ONBOARD_CALIBRATION,
     onboard_pose_file,
-    onboard_video_file,
     read_onboard,
     read_onboard_calibration,
     write_onboard_calibration,
 )
-from ._poses import pose_file, read_poses, unit_quaternion, write_poses
+from ._poses import (
+    mocap_markers_file,
+    pose_file,
+    read_poses,
+    unit_quaternion,
+    write_mocap_markers,
+    write_poses,
+)
 from .dpjait import CALIBRATION, DETECTIONS, MARKER_CORNERS, detection_files, read_sequence
 from .drafting import Draft, DraftOptions, Matching, draft_recording, match_files
 from .opening import find_marker_corners, is_recording, open_recording
@@ -42,7 +47,6 @@ __all__ = [
     "match_files",
     "mocap_markers_file",
     "onboard_pose_file",
-    "onboard_video_file",
     "open_recording",
     "pose_file",
     "read_marker_centres",

@@ -33,11 +33,6 @@ _POSES = re.compile(r"drone?_?(?P<number>\d+)_cam_(?P<rate>\d+(?:\.\d+)?)\.csv",
 _SIZES = ("width", "height")
 
 
-def onboard_video_file(number: int) -> str:
-    """Name of the video of the camera on drone `number`, 1-based."""
-    return f"dron{number}_cam_s.avi"
-
-
 def onboard_pose_file(number: int, fps: float = 25.0) -> str:
     """Name of the pose file of the camera on drone `number`, 1-based; `write_poses` writes this file."""
     return f"dron{number}_cam_{fps:g}.csv"

@@ -18,8 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.errors import SettingsError
 from psotrack.geometry import LENGTH_TOLERANCE
-from psotrack.recordings.datasets._rows import lengths_of, rows_by_frame
+from psotrack.recordings.datasets._rows import lengths_of
 from psotrack.support import Column, Table, TextRow, read_table, write_rows
+
+#: Largest number of a frame, whatever the number of rows, and per row: arrays over all frames take memory.
+_FRAMES, _FRAMES_PER_ROW = 1_000_000, 100
 
 Positions = Float[np.ndarray, "frames 3"]
 Orientations = Float[np.ndarray, "frames 4"]
@@ -39,7 +42,7 @@ def read_poses(path: Path | str) -> tuple[Positions, Orientations | None]:
     table = read_table(path)
     lengths_m = lengths_of(table, ["pos_x", "pos_y", "pos_z"])
     quaternion = _quaternion_columns(table)
-    rows = rows_by_frame(table)
+    rows = _rows_by_frame(table)
     position_m = np.full((max(rows) + 1, 3), np.nan)
     orientation_wxyz = np.full((max(rows) + 1, 4), np.nan)
     for frame, row in rows.items():
@@ -125,3 +128,44 @@ def unit_quaternion(row: TextRow, columns: list[Column]) -> Float[np.ndarray, "4
     if abs(norm - 1) > LENGTH_TOLERANCE:
         raise row.error(columns[0], "a quaternion of length 1", f"length {norm:g}")
     return quaternion / norm
+
+
+def _rows_by_frame(table: Table) -> dict[int, TextRow]:
+    """Rows by the numbers of the frames in the column `id`.
+
+    Raises:
+        InputError: a number is no whole number or is far above the number of rows, or a frame occurs twice. The message
+            names the line.
+    """
+    column = table.column("id")
+    rows: dict[int, TextRow] = {}
+    for row in table.rows:
+        frame = row.count(column)
+        if frame in rows:
+            raise row.error(column, "each frame once", f"{frame} again, after line {rows[frame].line}")
+        rows[frame] = row
+    last, most = max(rows), max(_FRAMES, _FRAMES_PER_ROW * len(rows))
+    if last > most:
+        expected = f"a frame number of at most {most} in a file of {len(rows)} rows"
+        raise rows[last].error(column, expected, f"{last}")
+    return rows
+
+
+#: Columns of the positions of a drone's motion-capture markers in the world, after `id`, the number of the frame. The
+#: published layout is unknown. Unlike in the pose files, the line of frame 0 is a measurement, not a placeholder.
+_MARKER_COLUMNS = [f"{marker}_{axis}[m]" for marker in "ABCD" for axis in "xyz"]
+
+
+def mocap_markers_file(number: int, fps: float = 25.0) -> str:
+    """Name of the file of drone `number`, 1-based."""
+    return f"dron{number}_markers_{fps:g}.csv"
+
+
+def write_mocap_markers(path: Path | str, markers_m: Float[np.ndarray, "frames 4 3"]) -> None:
+    """Write the marker positions of one drone, (frames, 4, 3), in the world, metres.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    rows = ([frame, *values] for frame, values in enumerate(markers_m.reshape(-1, len(_MARKER_COLUMNS))))
+    write_rows(path, [["id", *_MARKER_COLUMNS], *rows])
