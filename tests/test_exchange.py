@@ -197,6 +197,14 @@ def test_what_each_format_keeps(tmp_path):
     assert (units["qw"], units["cov_xy"], units["vx_m_s"]) == ("1", "m2", "m/s")
 
 
+def test_the_folder_of_a_bag_is_read(tmp_path):
+    (tmp_path / "bag").mkdir()
+    export_tracks(small_tracks(), "mcap", tmp_path / "bag" / "bag_0.mcap")
+    (tmp_path / "bag" / "metadata.yaml").touch()
+    read = read_tracks(tmp_path / "bag", recording=instants(50, 50.0))
+    np.testing.assert_array_equal(read.seen, small_tracks().seen)
+
+
 def test_unknown_orientations_stay_unknown(tmp_path):
     for to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
         export_tracks(replace(small_tracks(), orientation_wxyz=None), to, tmp_path / OUTPUTS[to])
@@ -205,7 +213,7 @@ def test_unknown_orientations_stay_unknown(tmp_path):
 
 @pytest.mark.parametrize(
     ("to", "name"),
-    [*OUTPUTS.items(), pytest.param("mot", "mot", marks=pytest.mark.slow), ("mcap", "bag")],
+    [*OUTPUTS.items(), pytest.param("mot", "mot", marks=pytest.mark.slow)],
     ids=lambda value: str(value),
 )
 def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tmp_path, to, name):
@@ -435,15 +443,15 @@ def test_the_mcap_library_and_rosbags_read_the_messages(tmp_path, footage):
     from rosbags.highlevel import AnyReader
 
     tracks = replace(small_tracks(), orientation_wxyz=None)
-    lost = export_tracks(tracks, "mcap", tmp_path / "bag", footage=replace(footage, images=True))
+    lost = export_tracks(tracks, "mcap", tmp_path / "bag.mcap", footage=replace(footage, images=True))
     assert lost == ("velocities", "status", "8 positions of lost drones")
-    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
+    with (tmp_path / "bag.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         by_mcap = [
             (channel.topic, message.log_time, content)
             for _, channel, message, content in reader.iter_decoded_messages()
         ]
-    with AnyReader([tmp_path / "bag"]) as bag:
+    with AnyReader([tmp_path / "bag.mcap"]) as bag:
         by_rosbags = [
             (connection.topic, time_ns, bag.deserialize(raw, connection.msgtype))
             for connection, time_ns, raw in bag.messages()
@@ -481,8 +489,8 @@ def test_a_camera_info_and_its_transform_project_as_the_camera_does(tmp_path, fo
     """The oracle is OpenCV, with the numbers that ROS programs get."""
     from rosbags.highlevel import AnyReader
 
-    export_tracks(small_tracks(), "mcap", tmp_path / "bag", footage=footage)
-    with AnyReader([tmp_path / "bag"]) as bag:
+    export_tracks(small_tracks(), "mcap", tmp_path / "bag.mcap", footage=footage)
+    with AnyReader([tmp_path / "bag.mcap"]) as bag:
         contents = [(each.topic, bag.deserialize(raw, each.msgtype)) for each, _, raw in bag.messages()]
     (info,) = (content for topic, content in contents if topic == "/c2/camera_info")
     assert (info.distortion_model, len(info.d), info.width, info.height) == ("plumb_bob", 5, *WH)
@@ -578,7 +586,7 @@ def test_nothing_is_overwritten(run_psotrack, flight, tmp_path):
 @pytest.mark.parametrize("names", [("a b", "a_b"), ("c1", "d"), ("world", "d")])
 def test_names_that_are_one_name_in_ros(tmp_path, footage, names):
     with pytest.raises(InputError, match="differ as names of ROS"):
-        export_tracks(replace(small_tracks(), drones=names), "mcap", tmp_path / "bag", footage=footage)
+        export_tracks(replace(small_tracks(), drones=names), "mcap", tmp_path / "bag.mcap", footage=footage)
     assert not list(tmp_path.iterdir())
 
 
@@ -586,9 +594,9 @@ def test_a_failure_leaves_nothing(tmp_path, footage, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("psotrack.recordings.exchange.mcap_files._write_bag_file", full)
+    monkeypatch.setattr("psotrack.recordings.exchange.ros_messages.transform", full)
     with pytest.raises(OutputError, match="No space left"):
-        export_tracks(small_tracks(), "mcap", tmp_path / "bag", footage=footage)
+        export_tracks(small_tracks(), "mcap", tmp_path / "bag.mcap", footage=footage)
     assert not list(tmp_path.iterdir())
 
 

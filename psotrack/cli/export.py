@@ -48,8 +48,8 @@ def export(
 
     Options:
         to: format of the output.
-        out: file of the output; a folder for tum with several drones, kitti, and mot with SEQ; either for mcap. None:
-            beside TRACKS, with the format in its name.
+        out: file of the output; a folder for tum with several drones, kitti, and mot with SEQ. None: beside TRACKS,
+            with the format in its name.
         images: write the images of SEQ's cameras too; only with --to mcap.
         drone_size_m: full lengths of a drone along x, y and z, in metres, for boxes of --to mot. None: those that the
             record beside TRACKS has.

@@ -28,8 +28,8 @@ def export_tracks(
     """Write tracks in a format of other programs, as a file or as a folder; `read_tracks` reads them again.
 
     tum: a folder with a file per drone, or one file that ends in .tum or .txt for one drone. kitti: a folder. mot: a
-    file of positions that ends in .txt, or with a recording a folder with positions and with boxes per camera. mcap: a
-    file, or the folder of a bag. c3d, csv, parquet, json: a file.
+    file of positions that ends in .txt, or with a recording a folder with positions and with boxes per camera. c3d,
+    mcap, csv, parquet, json: a file.
 
     Args:
         trajectories: the tracks.

@@ -79,7 +79,7 @@ FORMATS = {
     "kitti": TrackFormat(_POSES, write_kitti, entries=("poses", "sequences")),
     "mot": TrackFormat(frozenset(), write_mot, (".txt",), ("3d", "gt", "trackers")),
     "c3d": TrackFormat(frozenset({NAMES}), write_c3d_tracks, (".c3d",), needs_all=True),
-    "mcap": TrackFormat(_POSES | {"covariances"}, write_mcap, (".mcap",), ("*.mcap", "metadata.yaml")),
+    "mcap": TrackFormat(_POSES | {"covariances"}, write_mcap, (".mcap",)),
     "csv": TrackFormat(_ALL, _write_table, (".csv",), needs_all=True),
     "parquet": TrackFormat(_ALL, _write_table, (".parquet",), needs_all=True),
     "json": TrackFormat(_ALL, write_json_tracks, (".json",), needs_all=True),

@@ -7,7 +7,7 @@
     /CAMERA/image/compressed        sensor_msgs/CompressedImage, JPEG
 
 Stamps are times on the recording's clock, from 0 on. A drone whose name is no ROS name, such as `0`, has the topic
-/drone_0/pose; the metadata record `psotrack` has the names. A folder is a rosbag2 bag with one MCAP file. The libraries
+/drone_0/pose; the metadata record `psotrack` has the names. The folder of a rosbag2 bag can be read, too. The libraries
 mcap and mcap-ros2-support are an extra: `pip install '.[ros]'`.
 """
 
@@ -37,7 +37,7 @@ from psotrack.recordings.exchange.timed_paths import joined, timed_path
 from psotrack.support import LARGEST, MODERATE, Advance, Report, first_repeat
 from psotrack.trajectories import Trajectories
 
-WORLD, METADATA, BAG = "world", "psotrack", "metadata.yaml"
+WORLD, METADATA = "world", "psotrack"
 _JPEG_QUALITY = 90
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 #: Types of messages whose poses are read.
@@ -52,7 +52,7 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     """Write poses of the drones, and with a recording its cameras; return what is missing in it, as noun phrases.
 
     Args:
-        path: the file, or a new folder if the name does not end in .mcap.
+        path: the file.
         trajectories: the tracks.
         footage: the recording, and whether its images are written; None: poses alone.
         report: shows the progress in frames of the tracks and images.
@@ -76,12 +76,8 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
     filmed = {}
     if footage is not None and footage.images:
         filmed = {name: each for name, each in cameras.items() if each.name in footage.recording.videos}
-    counts: Counter[tuple[str, str]] = Counter()
-    first_ns, last_ns = 2**63 - 1, 0
-    file = path if path.suffix == ".mcap" else path / f"{path.name.lstrip('.').partition('.')[0]}_0.mcap"
-    file.parent.mkdir(parents=True, exist_ok=True)
     total = trajectories.num_frames + sum(len(camera.time_s) for camera in filmed.values())
-    with report("messages", total) as advance, file.open("wb") as stream:
+    with report("messages", total) as advance, path.open("wb") as stream:
         streams = [_drone_messages(trajectories, names, advance)]
         if footage is not None:
             places = _camera_messages(footage.recording.rig, cameras, float(trajectories.time_s[-1]))
@@ -93,11 +89,7 @@ def write_mcap(path: Path, trajectories: Trajectories, footage: Footage | None, 
         writer.add_metadata(METADATA, {"version": "1", "drones": json.dumps(drones, ensure_ascii=False)})
         for time_ns, topic, kind, content in heapq.merge(*streams, key=lambda message: message[0]):
             writer.write_message(topic, schemas[kind], content, time_ns, time_ns)
-            counts[topic, kind] += 1
-            first_ns, last_ns = min(first_ns, time_ns), max(last_ns, time_ns)
         writer.finish()
-    if file != path:
-        _write_bag_file(path, file.name, counts, first_ns, last_ns)
     if footage is None:
         return []
     lenses = [(camera.name, footage.recording.rig.cameras[camera.index]) for camera in frames]
@@ -266,35 +258,6 @@ def _image_messages(
             yield time_ns, f"/{name}/camera_info", ros.CAMERA_INFO, info
         content = {"header": head, "format": "jpeg", "data": encoded}
         yield time_ns, f"/{name}/image/compressed", ros.IMAGE, content
-
-
-def _write_bag_file(
-    folder: Path, file: str, counts: Counter[tuple[str, str]], first_ns: int, last_ns: int
-) -> None:
-    """Write the description of a bag, as rosbag2 does (its version 5)."""
-    import yaml
-
-    total = sum(counts.values())
-    span = {"duration": {"nanoseconds": last_ns - first_ns}, "message_count": total}
-    start = {"starting_time": {"nanoseconds_since_epoch": first_ns}}
-    shared = {"serialization_format": "cdr", "offered_qos_profiles": ""}
-    topics = [
-        {"topic_metadata": {"name": topic, "type": kind} | shared, "message_count": count}
-        for (topic, kind), count in sorted(counts.items())
-    ]
-    content = {
-        "version": 5,
-        "storage_identifier": "mcap",
-        **span,
-        **start,
-        "topics_with_message_count": topics,
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [file],
-        "files": [{"path": file, **span, **start}],
-    }
-    text = yaml.safe_dump({"rosbag2_bagfile_information": content}, sort_keys=False)
-    (folder / BAG).write_text(text, encoding="utf-8")
 
 
 def _library(name: str) -> ModuleType:

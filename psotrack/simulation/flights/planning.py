@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.linalg import norm
 
-from psotrack.errors import SettingsError
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.recordings import recorded_flight
 from psotrack.simulation.flights.varying import (
@@ -21,7 +20,6 @@ from psotrack.simulation.flights.varying import (
     flying_order,
     make,
     make_heading,
-    zero_draws,
 )
 from psotrack.simulation.scenarios import (
     FlightFromFile,
@@ -124,19 +122,10 @@ def plan(scenario: Scenario, seed: int) -> tuple[Flight, ...]:
         if found is None:
             return flights
         excesses.append(found)
-    raise _refusal(
-        scenario, excess(make(scenario, zero_draws(scenario), recorded), scenario, time_s), excesses
-    )
-
-
-def _refusal(scenario: Scenario, nominal: Excess | None, varied: list[Excess]) -> SettingsError:
-    """Error that names the limit that the flights violate without variation, or else the most frequent violation."""
-    if nominal:
-        return scenario_error(scenario, nominal.field, nominal.limit, nominal.found)
-    (field, limit), times = Counter((found.field, found.limit) for found in varied).most_common(1)[0]
-    example = next(found for found in varied if (found.field, found.limit) == (field, limit))
-    remedy = f"{times} of {len(varied)} variations broke this limit: lower variation, or leave more room"
-    return scenario_error(scenario, field, limit, example.found, remedy)
+    (field, limit), times = Counter((each.field, each.limit) for each in excesses).most_common(1)[0]
+    example = next(each for each in excesses if (each.field, each.limit) == (field, limit))
+    remedy = f"{times} of {NUM_ATTEMPTS} variations broke this limit: lower variation, or leave more room"
+    raise scenario_error(scenario, field, limit, example.found, remedy)
 
 
 def _recorded(scenario: Scenario, time_s: Float[np.ndarray, "frames"]) -> dict[int, Flight]:

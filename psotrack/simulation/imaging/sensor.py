@@ -7,7 +7,7 @@ stream, frame), and slow changes depend only on (seed, stream, time), so any fra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -71,22 +71,12 @@ def flicker_gain(imaging: Imaging, phase_rad: float, time_s: float) -> float:
     return float(1 - imaging.flicker / 2 * (1 + ripple)) / (1 - imaging.flicker / 2)
 
 
-@dataclass(frozen=True)
-class _Drift:
+def _drift(rng: np.random.Generator, channels: int) -> Callable[[float], Float[np.ndarray, "channels"]]:
     """A smooth random function of time with standard deviation 1 per channel: a sum of sinusoids of equal amplitude."""
-
-    angular_rad_s: Float[np.ndarray, "channels terms"]
-    phase_rad: Float[np.ndarray, "channels terms"]
-
-    def at(self, time_s: float) -> Float[np.ndarray, "channels"]:
-        terms = np.sin(self.angular_rad_s * time_s + self.phase_rad)
-        return np.sqrt(2 / _DRIFT_TERMS) * terms.sum(axis=-1)
-
-
-def _drift(rng: np.random.Generator, channels: int) -> _Drift:
     shape = (channels, _DRIFT_TERMS)
     period_s = np.exp(rng.uniform(np.log(_DRIFT_PERIODS_S[0]), np.log(_DRIFT_PERIODS_S[1]), shape))
-    return _Drift(2 * np.pi / period_s, rng.uniform(0, 2 * np.pi, shape))
+    angular_rad_s, phase_rad = 2 * np.pi / period_s, rng.uniform(0, 2 * np.pi, shape)
+    return lambda time_s: np.sqrt(2 / _DRIFT_TERMS) * np.sin(angular_rad_s * time_s + phase_rad).sum(axis=-1)
 
 
 class Sensor:
@@ -115,12 +105,10 @@ class Sensor:
     def gains(self, time_s: float) -> Float[np.ndarray, "3"]:
         """(3,), BGR, factors of linear light at a time by drift, automatic exposure and flicker."""
         imaging = self._imaging
-        white = self._white.at(time_s)
+        white = self._white(time_s)
         # The common part of the channels is brightness and is removed, which leaves 2/3 of the variance.
         white = np.sqrt(1.5) * (white - white.mean())
-        drift = (1 + imaging.exposure_drift * self._drift.at(time_s)) * (
-            1 + imaging.white_balance_drift * white
-        )
+        drift = (1 + imaging.exposure_drift * self._drift(time_s)) * (1 + imaging.white_balance_drift * white)
         lamps = flicker_gain(imaging, self._mains_rad, time_s)
         return np.maximum(drift, 0) * lamps * self.exposure(time_s)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -77,16 +77,13 @@ def silhouettes(
     time_s = scene.time_s(frame)
     drawn = [_draw_alone(scene, cam, drone, time_s) for drone in range(len(scene.flights))]
     nearest_m, owner = backdrop_depth_m.copy(), np.zeros(backdrop_depth_m.shape, np.int32)
-    in_image = [drone for drone in drawn if drone is not None]
-    for drone in in_image:
-        window = drone.window.slices
-        is_front = drone.covered & (drone.depth_m < nearest_m[window])
-        nearest_m[window][is_front] = drone.depth_m[is_front]
-        owner[window][is_front] = drone.number
-    return [
-        Silhouette(drone.number, drone.window, owner[drone.window.slices] == drone.number, drone.whole_px)
-        for drone in in_image
-    ]
+    in_image = [each for each in drawn if each is not None]
+    for alone, depth_m in in_image:
+        window = alone.window.slices
+        is_front = alone.seen & (depth_m < nearest_m[window])
+        nearest_m[window][is_front] = depth_m[is_front]
+        owner[window][is_front] = alone.number
+    return [replace(alone, seen=owner[alone.window.slices] == alone.number) for alone, _ in in_image]
 
 
 def lens_silhouettes(
@@ -130,26 +127,10 @@ def lens_silhouettes(
     return found
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """A drone drawn alone, without occlusion.
-
-    Attributes:
-        number: number of the drone, from 1.
-        window: part of the image that contains the drone.
-        covered: pixels of the window that the drone covers.
-        depth_m: depth of the drone at these pixels.
-        whole_px: number of pixels that the drone would have without the edges of the image.
-    """
-
-    number: int
-    window: RasterView
-    covered: Bool[np.ndarray, "rows columns"]
-    depth_m: Float[np.ndarray, "rows columns"]
-    whole_px: int
-
-
-def _draw_alone(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn | None:
+def _draw_alone(
+    scene: Scene, cam: Pinhole, drone: int, time_s: float
+) -> tuple[Silhouette, Float[np.ndarray, "rows columns"]] | None:
+    """The silhouette of a drone that nothing hides, and its depth in the window; None outside the image."""
     shape, flight, at = scene.models[drone], scene.flights[drone], np.array([time_s])
     triangles = np.concatenate([shape.triangles_m, disc_fans(shape)])
     triangles = triangles @ flight.rotation(at)[0].T + flight.position_m(at)[0]
@@ -166,4 +147,5 @@ def _draw_alone(scene: Scene, cam: Pinhole, drone: int, time_s: float) -> _Drawn
     draw(beyond, triangles, np.ones((len(triangles), 1, 3)), colour, depth_m)
     covered = colour[..., 0] > 0.5
     part = window.slices_in(beyond)
-    return _Drawn(drone + 1, window, covered[part], depth_m[part], int(np.count_nonzero(covered)))
+    alone = Silhouette(drone + 1, window, covered[part], int(np.count_nonzero(covered)))
+    return alone, depth_m[part]
