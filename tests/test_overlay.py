@@ -27,8 +27,8 @@ from helpers import with_cameras
 
 from psotrack import cli
 from psotrack.errors import OutputError
-from psotrack.recordings import VideoWriter, probe, read_frames
-from psotrack.show.flights import read_flight, status_rgb, view_in_images
+from psotrack.recordings import VideoWriter, probe, read_frames, view_in_images
+from psotrack.show.flights import read_flight, status_rgb
 from psotrack.show.overlay import Codec, OverlayOptions, find_codec, write_overlays
 from psotrack.support import COLOURS
 from psotrack.trajectories import Status, write_trajectories

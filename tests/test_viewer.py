@@ -34,9 +34,9 @@ from rerun.chunk import RrdReader
 
 from psotrack import cli
 from psotrack.geometry import project
-from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames
+from psotrack.recordings import OnboardVideo, VideoWriter, probe, read_frames, view_in_images
 from psotrack.recordings.datasets import open_recording
-from psotrack.show.flights import read_flight, view_in_images
+from psotrack.show.flights import read_flight
 from psotrack.show.viewer import LiveView, ViewContent, viewer_program, write_flight
 from psotrack.trajectories import read_trajectories, write_trajectories
 

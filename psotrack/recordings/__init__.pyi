@@ -11,6 +11,7 @@ from .image_files import (
     read_image,
     read_mask,
 )
+from .image_views import ImageViews, ellipse_outlines_px, view_in_images
 from .inventory import inventory_table
 from .opencv_messages import silence_opencv
 from .pictures import is_picture_folder, open_pictures, open_video, warn_of_missing_numbers
@@ -61,6 +62,7 @@ __all__ = [
     "CameraTable",
     "Detections",
     "FrameTimes",
+    "ImageViews",
     "MarkersTable",
     "OnboardVideo",
     "Recording",
@@ -78,6 +80,7 @@ __all__ = [
     "check_end",
     "check_rate",
     "digest_video",
+    "ellipse_outlines_px",
     "encoded_video",
     "find_images",
     "image_files",
@@ -106,6 +109,7 @@ __all__ = [
     "recording_file_text",
     "recording_of_video",
     "silence_opencv",
+    "view_in_images",
     "warn_of_missing_numbers",
     "with_all_videos",
     "write_detections",

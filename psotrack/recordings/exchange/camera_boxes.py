@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from psotrack.geometry import Extents, make_extents, project_boxes
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, view_in_images
 from psotrack.support import short_repr
-from psotrack.trajectories import Trajectories
-from psotrack.trajectories.resampling import interpolated
+from psotrack.trajectories import Trajectories, resample
 
 #: Longest gap between two frames of a track over which positions are interpolated, in intervals: one missing frame is a
 #: gap, in which no box is invented.
 _GAP = 1.5
-#: A row's time and the row of a drone depend on each other: the second correction is far below a line of the image.
-_ROLLING_PASSES = 2
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,41 +83,9 @@ def boxes_in_camera(
         trajectories: the tracks.
         size_m: (drones, 3), full lengths of the drones along the world's axes, metres.
     """
-    cameras = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else jnp.float32),
-        recording.rig.cameras[np.array([camera.index])],
-    )
-    seen = make_extents(cameras, jnp.asarray(size_m, jnp.float32))
-    line_time_s = recording.by_name[camera.name].line_time_s
-    width, height = camera.image_size_wh
-    time_s = np.repeat(camera.time_s[:, None], trajectories.num_drones, axis=1)
-    xyxy, shown = _project(seen, _positions_at(trajectories, time_s))
-    for _ in range(_ROLLING_PASSES if line_time_s else 0):
-        # The frame's time is that of the middle row.
-        row = np.clip(np.where(shown, xyxy[..., [1, 3]].mean(axis=-1), height / 2), 0, height)
-        xyxy, shown = _project(seen, _positions_at(trajectories, time_s + (row - height / 2) * line_time_s))
-    inside = (xyxy[..., 0] < width) & (xyxy[..., 1] < height) & (xyxy[..., 2] > 0) & (xyxy[..., 3] > 0)
-    return np.where((shown & inside)[..., None], xyxy, np.nan)
-
-
-def _project(
-    seen: Extents, position_m: Float[np.ndarray, "frames drones 3"]
-) -> tuple[Float[np.ndarray, "frames drones 4"], Bool[np.ndarray, "frames drones"]]:
-    """Boxes, and whether they have a meaning."""
-    known = np.isfinite(position_m).all(axis=-1)
-    # Any number in place of NaN: the box is not used.
-    boxes = project_boxes(seen, jnp.asarray(np.where(known[..., None], position_m, 0.0), jnp.float32))
-    return np.asarray(boxes.xyxy, np.float64)[:, :, 0], np.asarray(boxes.in_front)[:, :, 0] & known
-
-
-def _positions_at(
-    trajectories: Trajectories, time_s: Float[np.ndarray, "frames drones"]
-) -> Float[np.ndarray, "frames drones 3"]:
-    """Positions of each drone at times of its own, metres; NaN where the drone is not seen."""
-    position_m = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
     gap_s = _GAP * float(np.median(np.diff(trajectories.time_s))) if trajectories.num_frames > 1 else 0.0
-    columns = [
-        interpolated(trajectories.time_s, position_m[:, [drone]], gap_s)(time_s[:, drone])
-        for drone in range(trajectories.num_drones)
-    ]
-    return np.concatenate(columns, axis=1)
+    position_m = np.where(trajectories.seen[..., None], trajectories.position_m, np.nan)
+    seen = Trajectories(trajectories.frame, trajectories.time_s, trajectories.drones, position_m)
+    at_frames = resample(seen, np.arange(len(camera.time_s)), camera.time_s, gap_s=gap_s)
+    alone = replace(recording, cameras=(recording.by_name[camera.name],))
+    return view_in_images(alone, at_frames, size_m).boxes_px[:, :, 0]

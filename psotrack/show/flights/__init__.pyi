@@ -12,7 +12,6 @@ from .flight import (
     rows_at,
     split_sequence,
 )
-from .image_views import ImageViews, ellipse_outlines_px, view_in_images
 from .quality import QUANTITIES, Quantity, camera_quality, deviations_mm, quantities
 from .run_record import (
     LearnedDrone,
@@ -32,7 +31,6 @@ __all__ = [
     "Event",
     "EventKind",
     "FlightTracks",
-    "ImageViews",
     "LearnedDrone",
     "MeetingRecord",
     "Quantity",
@@ -42,7 +40,6 @@ __all__ = [
     "camera_quality",
     "colour_rgb",
     "deviations_mm",
-    "ellipse_outlines_px",
     "ellipsoids_90",
     "find_events",
     "find_recording",
@@ -60,6 +57,5 @@ __all__ = [
     "split_sequence",
     "status_rgb",
     "statuses",
-    "view_in_images",
     "write_tracked",
 ]

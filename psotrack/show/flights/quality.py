@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from psotrack.recordings import Recording
+from psotrack.recordings import Recording, view_in_images
 from psotrack.show.flights.flight import FlightTracks, TrackedFlight
-from psotrack.show.flights.image_views import view_in_images
 from psotrack.support import drone_colour
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from psotrack.show.flights import FlightTracks, ImageViews, ellipse_outlines_px, status_rgb, statuses
+from psotrack.recordings import ImageViews, ellipse_outlines_px
+from psotrack.show.flights import FlightTracks, status_rgb, statuses
 from psotrack.trajectories import Status
 
 #: How much white is mixed into the colours, which stand before images.

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError, OutputError, check_positive
-from psotrack.recordings import Recording, encoded_video, read_frames_at
-from psotrack.show.flights import ImageViews, TrackedFlight, rows_at, view_in_images
+from psotrack.recordings import ImageViews, Recording, encoded_video, read_frames_at, view_in_images
+from psotrack.show.flights import TrackedFlight, rows_at
 from psotrack.show.overlay.drawing import DrawnTracks, drawn_tracks, places_in
 from psotrack.show.overlay.map_view import make_map
 from psotrack.show.overlay.videos import DrawnCamera, DrawnVideo, write_video

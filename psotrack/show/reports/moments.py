@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from psotrack.geometry import in_images, project_visible
-from psotrack.recordings import Recording, read_frames_at
-from psotrack.show.flights import Event, EventKind, FlightTracks, view_in_images
+from psotrack.recordings import Recording, read_frames_at, view_in_images
+from psotrack.show.flights import Event, EventKind, FlightTracks
 from psotrack.show.overlay import draw_drones, drawn_tracks, places_in
 from psotrack.support import Report, processors
 

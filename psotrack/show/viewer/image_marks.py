@@ -10,8 +10,8 @@ import rerun as rr
 from jaxtyping import Int
 
 from psotrack.geometry import rotation_matrices
-from psotrack.recordings import OnboardVideo, Recording, read_detections
-from psotrack.show.flights import FlightTracks, TrackedFlight, ellipse_outlines_px, view_in_images
+from psotrack.recordings import OnboardVideo, Recording, ellipse_outlines_px, read_detections, view_in_images
+from psotrack.show.flights import FlightTracks, TrackedFlight
 from psotrack.show.viewer.camera_images import CameraKey, EncodedImage, ImageSource, encode_images
 from psotrack.show.viewer.entity_log import (
     EntityLog,

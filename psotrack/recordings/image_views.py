@@ -22,7 +22,8 @@ from psotrack.geometry import (
     project_visible,
     project_with_jacobian,
 )
-from psotrack.recordings import Recording, nearest_frames
+from psotrack.recordings.recording import Recording
+from psotrack.recordings.timing import nearest_frames
 from psotrack.trajectories import Trajectories
 
 #: Number of instants that are projected together, which bounds the memory of long flights.
