@@ -150,13 +150,13 @@ def read_recording_file(path: Path | str) -> RecordingFile:
     tables = data.get("cameras")
     if not isinstance(tables, dict) or not tables:
         found = "none" if tables is None or tables == {} else "another value"
-        raise _error(path, "cameras", "a table [cameras.NAME] for each camera", found)
+        raise file_error(path, "cameras", "a table [cameras.NAME] for each camera", found)
     _check_names(path, tables)
     # Each table is converted by itself, because msgspec's messages do not name the key of a mapping.
     cameras = {name: _read_camera(path, name, table) for name, table in tables.items()}
-    content = convert({**data, "cameras": {}}, RecordingFile, lambda *parts: _error(path, *parts))
+    content = convert({**data, "cameras": {}}, RecordingFile, lambda *parts: file_error(path, *parts))
     if content.calibration_unit is not None and content.calibration is None:
-        raise _error(path, "calibration", "a rig file, because there is a calibration_unit", "none")
+        raise file_error(path, "calibration", "a rig file, because there is a calibration_unit", "none")
     _check_bounds(path, content.world)
     return msgspec.structs.replace(content, cameras=cameras)
 
@@ -164,18 +164,18 @@ def read_recording_file(path: Path | str) -> RecordingFile:
 def _read_camera(path: Path, name: str, table: Any) -> CameraTable:
     place = f"cameras.{name}"
     if not isinstance(table, dict):
-        raise _error(path, place, f"a table [{place}]", f"{table!r}")
-    camera = convert(table, CameraTable, lambda field, *parts: _error(path, f"{place}.{field}", *parts))
+        raise file_error(path, place, f"a table [{place}]", f"{table!r}")
+    camera = convert(table, CameraTable, lambda field, *parts: file_error(path, f"{place}.{field}", *parts))
     for one, other in _EXCLUSIVE:
         if table.get(one) is not None and table.get(other) is not None:
-            raise _error(path, place, f"{one} or {other}", "both")
+            raise file_error(path, place, f"{one} or {other}", "both")
     if camera.fps is not None:
         check_rate(f"{path}, {place}.fps", camera.fps)
     if camera.video is None and camera.fps is None and camera.timestamps is None:
         why = (
             ", because the camera has no video" if camera.images is None else " of the images, or timestamps"
         )
-        raise _error(path, f"{place}.fps", f"frames per second{why}", "none")
+        raise file_error(path, f"{place}.fps", f"frames per second{why}", "none")
     return camera
 
 
@@ -185,7 +185,7 @@ def _check_keys(path: Path, data: Mapping[str, Any]) -> None:
     for key in data:
         if key not in names and key in CameraTable.__struct_fields__:
             remedy = "write it below [cameras.NAME] of the camera that it belongs to"
-            raise _error(path, key, f"one of {', '.join(names)}", key, remedy)
+            raise file_error(path, key, f"one of {', '.join(names)}", key, remedy)
 
 
 def _check_names(path: Path, tables: Mapping[str, Any]) -> None:
@@ -195,10 +195,10 @@ def _check_names(path: Path, tables: Mapping[str, Any]) -> None:
         check_file_name(name, f"{path}, cameras")
         # Options have lists of names, and pairs of a name and a value.
         if set(name) & set(",="):
-            raise _error(path, "cameras", "names without commas and equals signs", repr(name))
+            raise file_error(path, "cameras", "names without commas and equals signs", repr(name))
         key = camera_key(name)
         if key in spellings:
-            raise _error(
+            raise file_error(
                 path, f"cameras.{name}", "each camera once", f"{spellings[key]} as well, the same name"
             )
         spellings[key] = name
@@ -209,10 +209,11 @@ def _check_bounds(path: Path, world: WorldTable) -> None:
         low, high = world.bounds_m
         if any(a >= b for a, b in zip(low, high, strict=True)):
             expected = "the lowest corner, then the highest corner"
-            raise _error(path, "world.bounds_m", expected, f"{list(low)} and {list(high)}")
+            raise file_error(path, "world.bounds_m", expected, f"{list(low)} and {list(high)}")
 
 
-def _error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
+def file_error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
+    """Error about a place in a `recording.toml`; an empty place is the whole file."""
     where = f"{path}, {place}" if place else path
     return InputError(where, expected=expected, found=found, remedy=remedy)
 

@@ -1,7 +1,7 @@
 from .association import GATE_M, UNASSIGNED, fixed_partner_values
 from .files import DroneRows, check_cells, from_rows, read_trajectories, write_ambiguity, write_trajectories
 from .orientations import roll_pitch_yaw_deg, rotation_matrices
-from .resampling import resample
+from .resampling import merged, resample
 from .row_streams import RowStream
 from .status import Status
 from .summaries import drones_html, summary_columns
@@ -23,6 +23,7 @@ __all__ = [
     "drones_html",
     "fixed_partner_values",
     "from_rows",
+    "merged",
     "padded",
     "read_trajectories",
     "resample",

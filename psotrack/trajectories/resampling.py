@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from psotrack.trajectories.trajectories import Trajectories
+from psotrack.trajectories.trajectories import QUANTITIES, Trajectories
 
 #: Longest gap over which positions are interpolated, seconds; for slow trajectories 1.5 sample intervals.
 MAX_GAP_S = 0.1
@@ -77,6 +78,35 @@ def _turned(
             turned = spline(at_s) if spline else rotation[np.repeat(piece, len(at_s))]
             found[inside] = turned.as_quat(scalar_first=True)
     return found
+
+
+def merged(
+    parts: Sequence[Trajectories],
+    frames: Sequence[Int[np.ndarray, "_"]],
+    time_of: Callable[[Int[np.ndarray, "frames"]], Float[np.ndarray, "frames"]],
+) -> Trajectories:
+    """One set of trajectories from those of different drones, in the frames that some of them have; NaN where unknown.
+
+    Args:
+        parts: trajectories without status and numbers of cameras.
+        frames: for each of them (rows,), the numbers of the new frames of its rows.
+        time_of: times of frames, seconds, by their numbers.
+    """
+    frame = np.unique(np.concatenate(frames)).astype(np.int64)
+    drones = tuple(name for part in parts for name in part.drones)
+    values = [part.quantities() for part in parts]
+    known: dict[str, Any] = {
+        name: np.full((len(frame), len(drones), *QUANTITIES[name]), np.nan)
+        for each in values
+        for name in each
+    }
+    first = 0
+    for part, number, own in zip(parts, frames, values, strict=True):
+        rows, stop = np.searchsorted(frame, number), first + part.num_drones
+        for name, value in own.items():
+            known[name][rows, first:stop] = value
+        first = stop
+    return Trajectories(frame, time_of(frame).astype(np.float64), drones, **known)
 
 
 def longest_gap_s(time_s: Float[np.ndarray, "samples"]) -> float:

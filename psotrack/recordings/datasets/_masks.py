@@ -15,7 +15,6 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -57,10 +56,9 @@ class MaskWriter:
     """
 
     def __init__(self, path: Path | str) -> None:
-        self._path = Path(path)
+        self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_STORED)
 
     def __enter__(self) -> MaskWriter:
-        self._archive = zipfile.ZipFile(self._path, "w", zipfile.ZIP_STORED)
         return self
 
     def write(self, camera: str, drone: int, frame: int, mask: Mask) -> None:
@@ -75,12 +73,7 @@ class MaskWriter:
         png = _png(mask) if mask.any() else _empty_png(*mask.shape)
         self._archive.writestr(_stored_entry(f"{camera}/dron{drone}/{frame:06d}.png"), png)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._archive.close()
 
 

@@ -16,7 +16,7 @@ from psotrack.recordings import Reference, Timeline
 from psotrack.recordings.datasets._poses import read_poses
 from psotrack.recordings.mocap import marker_bodies, read_c3d
 from psotrack.support import first_line
-from psotrack.trajectories import Trajectories, read_trajectories, resample
+from psotrack.trajectories import Trajectories, merged, read_trajectories, resample
 from psotrack.trajectories.tum import read_tum
 
 _logger = logging.getLogger(__name__)
@@ -100,21 +100,7 @@ def _at_times(
         later_s: the clock of the references shows t + `later_s` at time t, seconds.
     """
     parts = [resample(reference, frame, time_s, later_s=later_s) for reference in references]
-    unknown = np.full((len(frame), 1, 4), np.nan)
-    turned = any(part.orientation_wxyz is not None for part in parts)
-    orientations = [
-        np.repeat(unknown, part.num_drones, axis=1)
-        if part.orientation_wxyz is None
-        else part.orientation_wxyz
-        for part in parts
-    ]
-    return Trajectories(
-        frame,
-        time_s,
-        tuple(drone for part in parts for drone in part.drones),
-        np.concatenate([part.position_m for part in parts], axis=1),
-        orientation_wxyz=np.concatenate(orientations, axis=1) if turned else None,
-    )
+    return merged(parts, [frame] * len(parts), lambda _: time_s)
 
 
 def _read(path: Path, fps: float, bodies: Bodies | None) -> Trajectories:

@@ -33,6 +33,7 @@ from psotrack.recordings import (
     StoredSilhouettes,
     VideoInfo,
     check_rate,
+    file_error,
     find_images,
     open_pictures,
     probe,
@@ -68,7 +69,7 @@ def read_recording_toml(path: Path | str, bodies: Mapping[str, Sequence[str]] | 
     path, content = Path(path), read_recording_file(path)
     if bodies:
         if content.reference is None:
-            raise _error(path, "reference", "a C3D file, because markers of drones are named", "none")
+            raise file_error(path, "reference", "a C3D file, because markers of drones are named", "none")
         named = {name: tuple(labels) for name, labels in bodies.items()}
         reference = msgspec.structs.replace(content.reference, bodies=named)
         content = msgspec.structs.replace(content, reference=reference)
@@ -127,7 +128,7 @@ class _Named:
 
     def error(self, key: str, expected: str, found: str, remedy: str = "") -> InputError:
         """Error whose message names the key."""
-        return _error(self.path, f"cameras.{self.name}.{key}", expected, found, remedy)
+        return file_error(self.path, f"cameras.{self.name}.{key}", expected, found, remedy)
 
     def file(self, key: str) -> Path | None:
         """The file that a key names, which must exist; None where the key is not there."""
@@ -278,7 +279,7 @@ def _check_videos(path: Path, cameras: Sequence[CameraRecording]) -> None:
         file = (each.video.images[0] if each.video.images else each.video.path).resolve()
         if file in owners:
             found = f"that of {owners[file]}, {file.name}"
-            raise _error(path, f"cameras.{each.name}", "a video of its own", found)
+            raise file_error(path, f"cameras.{each.name}", "a video of its own", found)
         owners[file] = each.name
     spans = {
         each.name: each.times.time_s[[0, -1]] for each in cameras if each.times and each.times.num_frames
@@ -328,7 +329,7 @@ def _check_one_each(path: Path, known: Mapping[str, str | None]) -> None:
     for name, entry in known.items():
         if entry is not None and entry in taken:
             expected = "cameras with names as in the calibration"
-            raise _error(path, f"cameras.{name}", expected, f"{entry} for {taken[entry]} as well")
+            raise file_error(path, f"cameras.{name}", expected, f"{entry} for {taken[entry]} as well")
         if entry is not None:
             taken[entry] = name
 
@@ -366,13 +367,9 @@ def _existing(folder: Path, written: str, path: Path, place: str) -> Path:
     """Path of a file that a key names, relative to the folder of the recording."""
     file = folder / written
     if not file.exists():
-        raise _error(path, place, "a file that exists", f"none at {file}")
+        raise file_error(path, place, "a file that exists", f"none at {file}")
     return file
 
 
 def _size_text(size_wh: tuple[int, int] | None) -> str:
     return "no size" if size_wh is None else f"{size_wh[0]} x {size_wh[1]} pixels"
-
-
-def _error(path: Path, place: str, expected: str, found: str, remedy: str = "") -> InputError:
-    return InputError(f"{path}, {place}", expected=expected, found=found, remedy=remedy)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from psotrack.errors import InputError
 from psotrack.recordings import Recording
-from psotrack.trajectories import QUANTITIES, Trajectories, resample
+from psotrack.trajectories import Trajectories, merged, resample
 
 #: Largest number of a frame.
 _LARGEST_FRAME = 2**31
@@ -95,14 +94,14 @@ def joined(where: object, paths: Sequence[Trajectories], recording: Recording | 
         at_instants = [_instants_of(path.time_s, instant_s) for path in paths]
         frames = [frame for frame in at_instants if frame is not None]
         if len(frames) == len(paths):
-            return _on_frames(paths, frames, lambda frame: instant_s[frame])
+            return merged(paths, frames, lambda frame: instant_s[frame])
     own_s = _own_interval_s(paths)
     if own_s is not None:
         frames = [np.round(path.time_s / own_s).astype(np.int64) for path in paths]
-        return _on_frames(paths, frames, lambda frame: frame * own_s)
+        return merged(paths, frames, lambda frame: frame * own_s)
     if instant_s is None:
         frames = [np.searchsorted(all_s, path.time_s) for path in paths]
-        return _on_frames(paths, frames, lambda frame: all_s[frame])
+        return merged(paths, frames, lambda frame: all_s[frame])
     return _interpolated(where, paths, instant_s)
 
 
@@ -157,23 +156,6 @@ def _own_interval_s(paths: Sequence[Trajectories]) -> float | None:
     return own_s
 
 
-def _on_frames(
-    paths: Sequence[Trajectories],
-    frames: Sequence[Int[np.ndarray, "_"]],
-    time_of: Callable[[Int[np.ndarray, "frames"]], Float[np.ndarray, "frames"]],
-) -> Trajectories:
-    """Trajectories in the frames that some path has."""
-    frame = np.unique(np.concatenate(frames)).astype(np.int64)
-    quantities: dict[str, Any] = {}
-    for name in {name for path in paths for name in path.quantities()}:
-        quantities[name] = np.full((len(frame), len(paths), *QUANTITIES[name]), np.nan)
-        for drone, (path, number) in enumerate(zip(paths, frames, strict=True)):
-            if name in path.quantities():
-                quantities[name][np.searchsorted(frame, number), drone] = path.quantities()[name][:, 0]
-    drones = tuple(name for path in paths for name in path.drones)
-    return Trajectories(frame, time_of(frame).astype(np.float64), drones, **quantities)
-
-
 def _interpolated(
     where: object, paths: Sequence[Trajectories], instant_s: Float[np.ndarray, "instants"]
 ) -> Trajectories:
@@ -182,4 +164,4 @@ def _interpolated(
     if not any(np.isfinite(part.position_m).any() for part in parts):
         expected = "two samples of a drone with an instant of the recording between them"
         raise InputError(where, expected=expected, found="none")
-    return _on_frames(parts, [frame] * len(parts), lambda number: instant_s[number])
+    return merged(parts, [frame] * len(parts), lambda number: instant_s[number])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from dataclasses import replace
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -120,12 +119,7 @@ class LiveView:
         """Show some values of one entity at this instant."""
         self._log.rows(path, self._now, kind, np.array([count]), **values)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._ends.close()
 
     def _close(self) -> None:
