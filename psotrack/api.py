@@ -46,14 +46,13 @@ from psotrack.show import flights, reports
 from psotrack.show import overlay as overlays
 from psotrack.support import (
     Report,
-    atomic_write,
     bind,
-    json_text,
     read_json,
     refuse_files,
     report_of,
     short_text,
     user_cache,
+    write_json,
 )
 from psotrack.tracking.births import room_bounds
 from psotrack.tracking.matching import from_detections, from_silhouettes
@@ -475,8 +474,7 @@ def _drafted(folder: Path, options: DraftOptions) -> Draft:
 
 
 def _written(path: Path, diagnosis: examination.Diagnosis) -> examination.Diagnosis:
-    with atomic_write(path) as temporary:
-        temporary.write_text(json_text(diagnosis.to_dict()) + "\n", encoding="utf-8")
+    write_json(path, diagnosis.to_dict())
     return diagnosis
 
 

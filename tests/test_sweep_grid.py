@@ -255,7 +255,7 @@ WRONG = [
         {"grid": {"swarm.particles": [20, 1]}},
         "grid.swarm.particles[1]: expected a whole number of at least 2, found 1",
     ),
-    ({"grid": {"flipped": [0.5, 2]}}, "grid.flipped[1]: expected a number from 0 to 1, found 2"),
+    ({"grid": {"flipped": [0.5, 2]}}, "grid.flipped[1]: expected a number of at most 1, found 2"),
     ({"grid": {"clock_frames": [-1]}}, "grid.clock_frames[0]: expected a number of at least 0, found -1"),
     (
         {"methods": {"a": {"silhouettes.working_reduction": 4}}, "grid": {"silhouettes.reduction": [4, 6]}},
@@ -317,9 +317,11 @@ def test_messages_of_a_file_begin_with_its_path(path):
 
 
 def test_a_perturbation_made_in_python_is_checked():
-    with pytest.raises(SettingsError, match="extrinsics_deg: expected a number from 0 to 180, found nan"):
+    with pytest.raises(SettingsError, match="extrinsics_deg: expected a number of at least 0, found NaN"):
         Perturbation(extrinsics_deg=float("nan"))
-    with pytest.raises(SettingsError, match="clock_frames: expected a number of at least 0, found inf"):
+    with pytest.raises(
+        SettingsError, match="clock_frames: expected a number of at most 1000000, found Infinity"
+    ):
         Perturbation(clock_frames=float("inf"))
 
 

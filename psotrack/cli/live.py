@@ -18,11 +18,12 @@ from msgspec import Meta
 
 from psotrack.cli.commands import command
 from psotrack.cli.options import Cache, Cameras, MostDrones, Seq, compiled_folder, recording_named
-from psotrack.cli.output import Output, check_suffix, write_json
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.settings import TrackingSettings
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
 from psotrack.settings import TrackSettings
+from psotrack.support import write_json
 from psotrack.support.interrupts import unhurried_end
 
 if TYPE_CHECKING:

@@ -18,7 +18,6 @@ from psotrack.errors import SettingsError
 from psotrack.support import (
     POSITION,
     Report,
-    atomic_write,
     joined,
     json_text,
     no_progress,
@@ -27,6 +26,7 @@ from psotrack.support import (
     refuse_files,
     terminal_bar,
     text_table,
+    write_json,
 )
 
 if TYPE_CHECKING:
@@ -196,9 +196,3 @@ def check_suffix(option: str, path: Path | None, *suffixes: str) -> None:
     """Raise `SettingsError` for a file that ends otherwise than an option wants."""
     if path is not None and path.suffix not in suffixes:
         raise SettingsError(option, expected=f"a file that ends in {' or '.join(suffixes)}", found=path.name)
-
-
-def write_json(path: str | Path, content: Any) -> None:
-    """Write a JSON file, NaN as null; an interruption leaves no partial file."""
-    with atomic_write(Path(path)) as temporary:
-        temporary.write_text(json_text(content) + "\n", encoding="utf-8")

@@ -19,10 +19,11 @@ from psotrack.cli.options import (
     detections_of,
     recording_named,
 )
-from psotrack.cli.output import Output, check_suffix, write_json
+from psotrack.cli.output import Output, check_suffix
 from psotrack.cli.settings import TrackingSettings, chosen_settings
 from psotrack.cli.types import says
 from psotrack.errors import SettingsError
+from psotrack.support import write_json
 
 
 @command()

@@ -15,13 +15,12 @@ import msgspec
 from psotrack.errors import InputError
 from psotrack.geometry import camera_key
 from psotrack.recordings.timing import check_rate
-from psotrack.support import atomic_write, check_file_name, convert, read_toml, toml_text
+from psotrack.support import Positive, atomic_write, check_file_name, convert, read_toml, toml_text
 
 #: Name of the file in a folder.
 RECORDING_FILE = "recording.toml"
 
 Vector = tuple[float, float, float]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 Pixels = Annotated[int, msgspec.Meta(ge=1)]
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 

@@ -15,17 +15,14 @@ from typing import Annotated, Any
 import msgspec
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.support import assign, convert, read_toml
+from psotrack.support import NotNegative, Positive, Share, assign, convert, read_toml
 
 _PRESETS = resources.files("psotrack.simulation.presets")
 
 Vector = tuple[float, float, float]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 #: Seconds, and m/s. Smaller values are far below those of any flight or lamp, and a division by them may overflow.
 Period = Annotated[float, msgspec.Meta(ge=1e-3)]
 Speed = Annotated[float, msgspec.Meta(ge=1e-3)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 GreyLevels = Annotated[float, msgspec.Meta(ge=0, le=255)]
 #: Counts have an upper limit, far above all useful values, so that a mistyped number does not fill the memory.
 Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]

@@ -58,6 +58,7 @@ from .schema import (
     toml_key,
     toml_text,
     toml_value,
+    write_json,
     write_toml,
 )
 from .similarity import similarity
@@ -159,6 +160,7 @@ __all__ = [
     "user_cache",
     "whole_number",
     "widening",
+    "write_json",
     "write_rows",
     "write_toml",
 ]

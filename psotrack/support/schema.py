@@ -140,6 +140,16 @@ def json_text(content: Any) -> str:
     return json.dumps(_with_null(content), indent=2, allow_nan=False)
 
 
+def write_json(path: Path | str, content: Any) -> None:
+    """Write a JSON file; see `json_text`.
+
+    Raises:
+        OutputError: the file cannot be written; an older one is unchanged.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(json_text(content) + "\n", encoding="utf-8")
+
+
 def toml_key(name: str) -> str:
     """A name as key of a TOML file, in quotes where it needs them."""
     return name if _BARE_KEY.fullmatch(name) else toml_value(name)

@@ -6,18 +6,15 @@ of the code that computes its rows, so that rows of another recording or of anot
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
-from psotrack.errors import SettingsError
-from psotrack.foreground.silhouettes import check_whole
 from psotrack.settings import TrackSettings, flatten
-from psotrack.support import digest_record
+from psotrack.support import Share, check_types, digest_record
 
 #: Number of hexadecimal digits of a digest in names.
 _DIGITS = 20
@@ -36,18 +33,13 @@ class Perturbation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         SettingsError: a value is out of range.
     """
 
-    extrinsics_deg: float = 0.0
-    clock_frames: float = 0.0
-    flipped: float = 0.0
-    draw: int = 0
+    extrinsics_deg: Annotated[float, msgspec.Meta(ge=0, le=180)] = 0.0
+    clock_frames: Annotated[float, msgspec.Meta(ge=0, le=1e6)] = 0.0
+    flipped: Share = 0.0
+    draw: Annotated[int, msgspec.Meta(ge=0)] = 0
 
     def __post_init__(self) -> None:
-        for name, most in (("extrinsics_deg", 180), ("clock_frames", math.inf), ("flipped", 1)):
-            value = getattr(self, name)
-            if not (0 <= value <= most and math.isfinite(value)):
-                expected = f"a number from 0 to {most}" if math.isfinite(most) else "a number of at least 0"
-                raise SettingsError(name, expected=expected, found=f"{value:g}")
-        check_whole("draw", self.draw, lowest=0)
+        check_types(self)
 
     @property
     def is_random(self) -> bool:

@@ -28,7 +28,7 @@ from typing import Any
 import pandas as pd
 
 from psotrack.errors import InputError
-from psotrack.support import atomic_write, digest_record, json_text, read_json
+from psotrack.support import digest_record, read_json, write_json
 from psotrack.sweeps.locks import Locks
 from psotrack.sweeps.sealed_files import DamagedError, read_parquet, write_parquet
 from psotrack.sweeps.tables import DESCRIBING, natural
@@ -82,7 +82,7 @@ class Store:
         Raises:
             OutputError: the file cannot be written.
         """
-        _write_json(self._failure_path(name), {"error": error, **cell})
+        write_json(self._failure_path(name), {"error": error, **cell})
 
     def remove_failure(self, name: str) -> None:
         """Remove the record of a cell's earlier failure, because the cell is finished."""
@@ -96,7 +96,7 @@ class Store:
         """
         path = self.folder / "_runs" / f"{digest_record(run)[:20]}.json"
         if not path.exists():
-            _write_json(path, run)
+            write_json(path, run)
 
     def rows(self, seeds: Mapping[str, Collection[int]] | None = None) -> pd.DataFrame:
         """One row per run of the finished cells.
@@ -182,8 +182,3 @@ def _place_of_cell(rows: pd.DataFrame) -> list[Any]:
     """What cells are sorted by: what describes them, in the order of the columns."""
     names = [str(name) for name in rows.columns if str(name).startswith(DESCRIBING)]
     return [natural(value) for value in rows[names].iloc[0]]
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(json_text(content) + "\n", encoding="utf-8")

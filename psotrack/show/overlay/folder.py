@@ -27,11 +27,11 @@ from psotrack.support import (
     atomic_write,
     check_file_name,
     digest_file,
-    json_text,
     map_in_processes,
     no_progress,
     read_json,
     refuse_to_overwrite,
+    write_json,
 )
 
 #: File beside the videos that says of what they are made.
@@ -217,8 +217,7 @@ def _begin(folder: Path, flight: TrackedFlight, videos: dict[str, str], force: b
     if len(kept) < len(videos):
         tracks = [str(each.path) for each in flight.tracks]
         content = {"videos": before | videos, "recording": flight.name, "tracks": tracks}
-        with atomic_write(path) as temporary:
-            temporary.write_text(json_text(content) + "\n", encoding="utf-8")
+        write_json(path, content)
     return kept
 
 
