@@ -7,7 +7,7 @@ for the heading.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -159,6 +159,11 @@ class Turn:
 Draws = tuple[tuple[Draw, Turn], ...]
 
 
+def zero_draws(scenario: Scenario) -> Draws:
+    """Zeros for each drone, which leave the scenario's flights unchanged."""
+    return tuple((_draw([drone], lambda *shape: np.zeros(shape)), Turn()) for drone in scenario.drones)
+
+
 def draws(scenario: Scenario, rng: np.random.Generator) -> Draws:
     """Random numbers for each drone; drones of one group have the same numbers, except for the heading."""
     drawn: dict[str | int, Draw] = {}
@@ -169,18 +174,17 @@ def draws(scenario: Scenario, rng: np.random.Generator) -> Draws:
         )
         group = drone.group or index
         if group not in drawn:
-            drawn[group] = _draw(members, rng)
+            drawn[group] = _draw(members, lambda *shape: rng.uniform(-1, 1, shape))
         turn = Turn(float(rng.uniform(-1, 1)), float(rng.uniform(0, 2 * np.pi)))
         result.append((drawn[group], turn))
     return tuple(result)
 
 
-def _draw(drones: Sequence[Drone], rng: np.random.Generator) -> Draw:
+def _draw(drones: Sequence[Drone], uniform: Callable[..., Float[np.ndarray, "*shape"]]) -> Draw:
     """Random numbers for drones of one group, enough for the flight with the most harmonics or waypoints."""
     harmonics = max(_num_harmonics(drone.flight) for drone in drones)
     points = max(len(drone.flight.points_m) if isinstance(drone.flight, Waypoints) else 0 for drone in drones)
-    shapes = (harmonics, 3, harmonics, harmonics, (points, 3))
-    return Draw(*(rng.uniform(-1, 1, shape) for shape in shapes))
+    return Draw(uniform(harmonics), uniform(3), uniform(harmonics), uniform(harmonics), uniform(points, 3))
 
 
 def _num_harmonics(record: FlightRecord) -> int:
