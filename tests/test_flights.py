@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from psotrack.errors import InputError, SettingsError
-from psotrack.recordings import FrameTimes, Recording
+from psotrack.recordings import FrameTimes, Recording, view_in_images
 from psotrack.recordings.exchange import export_tracks
 from psotrack.show.flights import (
     EventKind,
@@ -25,7 +25,6 @@ from psotrack.show.flights import (
     read_flight,
     recording_beside,
     split_sequence,
-    view_in_images,
 )
 from psotrack.trajectories import Status, Trajectories, write_trajectories
 
