@@ -82,7 +82,6 @@ class CalibratedRig:
         used: (cameras, instants, corners), False for outliers and for what is not seen.
         lens_models: for each camera, the model of its lens.
         lens_std: for each camera, standard deviations of fx, fy, cx, cy and of the distortion; 0 where it was known.
-        covariance: (cameras, 6, 6), covariance of a small turn about the camera's axes, rad, and of the translation, m.
         centre_covariance_m2: (cameras, 3, 3), covariances of the camera centres, world, m².
         shared: (cameras, cameras), number of instants that two cameras share.
     """
@@ -96,7 +95,6 @@ class CalibratedRig:
     used: Bool[np.ndarray, "cameras instants corners"]
     lens_models: tuple[LensModel, ...]
     lens_std: tuple[np.ndarray, ...]
-    covariance: Float[np.ndarray, "cameras 6 6"]
     centre_covariance_m2: Float[np.ndarray, "cameras 3 3"]
     shared: Int[np.ndarray, "cameras cameras"]
 
@@ -373,7 +371,7 @@ def _result(
     covariance = _covariance(bundle)
     problem, state = bundle.problem, bundle.state
     cameras: dict[str, Camera] = {}
-    lens_std, by_camera, centres = [], [], []
+    lens_std, centres = [], []
     residual_px, own_px = np.full((2, *views.corners_px.shape[:3]), np.nan)
     used = np.zeros(views.corners_px.shape[:3], bool)
     at = problem.camera, problem.target
@@ -383,10 +381,8 @@ def _result(
         # Unknowns that were not adjusted have the index -1, the padding.
         lens_std.append(np.sqrt(np.diag(padded)[problem.lens_columns[index]]))
         columns = problem.pose_columns[index]
-        block = padded[np.ix_(columns, columns)]
         by_pose = centre_by_pose(T[:3, :3], T[:3, 3])
-        by_camera.append(block)
-        centres.append(by_pose @ block @ by_pose.T)
+        centres.append(by_pose @ padded[np.ix_(columns, columns)] @ by_pose.T)
         cameras[name] = models[index].camera(
             state.lenses[index], T, (int(views.image_size_wh[index, 0]), int(views.image_size_wh[index, 1]))
         )
@@ -400,7 +396,6 @@ def _result(
         used,
         models,
         tuple(lens_std),
-        np.stack(by_camera),
         np.stack(centres),
         chain.shared,
     )
