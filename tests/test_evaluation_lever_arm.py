@@ -1,13 +1,11 @@
 """The offset of each drone's tracked point and its standard error: values, JSON and table."""
 
-import io
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from evaluation_flights import ROUNDING, on_x_axis
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from psotrack.evaluation import evaluate, tables
@@ -103,14 +101,9 @@ class TestLeverArm:
         assert len(json.loads(json.dumps(drone, allow_nan=False))["offset_standard_error_m"]) == 3
 
     def test_the_table_shows_the_largest_standard_error(self):
-        def print_table(evaluation):
-            console = Console(file=io.StringIO(), width=80)
-            console.print(tables.render(evaluation))
-            return console.file.getvalue()
-
         evaluation = evaluate(*turning_flight(noise_m=0.02))
         largest_mm = 1e3 * max(evaluation.per_drone[0].offset_standard_error_m)
-        assert f"without each drone's offset (body frame, known to {largest_mm:.1f} mm)" in print_table(
+        assert f"without each drone's offset (body frame, known to {largest_mm:.1f} mm)" in tables.as_text(
             evaluation
         )
-        assert "(world frame)" in print_table(evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0])))
+        assert "(world frame)" in tables.as_text(evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0])))

@@ -1,6 +1,5 @@
 """Tables and plots of an evaluation: they show the evaluation's numbers, and tables fit in a terminal."""
 
-import io
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from psotrack.errors import InputError
 from psotrack.evaluation import evaluate, plots, tables
@@ -43,15 +41,9 @@ def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] =
     )
 
 
-def print_table(table) -> list[str]:
-    console = Console(file=io.StringIO(), width=80)
-    console.print(table)
-    return console.file.getvalue().splitlines()
-
-
 class TestTable:
     def test_rows(self):
-        lines = print_table(tables.render(evaluate(*flights()), "S02_D4_A"))
+        lines = tables.as_text(evaluate(*flights()), "S02_D4_A").splitlines()
         assert lines[0].strip() == "S02_D4_A: 50 frames, 3 drones, errors in mm"
         rows = {line[:15].strip(): line[15:].split() for line in lines}
         assert rows["dron0 (track 0)"] == [
@@ -82,7 +74,7 @@ class TestTable:
     def test_covariances(self):
         est, ref = flights()
         covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (NUM_FRAMES, 3, 3, 3))
-        lines = print_table(tables.render(evaluate(replace(est, covariance_m2=covariance_m2), ref)))
+        lines = tables.as_text(evaluate(replace(est, covariance_m2=covariance_m2), ref)).splitlines()
         # The error of 20 mm is two standard deviations of 10 mm, so NEES is 4; without the offset, NEES is 0.
         row = "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 ("
         assert any(line.startswith(row) for line in lines)
@@ -91,7 +83,7 @@ class TestTable:
         est, ref = flights()
         orientation_wxyz = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (NUM_FRAMES, 3, 4))
         both = (replace(flight, orientation_wxyz=orientation_wxyz) for flight in (est, ref))
-        text = "\n".join(print_table(tables.render(evaluate(*both))))
+        text = tables.as_text(evaluate(*both))
         assert "RPE over 1 s 0.0 mm and 0.00 deg" in text
 
     def test_ten_drones_with_large_errors_fit_into_eighty_columns(self):
@@ -99,7 +91,7 @@ class TestTable:
         est.position_m[30:, :5] += 3.0
         covariance_m2 = np.broadcast_to(1e-8 * np.eye(3), (NUM_FRAMES, 10, 3, 3))
         est = replace(est, covariance_m2=covariance_m2)
-        lines = print_table(tables.render(evaluate(est, ref), "S04_D10"))
+        lines = tables.as_text(evaluate(est, ref), "S04_D10").splitlines()
         assert max(map(len, lines)) <= 80
         # No name is cut off, and no part of a name is interpreted as a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
@@ -113,7 +105,7 @@ class TestTable:
         names = tuple(f"interceptor_of_the_left_hand_side_{number}" for number in range(3))
         est, ref = flights(names=names)
         est.position_m[:, 1] = np.nan
-        lines = print_table(tables.render(evaluate(est, ref)))
+        lines = tables.as_text(evaluate(est, ref)).splitlines()
         assert max(map(len, lines)) <= 80
         assert not any("…" in line for line in lines)
         width = lines[1].index("mean") - 2
@@ -123,7 +115,7 @@ class TestTable:
     def test_large_errors_are_shown_in_metres(self):
         est, ref = flights()
         est.position_m[:, :, 2] += 4.0
-        lines = print_table(tables.render(evaluate(est, ref)))
+        lines = tables.as_text(evaluate(est, ref)).splitlines()
         assert lines[0].strip() == "50 frames, 3 drones, errors in m"
         row = next(line for line in lines if line.startswith("dron0")).split()
         assert (row[3], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
@@ -131,16 +123,15 @@ class TestTable:
     def test_a_missed_drone(self):
         est, ref = flights()
         est.status[:, 2] = Status.LOST
-        row = next(
-            line for line in print_table(tables.render(evaluate(est, ref))) if line.startswith("dron2")
-        )
+        lines = tables.as_text(evaluate(est, ref)).splitlines()
+        row = next(line for line in lines if line.startswith("dron2"))
         assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
 
     def test_text_begins_with_the_mean_error_and_prints_the_table(self):
         evaluation = evaluate(*flights())
         assert repr(evaluation).startswith("Evaluation(mean error 20.0 mm, missed 6.7%, MOTA 0.933, ")
         assert str(evaluation).splitlines()[0].strip() == "50 frames, 3 drones, errors in mm"
-        assert len(str(evaluation).splitlines()) == len(print_table(tables.render(evaluation)))
+        assert str(evaluation) == tables.as_text(evaluation)
         assert next(iter(evaluation.to_dict())) == "mean_error_m"
 
     def test_tracks_of_the_first_frames_are_said_to_end_early(self, caplog):

@@ -10,7 +10,7 @@ import numpy as np
 from helpers import cameras_of, ring_rig
 from test_evaluation_shown import flights
 
-from psotrack.evaluation import evaluate, tables
+from psotrack.evaluation import evaluate
 from psotrack.pipeline import TrackedRecording
 from psotrack.recordings import FrameTimes, Recording
 from psotrack.settings import TrackSettings
@@ -145,7 +145,7 @@ def test_an_evaluation_shows_the_numbers_of_the_terminal() -> None:
     ]
     assert {"CLEAR", "HOTA", "GOSPA", "RMSE", "centred"} <= {row[0] for row in page.rows}
     assert "i" not in page.tags
-    assert len(page.rows[1]) == len(page.rows[0]) == len(tables.render(evaluation).columns)
+    assert len(page.rows[1]) == len(page.rows[0])
 
 
 def test_a_recording_shows_its_cameras(tmp_path: Path) -> None:

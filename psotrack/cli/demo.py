@@ -60,7 +60,7 @@ def demo(output: Output, *, out: Path = Path("psotrack-demo"), seed: int = 0, jo
     with atomic_write(picture) as picture_file:
         save_picture(picture_file, flight_of(tracked, recording))
         write_tracked(tracks, tracked, folder, force=force)
-    output.show(tables.render(errors, title=recording.name))
+    output.say(*tables.as_text(errors, recording.name).splitlines())
     output.say(f"picture: {picture}")
     # A command of an environment that is not activated is typed with its path.
     program = "psotrack" if shutil.which("psotrack") else os.path.relpath(sys.argv[0])

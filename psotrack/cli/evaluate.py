@@ -93,7 +93,7 @@ def evaluate(
             offset_s = None if offset == "auto" else offset
             compared = evaluation.compare_paths(path, body, turns, settings, offset_s=offset_s)
         output.json(compared.to_dict())
-        output.show(tables.render_paths(compared, title=f"{tracks.name} and {sequence.name}"))
+        output.say(*tables.paths_as_text(compared, f"{tracks.name} and {sequence.name}").splitlines())
         if picture is not None:
             plots.save_paths(picture, {tracks.stem: compared}, force=output.force)
             output.say(f"{picture}: paths, and errors over time")
@@ -105,7 +105,7 @@ def evaluate(
         found = evaluation.evaluate(estimate, truth)
     output.json(found.to_dict() | ({} if offset is None else {"reference_offset_s": by_s}))
     clock = "" if offset is None else f", reference's clock {by_s:+.4f} s"
-    output.show(tables.render(found, title=f"{recording.name}{clock}"))
+    output.say(*tables.as_text(found, f"{recording.name}{clock}").splitlines())
     if picture is not None:
         plots.save_overview(picture, estimate, truth, force=output.force)
         output.say(f"{picture}: paths, and errors over time")

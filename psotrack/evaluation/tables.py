@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-
-from psotrack.support import html_block, html_lines, html_table
+from psotrack.support import html_block, html_lines, html_table, text_table
 
 if TYPE_CHECKING:
     from psotrack.evaluation.path_comparison import PathComparison
@@ -20,7 +14,7 @@ if TYPE_CHECKING:
 _COLUMNS = ("mean", "median", "std", "p95", "max", "missed", "centred", "offset x y z")
 
 
-def render(evaluation: Evaluation, title: str = "") -> Table:
+def as_text(evaluation: Evaluation, title: str = "") -> str:
     """Table at most 80 characters wide: one row per drone, one row for all drones, and the scores below.
 
     Errors are in millimetres, or in metres if the mean error is a metre or more. A drone is named as in the reference,
@@ -28,62 +22,29 @@ def render(evaluation: Evaluation, title: str = "") -> Table:
     """
     unit = _unit_of(evaluation)
     heading = _heading(evaluation, unit)
-    scores = "\n".join(f"{label:<10}{line}" for label, line in _scores(evaluation, unit).items())
-    table = _table(f"{title}: {heading}" if title else heading, scores, "drone", _COLUMNS)
-    *drones, together = _rows(evaluation, unit)
-    for name, *cells in drones:
-        table.add_row(Text(name), *cells)
-    table.add_section()
-    table.add_row(*together, style="bold")
-    return table
+    scores = [f"{label:<10}{line}" for label, line in _scores(evaluation, unit).items()]
+    table = text_table(["drone", *_COLUMNS], _rows(evaluation, unit), whole=_COLUMNS)
+    return "\n".join([f"{title}: {heading}" if title else heading, table, *scores])
 
 
-def render_paths(comparison: PathComparison, title: str) -> Table:
+def paths_as_text(comparison: PathComparison, title: str) -> str:
     """Tables 7 and 8 of one path: distances in millimetres, angles in degrees, with the offsets that were found."""
     found, turning = comparison, comparison.turning
-    known = "" if found.offset_std_s != found.offset_std_s else f" ± {found.offset_std_s:.4f} s"
-    lines = [f"the reference's clock is {found.offset_s:+.4f} s{known} ahead of the path's"]
-    if turning is not None and turning.offset_s != found.offset_s:
-        lines.append(f"the clock of the reference's orientations is {turning.offset_s:+.4f} s ahead")
-    arm = " ".join(f"{1e3 * part:+.1f}" for part in found.lever_arm_m)
-    lines.append(f"lever arm {arm} mm; length of the reference's path {found.path_length_m:.2f} m")
-    table = _table(title, "\n".join(lines), "", ("mean", "median", "std", "min", "max", "frames"))
+    rows = []
     for key, one in found.statistics.items():
         *words, unit = key.split("_")
         factor, decimals, unit = (1e3, 2, "mm") if unit == "m" else (1.0, 3, "deg")
         values = (one.mean, one.median, one.std, one.minimum, one.maximum)
         cells = (f"{factor * value:.{decimals}f}" for value in values)
-        table.add_row(f"{' '.join(words)} ({unit})", *cells, str(one.count))
-    return table
-
-
-def _table(title: str, caption: str, names: str, columns: Sequence[str]) -> Table:
-    """A table without rows: names on the left, then numbers; nothing is cut."""
-    table = Table(
-        title=Text(title, style="bold"),
-        caption=Text(caption, style="default"),
-        box=box.HORIZONTALS,
-        show_edge=False,
-        pad_edge=False,
-        # The width of the caption, which would wrap otherwise.
-        min_width=76,
-        padding=(0, 0, 0, 1),
-        title_justify="left",
-        caption_justify="left",
-    )
-    # Only the names are folded where the table would be too wide.
-    table.add_column(names, overflow="fold", max_width=24)
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
-
-
-def as_text(evaluation: Evaluation) -> str:
-    """The table as text without colours."""
-    console = Console(width=80, color_system=None)
-    with console.capture() as capture:
-        console.print(render(evaluation))
-    return capture.get().rstrip()
+        rows.append([f"{' '.join(words)} ({unit})", *cells, str(one.count)])
+    table = text_table(("", "mean", "median", "std", "min", "max", "frames"), rows)
+    known = "" if found.offset_std_s != found.offset_std_s else f" ± {found.offset_std_s:.4f} s"
+    lines = [title, table, f"the reference's clock is {found.offset_s:+.4f} s{known} ahead of the path's"]
+    if turning is not None and turning.offset_s != found.offset_s:
+        lines.append(f"the clock of the reference's orientations is {turning.offset_s:+.4f} s ahead")
+    arm = " ".join(f"{1e3 * part:+.1f}" for part in found.lever_arm_m)
+    lines.append(f"lever arm {arm} mm; length of the reference's path {found.path_length_m:.2f} m")
+    return "\n".join(lines)
 
 
 def to_html(evaluation: Evaluation) -> str:
