@@ -10,7 +10,7 @@ import msgspec
 
 from psotrack.errors import InputError
 from psotrack.pipeline import TrackedRecording
-from psotrack.support import atomic_write_all, convert, json_text, read_json, refuse_files
+from psotrack.support import atomic_write_all, convert, read_json, refuse_files, write_json
 from psotrack.trajectories import write_ambiguity, write_trajectories
 
 
@@ -109,7 +109,7 @@ def write_tracked(
     with atomic_write_all(*files) as (record_file, ambiguity_file, tracks_file):
         write_trajectories(tracks_file, tracks)
         write_ambiguity(ambiguity_file, tracks.time_s, identities.pairs, identities.ambiguity)
-        record_file.write_text(json_text({**tracked.record, **named}) + "\n", encoding="utf-8")
+        write_json(record_file, {**tracked.record, **named})
 
 
 def read_run_record(path: Path | str) -> RunRecord | None:
