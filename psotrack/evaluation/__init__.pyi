@@ -1,7 +1,6 @@
 from .consistency import INSIDE_90
-from .metrics import evaluate
+from .metrics import errors_over_time, evaluate
 from .offsets import Offset, find_offset
-from .over_time import errors_over_time
 from .path_comparison import PathComparison, PathSettings, Statistics, compare_paths, drone_of
 from .records import DroneEvaluation, ErrorSummary, Evaluation
 

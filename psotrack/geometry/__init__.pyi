@@ -14,9 +14,14 @@ from .cameras import (
     to_pixels,
     undistort,
 )
-from .image_fit import project_with_jacobian, to_pixels_with_jacobian
-from .image_scale import sizes_m, sizes_px, undistortion_stretch
-from .lenses import FISHEYE_COEFFICIENTS, PINHOLE_COEFFICIENTS, LensNumbers, distort
+from .image_fit import project_with_jacobian, sizes_m, sizes_px, to_pixels_with_jacobian
+from .lenses import (
+    FISHEYE_COEFFICIENTS,
+    PINHOLE_COEFFICIENTS,
+    LensNumbers,
+    distort,
+    undistortion_stretch,
+)
 from .reprojection import reconstruct, triangulate
 from .rotations import LENGTH_TOLERANCE, cross_matrices, rotation_matrices
 from .shared_views import in_images, looking_depths_m, views_meet

@@ -81,6 +81,20 @@ def lens_derivative(
     return _by_model(lens, x, y, _pinhole_derivative, _fisheye_derivative)
 
 
+def undistortion_stretch(
+    lens: HasLens, normalised: Float[np.ndarray, "*#points 2"]
+) -> Float[np.ndarray, "*#points"]:
+    """Factor by which the removal of lens distortion enlarges small lengths, the root mean square of all directions.
+
+    Args:
+        lens: lenses.
+        normalised: (..., 2), undistorted normalised image coordinates.
+    """
+    xx, xy, yx, yy = lens_derivative(lens, normalised[..., 0], normalised[..., 1])
+    # The squared norm of the inverse of a 2 x 2 matrix is that of the matrix divided by its squared determinant.
+    return np.asarray(np.sqrt((xx**2 + xy**2 + yx**2 + yy**2) / 2) / np.abs(xx * yy - xy * yx))
+
+
 def _by_model(
     lens: HasLens, x: Array, y: Array, pinhole: Callable[..., Any], fisheye: Callable[..., Any]
 ) -> tuple[Array, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from psotrack.geometry.cameras import Camera, undistort
-from psotrack.geometry.image_scale import undistortion_stretch
+from psotrack.geometry.lenses import undistortion_stretch
 
 #: Largest condition number of the normal equations; beyond this number the rays count as parallel.
 MAX_CONDITION = 1e12

@@ -1,7 +1,6 @@
+from .array_checks import first_repeat, first_repeated, first_true, has_negative_eigenvalue
 from .calls import check_records, checked
-from .compile_time import measured_compiling
-from .compiled import drop_programs_if_many, keep_compiled
-from .covariances import has_negative_eigenvalue
+from .compiled import drop_programs_if_many, keep_compiled, measured_compiling
 from .delimited import Column, Table, TextRow, read_rows, read_table, write_rows
 from .devices import Device, processors, share_processors, use_device
 from .figures import COLOURS, FAINT, INK, LINE, STYLE, drone_colour, save_figure
@@ -20,8 +19,7 @@ from .files import (
     refuse_to_overwrite,
     user_cache,
 )
-from .html import html_block, html_lines, html_table
-from .number_lines import are_numbers, first_line, first_repeated, first_true, number_words, read_numbers
+from .number_lines import are_numbers, first_line, number_words, read_numbers
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
     PluginKind,
@@ -63,8 +61,15 @@ from .schema import (
 )
 from .similarity import similarity
 from .standard_errors import block_jackknife, standard_error, time_blocks, widening
-from .text_tables import POSITION, finite_or_none, format_numbers, text_table
-from .times import LEAST_STEP_S, first_repeat
+from .text_tables import (
+    POSITION,
+    finite_or_none,
+    format_numbers,
+    html_block,
+    html_lines,
+    html_table,
+    text_table,
+)
 
 __all__ = [
     "ARCHIVE_SUFFIX",
@@ -72,7 +77,6 @@ __all__ = [
     "FAINT",
     "INK",
     "LARGEST",
-    "LEAST_STEP_S",
     "LINE",
     "MODERATE",
     "POSITION",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from psotrack.errors import InputError
 from psotrack.support.files import read_text
@@ -86,15 +86,3 @@ def read_numbers(path: Path, columns: int, expected: str, *, more: bool = False)
     if not rows:
         raise InputError(path, expected="at least one line with numbers", found="none")
     return NumberLines(path, np.array(rows), lines)
-
-
-def first_true(wrong: Bool[np.ndarray, "rows"]) -> int | None:
-    """Index of the first row that is wrong; None if there is none."""
-    return int(np.argmax(wrong)) if wrong.any() else None
-
-
-def first_repeated(keys: Int[np.ndarray, "rows"]) -> int | None:
-    """Index of the first row whose key a row before has; None if there is none."""
-    repeated = np.ones(len(keys), bool)
-    repeated[np.unique(keys, return_index=True)[1]] = False
-    return first_true(repeated)

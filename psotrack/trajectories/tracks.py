@@ -93,15 +93,9 @@ ARRAYS = tuple(
 )
 
 
-def unknown_value(name: str, dtype: np.dtype) -> float | int:
-    """The value of an array of `Tracks` where nothing is known of a drone: NaN, lost, or 0."""
-    if name == "status":
-        return int(Status.LOST)
-    return np.nan if dtype.kind == "f" else 0
-
-
 def padded(name: str, array: np.ndarray, num_drones: int) -> np.ndarray:
-    """An array of axes (frames, drones, ...) with this number of drones: the first ones, then unknown ones."""
+    """An array of `Tracks` with this number of drones: the first ones, then unknown ones, NaN, lost or 0."""
+    unknown = np.nan if array.dtype.kind == "f" else int(Status.LOST) if name == "status" else 0
     missing = max(num_drones - array.shape[1], 0)
     pads = [(0, 0), (0, missing), *[(0, 0)] * (array.ndim - 2)]
-    return np.pad(array[:, :num_drones], pads, constant_values=unknown_value(name, array.dtype))
+    return np.pad(array[:, :num_drones], pads, constant_values=unknown)
