@@ -7,6 +7,7 @@ A `Report` shows the progress of one stage: `progress_bar` where the reader is (
 from __future__ import annotations
 
 import contextlib
+import functools
 import sys
 import threading
 import time
@@ -82,12 +83,8 @@ def progress_lines(
         long_s: shortest stage whose end is written, seconds.
         clock: time that only increases, seconds.
     """
-
-    def report(description: str, total: int) -> contextlib.AbstractContextManager[Advance]:
-        say = _to_stderr if write is None else write
-        return _said(description, total, say, every_s=_EVERY_S, least=_FRACTION, long_s=long_s, clock=clock)
-
-    return report
+    say = _to_stderr if write is None else write
+    return functools.partial(_said, say=say, every_s=_EVERY_S, least=_FRACTION, long_s=long_s, clock=clock)
 
 
 def joined(*reports: Report) -> Report:
