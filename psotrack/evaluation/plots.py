@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from psotrack.evaluation.path_comparison import PathComparison
 from psotrack.evaluation.tables import drone_label
-from psotrack.support import COLOURS, FAINT, INK, STYLE, drone_colour, save_figure
+from psotrack.support import COLOURS, FAINT, INK, drone_colour, save_figure
 from psotrack.trajectories import Trajectories
 from psotrack.trajectories.association import (
     UNASSIGNED,
@@ -109,8 +109,6 @@ def _save(
     title: str = "",
 ) -> None:
     """Draw both views at one scale, and a panel for each kind of value."""
-    from matplotlib import rc_context
-
     # A line has a gap where frames are skipped.
     step_s = np.diff(time_s)
     skipped = np.flatnonzero(step_s > 1.5 * min(step_s, default=1.0)) + 1
@@ -150,8 +148,7 @@ def _save(
         panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4)
         figure.suptitle(title, fontsize=9)
 
-    with rc_context(STYLE):
-        save_figure(png, (8.0, float(heights.sum()) + 2.4 * len(over_time) + 1.0), draw, force)
+    save_figure(png, (8.0, float(heights.sum()) + 2.4 * len(over_time) + 1.0), draw, force)
 
 
 def _scale(axes: Axes, values: Float[np.ndarray, "values"]) -> None:

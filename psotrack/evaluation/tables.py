@@ -126,16 +126,16 @@ def _scores(evaluation: Evaluation, unit: _Unit) -> dict[str, str]:
         "": f"mean when matched anew in each frame {matched} mm",
         "HOTA": (
             f"{evaluation.hota:.3f}: DetA {evaluation.deta:.3f}, AssA {evaluation.assa:.3f}, "
-            f"LocA {_score(evaluation.loca)}"
+            f"LocA {_or_dash(evaluation.loca, '.3f')}"
         ),
         "GOSPA": f"{gospa} mm: localisation {localisation}, missed {missed}, false {false}",
         "RMSE": _paths(evaluation, unit),
     }
     if evaluation.inside_90_rate is not None:
         lines["ellipsoid"] = (
-            f"of 90 % holds {_percent(evaluation.inside_90_rate)} "
-            f"({_percent(evaluation.offset_removed_inside_90_rate)} centred), "
-            f"mean NEES {_nees(evaluation.mean_nees)} ({_nees(evaluation.offset_removed_mean_nees)})"
+            f"of 90 % holds {_or_dash(evaluation.inside_90_rate, '.1%')} "
+            f"({_or_dash(evaluation.offset_removed_inside_90_rate, '.1%')} centred), mean NEES "
+            f"{_or_dash(evaluation.mean_nees, '.2g')} ({_or_dash(evaluation.offset_removed_mean_nees, '.2g')})"
         )
     lines["centred"] = _centred(evaluation, unit)
     return lines
@@ -159,13 +159,5 @@ def _paths(evaluation: Evaluation, unit: _Unit) -> str:
     return f"ATE {ate} {unit.name} ({ate_aligned} aligned), RPE over 1 s {rpe} {unit.name}{turn}"
 
 
-def _score(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1%}"
-
-
-def _nees(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}"
+def _or_dash(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"

@@ -75,12 +75,13 @@ def save_figure(
     """
     if Path(path).suffix.lower() != ".png":
         raise OutputError(path, expected="a file that ends in .png", found=Path(path).name)
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     refuse_to_overwrite(path, force)
-    figure = Figure(size_inches, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    draw(figure)
-    with atomic_write(path) as temporary:
+    with rc_context(STYLE), atomic_write(path) as temporary:
+        figure = Figure(size_inches)
+        FigureCanvasAgg(figure)
+        draw(figure)
         figure.savefig(temporary, format="png")

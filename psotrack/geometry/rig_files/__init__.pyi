@@ -1,5 +1,5 @@
 from .dpjait_calibration import write_calibration
-from .fields import UNITS_M, CameraFields, Entry, camera_values, lens_model
+from .fields import UNITS_M, CameraFields, Entry, camera_values
 from .formats import (
     RIG_FORMATS,
     WRITTEN_RIG_FORMATS,
@@ -21,7 +21,6 @@ __all__ = [
     "camera_values",
     "entries_of",
     "fields_of_table",
-    "lens_model",
     "read_cameras",
     "read_lenses",
     "read_rig",

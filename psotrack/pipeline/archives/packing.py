@@ -13,8 +13,7 @@ import msgspec
 
 from psotrack.errors import InputError
 from psotrack.foreground.silhouettes import compute, stored_silhouettes
-from psotrack.geometry import Camera
-from psotrack.geometry.rig_files import lens_model
+from psotrack.geometry.rig_files import camera_values
 from psotrack.pipeline import detection_files_of, usable_for
 from psotrack.pipeline.archives.manifest import Manifest, PackedVideo, TrackRecord, read_record
 from psotrack.pipeline.archives.zip_file import Source, write_archive
@@ -183,7 +182,10 @@ def _camera_table(camera: CameraRecording, video_path: str | None) -> tuple[Came
     video, stored, times = camera.video, camera.silhouettes, camera.times
     assert camera.camera is not None
     assert times is not None
-    table = {**_lens_and_place(camera.camera), "line_time_s": camera.line_time_s}
+    table = {**camera_values(camera.camera, placed=False), "line_time_s": camera.line_time_s}
+    # A Rodrigues vector would change the last digits of the rotation.
+    T_cam_world = camera.camera.T_cam_world
+    table |= {"R": T_cam_world[:3, :3].tolist(), "tvec": T_cam_world[:3, 3].tolist()}
     files: _Files = {}
     if video is not None and video_path is not None:
         table["video"] = video_path
@@ -236,20 +238,6 @@ def _other_recording(tracks: Path, record: TrackRecord, opened: Recording, has: 
         f"{record.rate_hz:g} Hz, while {opened.name} has {has}",
         remedy="name the recording that was tracked, or track again with this version",
     )
-
-
-def _lens_and_place(camera: Camera) -> dict[str, Any]:
-    distortion, fisheye = lens_model(camera)
-    width, height = (int(side) for side in camera.image_size_wh)
-    return {
-        "size": (width, height),
-        "K": camera.K.tolist(),
-        "model": "fisheye" if fisheye else "opencv",
-        "distortion": tuple(distortion),
-        # A Rodrigues vector would change the last digits of the rotation.
-        "R": camera.T_cam_world[:3, :3].tolist(),
-        "tvec": camera.T_cam_world[:3, 3].tolist(),
-    }
 
 
 def _video_files(path: str, video: VideoInfo) -> _Files:
