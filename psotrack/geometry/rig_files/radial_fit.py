@@ -65,12 +65,13 @@ def _fitted(
     """OpenCV's first coefficients by least squares in the image, and their largest error, pixels."""
     from scipy.optimize import least_squares  # takes 0.2 s
 
-    focal_px = K[[0, 1], [0, 1]]
+    focal_px = K[[0, 1], [0, 1]][:, None]
 
-    def off_px(dist: Float[np.ndarray, " opencv"]) -> Float[np.ndarray, "n 2"]:
-        return (np.stack(distort(LensNumbers(dist), *points.T), axis=-1) - distorted) * focal_px
+    def off_px(dist: Float[np.ndarray, " opencv"]) -> Float[np.ndarray, " residuals"]:
+        off = np.stack(distort(LensNumbers(dist), *points.T)) - distorted.T
+        return (off * focal_px).ravel()
 
     dist = np.zeros(num_coefficients)
     with contextlib.suppress(ValueError):  # no finite distances: no distortion, whose error is large
-        dist = least_squares(lambda dist: off_px(dist).ravel(), dist, method="lm").x
-    return dist, float(np.linalg.norm(off_px(dist), axis=-1).max())
+        dist = least_squares(off_px, dist, method="lm").x
+    return dist, float(np.linalg.norm(off_px(dist).reshape(2, -1), axis=0).max())
