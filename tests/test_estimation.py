@@ -102,12 +102,6 @@ def test_no_step_raises_a_cost():
             state = after
 
 
-def test_a_solved_problem_is_not_changed():
-    params, _ = measured_curves(4)
-    start = Curves(params, curve(params)[0])
-    assert levenberg_marquardt(start, max_steps=50, least_length=1e-6) is start
-
-
 def coupled_equations(seed, blocks=5, m=3, n=4):
     """Normal equations with blocks, and the same equations as a dense matrix and its right side."""
     rng = np.random.default_rng(seed)

@@ -16,6 +16,8 @@ from psotrack.geometry.lenses import undistortion_stretch
 
 #: Largest condition number of the normal equations; beyond this number the rays count as parallel.
 MAX_CONDITION = 1e12
+#: Cameras that are nearer to each other are one viewpoint, metres.
+_NEAREST_M = 0.3
 
 
 def triangulate_linearly(
@@ -96,14 +98,14 @@ def solve_equations(
     return np.where(solvable[..., None], point[..., 0], np.nan)
 
 
-def viewpoints(cameras: Camera, nearest_m: float = 0.3) -> Int[np.ndarray, "cameras"]:
-    """Viewpoint number of each camera, (cameras,): cameras nearer to each other than `nearest_m` share a number.
+def viewpoints(cameras: Camera) -> Int[np.ndarray, "cameras"]:
+    """Viewpoint number of each camera, (cameras,): cameras nearer to each other than 0.3 m share a number.
 
     Two cameras beside each other locate a drone hardly better than one camera.
     """
     centre = cameras.centre_world
     label = np.arange(len(centre))
     for a, b in combinations(range(len(centre)), 2):
-        if np.linalg.norm(centre[a] - centre[b]) < nearest_m:
+        if np.linalg.norm(centre[a] - centre[b]) < _NEAREST_M:
             label[label == label[b]] = label[a]
     return label

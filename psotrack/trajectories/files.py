@@ -78,8 +78,6 @@ def write_ambiguity(
     time_s: Float[np.ndarray, "frames"],
     pairs: Int[np.ndarray, "pairs 2"],
     ambiguity: Float[np.ndarray, "frames pairs"],
-    *,
-    force: bool = False,
 ) -> None:
     """Write the probabilities that the labels of two drones are exchanged, one row per frame and pair above 0.
 
@@ -88,12 +86,10 @@ def write_ambiguity(
         time_s: (frames,), times of the frames, seconds.
         pairs: (pairs, 2), indices of the two drones.
         ambiguity: (frames, pairs), probability that the labels of a pair are exchanged.
-        force: replace an existing file.
 
     Raises:
-        OutputError: the file exists and `force` is not set, or it cannot be written.
+        OutputError: the file cannot be written.
     """
-    refuse_to_overwrite(path, force)
     frame, pair = np.nonzero(ambiguity)
     columns = {
         "frame": frame,

@@ -172,26 +172,20 @@ class Linearised(Protocol):
 _State = TypeVar("_State", bound=Linearised)
 
 
-def levenberg_marquardt(
-    start: _State, *, max_steps: int, least_gain: float | None = None, least_length: float = 0.0
-) -> _State:
+def levenberg_marquardt(start: _State, *, max_steps: int, least_gain: float | None = None) -> _State:
     """Lower the cost of a problem by damped steps; no step raises the cost.
 
-    The search ends after `max_steps`, or where one of the other criteria is met.
+    The search ends after `max_steps`, or where another criterion is met.
 
     Args:
         start: state near the solution.
         max_steps: largest number of steps that are tried.
         least_gain: relative change of the cost by the last step; None to leave the criterion out.
-        least_length: length of the next step in standard deviations; the step is not taken.
     """
     state, equations, damping = start, None, _FIRST_DAMPING
     for _ in range(max_steps):
         equations = equations or state.equations()
         step = equations.damped(damping).solved()
-        squared_length = np.vecdot(step.shared, np.matvec(equations.information, step.shared))
-        if least_length > 0 and squared_length < least_length**2:
-            break
         tried = state.moved(step)
         before, after = state.cost, tried.cost
         if after < before:
