@@ -134,8 +134,8 @@ def fixed_identity(pair: AlignedPair) -> Int[np.ndarray, "drones"]:
     for distance_m in (pair.distance_m[first_second], pair.distance_m):
         drones = np.flatnonzero(partner == UNASSIGNED)
         estimates = np.setdiff1d(np.arange(len(pair.drones_est)), partner)
-        mean_m = _mean_over_frames(distance_m[:, drones][:, :, estimates])
-        rows, columns = _assign(mean_m)
+        known_m = np.ma.masked_invalid(distance_m[:, drones][:, :, estimates])
+        rows, columns = _assign(known_m.mean(axis=0).filled(np.nan))
         partner[drones[rows]] = estimates[columns]
     return partner
 
@@ -227,16 +227,6 @@ def _assign(
     rows, columns = linear_sum_assignment(np.where(possible, cost, forbidden))
     kept = possible[rows, columns]
     return rows[kept], columns[kept]
-
-
-def _mean_over_frames(
-    distance_m: Float[np.ndarray, "frames drones estimates"],
-) -> Float[np.ndarray, "drones estimates"]:
-    """Mean over the frames in which both drones are known; NaN without such a frame."""
-    both = np.isfinite(distance_m)
-    count = both.sum(axis=0)
-    total_m = np.where(both, distance_m, 0.0).sum(axis=0)
-    return np.where(count > 0, total_m / np.maximum(count, 1), np.nan)
 
 
 def _span(frame: Int[np.ndarray, "frames"]) -> str:
