@@ -339,7 +339,7 @@ def test_a_correction_that_folds_the_image_is_refused(tmp_path):
 @given(k1=st.floats(-0.1, 0.25), k2=st.floats(-0.03, 0.03), shift=st.floats(-2, 2))
 def test_the_fit_reaches_the_error_that_it_states(k1, k2, shift):
     """OpenCV's own undistortion of the corners and edges agrees with the formula within the stated error."""
-    from psotrack.geometry.rig_files.radial_fit import fit_distortion
+    from psotrack.geometry.rig_files.vicon import fit_distortion
 
     centre = K[:2, 2] + shift
     fit = fit_distortion(K, SIZE_WH, centre, np.array([k1, k2]))

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from psotrack.geometry.rig_files.fields import CameraFields, quoted
-from psotrack.geometry.rig_files.yaml_text import parse_yaml
+from psotrack.geometry.rig_files.guarded_text import parse_yaml
 
 _MODELS = {"radtan": "opencv", "equidistant": "fisheye", "equi": "fisheye", "none": "opencv"}
 _REMEDY = "calibrate again with pinhole-radtan or pinhole-equi, or by `psotrack calibrate rig`"

@@ -33,8 +33,7 @@ from psotrack.geometry.rig_files.fields import (
     lens_model,
     stated_unit_m,
 )
-from psotrack.geometry.rig_files.xml_text import parse_xml
-from psotrack.geometry.rig_files.yaml_text import as_matrix, parse_yaml
+from psotrack.geometry.rig_files.guarded_text import as_matrix, parse_xml, parse_yaml
 from psotrack.support import atomic_write, read_text, whole_number
 
 #: Field of one camera of two: M1, cameraMatrix2, K_left, D_right.

@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from psotrack.geometry.rig_files.fields import CameraFields
-from psotrack.geometry.rig_files.xml_text import attributes, number, parse_xml
+from psotrack.geometry.rig_files.guarded_text import attributes, number, parse_xml
 
 _logger = logging.getLogger(__name__)
 
