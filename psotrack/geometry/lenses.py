@@ -127,8 +127,15 @@ def undistort_normalised(
         np.stack([np.broadcast_to(part, shape).ravel() for part in (x, y)]).astype(np.float64),
     )
     found = np.full(problem.target.shape, np.nan)
-    given = np.isfinite(problem.target).all(axis=0)
-    found[:, given] = problem.at(given).solved()
+    pending = np.flatnonzero(np.isfinite(problem.target).all(axis=0))
+    # The distorted point is a good start for most lenses. For the others, a search of the radius finds a better start.
+    for start in (_Inverse.near_start, _Inverse.far_start):
+        some = problem.at(pending)
+        solved = some.newton(start(some))
+        found[:, pending] = solved
+        pending = pending[np.isnan(solved[0])]
+        if not len(pending):
+            break
     return found[0].reshape(shape), found[1].reshape(shape)
 
 
@@ -356,7 +363,16 @@ class _Inverse:
             flat = np.where(self.fisheye, self.target, flat)
         return np.where(np.isfinite(flat), flat, 0.0)
 
-    def _start(self) -> np.ndarray:
+    def near_start(self) -> np.ndarray:
+        """(2, points), the distorted points; of a fisheye without coefficients the undistorted points."""
+        start = self._flat()
+        if self.fisheye is None:
+            return start
+        bent = np.hypot(*start)
+        scale = np.tan(np.minimum(bent, 1.5)) / np.maximum(bent, 1e-12)
+        return np.where(self.fisheye & (bent > 1e-12), start * scale, start)
+
+    def far_start(self) -> np.ndarray:
         """(2, points), points whose image has nearly the right distance from the axis, by bisection of the angle."""
         flat = self._flat()
         wanted = np.hypot(*flat)
@@ -376,9 +392,8 @@ class _Inverse:
             low, high = np.where(is_far, low, middle), np.where(is_far, middle, high)
         return direction * np.tan((low + high) / 2)
 
-    def solved(self) -> np.ndarray:
-        """(2, points), solutions; NaN where Newton's steps do not converge, or converge beyond the fold."""
-        start = self._start()
+    def newton(self, start: np.ndarray) -> np.ndarray:
+        """(2, points), solutions; NaN where the steps do not converge, or converge beyond the fold."""
         solution = np.full(start.shape, np.nan)
         at, index, share = start.copy(), np.arange(start.shape[1]), np.ones(start.shape[1])
         with np.errstate(all="ignore"):
