@@ -59,7 +59,7 @@ COMMANDS = {
     "recording.toml": "init {flight}/flight --out {out} --force --quiet",
     "info.json": "init --show {flight}/flight --json {out} --force",
     "errors.json": "evaluate {flight}/tracks.csv {flight}/flight --json {out} --force",
-    "errors.png": "evaluate {flight}/tracks.csv {flight}/flight --plot {out} --force",
+    "errors.png": "evaluate {flight}/tracks.csv {flight}/flight --plot {out} --force --quiet",
     "export.csv": "export {flight}/tracks.csv --to csv --out {out} --force",
     "export.parquet": "export {flight}/tracks.csv --to parquet --out {out} --force",
     "export.json": "export {flight}/tracks.csv --to json --out {out} --force",

@@ -60,9 +60,9 @@ _LONGEST = 0.3
 #: Weight of the stated variance, as a number of residuals, in the density of the residuals; and logarithm of the
 #: density of an outlier's pixel, which may lie anywhere within about 100 x 100 px.
 _PRIOR_RESIDUALS, _LOG_ANYWHERE = 3.0, -2 * log(100.0)
-#: Weight of the recording's variances against the residuals of a frame, as a number of residuals: those of two to three
-#: markers. With 8 and with 50, the figures of Table 7 differ little.
-_RECORDING_RESIDUALS = 20.0
+#: Weight of the recording's variances against the residuals of a frame, as a number of residuals: those of about six
+#: markers. With 8 and with 20, the figures of Table 7 differ little, but four markers show their own errors less well.
+_RECORDING_RESIDUALS = 50.0
 #: Number of markers that suffices for a pose; in frames of fewer than eight markers, half of the markers suffice.
 _ENOUGH_MARKERS = 4
 #: Standard deviation of a corner whose detection states none, and the smallest that is believed, pixels.
