@@ -10,7 +10,7 @@ import pytest
 from helpers import ring_rig
 from scipy.stats import multivariate_normal
 
-from psotrack.calibration.doctor import examine, fault_search
+from psotrack.calibration.doctor import evidence, examine
 from psotrack.calibration.doctor.common_points import CommonPoints
 from psotrack.calibration.doctor.corrections import (
     PER_CAMERA,
@@ -176,11 +176,9 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     rig, data = small_problem()
     points, at = data.points, Corrected(rig, np.zeros(4))
     hypothesis = next(
-        each
-        for each in fault_search.list_hypotheses(4, range(4))
-        if (each.kind, each.camera) == ("turned", 1)
+        each for each in evidence.list_hypotheses(4, range(4)) if (each.kind, each.camera) == ("turned", 1)
     )
-    gathered = fault_search.gather(at, data)
+    gathered = evidence.gather(at, data)
     std = gathered.prior_std
     found = gathered.judge(hypothesis, gathered.as_sound).log_odds
 
@@ -194,24 +192,24 @@ def test_the_evidence_is_that_of_the_dense_normal_distribution():
     same = (rows[:, None, 1:] == rows[None, :, 1:]).all(axis=-1)
     piece = points.piece[rows[:, 0]]
     side = np.array([points.side_px[p, c] for p, c, _ in rows])
-    floor = np.hypot(side, fault_search._SMALL_BOX_PX)
+    floor = np.hypot(side, evidence._SMALL_BOX_PX)
     image = (points.centre_px - rig.cameras.K[:, :2, 2]) / (rig.cameras.image_size_wh / 2)
     over = np.array([[1.0, *image[p, c]] for p, c, _ in rows])
     theta = np.array([slopes.by_parameter[tuple(row)][list(hypothesis.columns)] for row in rows])
     theta = np.where((rows[:, 1] == 1)[:, None], theta, 0.0)
     logs: dict[str, list[float]] = {"sound": [], "turned": []}
-    sizes = product(fault_search._PIECE_ERRORS, fault_search._CAMERA_ERRORS, fault_search._CALIBRATION_PX)
+    sizes = product(evidence._PIECE_ERRORS, evidence._CAMERA_ERRORS, evidence._CALIBRATION_PX)
     for of_piece, of_camera, of_calibration in sizes:
-        rare = fault_search._RARE * ((of_camera > 0.1) + (of_calibration > 0.7))
+        rare = evidence._RARE * ((of_camera > 0.1) + (of_calibration > 0.7))
         shared = np.where(piece[:, None] == piece, np.outer(floor, floor), 0.0)
         covariance = base + np.where(same, shared * of_piece**2, 0.0)
         smooth = over @ over.T
         covariance += np.where(same, smooth * (of_camera**2 * np.outer(side, side) + of_calibration**2), 0.0)
         logs["sound"].append(rare + multivariate_normal.logpdf(e, cov=covariance))
-        for factor in fault_search._PRIOR_FACTORS:
+        for factor in evidence._PRIOR_FACTORS:
             wide = theta * factor * std[list(hypothesis.columns)]
             logs["turned"].append(rare + multivariate_normal.logpdf(e, cov=covariance + wide @ wide.T))
-    expected = np.logaddexp.reduce(logs["turned"]) - np.log(len(fault_search._PRIOR_FACTORS))
+    expected = np.logaddexp.reduce(logs["turned"]) - np.log(len(evidence._PRIOR_FACTORS))
     expected -= np.logaddexp.reduce(logs["sound"])
     assert found == pytest.approx(expected, abs=0.01)
 

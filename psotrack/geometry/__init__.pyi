@@ -14,7 +14,8 @@ from .cameras import (
     to_pixels,
     undistort,
 )
-from .image_fit import project_with_jacobian, sizes_m, sizes_px, to_pixels_with_jacobian
+from .image_fit import project_with_jacobian, to_pixels_with_jacobian
+from .image_scale import sizes_m, sizes_px
 from .lenses import (
     FISHEYE_COEFFICIENTS,
     PINHOLE_COEFFICIENTS,

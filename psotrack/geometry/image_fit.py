@@ -1,8 +1,7 @@
-"""Points in space whose projections are nearest to given pixels, derivatives of projections, and sizes in images.
+"""Points in space whose projections are nearest to given pixels: least squares in the image, in float64.
 
-Points are found by least squares in the image, in float64. The cost of a point is the sum of squared distances between
-pixels and projections, in standard deviations of the pixels, lens included (Hartley & Zisserman 2004, section 12.3).
-All points are fitted at once, as a batch.
+The cost of a point is the sum of squared distances between pixels and projections, in standard deviations of the
+pixels, lens included (Hartley & Zisserman 2004, section 12.3). All points are fitted at once, as a batch.
 """
 
 from __future__ import annotations
@@ -196,44 +195,3 @@ def _disagreement(
     xy = -np.vecdot(JC[..., 0, :], J[..., 1, :])
     x, y = r[..., 0], r[..., 1]
     return (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-
-
-def sizes_m(
-    cameras: Camera, points_cam: Float[np.ndarray, "*#points 3"], size_px: Float[np.ndarray, "*#points 2"]
-) -> Float[np.ndarray, "*#points 2"]:
-    """Widths and heights in metres of small objects at points, from the sides of their boxes.
-
-    In a pinhole camera an object is flat and parallel to the image: depth / focal length. In a fisheye, where the
-    optical axis may be far away, the object is a sphere.
-
-    Args:
-        cameras: cameras with leading axes (*batch).
-        points_cam: (..., 3), camera coordinates, metres, broadcast against the cameras.
-        size_px: (..., 2), widths and heights of boxes, pixels.
-    """
-    flat = size_px * points_cam[..., 2:] / _focal_px(cameras)
-    if cameras.fisheye is None:
-        return np.asarray(flat)
-    return np.where(np.asarray(cameras.fisheye)[..., None], size_px / _of_spheres(cameras, points_cam), flat)
-
-
-def sizes_px(
-    cameras: Camera, points_cam: Float[np.ndarray, "*#points 3"], size_m: Float[np.ndarray, "*#points 2"]
-) -> Float[np.ndarray, "*#points 2"]:
-    """Inverse of `sizes_m`: sides of the boxes of objects with given widths and heights."""
-    flat = size_m * _focal_px(cameras) / np.maximum(points_cam[..., 2:], NEAR_M)
-    if cameras.fisheye is None:
-        return np.asarray(flat)
-    return np.where(np.asarray(cameras.fisheye)[..., None], size_m * _of_spheres(cameras, points_cam), flat)
-
-
-def _focal_px(cameras: Camera) -> Float[np.ndarray, "*cameras 2"]:
-    return np.stack([cameras.K[..., 0, 0], cameras.K[..., 1, 1]], axis=-1)
-
-
-def _of_spheres(
-    cameras: Camera, points_cam: Float[np.ndarray, "*#points 3"]
-) -> Float[np.ndarray, "*#points 2"]:
-    """Width and height in pixels, per metre of its diameter, of a small sphere at a point."""
-    _, jacobian = to_pixels_with_jacobian(cameras, points_cam)
-    return np.linalg.norm(jacobian, axis=-1)

@@ -2,6 +2,7 @@ from .flights.piloting import flight_space
 from .flights.recordings import write_recorded_flight
 from .generate import simulate
 from .imaging.renderer import CameraRenderer
+from .listing import catalogue
 from .own_cameras import OWN_CAMERAS, simulate_own_cameras
 from .scenarios import (
     RESTLESS,
@@ -13,7 +14,7 @@ from .scenarios import (
     preset_text,
     scenario,
 )
-from .scene import Scene, build, catalogue
+from .scene import Scene, build
 
 __all__ = [
     "OWN_CAMERAS",

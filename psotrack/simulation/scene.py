@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import Camera, Rig, look_at, make_camera, make_rig
-from psotrack.simulation import scenarios
 from psotrack.simulation.flights.motion import Flight
 from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import CameraPlace, Scenario
@@ -125,28 +123,3 @@ def image_size_wh(scenario: Scenario, scale: float) -> tuple[int, int]:
         found = f"{width} x {height}"
         raise SettingsError("scale", expected=f"images of at least {_MIN_SIDE_PX} pixels a side", found=found)
     return width, height
-
-
-def catalogue() -> list[dict[str, Any]]:
-    """One record per scenario of the package; the speed is the mean over drones and frames for seed 0."""
-    rows = []
-    for name in scenarios.preset_names():
-        recipe = scenarios.scenario(name)
-        scene = build(recipe)
-        position_m = scene.positions_m(recipe.num_frames)
-        speed = np.linalg.norm(np.diff(position_m, axis=0), axis=-1).mean() * recipe.fps
-        rows.append(
-            {
-                "name": name,
-                "drones": len(recipe.drones),
-                "cameras": len(scene.rig.names),
-                "frames": recipe.num_frames,
-                "seconds": recipe.num_frames / recipe.fps,
-                "hall": recipe.hall,
-                "mean_speed_m_s": round(float(speed), 3),
-                "markers": recipe.markers,
-                "onboard": recipe.onboard is not None,
-                "description": recipe.description,
-            }
-        )
-    return rows

@@ -19,6 +19,7 @@ from .files import (
     refuse_to_overwrite,
     user_cache,
 )
+from .html import html_block, html_lines, html_table
 from .number_lines import are_numbers, first_line, number_words, read_numbers
 from .numbers import LARGEST, MODERATE, NotNegative, Positive, Share, is_moderate, whole_number
 from .plugins import (
@@ -61,15 +62,7 @@ from .schema import (
 )
 from .similarity import similarity
 from .standard_errors import block_jackknife, standard_error, time_blocks, widening
-from .text_tables import (
-    POSITION,
-    finite_or_none,
-    format_numbers,
-    html_block,
-    html_lines,
-    html_table,
-    text_table,
-)
+from .text_tables import POSITION, finite_or_none, format_numbers, text_table
 
 __all__ = [
     "ARCHIVE_SUFFIX",

@@ -1,5 +1,6 @@
-"""Compiled programs: a cache on disk, so that JAX compiles each once per machine, a bound on those in memory, and the
-time that JAX takes to compile: figures of speed count it apart from the work.
+"""Compiled programs: a cache on disk, so that JAX compiles each once per machine, and a bound on those in memory.
+
+Also the time that JAX takes to compile, which figures of speed count apart from the work.
 """
 
 from __future__ import annotations

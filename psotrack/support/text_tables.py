@@ -1,10 +1,9 @@
-"""Tables and numbers as text, as results show themselves in terminals, and as HTML, as in notebooks."""
+"""Tables and numbers as text, as results show themselves in terminals."""
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 #: Heading of a column of positions; each of its cells stays on one line.
@@ -52,32 +51,3 @@ def format_numbers(values: Iterable[float], digits: int) -> str:
 def finite_or_none(value: float) -> float | None:
     """The number, or None (null in JSON) for NaN and infinities."""
     return float(value) if math.isfinite(value) else None
-
-
-def html_block(title: str, *parts: str) -> str:
-    """A title above parts, which are HTML; all other text is escaped."""
-    return f"<div><div><b>{html.escape(title)}</b></div>{''.join(parts)}</div>"
-
-
-def html_lines(lines: Mapping[str, str]) -> str:
-    """One line for each label: the label and its text; nothing without lines."""
-    rows = [(label, text) for label, text in lines.items() if text]
-    return _table(("", ""), rows, header=False) if rows else ""
-
-
-def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of texts.
-
-    Args:
-        headings: one per column.
-        rows: texts of the cells.
-    """
-    return _table(headings, list(rows), header=True)
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], *, header: bool) -> str:
-    import pandas as pd
-
-    # pandas cuts long texts otherwise.
-    with pd.option_context("display.max_colwidth", None):
-        return pd.DataFrame(rows, columns=list(headings)).to_html(index=False, header=header, border=0)

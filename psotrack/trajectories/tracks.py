@@ -95,7 +95,8 @@ ARRAYS = tuple(
 
 def padded(name: str, array: np.ndarray, num_drones: int) -> np.ndarray:
     """An array of `Tracks` with this number of drones: the first ones, then unknown ones, NaN, lost or 0."""
-    unknown = np.nan if array.dtype.kind == "f" else int(Status.LOST) if name == "status" else 0
+    nothing = np.nan if array.dtype.kind == "f" else 0
+    unknown = int(Status.LOST) if name == "status" else nothing
     missing = max(num_drones - array.shape[1], 0)
     pads = [(0, 0), (0, missing), *[(0, 0)] * (array.ndim - 2)]
     return np.pad(array[:, :num_drones], pads, constant_values=unknown)

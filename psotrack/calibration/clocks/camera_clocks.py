@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from psotrack.errors import SettingsError, check_positive
 from psotrack.geometry import (
@@ -60,11 +60,13 @@ class CameraOffsets:
         std_frames: (cameras,), standard deviations of the offsets, frames; near `max_offset_frames` for a camera whose
             detections do not show its offset.
         white_std_frames: (cameras,), the same if the errors of all detections were independent.
+        shown: (cameras,), whether the detections show the offset at all.
     """
 
     offset_frames: Float[np.ndarray, "cameras"]
     std_frames: Float[np.ndarray, "cameras"]
     white_std_frames: Float[np.ndarray, "cameras"]
+    shown: Bool[np.ndarray, "cameras"]
 
 
 def camera_offsets(
@@ -97,17 +99,19 @@ def camera_offsets(
     check_positive("max_offset_frames", max_offset_frames)
     if points_px.shape[2] != len(rig):
         raise SettingsError("points_px", expected=f"{len(rig)} cameras", found=f"{points_px.shape[2]}")
-    reach, offset_frames = max(1, round(_REACH_S * fps)), np.zeros(len(rig))
-    system = _linearise(rig.cameras, points_px, reach, offset_frames, np.ones(points_px.shape[:-1]))
-    for step in range(_WEIGHT_ROUNDS + _MAX_STEPS):
-        # Offsets are not changed before the weights have excluded the outliers.
-        if step >= _WEIGHT_ROUNDS:
-            offset_frames = system.moved_frames(max_offset_frames)
-        change_frames = np.abs(offset_frames - system.offset_frames).max()
-        system = _linearise(rig.cameras, points_px, reach, offset_frames, system.weights)
-        if step >= _WEIGHT_ROUNDS and change_frames < _SETTLED:
+    reach, zero_frames = max(1, round(_REACH_S * fps)), np.zeros(len(rig))
+    system = _linearise(rig.cameras, points_px, reach, zero_frames, np.ones(points_px.shape[:-1]))
+    # Offsets are not changed before the weights have excluded the outliers.
+    for _ in range(_WEIGHT_ROUNDS):
+        system = _linearise(rig.cameras, points_px, reach, zero_frames, system.weights)
+    for _ in range(_MAX_STEPS):
+        last_frames, moved_frames = system.offset_frames, system.moved_frames(max_offset_frames)
+        system = _linearise(rig.cameras, points_px, reach, moved_frames, system.weights)
+        if np.abs(moved_frames - last_frames).max() < _SETTLED:
             break
-    return CameraOffsets(offset_frames, *_standard_deviations(system, max_offset_frames))
+    std_frames, white_std_frames = _standard_deviations(system, max_offset_frames)
+    shown = white_std_frames < _SHOWN * max_offset_frames
+    return CameraOffsets(system.offset_frames, std_frames, white_std_frames, shown)
 
 
 @dataclass(frozen=True)

@@ -260,10 +260,10 @@ def estimate_clocks(
     offset_s = np.array([one.offset_frames for one in estimates]) / timeline.rate_hz
     ratio = np.array([one.std_frames / one.white_std_frames for one in estimates])
     white_s = np.array([one.white_std_frames for one in estimates]) / timeline.rate_hz
-    seen = white_s < MAX_OFFSET_FRAMES / 10 / timeline.rate_hz
+    shown = np.array([one.shown for one in estimates])
     # One stretch of one camera shows badly how far its errors are correlated: all tell it together.
-    larger = np.sqrt(max(float(np.mean(ratio[seen] ** 2)), 1.0)) if seen.any() else 1.0
-    std_s = np.where(seen, larger * white_s, np.inf)
+    larger = np.sqrt(max(float(np.mean(ratio[shown] ** 2)), 1.0)) if shown.any() else 1.0
+    std_s = np.where(shown, larger * white_s, np.inf)
     return fit_clocks(time_s, offset_s, std_s, known_s=_KNOWN / timeline.rate_hz)
 
 

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from psotrack.calibration.doctor.corrections import Corrected
-from psotrack.calibration.doctor.fault_search import FoundFault, Judged
+from psotrack.calibration.doctor.evidence import Judged
+from psotrack.calibration.doctor.fault_search import FoundFault
 from psotrack.geometry import Camera, Rig
 
 #: Largest median distance between reference and points that agree, metres: lever arms of real recordings are up to

@@ -120,7 +120,8 @@ def calibrate_by_point(lenses: Rig, views: PointViews) -> PointRig:
         if len(placed) == len(lenses):
             return found
         placed = dict(zip(some, np.asarray(found.rig.cameras.T_cam_world), strict=True))
-        index, placed[index] = _next_camera(lenses, views, found.points_m, placed)
+        index, T = _next_camera(lenses, views, found.points_m, placed)
+        placed[index] = T
 
 
 def covariance_of_centres(

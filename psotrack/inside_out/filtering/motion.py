@@ -139,6 +139,7 @@ def predict(motion: Motion, dt_s: float, agility: Agility) -> tuple[Motion, Matr
     """
     model = _model(round(dt_s, 9))
     mean, F = model.F @ motion.mean, model.F.copy()
+    # The turn is 0 before, so that it is the turn rate times the time now.
     turn = mean[_TURN].copy()
     there = _rotation(turn)
     F[_TURN, _TURN] = there.T

@@ -40,8 +40,8 @@ _TURN_POSES = 2
 _WILDEST = Agility(50.0, 20.0)
 #: Smallest number of markers that agree beyond chance: two more than the one that has a pose by itself.
 _BEYOND_CHANCE = 3
-#: Ambiguity of a pose below which no other pose explains its markers, and how many times denser poses of a motion must
-#: be than outliers.
+#: Ambiguity of a pose below which no other pose explains its markers; and largest ratio of the density of outliers to
+#: that of a pose that the motion predicts.
 _UNLIKELY = 1e-3
 #: Standard deviation of the wrong one of two poses from the right one, along each axis (m) and about each axis (rad).
 _OTHER_POSE_STD = 1.0
@@ -302,8 +302,7 @@ def probability_right(
 def _is_predicted(updated: _Updated) -> bool:
     """Whether the last pose is predicted by the motion rather than an outlier.
 
-    The density of the pose must exceed the density of an outlier within a metre and a radian by the factor
-    1 / `_UNLIKELY`.
+    The density of an outlier within a metre and a radian must be below `_UNLIKELY` times the density of the pose.
     """
     return bool(updated.log_density > -np.log(_UNLIKELY))
 

@@ -135,8 +135,11 @@ def inside_at(path: CameraPath, time_s: Float[np.ndarray, "frames"], offset_s: f
     rows = np.flatnonzero(found.seen)
     posed = np.flatnonzero(found.seen & np.isfinite(found.orientation_wxyz).all(axis=1))
     if len(posed) < 2 or found.velocity_m_s is None:
-        nothing, identity = np.full((frames, 3, 3), np.nan), np.tile(np.eye(3), (frames, 1, 1))
-        vector, never, no = nothing[:, 0], np.full(frames, np.inf), np.zeros(frames, bool)
+        nothing = np.full((frames, 3, 3), np.nan)
+        identity = np.tile(np.eye(3), (frames, 1, 1))
+        vector = nothing[:, 0]
+        never = np.full(frames, np.inf)
+        no = np.zeros(frames, bool)
         return Inside(vector, vector, vector, nothing, nothing, white, identity, never, never, no, no)
     row_s, pose_s = found.time_s[rows], found.time_s[posed]
     step_s = max(_step_s(path.time_s), _step_s(time_s)) / 2 + _SAME_S

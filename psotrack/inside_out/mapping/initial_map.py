@@ -73,7 +73,8 @@ class MarkerPlacer:
 
     def place(self, marker: int, views: ViewPoses) -> PlacedMarker | None:
         """The position of a marker that fits most sightings; None if no view shows the marker."""
-        at, (T_views, count) = self.sightings.view, views
+        T_views, count = views
+        at = self.sightings.view
         seen = np.isfinite(T_views[at, 0, 0, 0]) & np.isfinite(self._T[:, 0, 0, 0])
         rows = np.flatnonzero((self.sightings.marker == marker) & seen)
         if not len(rows):
