@@ -20,7 +20,7 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
+.PHONY: help demo test test-slow nightly fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -46,11 +46,16 @@ $(VENV)/.installed: $(VENV)/.package
 demo: $(VENV)/.package  ## simulate four drones, track them from the videos, print the errors, save a picture in demo/
 	@$(BIN)/psotrack demo --out demo --force
 
-test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/test_video.py ..." for some files
-	@$(pytest) -m 'not slow' $(NAMES)
+test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/recordings/test_video.py ..." for some files
+	@$(pytest) -m 'not slow and not nightly' $(NAMES)
 
 test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and experiments at small sizes
-	@PSOTRACK_TYPE_CHECKS=off $(pytest) -m slow $(NAMES)
+	@$(pytest) -m 'slow and not nightly' $(NAMES)
+
+nightly: $(VENV)/.installed  ## what takes long and finds little: the fast tests with types checked, nightly tests, fuzz, kills
+	@PSOTRACK_TYPE_CHECKS=on $(pytest) -m 'not slow and not nightly' $(NAMES)
+	@$(pytest) -m nightly $(NAMES)
+	@$(MAKE) --no-print-directory fuzz kills
 
 fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINUTES=60 for more, SEED=7 for others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))

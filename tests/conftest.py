@@ -32,9 +32,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 # jaxtyping and beartype check the types and shapes of the annotated calls of the package. The hook must be installed
-# before the package is imported. The checks take a third to a half of the time of slow tests, so `make test-slow`
-# runs without them: a function that only slow tests call is not checked.
-if os.environ.get("PSOTRACK_TYPE_CHECKS") != "off":
+# before the package is imported. The checks take a third to a half of the time, so only `make nightly` asks for them.
+if os.environ.get("PSOTRACK_TYPE_CHECKS") == "on":
     lazy_checks.install("psotrack")
 
 from helpers import Output

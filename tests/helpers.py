@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+from psotrack.errors import LONGEST_MESSAGE, PsotrackError
 from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project, undistort
 from psotrack.recordings import CameraRecording, Recording
@@ -92,6 +93,41 @@ class Output(NamedTuple):
     code: int
     out: str
     err: str
+
+
+def assert_refused(bad: Callable[[], object], *words: object, unchanged: Path) -> None:
+    """Assert that bad input is refused: one short line with the words, exit code 2, and a folder as it was before.
+
+    Args:
+        bad: calls a function of the package, which must raise one of its errors, or runs a command and returns its
+            `Output`.
+        words: parts of the line: what was expected, what was found, where, and the remedy.
+        unchanged: folder in which no file may appear, change or go, hidden files included.
+    """
+    before = content_of(unchanged)
+    try:
+        result = bad()
+    except PsotrackError as error:
+        line = f"psotrack: {error}\n"
+    else:
+        assert isinstance(result, Output), f"expected an error, found {result!r}"
+        assert (result.code, result.out) == (2, ""), result
+        line = result.err
+    assert line.startswith("psotrack: "), line
+    assert line.count("\n") == 1, line
+    # A long place, such as the folder of the tests, is not cut.
+    assert len(line.replace(str(unchanged), "")) <= len("psotrack: \n") + LONGEST_MESSAGE, line
+    for word in words:
+        assert str(word) in line, line
+    assert content_of(unchanged) == before
+
+
+def content_of(folder: Path) -> dict[str, bytes | None]:
+    """Path of each file below a folder, hidden files included, -> its bytes; path of each folder -> None."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
 
 
 def environment_without_jax_settings() -> dict[str, str]:

@@ -10,13 +10,13 @@ from functools import partial
 from pathlib import Path
 
 import cv2
-import flight_files
 import numpy as np
 import onnx_models
 import pandas as pd
 import test_archives
 import test_dpjait
 import test_rig_formats as rigs
+import worlds
 from helpers import ring_rig
 
 from fuzz.mutations import Change, columns, members
@@ -145,7 +145,7 @@ def _exported(to: str, out: str, file: str | None = None, inside: Change | None 
     """Tracks in a format of `export`; `file` is the file in the folder `out`."""
 
     def make(folder: Path) -> None:
-        exchange.export_tracks(flight_files.make_tracks(), to, folder / out)
+        exchange.export_tracks(worlds.make_tracks(), to, folder / out)
         if to == "mot":
             (folder / "seqinfo.ini").write_text("[Sequence]\nname=a\nframeRate=25\nseqLength=14\n")
 
@@ -163,7 +163,7 @@ def _mot_info(folder: Path) -> None:
 
 _TRACKS = {
     "tracks-csv": Format(
-        lambda folder: flight_files.make_tracks_file(folder / "tracks.csv"),
+        lambda folder: worlds.make_tracks_file(folder / "tracks.csv"),
         "tracks.csv",
         (partial(read_trajectories, fps=25.0), exchange.read_tracks),
         _EXPORT,
@@ -183,7 +183,7 @@ _TRACKS = {
     "tracks-c3d": _exported("c3d", "tracks.c3d"),
     "mcap": _exported("mcap", "tracks.mcap"),
     "run-record": Format(
-        lambda folder: flight_files.make_tracks_file(folder / "tracks.csv"),
+        lambda folder: worlds.make_tracks_file(folder / "tracks.csv"),
         "tracks.json",
         (flights.read_run_record, lambda path: flights.read_tracks_file(path.with_suffix(".csv"), "a")),
         "export {folder}/tracks.csv --to mcap --out {out}/tracks.mcap",
@@ -196,10 +196,10 @@ _TRACKS = {
 
 def _recording(folder: Path) -> None:
     """A recording with all kinds of files; the videos have few frames, so that a try is quick."""
-    flight_files.make_sequence(folder)
-    rows = "".join(f"{frame},{10 + frame},20,12,10,16,25,0.9\n" for frame in range(flight_files.NUM_FRAMES))
+    worlds.make_sequence(folder)
+    rows = "".join(f"{frame},{10 + frame},20,12,10,16,25,0.9\n" for frame in range(worlds.NUM_FRAMES))
     (folder / "boxes.csv").write_text(rows)
-    times = "".join(f"{frame},{frame / flight_files.RATE_HZ}\n" for frame in range(flight_files.NUM_FRAMES))
+    times = "".join(f"{frame},{frame / worlds.RATE_HZ}\n" for frame in range(worlds.NUM_FRAMES))
     (folder / "times.csv").write_text(f"frame,time_s\n{times}")
     labels = tuple(f"{body}:{body}{i}" for body in ("dronA", "dronB") for i in range(4))
     cross_m = np.array([[0.1, 0, 0], [0, 0.12, 0], [-0.15, 0, 0], [0, -0.1, 0.05]])
@@ -210,7 +210,7 @@ def _recording(folder: Path) -> None:
     text = (folder / "recording.toml").read_text()
     text = text.replace('video = "c1.avi"', 'video = "c1.avi"\ntimestamps = "times.csv"')
     text = text.replace('video = "c2.avi"', 'video = "c2.avi"\nline_time_s = 1e-5\ndetections = "boxes.csv"')
-    files = ", ".join(f'"{name}.csv"' for name in flight_files.REFERENCE)
+    files = ", ".join(f'"{name}.csv"' for name in worlds.REFERENCE)
     text = text.replace(f"files = [{files}]", 'files = ["mocap.c3d"]\ntime_offset_s = 0.01')
     text += '[markers]\ncorners = "corners.csv"\n[world]\nbounds_m = [[-3, -3, 0], [3, 3, 3]]\n'
     (folder / "recording.toml").write_text(text)
@@ -222,7 +222,7 @@ def _corners() -> Mapping[int, np.ndarray]:
 
 
 def _csv_recording(folder: Path) -> None:
-    flight_files.make_sequence(folder)
+    worlds.make_sequence(folder)
 
 
 def _open(path: Path) -> object:
@@ -360,7 +360,7 @@ def _path_of_camera(folder: Path) -> None:
         ),
         "dron1",
     )
-    flight_files.make_tracks_file(folder / "tracks.csv")
+    worlds.make_tracks_file(folder / "tracks.csv")
 
 
 def _table(file: str, text: str, *reads: Read, command: str = "") -> Format:

@@ -1,0 +1,430 @@
+"""A disk that is really full, one that cannot be written, and a slow one; `test_disks.py` needs no rights to mount.
+
+A small file system in memory stands for the disk. Its free pages and its number of files are counted over all files
+together, so that a limit meets each write of a command in turn, those of other libraries included.
+"""
+
+import contextlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from helpers import make_once, ring_rig
+from small_sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
+from test_cli_calibrate import film_board, pairs_of
+from test_fuse_command import make_files
+from test_map_markers import make_walk
+from test_synchronisation import make_recording
+from worlds import make_sequence, make_tracks_file
+
+from psotrack.geometry.rig_files import write_rig
+from psotrack.show.flights import find_recording
+
+#: Content of the files that a command is to replace.
+OLDER = b"older"
+PAGE_BYTES = 4096
+#: Seconds of stages and of the whole run, which differ from run to run.
+TIMES = re.compile(rb'("seconds": )\{[^}]*\}|("(?:real_time_factor\w*|start_s)": )[-+.e0-9]+')
+
+
+class SmallDisk:
+    """A file system in memory, at `place`; `filler` takes what it must not take."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.place = folder, folder / "place"
+
+    def mount(self, *options: str) -> None:
+        command = ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(self.folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"a file system cannot be mounted here: {done.stderr.strip()}")
+
+    def remount(self, *options: str) -> None:
+        subprocess.run(["mount", "-o", ",".join(["remount", *options]), str(self.folder)], check=True)
+
+    def used(self) -> tuple[int, int]:
+        """Pages and files that are in use."""
+        status = os.statvfs(self.folder)
+        return (
+            status.f_blocks - status.f_bfree
+        ) * status.f_frsize // PAGE_BYTES, status.f_files - status.f_ffree
+
+    @contextlib.contextmanager
+    def room_for(self, *, pages: int = 10**5, files: int = 10**5):
+        """The disk takes this many more pages and files until the block ends."""
+        used_pages, used_files = self.used()
+        # No limit would be 0.
+        self.remount(f"size={max(1, used_pages + pages) * PAGE_BYTES}", f"nr_inodes={used_files + files}")
+        try:
+            yield
+        finally:
+            self.remount("size=1g", "nr_inodes=1000000")
+
+
+@pytest.fixture
+def disk(tmp_path, monkeypatch):
+    """A small disk, whose folder `place` is the current folder."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    found = SmallDisk(folder)
+    found.mount("size=1g")
+    try:
+        # A page that is in use, because a file system without any page has no limit.
+        (folder / "filler").write_bytes(bytes(PAGE_BYTES))
+        found.place.mkdir()
+        monkeypatch.chdir(found.place)
+        yield found
+    finally:
+        os.chdir(tmp_path)
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return small_sequence(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory, root):
+    """Inputs of the commands, which no test changes."""
+
+    def make(folder):
+        make_sequence(folder / "flight")
+        make_tracks_file(folder / "flight_tracks.csv")
+        rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
+        write_rig(folder / "lenses.yml", rig)
+        pairs_of(folder / "pairs.csv", rig)
+        film_board(folder / "board.avi")
+        for name, make_inputs in (("walk", make_walk), ("fuse", make_files), ("clocks", make_recording)):
+            (folder / name).mkdir()
+            make_inputs(folder / name)
+        tracked = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
+        assert tracked.returncode == 0, tracked.stderr
+        sequence = root / "Simulated_Data" / "S01_D2_A"
+        packed = psotrack(
+            root, "archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack"
+        )
+        assert packed.returncode == 0, packed.stderr
+        grid_file(folder, [2, 3]).rename(folder / "grid.toml")
+
+    return make_once(tmp_path_factory, "inputs_of_small_disks", make)
+
+
+def content_of(folder: Path) -> dict[str, bytes | None]:
+    """Path of every file, hidden ones included, -> bytes without times; of a folder -> None."""
+    return {
+        str(path.relative_to(folder)): TIMES.sub(rb"\1\2", path.read_bytes()) if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def limits(number: int, tries: int) -> list[int]:
+    """Numbers from 0 to `number` - 1: all, or some of them, with the smallest and the largest."""
+    return sorted({round(i * (number - 1) / (tries - 1)) for i in range(tries)}) if number > 0 else []
+
+
+#: The small sequence with little effort; the program is the one that `small_sequence` compiles.
+TRACK = (
+    "track {root}/Simulated_Data/S01_D2_A --particles 8 --iterations 2 --swarm joint --score hard --init truth "
+    "--drone-size 0.5,0.5,0.2 --reduction 2 --jobs 1 --force --quiet"
+)
+#: Outputs, which belong together -> words of the command that writes them.
+COMMANDS = {
+    ("tracks.csv", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.csv",
+    ("tracks.parquet", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.parquet",
+    (
+        "flight.psotrack",
+    ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --out flight.psotrack --force",
+    (
+        "videos.psotrack",
+    ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
+    ("folder",): "archive {inputs}/packed.psotrack --out folder",
+    ("rig.toml",): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.toml "
+    "--force",
+    (
+        "rig.yml",
+    ): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.yml --force",
+    ("lens.toml",): "calibrate rig {inputs}/board.avi --squares 7x5 --square 0.04 --marker 0.03 --lens 4 "
+    "--out lens.toml --force --quiet",
+    (
+        "camera.csv",
+    ): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    "--out camera.csv --force --frames 8 --quiet",
+    ("corners.csv",): "onboard map {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    "--known 7 --out corners.csv --force --quiet",
+    (
+        "markers.csv",
+    ): "onboard detect {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
+    ("fused.csv",): "onboard fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
+    ("doctor.json",): "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
+def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, monkeypatch, names):
+    monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
+    words = COMMANDS[names].format(root=root, inputs=inputs, walk=inputs / "walk" / "walk.avi").split()
+
+    def reset():
+        for path in disk.place.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if "--force" in words:
+            for name in names:
+                Path(name).write_bytes(OLDER)
+
+    parents = {str(parent) for name in names for parent in Path(name).parents}
+    empty = disk.used()
+    undisturbed = run_psotrack(*words)
+    assert undisturbed.code == 0, undisturbed.err
+    whole = content_of(disk.place)
+    pages, files = (most - least for most, least in zip(disk.used(), empty, strict=True))
+    for room in [{"pages": n} for n in limits(pages, 3)] + [{"files": n} for n in limits(files, 3)]:
+        reset()
+        older = content_of(disk.place)
+        with disk.room_for(**room):
+            result = run_psotrack(*words)
+        assert result.code == 2, (room, result)
+        assert result.err.count("\n") == 1, (room, result.err)
+        assert any(name in result.err for name in names), (room, result.err)
+        # Folders in which the outputs are to be may have been made.
+        left = {path: content for path, content in content_of(disk.place).items() if path not in parents}
+        assert left == older, room
+    assert run_psotrack(*words).code == 0
+    assert content_of(disk.place) == whole
+
+
+#: Output folders of commands that go on where the last call has ended -> words of the command.
+GO_ON = {
+    "data": "simulate S01_D2_A --out data --frames 3 --scale 0.1 --jobs 1 --no-onboard --quiet",
+    "cache": "detect --silhouettes {inputs}/flight --cache cache --jobs 1 --quiet",
+    "videos": "overlay {inputs}/flight_tracks.csv {inputs}/flight --out videos --jobs 1 --quiet",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", GO_ON)
+def test_the_next_run_goes_on(run_psotrack, disk, inputs, monkeypatch, tmp_path, name):
+    """The disk grows from call to call, and is never emptied."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    words = GO_ON[name].format(inputs=inputs).split()
+    empty = disk.used()
+    assert run_psotrack(*words).code == 0
+    whole = content_of(disk.place)
+    pages, files = (most - least for most, least in zip(disk.used(), empty, strict=True))
+    shutil.rmtree(disk.place / name)
+    for kind, index, number in (("files", 1, files), ("pages", 0, pages)):
+        for room in limits(number, 4):
+            used = disk.used()[index] - empty[index]
+            if room < used:
+                continue
+            with disk.room_for(**{kind: room - used}):
+                result = run_psotrack(*words)
+            assert result.code == 2, (kind, room, result)
+            assert result.err.count("\n") == 1, (kind, room, result.err)
+            assert name in result.err, (kind, room, result.err)
+            left = content_of(disk.place)
+            assert not [path for path in left if ".partial" in path], (kind, room)
+            finished = {path: content for path, content in left.items() if "/." not in path and content}
+            assert finished.items() <= whole.items(), (kind, room)
+    assert run_psotrack(*words).code == 0
+    assert content_of(disk.place) == whole
+
+
+@pytest.mark.slow
+def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
+    monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
+    words = ["sweep", inputs / "grid.toml", "--data", root, "--quiet", "--out"]
+    assert run_psotrack(*words, "whole").code == 0
+    # Until the disk takes the first cell.
+    rooms = [{"files": n} for n in range(4)] + [{"pages": n} for n in range(0, 100, 3)]
+    while not stamps(Path("results")):
+        room = rooms.pop(0)
+        with disk.room_for(**room):
+            result = run_psotrack(*words, "results")
+        assert result.code == 2, (room, result)
+        assert result.err.count("\n") == 1, (room, result.err)
+        assert "results" in result.err, (room, result.err)
+        assert not [path for path in content_of(disk.place) if ".partial" in path], room
+        # No cell has failed: the disk has.
+        assert not list(disk.place.glob("results/cells/*.error.json")), room
+    finished = stamps(Path("results"))
+    assert len(finished) == 1
+    assert run_psotrack(*words, "results").code == 0
+    assert finished.items() < stamps(Path("results")).items(), "a finished cell is not run again"
+    expected, found = (
+        all_rows(Path(name)).set_index("settings.swarm.iterations").sort_index().filter(regex="error")
+        for name in ("whole", "results")
+    )
+    assert len(expected.columns) > 0
+    pd.testing.assert_frame_equal(found, expected)
+
+
+@pytest.mark.slow
+def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
+    words = [
+        "sweep",
+        inputs / "grid.toml",
+        "--data",
+        root,
+        "--quiet",
+        "--cluster",
+        "local",
+        "--out",
+        "results",
+    ]
+    # Until a worker meets the full disk, and not the command, whose manifest takes more than two pages.
+    pages, said = 2, ""
+    while "results/cells" not in said and "results/_errors" not in said:
+        pages += 1
+        with disk.room_for(pages=pages):
+            result = psotrack(root, *words)
+        said = result.stderr
+        assert (result.returncode, said.count("\n")) == (2, 1), said
+    # Two workers may have had room for the errors of their cells, but no cell has rows.
+    assert not list(disk.place.glob("results/cells/*"))
+    result = psotrack(root, *words)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert len(stamps(Path("results"))) == 2
+
+
+@pytest.mark.slow
+def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
+    """Found: after a full disk, the next call refused the sequence that the first one had simulated."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
+    words = ["demo", "--out", "demo", "--jobs", "1", "--quiet"]
+    assert run_psotrack(*words).code == 0
+
+    def simulated():
+        return {path: path.stat().st_mtime_ns for path in Path("demo/Simulated_Data").rglob("*")}
+
+    whole, made = content_of(disk.place), simulated()
+    results = [
+        Path("demo", name) for name in ("tracks.csv", "tracks.json", "tracks.ambiguity.csv", "demo.png")
+    ]
+    # Found: the demo wrote no record, so that `psotrack view demo/tracks.csv` had no cameras.
+    assert find_recording(results[0]).resolve() == Path("demo/Simulated_Data/S02_D4_A").resolve()
+    for pages in (0, 2, results[0].stat().st_size // PAGE_BYTES + 2):
+        for path in results:
+            path.unlink(missing_ok=True)
+        with disk.room_for(pages=pages):
+            result = run_psotrack(*words)
+        assert (result.code, result.err.count("\n")) == (2, 1), (pages, result)
+        assert not any(path.exists() for path in results), pages
+        assert ".partial" not in "".join(content_of(disk.place)), pages
+    assert run_psotrack(*words).code == 0
+    assert content_of(disk.place) == whole
+    assert simulated() == made
+    for path in results:
+        path.unlink()
+    other = run_psotrack(*words, "--seed", 2)
+    assert other.code == 2
+    assert "S02_D4_A: expected a path that does not exist yet" in other.err
+
+
+#: Commands with an output on a disk that cannot be written, at `out`.
+REFUSED = [
+    "track {flight} --out out/tracks.csv",
+    "track {flight} --out out/tracks.csv --causal",
+    "track {flight} --out tracks.csv --json out/record.json",
+    "track {flight} --out tracks.csv --log out/steps.log",
+    "track {flight} --out tracks.csv --save-config out/run.toml",
+    "track {flight} --out tracks.csv --cache out/cache",
+    "live {flight} --replay --out out/tracks.csv",
+    "sweep {flight}/grid.toml --data {flight}/.. --out out/results",
+    "simulate S01_D2_A --out out/data",
+    "detect --silhouettes {flight} --cache out/cache",
+    "detect {flight} --masks out/masks",
+    "detect {flight} --blobs --out out/boxes",
+    "simulate labels {flight} {flight}/../second --drone-size 0.3,0.3,0.15 --out out/yolo",
+    "overlay {flight}/tracks.csv {flight} --out out/videos",
+    "report {flight}/tracks.csv {flight} --out out/page.html",
+    "evaluate {flight}/tracks.csv {flight} --plot out/errors.png",
+    "export {flight}/tracks.csv --to tum --out out/tum",
+    "archive {flight}/tracks.csv {flight} --out out/flight.psotrack",
+    "doctor {flight} --detections blobs --json out/doctor.json",
+]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """A small recording with tracks and a grid, and another one, which no test changes."""
+
+    def make(folder):
+        make_sequence(folder / "second")
+        make_tracks_file(make_sequence(folder / "flight") / "tracks.csv")
+        text = grid_file(folder, [2]).read_text(encoding="utf-8")
+        (folder / "flight" / "grid.toml").write_text(text.replace("S01_D2_A", "flight"), encoding="utf-8")
+
+    return make_once(tmp_path_factory, "flight_of_small_disks", make) / "flight"
+
+
+def test_a_disk_that_cannot_be_written_is_named_before_the_work(
+    run_psotrack, disk, flight, tmp_path, monkeypatch
+):
+    (tmp_path / "here").mkdir()
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path / "here")
+    Path("out").symlink_to(disk.place)
+    disk.remount("ro")
+    for command in REFUSED:
+        result = run_psotrack(*command.format(flight=flight).split())
+        assert result.code == 2, (command, result)
+        assert result.err.count("\n") == 1, (command, result.err)
+        assert "psotrack: out/" in result.err, (command, result.err)
+        # Neither silhouettes nor tracks were computed.
+        assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["filler"], command
+
+
+@pytest.mark.slow
+def test_a_cache_that_cannot_be_written_is_read(run_psotrack, disk, root, tmp_path, monkeypatch):
+    shutil.copytree(root / "cache", "cache")
+    monkeypatch.setenv("PSOTRACK_CACHE", str(disk.place / "cache"))
+    disk.remount("ro")
+    words = TRACK.format(root=root).split()
+    result = run_psotrack(*words, "--out", tmp_path / "tracks.csv")
+    assert (result.code, result.err) == (0, "")
+    monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
+    assert run_psotrack(*words, "--out", tmp_path / "again.csv").code == 0
+    assert (tmp_path / "tracks.csv").read_bytes() == (tmp_path / "again.csv").read_bytes()
+
+
+#: `psotrack` on a slow disk: each file of the stored silhouettes takes this long.
+SLOW = """
+import time
+from pathlib import Path
+write = Path.write_bytes
+def write_slowly(*words):
+    time.sleep(0.3)
+    return write(*words)
+Path.write_bytes = write_slowly
+from psotrack.cli import main
+main()
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_make_silhouettes_on_a_slow_disk(run_psotrack, flight, tmp_path):
+    words = ["detect", "--silhouettes", str(flight), "--jobs", "1", "--quiet", "--cache"]
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", SLOW, *words, str(tmp_path / "slow")],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
+    said = [process.communicate(timeout=120) for process in both]
+    assert [(process.returncode, *words) for process, words in zip(both, said, strict=True)] == [
+        (0, "", "")
+    ] * 2
+    assert run_psotrack(*words, tmp_path / "quick").code == 0
+    assert content_of(tmp_path / "slow") == content_of(tmp_path / "quick")

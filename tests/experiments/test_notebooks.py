@@ -1,0 +1,134 @@
+"""The notebooks: script and .ipynb have the same cells; committed notebooks have been run, and all notebooks run."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jupytext
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted((ROOT / "notebooks").glob("[a-z]*.py"))
+#: Largest size of a notebook, bytes: repository pages show larger files slowly or not at all.
+MAX_BYTES = 1_000_000
+#: Beginnings of paths on a particular machine, including the folder of this checkout.
+MACHINE_PATH = re.compile(rf"(?<![\w.])(/(home|root|tmp|Users)/|[A-Z]:\\|{re.escape(str(ROOT))})")
+
+each_script = pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+
+
+def committed_notebook(script):
+    """The committed notebook of a script."""
+    return nbformat.read(script.with_suffix(".ipynb"), as_version=4)
+
+
+def cells(notebook):
+    return [(cell.cell_type, cell.source) for cell in notebook.cells]
+
+
+def has_picture(cell):
+    kinds = [kind for output in cell.get("outputs", ()) for kind in output.get("data", {})]
+    return any(kind.startswith("image/") for kind in kinds)
+
+
+@each_script
+def test_script_and_notebook_have_the_same_cells(script):
+    assert cells(jupytext.read(script)) == cells(committed_notebook(script))
+
+
+def test_every_notebook_has_a_script():
+    assert [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))] == [
+        path.stem for path in SCRIPTS
+    ]
+
+
+@each_script
+def test_committed_notebook_has_been_run_from_top_to_bottom(script):
+    counts = [cell.execution_count for cell in committed_notebook(script).cells if cell.cell_type == "code"]
+    assert counts == list(range(1, len(counts) + 1))
+
+
+@each_script
+def test_every_picture_is_followed_by_a_what_to_see_cell(script):
+    notebook = committed_notebook(script)
+    after = [
+        following
+        for cell, following in zip(notebook.cells, notebook.cells[1:], strict=False)
+        if has_picture(cell)
+    ]
+    assert after
+    # This includes photographs of the hall at the beginning.
+    assert all(cell.cell_type == "markdown" and cell.source.startswith("*What to see") for cell in after)
+    assert not has_picture(notebook.cells[-1])
+
+
+@each_script
+def test_committed_notebook_shows_no_errors_and_no_paths_of_a_machine(script):
+    notebook = committed_notebook(script)
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert not [
+        output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"
+    ]
+    texts = [output.get("text", "") for output in outputs]
+    texts += [
+        text for output in outputs for kind, text in output.get("data", {}).items() if "image" not in kind
+    ]
+    assert not [text for text in texts if MACHINE_PATH.search(text)]
+
+
+@each_script
+def test_committed_notebook_is_small_and_its_metadata_are_stable(script):
+    path = script.with_suffix(".ipynb")
+    assert path.stat().st_size < MAX_BYTES
+    notebook = committed_notebook(script)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert "version" not in notebook.metadata.get("language_info", {})
+    assert not [cell for cell in notebook.cells if "execution" in cell.metadata]
+
+
+@each_script
+def test_functions_are_in_the_package(script):
+    statements = ast.parse(script.read_text()).body
+    # An animation needs one function that draws a frame.
+    assert sum(isinstance(node, ast.FunctionDef) for node in statements) <= 1
+    # Only one notebook is about parts that are not in the package.
+    assert script.stem == "bring_your_own" or not any(isinstance(node, ast.ClassDef) for node in statements)
+
+
+@pytest.fixture(scope="module")
+def copies(tmp_path_factory):
+    """Copies of the notebooks in a separate folder, with a link to the results that one notebook reads."""
+    root = tmp_path_factory.mktemp("checkout")
+    (root / "experiments").symlink_to(ROOT / "experiments")
+    folder = root / "notebooks"
+    folder.mkdir()
+    for script in SCRIPTS:
+        shutil.copy(script.with_suffix(".ipynb"), folder)
+    return folder
+
+
+@pytest.mark.slow
+@each_script
+def test_notebook_runs_at_tiny_size(script, copies):
+    """Run by nbmake in another pytest process, because this one turns warnings of Jupyter's machinery into errors."""
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--nbmake",
+        # The default, five minutes for a cell, is not enough for the compiler on slow machines.
+        "--nbmake-timeout=7200",
+        f"{script.stem}.ipynb",
+    ]
+    environment = os.environ | {"PSOTRACK_NOTEBOOKS": "tiny"}
+    ran = subprocess.run(command, cwd=copies, env=environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert (copies / "data" / "tiny").exists() or script.stem == "table_5"

@@ -1,0 +1,159 @@
+"""Sweeps as tasks of a Dask cluster: when a worker is killed, its cell runs again, and the results are complete."""
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import test_signals
+from helpers import listening_at
+from small_sweeps import all_rows, environment, grid_file, psotrack, small_sequence
+
+from psotrack.errors import InputError, SettingsError
+from psotrack.sweeps import Cluster, Inputs, Store, read_grid
+from psotrack.sweeps.cluster import run_on_cluster
+
+pytest.importorskip("distributed")
+
+#: Code that every worker runs first: one worker kills itself just before it moves its cell's file to its place.
+DYING = """
+import contextlib, os, signal, sys
+from pathlib import Path
+
+def die_once(event, arguments):
+    if event == "os.rename" and Path(arguments[1]).match("cells/*.parquet"):
+        with contextlib.suppress(FileExistsError):
+            Path(os.environ["DIED"]).open("x").close()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+sys.addaudithook(die_once)
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
+    root, results, died = small_sequence(tmp_path_factory), tmp_path / "results", tmp_path / "died"
+    (tmp_path / "dying.py").write_text(DYING)
+    dask = {"WORKER__PRELOAD": str(tmp_path / "dying.py")}
+    # The test must not fail on a slow machine: Dask's default timeout is half a minute.
+    dask |= {"COMM__TIMEOUTS__CONNECT": "600s", "COMM__TIMEOUTS__TCP": "600s"}
+    more = {f"DASK_DISTRIBUTED__{name}": value for name, value in dask.items()} | {"DIED": str(died)}
+    grid = grid_file(tmp_path, [2, 3, 4, 5])
+    words = ("sweep", grid, "--data", root, "--out", results, "--json", "-", "--cluster")
+    done = psotrack(root, *words, "local", "--workers", 2, **more)
+    assert done.returncode == 0, done.stderr
+    assert died.exists()
+    assert json.loads(done.stdout) == {"finished": 4, "failed": 0, "left": 0}
+    assert sorted(all_rows(results)["settings.swarm.iterations"]) == [2, 3, 4, 5]
+    (run,) = (json.loads(path.read_text()) for path in (results / "_runs").glob("*.json"))
+    assert run["cells"] == 4
+    # All cells are finished, so no cluster is needed, and the address without a cluster is no error.
+    again = psotrack(root, *words, "tcp://127.0.0.1:1")
+    assert json.loads(again.stdout) == {"finished": 0, "failed": 0, "left": 4}
+
+
+def test_without_dask_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(SettingsError, match=r"expected Dask, found .*; pip install '\.\[dask\]'"):
+        Cluster()
+
+
+@pytest.mark.slow
+def test_a_local_cluster_listens_on_the_loopback_only_and_ctrl_c_ends_it_with_one_line(
+    start_python, tmp_path_factory, tmp_path
+):
+    root, results = small_sequence(tmp_path_factory), tmp_path / "results"
+    # A cell of minutes, so that Ctrl-C comes while a worker computes.
+    grid = grid_file(tmp_path, [100_000], runs=100)
+    words = ("sweep", grid, "--data", root, "--out", results, "--cluster", "local", "--workers", 2)
+    process = start_python("-c", test_signals.AT_A_TERMINAL, *words, env=environment(root))
+    line = process.stderr.readline()
+    end_s = time.monotonic() + 120
+    while not list(results.glob("cells/*.lock")) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    time.sleep(1.0)  # The worker is in the computation.
+    addresses = listening_at(process.pid)
+    err, took_s = test_signals.end(process, signal.SIGINT)
+    listens = r"the cluster listens at tcp://127\.0\.0\.1:\d+, for programs on this computer only\n"
+    assert re.fullmatch(listens, line)
+    assert addresses == {"127.0.0.1"}
+    assert err == "psotrack: interrupted; earlier results are unchanged; run the command again to finish\n"
+    assert process.returncode == 130
+    assert took_s < test_signals.LONGEST_S
+    test_signals.assert_nothing_left(process)
+
+
+@pytest.mark.parametrize(
+    ("address", "warned"),
+    [
+        ("tcp://10.0.0.5:8786", True),
+        ("10.0.0.5:8786", True),
+        ("tcp://scheduler.lab:8786", True),
+        ("tcp://127.0.0.1:8786", False),
+        ("localhost:8786", False),
+        ("tcp://[::1]:8786", False),
+        ("tls://10.0.0.5:8786", False),
+    ],
+)
+def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
+    tmp_path, monkeypatch, caplog, address, warned
+):
+    def refuse(*_):
+        raise OSError("nobody listens")
+
+    monkeypatch.setattr("distributed.Client", refuse)
+    cells = read_grid(grid_file(tmp_path, [2])).cells()
+    with pytest.raises(InputError, match="nobody listens"):
+        next(run_on_cluster(Cluster(address), list(cells), Inputs(tmp_path, tmp_path), Store(tmp_path)))
+    lines = [record.getMessage() for record in caplog.records if "TLS" in record.getMessage()]
+    assert len(lines) == warned
+    assert all(line.startswith(f"--cluster {address}: ") for line in lines)
+
+
+def _certificates(folder: Path) -> dict[str, str]:
+    """A certificate that signs itself, and Dask's settings with it."""
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=test"]
+    key, certificate = folder / "key.pem", folder / "certificate.pem"
+    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    settings = {"CA_FILE": certificate}
+    for role in ("SCHEDULER", "WORKER", "CLIENT"):
+        settings |= {f"{role}__KEY": key, f"{role}__CERT": certificate}
+    return {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(path) for name, path in settings.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
+def test_a_sweep_on_a_cluster_with_tls(tmp_path_factory, tmp_path):
+    """The commands of the page about clusters: a scheduler and a worker with TLS, and a sweep."""
+    root, tls = small_sequence(tmp_path_factory), _certificates(tmp_path)
+    file = tmp_path / "scheduler.json"
+    program = [sys.executable, "-m"]
+    listening = ["--protocol", "tls", "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file]
+    scheduler = [*program, "distributed.cli.dask_scheduler", "--port", "0", *listening]
+    worker = [*program, "distributed.cli.dask_worker", "--nthreads", "1", *listening]
+    processes = []
+    try:
+        processes.append(subprocess.Popen(scheduler, env=environment(root) | tls))
+        deadline = time.monotonic() + 60
+        while not file.exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        address = json.loads(file.read_text())["address"]
+        assert address.startswith("tls://127.0.0.1:")
+        processes.append(subprocess.Popen(worker, env=environment(root) | tls))
+        words = ("sweep", grid_file(tmp_path, [2]), "--data", root, "--cluster", address, "--json", "-")
+        done = psotrack(root, *words, "--out", tmp_path / "results", **tls)
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout) == {"finished": 1, "failed": 0, "left": 0}
+        stranger = psotrack(root, *words, "--out", tmp_path / "other")
+        assert stranger.returncode == 2
+        assert stranger.stderr.startswith("psotrack: --cluster: expected a Dask scheduler"), stranger.stderr
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.wait(30)
