@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import onnx_models
 import pandas as pd
+import rig_texts as rigs
 import test_archives
 import test_dpjait
-import test_rig_formats as rigs
 import worlds
 from helpers import ring_rig
 
