@@ -1,6 +1,7 @@
 """A headless Chromium for the tests of pages: the machine's own, because test runs download nothing."""
 
 import contextlib
+import os
 import shutil
 
 import cv2
@@ -20,10 +21,12 @@ ARGUMENTS = [
 
 @contextlib.contextmanager
 def open_browser(arguments=ARGUMENTS):
-    """A browser of Playwright; the test is skipped on a machine without Chromium."""
+    """A browser of Playwright; without Chromium the test fails, or is skipped if PSOTRACK_NO_BROWSER is 1."""
     path = next((found for name in NAMES if (found := shutil.which(name))), None)
     if path is None:
-        pytest.skip(f"none of {', '.join(NAMES)} is installed")
+        if os.environ.get("PSOTRACK_NO_BROWSER") == "1":
+            pytest.skip("PSOTRACK_NO_BROWSER is 1")
+        pytest.fail(f"none of {', '.join(NAMES)} is installed; PSOTRACK_NO_BROWSER=1 leaves these tests out")
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as programs:
