@@ -20,7 +20,7 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow nightly fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
+.PHONY: help demo test test-slow nightly real fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -56,6 +56,10 @@ nightly: $(VENV)/.installed  ## what takes long and finds little: the fast tests
 	@PSOTRACK_TYPE_CHECKS=on $(pytest) -m 'not slow and not nightly' $(NAMES)
 	@$(pytest) -m nightly $(NAMES)
 	@$(MAKE) --no-print-directory fuzz kills
+
+real: $(VENV)/.installed  ## the tests on other people's recordings below PSOTRACK_REAL_DATA; says which are not there
+	@$(BIN)/python tests/real_data.py
+	@$(pytest) -m real $(NAMES)
 
 fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINUTES=60 for more, SEED=7 for others
 	@PYTHONPATH=tests $(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(if $(SEED),--seed $(SEED))

@@ -1,7 +1,6 @@
 """Boards in images that OpenCV draws: printed inverted, seen mirrored, and boards that are not the stated one."""
 
 import json
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from board_rigs import draw_board
 from click.testing import CliRunner
+from real_data import published
 from scipy.spatial.transform import Rotation
 
 import psotrack as pt
@@ -38,7 +38,6 @@ SIZE_WH = (640, 480)
 K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
 BOARD = Board((4, 6), 0.04, 0.03)
 CHESS = Board((6, 5), 0.03, kind="chessboard")
-REAL = Path(os.environ.get("PSOTRACK_REAL_DATA", "absent"))
 
 
 def pose(seed=0):
@@ -256,10 +255,10 @@ def test_a_camera_that_never_sees_the_board(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (REAL / "mprib/caliscope").is_dir(), reason="real recordings: PSOTRACK_REAL_DATA")
+@pytest.mark.real
 def test_four_webcams():
     """A board printed white on black, which one camera sees from behind; the author's focal lengths are near."""
-    folder = REAL / "mprib/caliscope/tests/sessions/4_cam_recording/calibration/extrinsic"
+    folder = published("mprib/caliscope") / "tests/sessions/4_cam_recording/calibration/extrinsic"
     cameras = open_images([folder / f"cam_{n}.mp4" for n in range(4)])
     found = find_views(Board((4, 5), 0.054, 0.0405, "4x4_1000"), cameras, instants_of_numbers(cameras))
     assert (found.mirrored > 0).tolist() == [False, True, False, False]
@@ -272,10 +271,11 @@ def test_four_webcams():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (REAL / "kyamagu/mexopencv").is_dir(), reason="real recordings: PSOTRACK_REAL_DATA")
+@pytest.mark.real
 def test_a_stereo_pair_and_a_chessboard():
     """OpenCV's sample reports 0.22 px."""
-    cameras = open_images([REAL / f"kyamagu/mexopencv/test/{side}??.jpg" for side in ("left", "right")])
+    folder = published("kyamagu/mexopencv") / "test"
+    cameras = open_images([folder / f"{side}??.jpg" for side in ("left", "right")])
     found = find_views(Board((10, 7), 0.025, kind="chessboard"), cameras, instants_of_numbers(cameras))
     calibrated = calibrate_rig(found.board, found.views)
     rms_px = np.sqrt(np.mean(calibrated.residual_px[calibrated.used] ** 2))

@@ -1,8 +1,6 @@
 """`psotrack evaluate` of paths with orientations: evo as oracle, planted clocks, and axes."""
 
 import json
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 from evo.core import metrics, sync
 from evo.tools import file_interface
+from real_data import published
 from scipy.spatial.transform import Rotation
 from test_path_comparison import ARM_M, FPS, TURN, body, compare, filmed_path, recording
 
@@ -20,7 +19,6 @@ from psotrack.recordings.exchange import read_tracks
 from psotrack.trajectories import write_trajectories
 from psotrack.trajectories.tum import write_tum
 
-REAL = Path(os.environ.get("PSOTRACK_REAL_DATA", "absent")) / "MichaelGrupp/evo/test/data"
 CLOCK_S, TURN_CLOCK_S = 0.3137, -2.173
 
 
@@ -140,10 +138,11 @@ def test_it_agrees_with_evo(tmp_path):
     assert searched["distance_m"]["mean"] <= found["distance_m"]["mean"]
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="real recordings: PSOTRACK_REAL_DATA")
+@pytest.mark.real
 def test_it_agrees_with_evo_on_a_real_flight_of_a_camera():
     """evo takes the nearest pose of the reference, within 10 ms, where psotrack interpolates."""
-    estimate, reference = REAL / "freiburg1_xyz-rgbdslam.txt", REAL / "freiburg1_xyz-groundtruth.txt"
+    folder = published("MichaelGrupp/evo") / "test/data"
+    estimate, reference = (folder / f"freiburg1_xyz-{name}.txt" for name in ("rgbdslam", "groundtruth"))
     found = run(estimate, reference, "--offset", 0, "--no-lever-arm", "--no-turn")
     position, rotation = evo_ape(estimate, reference)
     for ours, theirs in ((found["distance_m"], position), (found["angle_deg"], rotation)):

@@ -2,10 +2,8 @@
 
 import csv
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,13 +12,12 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from marker_pictures import Sheet, picture, rows_of_sheets
+from real_data import published
 
 from psotrack.cli.onboard.detect_markers import detect_markers
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.foreground.markers import MarkerDetector, marker_dictionary
 from psotrack.recordings import VideoWriter, read_grey
-
-REAL = Path(os.environ.get("PSOTRACK_REAL_DATA", "real-data"))
 
 
 def opencv_markers(gray, dictionary, refinement=cv2.aruco.CORNER_REFINE_NONE):
@@ -374,24 +371,21 @@ def test_levels_of_any_depth(tmp_path):
         np.testing.assert_allclose(read_grey(path).astype(int), gray, atol=1)
 
 
-real = pytest.mark.parametrize(
-    ("pattern", "dictionary"),
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "pattern", "dictionary"),
     [
-        ("UbiquityRobotics/fiducials/**/*.jpg", "5x5_1000"),
-        ("duckietown/lib-dt-apriltags/**/*.png", "apriltag_36h11"),
-        ("AprilRobotics/apriltag/**/*.jpg", "apriltag_36h11"),
-        ("abakisita/camera_calibration/**/*.jpg", "6x6_250"),
-        ("Ashrafhij/TelloAI-V.0.1/part_A/image*.jpg", "4x4_50"),
+        ("UbiquityRobotics/fiducials", "**/*.jpg", "5x5_1000"),
+        ("duckietown/lib-dt-apriltags", "**/*.png", "apriltag_36h11"),
+        ("AprilRobotics/apriltag", "**/*.jpg", "apriltag_36h11"),
+        ("abakisita/camera_calibration", "**/*.jpg", "6x6_250"),
+        ("Ashrafhij/TelloAI-V.0.1", "part_A/image*.jpg", "4x4_50"),
     ],
 )
-
-
-@real
-@pytest.mark.slow
-def test_what_opencv_finds_in_photographs_is_found(pattern, dictionary):
-    paths = sorted(REAL.glob(pattern))
-    if not paths:
-        pytest.skip(f"no {pattern} below PSOTRACK_REAL_DATA")
+def test_what_opencv_finds_in_photographs_is_found(name, pattern, dictionary):
+    paths = sorted(published(name).glob(pattern))
+    assert paths
     for path in paths:
         gray = read_grey(path)
         for thorough in (False, True):
@@ -399,14 +393,13 @@ def test_what_opencv_finds_in_photographs_is_found(pattern, dictionary):
             assert overlooked(gray, dictionary, found) == [], path.name
 
 
+@pytest.mark.real
 @pytest.mark.slow
 def test_inverted_boards_in_videos():
     """In the negative, OpenCV finds the markers of these boards, of 15 to 60 pixels."""
-    paths = sorted((REAL / "mprib/caliscope/tests/sessions/charuco_calibration").glob("**/*.mp4"))
-    if not paths:
-        pytest.skip("no mprib/caliscope below PSOTRACK_REAL_DATA")
+    folder = published("mprib/caliscope") / "tests/sessions/charuco_calibration"
     detector = MarkerDetector("4x4_50", thorough=True)
-    for path in paths:
+    for path in sorted(folder.glob("**/*.mp4")):
         capture = cv2.VideoCapture(str(path))
         for number in range(96):
             there, frame = capture.read()
@@ -420,11 +413,10 @@ def test_inverted_boards_in_videos():
                 ] == []
 
 
+@pytest.mark.real
 @pytest.mark.slow
 def test_photographs_of_unknown_markers_show_none():
-    paths = sorted((REAL / "QAlexBall/opencv_contrib/modules/aruco/tutorials").glob("**/*original.png"))
-    if not paths:
-        pytest.skip("no QAlexBall/opencv_contrib below PSOTRACK_REAL_DATA")
-    for path in paths:
+    folder = published("QAlexBall/opencv_contrib") / "modules/aruco/tutorials"
+    for path in sorted(folder.glob("**/*original.png")):
         for dictionary in ("4x4_50", "5x5_1000", "6x6_250", "7x7_1000", "apriltag_36h11"):
             assert len(MarkerDetector(dictionary, thorough=True).detect(read_grey(path))) == 0, path.name

@@ -4,28 +4,18 @@ They are read from `$PSOTRACK_REAL_DATA/OWNER/NAME/`, and none is part of this r
 """
 
 import json
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from real_data import published
 
 from psotrack.errors import InputError
 from psotrack.geometry import project, triangulate_linearly, undistort
 from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
 
-
-def published(owner_and_name):
-    """Folder of a published repository; the test is skipped where it is absent."""
-    root = os.environ.get("PSOTRACK_REAL_DATA")
-    if not root:
-        pytest.skip("PSOTRACK_REAL_DATA does not name the folder of the real recordings")
-    folder = Path(root) / owner_and_name
-    if not folder.is_dir():
-        pytest.skip(f"{owner_and_name} is not in the folder of the real recordings")
-    return folder
+pytestmark = pytest.mark.real
 
 
 @pytest.mark.parametrize("name", ["camera_array.toml", "config.toml"])
