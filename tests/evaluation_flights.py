@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.trajectories import UNASSIGNED, Trajectories
+from psotrack.trajectories import UNASSIGNED, Status, Trajectories
 
 #: Frames per second. Frames 0 and 1 are the first second, in which identity is fixed.
 FPS = 2.0
@@ -55,3 +55,28 @@ def pairings(num_drones: int, num_estimates: int):
     """Set of all assignments of estimates to drones; each drone has its own estimate, or none (`UNASSIGNED`)."""
     choices = [*range(num_estimates), *[UNASSIGNED] * num_drones]
     return set(itertools.permutations(choices, num_drones))
+
+
+#: Frames of `circling_flights`.
+NUM_FRAMES = 50
+
+
+def circling_flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
+    """Estimate and reference of drones on circles.
+
+    The estimate has an offset of 20 mm, and drone 2 is lost in frames 10 to 19. With `swap`, the first two tracks are
+    exchanged from frame 40 on.
+    """
+    frame = np.arange(NUM_FRAMES)
+    angle = frame[:, None] / 10 + np.arange(num_drones)
+    ref_m = np.stack([np.cos(angle) + 2 * np.arange(num_drones), np.sin(angle), 1 + 0 * angle], axis=-1)
+    est_m = ref_m + np.array([0.02, 0, 0])
+    if swap:
+        est_m[40:, [0, 1]] = est_m[40:, [1, 0]]
+    status = np.full((NUM_FRAMES, num_drones), Status.TRACKED)
+    status[10:20, 2] = Status.LOST
+    numbers = tuple(str(number) for number in range(num_drones))
+    return (
+        Trajectories(frame, frame / 25, numbers, est_m, status=status),
+        Trajectories(frame, frame / 25, names or tuple(f"dron{number}" for number in numbers), ref_m),
+    )

@@ -1,5 +1,6 @@
-"""Tables and plots of an evaluation: they show the evaluation's numbers, and tables fit in a terminal."""
+"""Offsets of tracked points, and tables and plots of an evaluation: they show its numbers, and fit in a terminal."""
 
+import functools
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,60 +9,113 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from evaluation_flights import NUM_FRAMES, ROUNDING, on_x_axis
+from evaluation_flights import circling_flights as flights
+from helpers import assert_refused
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
-from psotrack.errors import InputError
 from psotrack.evaluation import evaluate, plots, tables
+from psotrack.support import drone_colour, standard_error
 from psotrack.trajectories import Status, Trajectories
 
-NUM_FRAMES = 50
+ARM_M = np.array([0.03, -0.02, -0.117])
 #: Labels of the reference's drones, with the numbers of their tracks.
 LABELS = ["dron0 (track 0)", "dron1 (track 1)", "dron2 (track 2)"]
 
 
-def flights(num_drones: int = 3, *, swap: bool = False, names: tuple[str, ...] = ()):
-    """Estimate and reference of drones on circles.
+def autoregressive(rng, count: int, persistence: float):
+    """(count,), stationary autoregressive series of variance 1."""
+    values = rng.normal(size=count)
+    for i in range(1, count):
+        values[i] = persistence * values[i - 1] + np.sqrt(1 - persistence**2) * values[i]
+    return values
 
-    The estimate has an offset of 20 mm, and drone 2 is lost in frames 10 to 19. With `swap`, the first two tracks are
-    exchanged from frame 40 on.
-    """
-    frame = np.arange(NUM_FRAMES)
-    angle = frame[:, None] / 10 + np.arange(num_drones)
-    ref_m = np.stack([np.cos(angle) + 2 * np.arange(num_drones), np.sin(angle), 1 + 0 * angle], axis=-1)
-    est_m = ref_m + np.array([0.02, 0, 0])
-    if swap:
-        est_m[40:, [0, 1]] = est_m[40:, [1, 0]]
-    status = np.full((NUM_FRAMES, num_drones), Status.TRACKED)
-    status[10:20, 2] = Status.LOST
-    numbers = tuple(str(number) for number in range(num_drones))
+
+def turning_flight(num_frames: int = 400, noise_m: float = 0.0):
+    """Estimate and reference of a drone that flies and turns; the tracked point is at the end of the lever arm."""
+    rng = np.random.default_rng(0)
+    time_s = np.arange(num_frames) / 25
+    ref_m = np.stack([np.cos(time_s), np.sin(0.7 * time_s), 1 + 0.2 * np.sin(2 * time_s)], axis=-1)[:, None]
+    turn = Rotation.from_euler("ZYX", np.stack([2 * time_s, 0.1 * np.sin(time_s), 0 * time_s], axis=-1))
+    est_m = ref_m + turn.apply(ARM_M)[:, None] + rng.normal(0, noise_m, ref_m.shape)
+    frame = np.arange(num_frames)
+    orientation_wxyz = turn.as_quat(scalar_first=True)[:, None]
     return (
-        Trajectories(frame, frame / 25, numbers, est_m, status=status),
-        Trajectories(frame, frame / 25, names or tuple(f"dron{number}" for number in numbers), ref_m),
+        Trajectories(frame, time_s, ("0",), est_m),
+        Trajectories(frame, time_s, ("dron1",), ref_m, orientation_wxyz=orientation_wxyz),
     )
+
+
+class TestOffsets:
+    @pytest.mark.parametrize("persistence", [0.0, 0.5, 0.9])
+    def test_the_standard_error_equals_the_spread_of_means(self, persistence):
+        """The oracle is the spread of the means of 300 series of 1000 frames."""
+        rng = np.random.default_rng(1)
+        series = np.stack([autoregressive(rng, 1000, persistence) for _ in range(300)], axis=1)
+        spread = series.mean(axis=0).std()
+        # The spread of 300 means has an error of 4 %; blocks of 50 frames miss 10 % where 19 frames count as one.
+        assert np.sqrt((standard_error(series) ** 2).mean()) == pytest.approx(spread, rel=0.15)
+
+    def test_standard_errors_by_hand(self):
+        # s² = (0.1² + 0.1²) / (2 - 1), divided by 2: 0.1².
+        assert standard_error(np.array([[0.1], [0.3]])) == pytest.approx(0.1)
+        # It is not below the standard error of independent frames.
+        assert standard_error(np.tile([[1.0], [-1.0]], (50, 1)))[0] == pytest.approx(1 / np.sqrt(99))
+        # Rows with NaN are ignored.
+        values = np.random.default_rng(2).normal(size=(50, 3))
+        with_gaps = np.insert(values, [20, 50], np.nan, axis=0)
+        np.testing.assert_allclose(standard_error(with_gaps), standard_error(values), atol=ROUNDING)
+        for unknown in (values[:1], np.full((5, 2), np.nan)):
+            assert np.isnan(standard_error(unknown)).all()
+
+    def test_in_the_body_frame_the_offset_is_exact_without_noise(self):
+        evaluation = evaluate(*turning_flight())
+        (drone,) = evaluation.per_drone
+        np.testing.assert_allclose(drone.offset_m, ARM_M, atol=ROUNDING)
+        np.testing.assert_allclose(drone.offset_standard_error_m, 0, atol=ROUNDING)
+        # Errors with the offset, and with the offset removed.
+        assert evaluation.mean_error_m == pytest.approx(np.linalg.norm(ARM_M))
+        assert evaluation.offset_removed_mean_error_m == pytest.approx(0, abs=ROUNDING)
+
+    def test_in_the_world_frame_the_offset_of_a_turning_drone_is_less_certain(self):
+        est, ref = turning_flight(noise_m=0.02)
+        evaluation = evaluate(est, ref)
+        (body,) = evaluation.per_drone
+        (world,) = evaluate(est, replace(ref, orientation_wxyz=None)).per_drone
+        assert (body.offset_frame, world.offset_frame) == ("body", "world")
+        # The standard error is 20 mm / √400 = 1 mm, estimated from 20 blocks, with an error of √(1/38) = 16 %.
+        np.testing.assert_allclose(body.offset_standard_error_m, 1e-3, rtol=0.5)
+        assert np.abs(np.subtract(body.offset_m, ARM_M)).max() < 4e-3
+        # The horizontal components, 36 mm, turn with the drone, so that their mean over five turns is nearly 0.
+        assert world.offset_standard_error_m[0] > 2 * body.offset_standard_error_m[0]
+        assert world.offset_m[2] == pytest.approx(ARM_M[2], abs=5e-3)
+        largest_mm = 1e3 * max(body.offset_standard_error_m)
+        assert f"drone's offset (body frame, known to {largest_mm:.1f} mm)" in tables.as_text(evaluation)
+        keys = list(evaluation.to_dict()["per_drone"][0])
+        place = keys.index("offset_m")
+        assert keys[place + 1 : place + 3] == ["offset_standard_error_m", "offset_frame"]
+
+    def test_one_frame_has_no_standard_error(self):
+        evaluation = evaluate(on_x_axis([None, 2, None]), on_x_axis([0, 0, 0]))
+        (drone,) = evaluation.per_drone
+        assert (drone.offset_m, drone.offset_standard_error_m) == ((2, 0, 0), None)
+        assert "(world frame)" in tables.as_text(evaluation)
 
 
 class TestTable:
     def test_rows(self):
-        lines = tables.as_text(evaluate(*flights()), "S02_D4_A").splitlines()
+        evaluation = evaluate(*flights())
+        text = tables.as_text(evaluation, "S02_D4_A")
+        lines = text.splitlines()
         assert lines[0].strip() == "S02_D4_A: 50 frames, 3 drones, errors in mm"
         rows = {line[:15].strip(): line[15:].split() for line in lines}
-        assert rows["dron0 (track 0)"] == [
-            "20.0",
-            "20.0",
-            "0.0",
-            "20.0",
-            "20.0",
-            "0.0%",
-            "0.0",
-            "+20",
-            "+0",
-            "+0",
-        ]
+        errors = ["20.0", "20.0", "0.0", "20.0", "20.0"]
+        assert rows["dron0 (track 0)"] == [*errors, "0.0%", "0.0", "+20", "+0", "+0"]
         # The third drone is lost in 10 of its 50 frames; of all 150 positions, that is 6.7 %.
         assert rows["dron2 (track 2)"][5] == "20.0%"
-        assert rows["all"] == ["20.0", "20.0", "0.0", "20.0", "20.0", "6.7%", "0.0"]
-        text = "\n".join(lines)
+        assert rows["all"] == [*errors, "6.7%", "0.0"]
         assert "MOTA 0.933, MOTP 20.0 mm, IDF1 0.966, identity switches 0" in text
         # 0.02 m reaches all thresholds: DetA = 140/150, and AssA is the mean of 100 matches of 1 and 40 of 40/50.
         assert "HOTA      0.938: DetA 0.933, AssA 0.943, LocA 0.960" in text
@@ -69,33 +123,33 @@ class TestTable:
         assert "GOSPA     162 mm: localisation 33.5, missed 158, false 0.0" in text
         assert "RMSE      ATE 20.0 mm (0.0 aligned), RPE over 1 s 0.0 mm" in text
         assert "ellipsoid" not in text
-        assert "world frame" in text
+        assert repr(evaluation).startswith("Evaluation(mean error 20.0 mm, missed 6.7%, MOTA 0.933, ")
+        assert str(evaluation) == tables.as_text(evaluation)
 
-    def test_covariances(self):
+    def test_covariances_orientations_and_a_missed_drone(self):
         est, ref = flights()
-        covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (NUM_FRAMES, 3, 3, 3))
-        lines = tables.as_text(evaluate(replace(est, covariance_m2=covariance_m2), ref)).splitlines()
-        # The error of 20 mm is two standard deviations of 10 mm, so NEES is 4; without the offset, NEES is 0.
-        row = "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 ("
-        assert any(line.startswith(row) for line in lines)
-
-    def test_orientations(self):
-        est, ref = flights()
+        est.status[:, 2] = Status.LOST
         orientation_wxyz = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (NUM_FRAMES, 3, 4))
-        both = (replace(flight, orientation_wxyz=orientation_wxyz) for flight in (est, ref))
-        text = tables.as_text(evaluate(*both))
+        est, ref = (replace(flight, orientation_wxyz=orientation_wxyz) for flight in (est, ref))
+        covariance_m2 = np.broadcast_to(1e-4 * np.eye(3), (NUM_FRAMES, 3, 3, 3))
+        text = tables.as_text(evaluate(replace(est, covariance_m2=covariance_m2), ref))
+        # The error of 20 mm is two standard deviations of 10 mm, so NEES is 4; without the offset, NEES is 0.
+        assert "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 (" in text
         assert "RPE over 1 s 0.0 mm and 0.00 deg" in text
+        row = next(line for line in text.splitlines() if line.startswith("dron2"))
+        assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
 
     def test_ten_drones_with_large_errors_fit_into_eighty_columns(self):
         est, ref = flights(10, swap=True, names=tuple(f"[red]d_{number}" for number in range(10)))
         est.position_m[30:, :5] += 3.0
         covariance_m2 = np.broadcast_to(1e-8 * np.eye(3), (NUM_FRAMES, 10, 3, 3))
-        est = replace(est, covariance_m2=covariance_m2)
-        lines = tables.as_text(evaluate(est, ref), "S04_D10").splitlines()
+        lines = tables.as_text(
+            evaluate(replace(est, covariance_m2=covariance_m2), ref), "S04_D10"
+        ).splitlines()
         assert max(map(len, lines)) <= 80
         # No name is cut off, and no part of a name is interpreted as a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
-        assert sum("…" in line for line in lines) == 0
+        assert not any("…" in line for line in lines)
         # No line of the scores is folded.
         scores = lines[next(n for n, line in enumerate(lines) if line.startswith("all")) + 1 :]
         first_words = [line[:10].strip() for line in scores]
@@ -103,11 +157,8 @@ class TestTable:
 
     def test_long_names_are_folded_and_not_cut(self):
         names = tuple(f"interceptor_of_the_left_hand_side_{number}" for number in range(3))
-        est, ref = flights(names=names)
-        est.position_m[:, 1] = np.nan
-        lines = tables.as_text(evaluate(est, ref)).splitlines()
+        lines = tables.as_text(evaluate(*flights(names=names))).splitlines()
         assert max(map(len, lines)) <= 80
-        assert not any("…" in line for line in lines)
         width = lines[1].index("mean") - 2
         shown = "".join(line[:width].replace(" ", "") for line in lines)
         assert all(name in shown for name in names)
@@ -119,20 +170,6 @@ class TestTable:
         assert lines[0].strip() == "50 frames, 3 drones, errors in m"
         row = next(line for line in lines if line.startswith("dron0")).split()
         assert (row[3], row[-3:]) == ("4.00", ["+0.0", "+0.0", "+4.0"])
-
-    def test_a_missed_drone(self):
-        est, ref = flights()
-        est.status[:, 2] = Status.LOST
-        lines = tables.as_text(evaluate(est, ref)).splitlines()
-        row = next(line for line in lines if line.startswith("dron2"))
-        assert row.split() == ["dron2", "-", "-", "-", "-", "-", "100.0%", "-", "-"]
-
-    def test_text_begins_with_the_mean_error_and_prints_the_table(self):
-        evaluation = evaluate(*flights())
-        assert repr(evaluation).startswith("Evaluation(mean error 20.0 mm, missed 6.7%, MOTA 0.933, ")
-        assert str(evaluation).splitlines()[0].strip() == "50 frames, 3 drones, errors in mm"
-        assert str(evaluation) == tables.as_text(evaluation)
-        assert next(iter(evaluation.to_dict())) == "mean_error_m"
 
     def test_tracks_of_the_first_frames_are_said_to_end_early(self, caplog):
         """Found: "missed 84 %" without a word after `track --frames 40`."""
@@ -159,8 +196,14 @@ def drawn(monkeypatch):
 
 
 class TestPictures:
-    def test_errors_in_millimetres_have_gaps_where_a_drone_is_missed(self, drawn):
-        above, _, errors = drawn(*flights())
+    def test_views_of_one_scale_and_errors_with_gaps_where_a_drone_is_missed(self, drawn):
+        est, ref = flights()
+        above, side, errors = drawn(est, ref)
+        for axes, two in ((above, [0, 1]), (side, [0, 2])):
+            np.testing.assert_array_equal(axes.lines[0].get_xydata(), ref.position_m[:, 0, two])
+            np.testing.assert_array_equal(axes.lines[3].get_xydata(), est.position_m[:, 0, two])
+            assert axes.get_aspect() == 1
+        assert above.get_xlim() == side.get_xlim()
         expected_mm = np.full(NUM_FRAMES, 20.0)
         expected_mm[10:20] = np.nan
         np.testing.assert_allclose(errors.lines[2].get_ydata(), expected_mm, rtol=1e-12)
@@ -172,27 +215,15 @@ class TestPictures:
         assert [list(mark.get_xdata()) for mark in errors.lines[3:]] == [[40 / 25] * 2]
         assert errors.get_yscale() == "log"
 
-    def test_lines_have_gaps_at_frames_without_reference(self, drawn):
+    def test_lines_have_gaps_at_frames_without_reference_and_a_false_track_is_named(self, drawn):
         est, ref = flights()
         ref.position_m[25:30] = np.nan
-        for axes in drawn(est, ref):
+        all_axes = drawn(est, ref.of_drones([0, 1]))
+        for axes in all_axes:
             # A line has 45 frames with a reference, and one NaN for the gap.
             assert len(axes.lines[0].get_ydata()) == 46
             assert np.flatnonzero(np.isnan(axes.lines[0].get_ydata())).tolist() == [25]
-
-    def test_views_have_one_scale(self, drawn):
-        est, ref = flights()
-        above, side, _ = drawn(est, ref)
-        for axes, two in ((above, [0, 1]), (side, [0, 2])):
-            np.testing.assert_array_equal(axes.lines[0].get_xydata(), ref.position_m[:, 0, two])
-            np.testing.assert_array_equal(axes.lines[3].get_xydata(), est.position_m[:, 0, two])
-            assert axes.get_aspect() == 1
-        assert above.get_xlim() == side.get_xlim()
-
-    def test_a_false_track_is_named(self, drawn):
-        est, ref = flights()
-        two = Trajectories(ref.frame, ref.time_s, ref.drones[:2], ref.position_m[:, :2])
-        assert drawn(est, two)[0].get_legend().get_texts()[-1].get_text() == "false track 2"
+        assert all_axes[0].get_legend().get_texts()[-1].get_text() == "false track 2"
 
     def test_a_png_file_has_the_colour_of_each_drone(self, tmp_path):
         path = tmp_path / "picture.png"
@@ -202,29 +233,24 @@ class TestPictures:
         plots.save_overview(path, est, ref)
         rgb = cv2.imread(str(path))[..., ::-1].reshape(-1, 3).astype(int)
         for drone in range(3):
-            colour = np.round(np.array(to_rgb(plots.drone_colour(drone))) * 255)
+            colour = np.round(np.array(to_rgb(drone_colour(drone))) * 255)
             # Lines are a few hundred pixels long; a line behind the line of its reference still has visible edges.
             assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
 
     def test_recordings_without_common_frames_leave_no_file(self, tmp_path):
         est, ref = flights()
-        later = Trajectories(ref.frame + 1000, ref.time_s, ref.drones, ref.position_m)
-        with pytest.raises(InputError, match="frames of the reference"):
-            plots.save_overview(tmp_path / "picture.png", est, later)
-        assert not list(tmp_path.iterdir())
+        later = replace(ref, frame=ref.frame + 1000)
+        bad = functools.partial(plots.save_overview, tmp_path / "picture.png", est, later)
+        assert_refused(bad, "frames of the reference", unchanged=tmp_path)
 
 
-def test_importing_loads_neither_pandas_nor_matplotlib(tmp_path):
-    """Drawing does not load pyplot either, which has global state."""
+def test_importing_loads_neither_pandas_nor_matplotlib_and_drawing_no_pyplot(tmp_path):
+    """In a process of its own, because other tests may have imported them. Pyplot has global state."""
     code = (
         "import sys; from psotrack.evaluation import plots, tables; import psotrack.trajectories.files;"
-        "assert not {'matplotlib', 'pandas', 'pyarrow'} & set(sys.modules), set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-    # A separate process is needed, because other tests may have imported pyplot.
-    code = (
-        "import sys, test_evaluation_shown as shown;"
-        f"shown.plots.save_overview({str(tmp_path / 'picture.png')!r}, *shown.flights());"
+        "assert not {'matplotlib', 'pandas', 'pyarrow'} & set(sys.modules), set(sys.modules);"
+        "import evaluation_flights as flights;"
+        f"plots.save_overview({str(tmp_path / 'picture.png')!r}, *flights.circling_flights());"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

@@ -1,0 +1,541 @@
+"""Scores of an evaluation: results by hand for five frames, properties, brute force, and other packages as oracles.
+
+trackeval 1.3.0 is the code of HOTA's authors; motmetrics 1.4.0 is an independent implementation of CLEAR and IDF1.
+trackeval depends on opencv-python, which would replace opencv-python-headless. Therefore trackeval is not in the `test`
+extra, and its tests are skipped if it is not installed.
+"""
+
+import itertools
+import json
+from dataclasses import replace
+
+import motmetrics
+import numpy as np
+import pytest
+from evaluation_flights import FPS, ROUNDING, TRUTH, on_x_axis, pairings, random_flights, seeds
+from helpers import assert_refused
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from psotrack.evaluation import INSIDE_90, errors_over_time, evaluate
+from psotrack.trajectories import GATE_M, UNASSIGNED, Status, Trajectories
+
+#: The first drone has errors of 0.1 m, the second of 0, 0, 0.2, 0.2 and 0.4 m.
+EST = on_x_axis([0.1] * 5, [10, 10, 10.2, 10.2, 10.4])
+KEYS = {
+    *("frames", "drones", "missed_rate", "id_switches", "mota", "motp_m", "idf1", "per_drone"),
+    *("mean_error_m", "median_error_m", "std_error_m", "p95_error_m", "max_error_m"),
+    *("matched_mean_error_m", "offset_removed_mean_error_m"),
+    *("hota", "deta", "assa", "loca"),
+    *("gospa_m", "gospa_localisation_m", "gospa_missed_m", "gospa_false_m"),
+    *("ate_rmse_m", "ate_aligned_rmse_m", "rpe_1s_rmse_m", "rpe_1s_rotation_rmse_deg"),
+    *("inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "offset_removed_mean_nees"),
+}
+
+
+def check(evaluation, tolerance=ROUNDING, **expected):
+    """Assert that an evaluation, or one of its drones, has these values."""
+    found = {name: getattr(evaluation, name) for name in expected}
+    assert found == {
+        name: pytest.approx(value, abs=tolerance) if isinstance(value, float) else value
+        for name, value in expected.items()
+    }
+
+
+def with_covariance(est, covariance_m2):
+    shape = (est.num_frames, est.num_drones, 3, 3)
+    return replace(est, covariance_m2=np.broadcast_to(np.array(covariance_m2, float), shape).copy())
+
+
+def turning(yaw_deg, **others) -> Trajectories:
+    """Trajectories of one drone that stays at one place and turns about the vertical."""
+    still = on_x_axis([0] * len(yaw_deg))
+    about_z = Rotation.from_euler("z", np.array(yaw_deg, float)[:, None], degrees=True)
+    return replace(still, orientation_wxyz=about_z.as_quat(scalar_first=True)[:, None], **others)
+
+
+class TestFiveFrames:
+    """Two frames per second: a second is from frame 0 to 2, 1 to 3 and 2 to 4, and frames 0 and 1 fix identities."""
+
+    def test_errors_without_confusion(self):
+        evaluation = evaluate(with_covariance(EST, 0.01 * np.eye(3)), TRUTH)
+        # The errors have five deviations of 0.03 from their mean, two of 0.13, two of 0.07 and one of 0.27.
+        variance_m2 = (5 * 0.03**2 + 2 * 0.13**2 + 2 * 0.07**2 + 0.27**2) / 10
+        check(
+            evaluation,
+            frames=5,
+            drones=2,
+            missed_rate=0.0,
+            id_switches=0,
+            mota=1.0,
+            idf1=1.0,
+            mean_error_m=0.13,
+            matched_mean_error_m=0.13,
+            motp_m=0.13,
+            median_error_m=0.1,
+            std_error_m=variance_m2**0.5,
+            # The 95th percentile of ten sorted errors is at rank 8.55, counted from 0: between 0.2 and 0.4.
+            p95_error_m=0.2 + 0.55 * 0.2,
+            max_error_m=0.4,
+            ate_rmse_m=((0.05 + 0.24) / 10) ** 0.5,
+            # All positions are on a line, so alignment only removes the mean.
+            ate_aligned_rmse_m=variance_m2**0.5,
+            # A constant offset gives no error; the second drone's error grows by 0.2 m in every second.
+            rpe_1s_rmse_m=(3 * 0.04 / 6) ** 0.5,
+            rpe_1s_rotation_rmse_deg=None,
+            # NEES is the squared error divided by 0.01 m2: 5 x 1, then 0, 0, 4, 4, 16. Only the last is above 6.25.
+            inside_90_rate=0.9,
+            mean_nees=(5 * 1 + 4 + 4 + 16) / 10,
+            # Without the offsets of 0.1 and 0.16 m: 5 x 0, then 2.56, 2.56, 0.16, 0.16, 5.76.
+            offset_removed_inside_90_rate=1.0,
+            offset_removed_mean_nees=1.12,
+        )
+        first, second = evaluation.per_drone
+        check(
+            first,
+            ate_rmse_m=0.1,
+            ate_aligned_rmse_m=0.0,
+            rpe_1s_rmse_m=0.0,
+            inside_90_rate=1.0,
+            mean_nees=1.0,
+        )
+        # The drone stands still, so alignment removes 0.16 m: errors of 2 x 0.16, 2 x 0.04 and 0.24 remain.
+        aligned_m = ((2 * 0.0256 + 2 * 0.0016 + 0.0576) / 5) ** 0.5
+        check(
+            second,
+            ate_rmse_m=(0.24 / 5) ** 0.5,
+            ate_aligned_rmse_m=aligned_m,
+            rpe_1s_rmse_m=0.2,
+            mean_nees=4.8,
+        )
+
+    def test_a_swap(self):
+        swapped = on_x_axis([0, 0, 0, 10, 10], [10, 10, 10, 0, 0])
+        check(
+            evaluate(swapped, TRUTH), mean_error_m=4.0, matched_mean_error_m=0.0, motp_m=0.0, missed_rate=0.0
+        )
+        check(evaluate(swapped, TRUTH), id_switches=2, mota=1 - 2 / 10, idf1=2 * 6 / (10 + 10), gospa_m=0.0)
+        # Each drone matches one track in 3 frames: TPA = 3, FNA = FPA = 2, so 3/7 for each of these 3 matches. It
+        # matches the other track in 2 frames: TPA = 2, FNA = FPA = 3, so 2/8 for each of these 2 matches. The mean is
+        # (3 x 3/7 + 2 x 1/4) / 5 = 5/14.
+        check(evaluate(swapped, TRUTH), deta=1.0, loca=1.0, assa=5 / 14, hota=(5 / 14) ** 0.5)
+
+    def test_a_missed_drone_has_none_of_the_values_in_json_too(self):
+        evaluation = evaluate(on_x_axis([10.2] * 5), TRUTH)
+        check(evaluation, mean_error_m=0.2, missed_rate=0.5, mota=0.5, idf1=2 * 5 / (10 + 5))
+        assert evaluation.to_dict().keys() == KEYS
+        missed, found = json.loads(json.dumps(evaluation.to_dict(), allow_nan=False))["per_drone"]
+        assert (missed["drone"], missed["missed_rate"], found["drone"], found["missed_rate"]) == (
+            "d0",
+            1,
+            "d1",
+            0,
+        )
+        assert found["estimate"] == "d0"
+        unknown = (
+            "estimate",
+            "mean_error_m",
+            "offset_m",
+            "ate_rmse_m",
+            "ate_aligned_rmse_m",
+            "rpe_1s_rmse_m",
+        )
+        assert [missed[name] for name in unknown] == [None] * len(unknown)
+
+    def test_a_false_track(self):
+        evaluation = evaluate(on_x_axis([50] * 5, [10] * 5, [0] * 5), TRUTH)
+        check(evaluation, mean_error_m=0.0, missed_rate=0.0, mota=1 - 5 / 10, idf1=2 * 10 / (10 + 15))
+
+    def test_lost_rows_are_missed_and_coasting_rows_are_not(self):
+        status = np.full((5, 2), Status.TRACKED)
+        status[2:4, 1], status[4, 1] = Status.LOST, Status.COASTING
+        evaluation = evaluate(on_x_axis([0] * 5, [10, 10, 99, 99, 10.2], status=status), TRUTH)
+        check(evaluation, missed_rate=0.2, mean_error_m=0.2 / 8, mota=1 - 2 / 10, idf1=2 * 8 / (10 + 8))
+
+    def test_frames_of_one_side_only(self):
+        check(evaluate(on_x_axis([0, 0], [10, 10], frame=[1, 3]), TRUTH), frames=5, missed_rate=0.6)
+        outside = on_x_axis([0] * 7, [10] * 5 + [99] * 2)
+        assert evaluate(outside, TRUTH) == evaluate(on_x_axis([0] * 5, [10] * 5), TRUTH)
+
+    def test_unknown_positions_of_the_reference_are_ignored(self):
+        truth = on_x_axis([0] * 5, [10, 10, None, None, 10])
+        evaluation = evaluate(on_x_axis([0] * 5, [10.2] * 5), truth)
+        # The track of a drone whose position is unknown is no false positive.
+        check(evaluation, frames=5, mean_error_m=3 * 0.2 / 8, missed_rate=0.0, mota=1.0, idf1=1.0)
+        check(evaluation.per_drone[1], frames=3)
+        # A false track counts: TP = 8, FP = 5. So does a track that is near another drone than its own.
+        check(evaluate(on_x_axis([0] * 5, [10] * 5, [50] * 5), truth), deta=8 / 13)
+        moved = evaluate(on_x_axis([0] * 5, [10, 10, 0.3, 0.3, 10]), truth)
+        check(moved, mota=1 - 2 / 8, idf1=2 * 8 / (8 + 10))
+
+    def test_frames_and_drones_without_known_positions_are_ignored(self):
+        truth = on_x_axis([0, 0, None, 0, 0], [None] * 5)
+        evaluation = evaluate(on_x_axis([0.1, 0.1, 9, 0.1, 0.1]), truth)
+        check(evaluation, frames=4, drones=1, mean_error_m=0.1)
+        assert len(evaluation.per_drone) == 1
+
+    def test_outside_the_gate_is_a_miss_and_a_false_positive(self):
+        evaluation = evaluate(on_x_axis([0] * 5, [10, 10, 10, 10, 10.6]), TRUTH)
+        check(
+            evaluation, mean_error_m=0.06, matched_mean_error_m=0.0, mota=1 - 2 / 10, idf1=2 * 9 / (10 + 10)
+        )
+
+    def test_motp_keeps_pairs_of_the_previous_frame_and_the_matched_error_does_not(self):
+        est = on_x_axis([0, 0, 0.3, 0, 0], [0.4, 0.4, 0.1, 0.4, 0.4])
+        evaluation = evaluate(est, on_x_axis([0] * 5, [0.4] * 5))
+        check(evaluation, id_switches=0, motp_m=(0.3 + 0.3) / 10, matched_mean_error_m=(0.1 + 0.1) / 10)
+
+    def test_another_track_after_a_gap_is_a_switch(self):
+        est = on_x_axis([0, 0, None, None, None], [None, None, None, 0, 0])
+        check(evaluate(est, on_x_axis([0] * 5)), id_switches=1, mota=1 - (1 + 1) / 5, idf1=2 * 2 / (5 + 4))
+
+    def test_identity_is_that_of_the_first_second_and_later_drones_get_the_remaining_tracks(self):
+        evaluation = evaluate(on_x_axis([0, 0, 10, 10, 10], [10, 10, 0, 0, 0]), TRUTH)
+        assert [drone.estimate for drone in evaluation.per_drone] == ["d0", "d1"]
+        truth = on_x_axis([0] * 5, [None, None, 10, 10, 10])
+        evaluation = evaluate(on_x_axis([None, None, None, 10.1, 10.1], [0.1] * 5), truth)
+        assert [drone.estimate for drone in evaluation.per_drone] == ["d1", "d0"]
+        check(evaluation, missed_rate=1 / 8, mean_error_m=0.1)
+
+    def test_without_orientations_offsets_are_in_the_world_frame(self):
+        evaluation = evaluate(on_x_axis([0.1, 0.1, 0.1, 0.2, 0.5], [9] * 5), TRUTH)
+        first, second = evaluation.per_drone
+        assert (first.offset_frame, second.offset_frame) == ("world", "world")
+        np.testing.assert_allclose(
+            [first.offset_m, second.offset_m], [(0.2, 0, 0), (-1, 0, 0)], atol=ROUNDING
+        )
+        check(first, offset_removed_mean_error_m=(3 * 0.1 + 0 + 0.3) / 5)
+        check(evaluation, offset_removed_mean_error_m=0.6 / 10)
+
+    def test_nothing_is_found(self):
+        empty = replace(on_x_axis([0] * 5), drones=(), position_m=np.empty((5, 0, 3)))
+        for est in (on_x_axis([None] * 5), empty):
+            evaluation = evaluate(est, TRUTH)
+            check(evaluation, missed_rate=1.0, mota=0.0, idf1=0.0, mean_error_m=None, motp_m=None)
+            # Two missed drones in each frame cost 0.125 m2 each.
+            check(evaluation, gospa_m=0.5, gospa_missed_m=0.5, gospa_localisation_m=0.0, gospa_false_m=0.0)
+            check(evaluation, hota=0.0, deta=0.0, assa=0.0, loca=None)
+        # The lowest threshold of HOTA corresponds to 0.475 m.
+        check(evaluate(on_x_axis([0.48] * 5), TRUTH), hota=0.0, deta=0.0, assa=0.0, loca=None)
+
+    def test_hota_reaches_as_many_thresholds_as_the_distance_allows(self):
+        # 0.12 m is a similarity of 0.76, which reaches the 15 thresholds up to 0.75. At these 15 thresholds all ten
+        # pairs match. At the other four thresholds no pair matches, and LocA is 1 by convention.
+        evaluation = evaluate(on_x_axis([0.12] * 5, [10.12] * 5), TRUTH)
+        check(evaluation, hota=15 / 19, deta=15 / 19, assa=15 / 19, loca=(15 * 0.76 + 4) / 19)
+
+    def test_parts_of_gospa(self):
+        est = on_x_axis([0.1] * 5, [10, 10, 10.6, None, 10.3], [None, 50, None, None, None])
+        # Costs in m2, frame: 0     1             2                   3              4
+        # localisation        0.01  0.01          0.01                0.01           0.01 + 0.09
+        # missed                                  0.125 (0.6 > 0.5)   0.125
+        # false                     0.125         0.125
+        parts_m2 = {
+            "gospa_localisation_m": 0.14,
+            "gospa_missed_m": 0.25,
+            "gospa_false_m": 0.25,
+            "gospa_m": 0.64,
+        }
+        check(evaluate(est, TRUTH), **{name: (part_m2 / 5) ** 0.5 for name, part_m2 in parts_m2.items()})
+
+    def test_a_second_is_counted_in_frame_numbers_and_gaps_have_no_pair(self):
+        # Only the pair of frames 1 and 3 remains: frame 2 is missed, or has no reference and so no row.
+        for est, truth in (
+            (on_x_axis([0, 0, None, 0.3, 0.9]), on_x_axis([0] * 5)),
+            (on_x_axis([0.1, 0, 7, 0.3, 0.9]), on_x_axis([0, 0, None, 0, 0])),
+        ):
+            check(evaluate(est, truth), rpe_1s_rmse_m=0.3)
+        for short in ([0, 0.1], [0.1]):
+            check(evaluate(on_x_axis(short), on_x_axis([0] * len(short))), rpe_1s_rmse_m=None)
+
+    def test_rotations_over_a_second(self):
+        # The estimate turns by 10, 0 and 20 degrees per second; the drone does not turn.
+        expected_deg = ((100 + 0 + 400) / 3) ** 0.5
+        check(
+            evaluate(turning([0, 0, 10, 0, 30]), turning([0] * 5)),
+            1e-9,
+            rpe_1s_rotation_rmse_deg=expected_deg,
+        )
+        # A constant offset of the heading gives no error, nor does the sign of a quaternion.
+        ahead = turning([90, 90, 100, 90, 120])
+        ahead.orientation_wxyz[1::2] *= -1
+        check(evaluate(ahead, turning([0] * 5)), 1e-9, rpe_1s_rotation_rmse_deg=expected_deg)
+        check(evaluate(ahead, on_x_axis([0] * 5)), rpe_1s_rotation_rmse_deg=None)
+
+    def test_nees_uses_the_whole_matrix_where_there_is_one(self):
+        # The inverse of [[2, 1], [1, 2]] is [[2, -1], [-1, 2]] / 3, so an error of (1, 0, 0) has a NEES of 2/3.
+        correlated = with_covariance(on_x_axis([1.0] * 5), [[2, 1, 0], [1, 2, 0], [0, 0, 1]])
+        check(evaluate(correlated, on_x_axis([0] * 5)), mean_nees=2 / 3)
+        check(evaluate(TRUTH, TRUTH), inside_90_rate=None, mean_nees=None)
+        # One position of the first drone and five of the second have a covariance.
+        est = with_covariance(on_x_axis([0.1] * 5, [10.2] * 5), 0.01 * np.eye(3))
+        est.covariance_m2[1:, 0] = np.nan
+        check(evaluate(est, TRUTH), 1e-9, mean_nees=(1 * 1 + 5 * 4) / 6)
+
+    def test_errors_over_time_are_those_of_evaluate(self):
+        est = on_x_axis([0.1, 0.1, 0.1, 10.1, 10.1], [10.1, None, 10.1, 0.1, 0.1])
+        errors, evaluation = errors_over_time(est, TRUTH), evaluate(est, TRUTH)
+        assert list(errors) == ["frame", "time_s", "drone", "error_m", "switch"]
+        assert list(errors["drone"]) == ["d0"] * 5 + ["d1"] * 5
+        assert list(errors["frame"]) == [*range(5)] * 2
+        np.testing.assert_allclose(errors["time_s"], errors["frame"] / FPS)
+        np.testing.assert_allclose(errors["error_m"], [0.1] * 3 + [10.1] * 2 + [0.1, np.nan, 0.1, 9.9, 9.9])
+        assert list(np.flatnonzero(errors["switch"])) == [3, 8]
+        assert errors["error_m"].mean() == pytest.approx(evaluation.mean_error_m)
+        # Frames without a reference have no row.
+        assert len(errors_over_time(est, on_x_axis([0, 0, None, 0, 0], [10] * 5))) == 9
+
+
+BAD = {
+    "no common frame": (
+        (on_x_axis([0, 0], frame=[7, 8]), TRUTH),
+        ("expected frames of the reference", "0 to 4, found frames 7 to 8"),
+    ),
+    "no frame": ((on_x_axis([]), TRUTH), ("found no frames",)),
+    "no reference": ((TRUTH, on_x_axis([None] * 5)), ("reference: expected a known position",)),
+    **{
+        f"a variance of {variance_m2}": (
+            (with_covariance(TRUTH, np.diag([0.01, 0.01, variance_m2])), TRUTH),
+            ("estimate: expected covariances that are positive definite",),
+        )
+        for variance_m2 in (0.0, -0.01)
+    },
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_flights_that_cannot_be_compared_are_refused(case, tmp_path):
+    flights, words = BAD[case]
+    assert_refused(lambda: evaluate(*flights), *words, unchanged=tmp_path)
+
+
+def with_poses(est, ref):
+    """Estimate and reference, with random orientations and covariances added to the estimate."""
+    rng = np.random.default_rng(est.num_frames)
+    root = rng.normal(0, 0.1, (est.num_frames, est.num_drones, 3, 3))
+    wxyz = Rotation.random(est.num_frames * est.num_drones, rng=rng).as_quat(scalar_first=True)
+    orientation_wxyz = wxyz.reshape(est.num_frames, est.num_drones, 4)
+    covariance_m2 = root @ root.swapaxes(-1, -2) + 0.01 * np.eye(3)
+    return replace(est, orientation_wxyz=orientation_wxyz, covariance_m2=covariance_m2), ref
+
+
+def moved(flight, turn, shift_m):
+    """A flight in a world that is turned and shifted."""
+    R, shape = turn.as_matrix(), flight.orientation_wxyz.shape
+    turned = turn * Rotation.from_quat(flight.orientation_wxyz.reshape(-1, 4), scalar_first=True)
+    covariance_m2 = flight.covariance_m2
+    return replace(
+        flight,
+        position_m=flight.position_m @ R.T + shift_m,
+        orientation_wxyz=turned.as_quat(scalar_first=True).reshape(shape),
+        covariance_m2=None if covariance_m2 is None else R @ covariance_m2 @ R.T,
+    )
+
+
+def leaves(evaluation):
+    """All values of an evaluation, without names of estimates, in one order of the drones."""
+    content = evaluation.to_dict()
+    drones = sorted(content.pop("per_drone"), key=lambda drone: drone["drone"])
+    for drone in drones:
+        del drone["estimate"]
+    values = [*content.values(), *(value for drone in drones for value in drone.values())]
+    return [leaf for value in values for leaf in (value if isinstance(value, list | tuple) else [value])]
+
+
+@given(seeds, st.permutations(range(4)), st.permutations(range(3)))
+@settings(max_examples=25)
+def test_names_orders_and_the_worlds_axes_do_not_matter(seed, order, drones):
+    est, ref = with_poses(*random_flights(seed))
+    order, drones = list(order), list(drones)
+    est_shuffled = replace(est.of_drones(order), drones=tuple("wxyz"))
+    turn = Rotation.random(rng=np.random.default_rng(seed))
+    changed = [moved(each, turn, [3.0, -5.0, 7.0]) for each in (est_shuffled, ref.of_drones(drones))]
+    # In float64, positions of 10 m are exact to 2e-15 m; NEES divides by the squared standard deviation of 0.1 m.
+    # Angles are exact to 1e-16 rad, and near 180 degrees, because of the arc cosine, to 1e-8. No distance of these
+    # random flights is that close to the gate. Offsets are in the body's frame, which turns with the world.
+    for left, right in zip(leaves(evaluate(est, ref)), leaves(evaluate(*changed)), strict=True):
+        assert left == (pytest.approx(right, abs=1e-9) if isinstance(right, float) else right)
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_a_constant_offset_in_the_body_is_found_and_removed_and_a_flight_equals_itself(seed):
+    _, ref = random_flights(seed)
+    # Drones are farther apart than the offsets are long, so that identities are clear.
+    ref = replace(ref, position_m=ref.position_m + np.arange(3)[:, None] * [5.0, 0.0, 0.0])
+    offset_m = np.random.default_rng(seed).uniform(-0.2, 0.2, (3, 3))
+    body_to_world = Rotation.from_quat(ref.orientation_wxyz.reshape(-1, 4), scalar_first=True)
+    added_m = body_to_world.apply(np.tile(offset_m, (ref.num_frames, 1))).reshape(ref.position_m.shape)
+    evaluation = evaluate(replace(ref, position_m=ref.position_m + added_m, orientation_wxyz=None), ref)
+    check(evaluation, offset_removed_mean_error_m=0.0)
+    for drone in evaluation.per_drone:
+        assert drone.offset_frame == "body"
+        np.testing.assert_allclose(drone.offset_m, offset_m[ref.drones.index(drone.drone)], atol=1e-12)
+    itself = evaluate(ref, ref)
+    check(
+        itself, max_error_m=0.0, missed_rate=0.0, id_switches=0, mota=1.0, idf1=1.0, motp_m=0.0, gospa_m=0.0
+    )
+    check(
+        itself,
+        hota=1.0,
+        deta=1.0,
+        assa=1.0,
+        loca=1.0,
+        ate_rmse_m=0.0,
+        ate_aligned_rmse_m=0.0,
+        rpe_1s_rmse_m=0.0,
+    )
+
+
+@given(seeds)
+@settings(max_examples=15)
+def test_alignment_is_that_of_scipy(seed):
+    est, ref = random_flights(seed, missing=0, num_estimates=3)
+    evaluation = evaluate(est, ref)
+    pairs = [
+        (ref.drones.index(drone.drone), est.drones.index(drone.estimate)) for drone in evaluation.per_drone
+    ]
+    ref_m, est_m = (
+        flight.position_m[:, list(of)]
+        for flight, of in zip((ref, est), zip(*pairs, strict=True), strict=True)
+    )
+    for figures, chosen in [(evaluation, slice(None)), *zip(evaluation.per_drone, range(3), strict=True)]:
+        two_m = [positions_m[:, chosen].reshape(-1, 3) for positions_m in (ref_m, est_m)]
+        _, rssd_m = Rotation.align_vectors(*(points_m - points_m.mean(axis=0) for points_m in two_m))
+        check(figures, 1e-9, ate_aligned_rmse_m=rssd_m / len(two_m[0]) ** 0.5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_matching_in_a_frame_and_gospa_are_the_best_of_all_pairings(seed):
+    est, ref = random_flights(seed, missing=0)
+    distance_m = np.linalg.norm(ref.position_m[:, :, None] - est.position_m[:, None], axis=-1)
+    matched_m, cost_m2 = [], []
+    for here_m in distance_m:
+        every = [
+            [here_m[d, e] for d, e in enumerate(pairing) if e != UNASSIGNED] for pairing in pairings(3, 4)
+        ]
+        # Three drones and four estimates; each that is left over costs half the square of the gate.
+        cost_m2.append(min(np.sum(np.square(one)) + GATE_M**2 / 2 * (7 - 2 * len(one)) for one in every))
+        # As many pairs as possible, and among these the smallest sum of distances.
+        matched_m += min(
+            (one for one in every if max(one, default=0) <= GATE_M), key=lambda one: (-len(one), sum(one))
+        )
+    check(evaluate(est, ref), gospa_m=np.mean(cost_m2) ** 0.5, matched_mean_error_m=np.mean(matched_m))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_identity_is_the_best_permutation_of_the_first_second(seed):
+    est, ref = random_flights(seed, missing=0)
+    mean_m = np.linalg.norm(ref.position_m[:2, :, None] - est.position_m[:2, None], axis=-1).mean(axis=0)
+    best = min(itertools.permutations(range(4), 3), key=lambda order: sum(mean_m[range(3), order]))
+    assert [drone.estimate for drone in evaluate(est, ref).per_drone] == [est.drones[each] for each in best]
+
+
+def test_correct_covariances_have_the_expected_nees():
+    assert pytest.approx(chi2(3).ppf(0.9), rel=1e-12) == INSIDE_90
+    num_frames = 2000
+    root_m = np.array([[0.03, 0, 0], [0.01, 0.02, 0], [0.01, -0.02, 0.05]])
+    truth = turning(np.linspace(0, 720, num_frames))
+    noise_m = np.random.default_rng(0).normal(size=(num_frames, 1, 3)) @ root_m.T
+    est = with_covariance(replace(truth, position_m=truth.position_m + noise_m), root_m @ root_m.T)
+    off = evaluate(replace(est, position_m=est.position_m + np.array([0.0, 0.0, 0.03])), truth)
+    # Limits are four standard deviations: sqrt(0.09 / n) for a share of 0.9, sqrt(6 / n) for the mean of chi-square.
+    on_the_point = evaluate(est, truth)
+    for shares, mean in (
+        (on_the_point.inside_90_rate, on_the_point.mean_nees),
+        (off.offset_removed_inside_90_rate, off.offset_removed_mean_nees),
+    ):
+        assert shares == pytest.approx(0.9, abs=4 * (0.09 / num_frames) ** 0.5)
+        assert mean == pytest.approx(3, abs=4 * (6 / num_frames) ** 0.5)
+    assert off.mean_nees > 3.3
+
+
+# --- other packages
+
+
+def crowded_flights(seed: int) -> tuple[Trajectories, Trajectories]:
+    """Flights within a metre, so that many pairs are possible; some estimates are missing, but no reference."""
+    est, _ = random_flights(seed, num_frames=12)
+    _, ref = random_flights(seed, num_frames=12, missing=0)
+    return est, ref
+
+
+def separate_flights(seed: int) -> tuple[Trajectories, Trajectories]:
+    """Flights 3 m apart, with missing positions, identity switches, distances beyond the gate and a false track."""
+    rng = np.random.default_rng(seed)
+    num_frames, num_drones = 20, 4
+    ref_m = np.zeros((num_frames, num_drones, 3)) + np.arange(num_drones)[:, None] * [3.0, 0.0, 0.0]
+    ref_m += rng.normal(0, 0.1, ref_m.shape)
+    # A third of the distances exceed the gate.
+    est_m = ref_m + rng.normal(0, 0.25, ref_m.shape)
+    known, seen = rng.random((2, num_frames, num_drones)) > 0.15
+    # Frame 0 defines the identities, and every drone is known in it.
+    known[0], seen[0] = True, True
+    est_m[~seen] = np.nan
+    ref_m[~known] = np.nan
+    for start in rng.integers(3, num_frames, 3):
+        est_m[start:] = est_m[start:, rng.permutation(num_drones)]
+    # Tracks are removed where their drone is unknown; other tests show that such tracks do not count.
+    est_m[~known] = np.nan
+    false_m = np.where(rng.random((num_frames, 1, 1)) < 0.5, 50.0, np.nan) + np.zeros(3)
+    # psotrack ignores frames without any known drone; the other packages count the false track in such frames.
+    false_m[~known.any(axis=1)] = np.nan
+    frame = np.arange(num_frames)
+    return (
+        Trajectories(frame, frame / FPS, tuple("abcde"), np.concatenate([est_m, false_m], axis=1)),
+        Trajectories(frame, frame / FPS, tuple("wxyz"), ref_m),
+    )
+
+
+def frames(est: Trajectories, ref: Trajectories):
+    """Iterate over frames: numbers of the known drones, numbers of the present estimates, and their distances."""
+    for ref_m, est_m, known, seen in zip(ref.position_m, est.position_m, ref.seen, est.seen, strict=True):
+        drones, estimates = np.flatnonzero(known), np.flatnonzero(seen)
+        yield drones, estimates, np.linalg.norm(ref_m[drones, None] - est_m[None, estimates], axis=-1)
+
+
+def for_trackeval(est: Trajectories, ref: Trajectories):
+    """Input of trackeval's metrics, with the similarity 1 - distance / `GATE_M`."""
+    drones, estimates, distances_m = zip(*frames(est, ref), strict=True)
+    return {
+        "num_gt_ids": ref.num_drones,
+        "num_tracker_ids": est.num_drones,
+        "num_gt_dets": sum(map(len, drones)),
+        "num_tracker_dets": sum(map(len, estimates)),
+        "gt_ids": list(drones),
+        "tracker_ids": list(estimates),
+        "similarity_scores": [np.maximum(0, 1 - distance_m / GATE_M) for distance_m in distances_m],
+        "num_timesteps": ref.num_frames,
+    }
+
+
+@pytest.mark.parametrize("flights", [crowded_flights, separate_flights])
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_hota_is_that_of_trackeval(flights, seed):
+    metrics = pytest.importorskip("trackeval").metrics
+    est, ref = flights(seed)
+    theirs = metrics.HOTA().eval_sequence(for_trackeval(est, ref))
+    ours = evaluate(est, ref)
+    check(ours, **{name.lower(): theirs[name].mean() for name in ("HOTA", "DetA", "AssA", "LocA")})
+
+
+@pytest.mark.parametrize("flights", [crowded_flights, separate_flights])
+@given(seed=seeds)
+@settings(max_examples=15)
+def test_clear_and_identity_are_those_of_motmetrics(flights, seed):
+    est, ref = flights(seed)
+    if flights is crowded_flights:
+        # motmetrics keeps pairs from all earlier frames, psotrack only pairs of the previous frame. Both are the same
+        # if no drone is ever missed: all estimates are within the gate of all drones, and there are enough estimates.
+        est = replace(est, position_m=0.25 * est.position_m)
+        ref = replace(ref, position_m=0.25 * ref.position_m)
+        est.position_m[est.seen.sum(axis=1) < ref.num_drones] = 0.1
+    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    for drones, estimates, distance_m in frames(est, ref):
+        accumulator.update(drones, estimates, np.where(distance_m <= GATE_M, distance_m, np.nan))
+    names = ["mota", "motp", "idf1", "num_switches"]
+    mota, motp_m, idf1, switches = motmetrics.metrics.create().compute(accumulator, metrics=names).iloc[0]
+    check(evaluate(est, ref), id_switches=switches, mota=float(mota), motp_m=float(motp_m), idf1=float(idf1))
