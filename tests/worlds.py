@@ -10,7 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from helpers import ring_rig
+import pytest
+from helpers import make_once, ring_rig
 
 from psotrack.geometry import project
 from psotrack.geometry.rig_files import write_rig
@@ -88,3 +89,14 @@ def make_tracks_file(path: Path, error_m: float = 0.01) -> Path:
     drones = [{"drone": drone, "size_m": [0.3, 0.3, 0.15]} for drone in range(2)]
     path.with_suffix(".json").write_text(json.dumps({"rate_hz": RATE_HZ, "drones": drones}), encoding="utf-8")
     return path
+
+
+def two_flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sequences `flight` and `second`, and `tracks.csv` of the first; no test changes it."""
+
+    def make(folder: Path) -> None:
+        make_sequence(folder / "flight")
+        make_sequence(folder / "second")
+        make_tracks_file(folder / "tracks.csv")
+
+    return make_once(tmp_path_factory, "two_flights", make)

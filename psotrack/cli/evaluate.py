@@ -81,6 +81,7 @@ def evaluate(
 
     sequence = sequence_of(tracks, sequence)
     picture = None if plot is None else plot if plot.name else tracks.with_suffix(".png")
+    output.refuse(picture)
     is_poses = sequence.is_file() and sequence.suffix.lower() not in (".toml", ".c3d")
     if is_poses or drone is not None or orientations is not None or _is_camera_path(tracks):
         path = evaluation.drone_of(read_tracks(tracks), drone)

@@ -280,7 +280,6 @@ NOT_YET_MENDED = {
     "show/test_results_in_notebooks.py",
     "simulation/test_labels.py",
     "simulation/test_simulation_own_cameras.py",
-    "support/test_errors_and_files.py",
     "sweeps/test_sweep_cluster.py",
     "sweeps/test_sweep_runner.py",
     "tracking/test_compile_time.py",

@@ -94,16 +94,17 @@ def test_a_stage_that_an_error_ends_says_so() -> None:
     assert written == ["track: 4 of 10, stopped after 0.0 s"]
 
 
-def test_lines_go_to_stderr_and_short_work_is_quiet(capfd: pytest.CaptureFixture[str]) -> None:
-    with progress_bar("track", 2) as advance:
-        advance(2)
-    assert capfd.readouterr() == ("", "")
+def test_lines_go_to_stderr_and_short_work_is_quiet(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for report in (no_progress, progress_bar):
+        with report("track", 2) as advance:
+            advance(2)
+        assert capfd.readouterr() == ("", "")
     with progress_lines()("track", 2) as advance:
         advance(2)
     assert capfd.readouterr() == ("", "psotrack: track: 2 of 2 in 0.0 s\n")
-
-
-def test_a_bar_in_any_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A bar in any case.
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     with terminal_bar("track", 7) as advance:
@@ -121,7 +122,7 @@ def test_joined_reports_count_the_same_steps() -> None:
     assert first == second == ["track: 5 of 5 in 0.0 s"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 # The kernel of Jupyter leaves sockets to the garbage collector.
 @pytest.mark.filterwarnings("ignore")
 def test_a_saved_notebook_has_one_output_per_stage() -> None:

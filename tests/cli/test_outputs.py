@@ -1,0 +1,263 @@
+"""Outputs of all commands: kept without --force, whole or as they were on a full disk, and paths that are no files."""
+
+import contextlib
+import json
+import os
+import stat
+import threading
+from pathlib import Path
+
+import pytest
+from helpers import assert_refused, content_of
+
+resource = pytest.importorskip("resource", reason="limits on the size of files are a matter of Unix")
+
+#: What is there before -> words of the command that would replace it.
+OUTPUTS = {
+    "rig.toml": "calibrate convert {flight}/rig.toml rig.toml",
+    "lens.toml": "calibrate rig {flight}/c0.avi --squares 7x5 --square 0.04 --out lens.toml",
+    "lens.png": "calibrate rig {flight}/c0.avi --squares 7x5 --square 0.04 --out x.toml --plot lens.png",
+    "recording.toml": "init {flight} --out recording.toml",
+    "draft.json": "init {flight} --out x.toml --json draft.json",
+    "info.json": "init --show {flight} --json info.json",
+    "tracks.csv": "track {flight} --out tracks.csv",
+    "tracks.json": "track {flight} --out tracks.csv",
+    "tracks.ambiguity.csv": "track {flight} --out tracks.csv",
+    "run.toml": "track {flight} --out x.csv --save-config run.toml",
+    "run.json": "track {flight} --out x.csv --json run.json",
+    "live.csv": "live {flight} --replay --out live.csv",
+    "live.toml": "live {flight} --replay --out x.csv --save-config live.toml",
+    "errors.json": "evaluate {tracks} {flight} --json errors.json",
+    "errors.png": "evaluate {tracks} {flight} --json x.json --plot errors.png",
+    "export.csv": "export {tracks} --to csv --out export.csv",
+    "tum/mine": "export {tracks} --to tum --out tum",
+    "page.html": "report {tracks} {flight} --out page.html",
+    "flight.rrd": "view {tracks} --save flight.rrd",
+    "videos/c1.mp4": "overlay {tracks} {flight} --out videos",
+    "flight.psotrack": "archive {tracks} {flight} --out flight.psotrack",
+    "unpacked/mine": "archive {data}/version_1.psotrack --out unpacked",
+    "doctor.json": "doctor {flight} --tracks {tracks} --json doctor.json",
+    "masks.mp4": "detect {flight} --cameras c0 --masks masks.mp4",
+    "masks/c1/mine": "detect {flight} --masks masks",
+    "boxes/c1.csv": "detect {flight} --blobs --out boxes",
+    "silhouettes.json": "detect --silhouettes {flight} --json silhouettes.json",
+    "yolo/mine": "simulate labels {flight} {second} --drone-size 0.3,0.3,0.15 --out yolo",
+    "data/Simulated_Data/S01_D2_A/mine": "simulate S01_D2_A --out data",
+    "sticks.csv": "simulate fly --device keyboard --out sticks.csv",
+    "demo/tracks.csv": "demo --out demo",
+    "board.pdf": "board --out board.pdf",
+    "markers.csv": "onboard detect {flight}/c0.avi --out markers.csv",
+    "map.csv": "onboard map {flight}/c0.avi --known 1 --side 0.2 --fov 70,55 --out map.csv",
+    "camera.csv": "onboard localise {flight}/c0.avi --markers none.csv --fov 70,55 --out camera.csv",
+    "fused.csv": "onboard fuse {tracks} {tracks} --out fused.csv",
+    "cache.json": "cache --json cache.json",
+}
+#: Content of the file that a command is to replace.
+OLDER = b"older"
+
+
+def words_of(command, world):
+    places = {"flight": world / "flight", "second": world / "second", "tracks": world / "tracks.csv"}
+    return command.format(**places, data=Path(__file__).parents[1] / "data").split()
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """The current folder, which is empty."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "place"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_nothing_is_overwritten_without_force(run_psotrack, world, place, name):
+    """It is refused before the work: no silhouettes are stored either."""
+    Path(name).parent.mkdir(parents=True, exist_ok=True)
+    Path(name).write_bytes(OLDER)
+    words = words_of(OUTPUTS[name], world)
+    assert_refused(lambda: run_psotrack(*words), Path(name).parts[0], "pass --force", unchanged=place.parent)
+
+
+# --- full disks
+
+#: Name of the output -> words of a command, one for each library that writes files.
+FILES = {
+    "rig.toml": "calibrate convert {flight}/rig.toml rig.toml",
+    "recording.toml": "init {flight} --out recording.toml --quiet",
+    "errors.png": "evaluate {tracks} {flight} --plot errors.png --quiet",
+    "export.parquet": "export {tracks} --to parquet --out export.parquet",
+    "export.c3d": "export {tracks} --to c3d --out export.c3d",
+    "export.mcap": "export {tracks} {flight} --to mcap --images --out export.mcap",
+    "page.html": "report {tracks} {flight} --out page.html --jobs 1",
+    "masks.mp4": "detect {flight} --cameras c0 --masks masks.mp4 --jobs 1",
+}
+#: Commands whose outputs are folders.
+FOLDERS = {
+    "tum": "export {tracks} --to tum --out tum",
+    "mot": "export {tracks} {flight} --to mot --out mot",
+    "videos": "overlay {tracks} {flight} --out videos --jobs 1",
+    "masks": "detect {flight} --masks masks --jobs 1",
+    "yolo": "simulate labels {flight} {second} --drone-size 0.3,0.3,0.15 --out yolo --jobs 1",
+}
+#: Smallest limit, bytes. What pytest captures is a file too, and must take a line.
+LEAST = 500
+
+
+@contextlib.contextmanager
+def files_up_to(num_bytes):
+    """No file gets longer than a number of bytes, which needs no rights, and stands for a full disk.
+
+    Python ignores the signal that else ends the process.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def limits(whole):
+    """Three limits up to one byte less than the longest file of an output."""
+    longest = max(len(content) for content in whole.values() if content is not None)
+    return {LEAST, LEAST + (longest - LEAST) // 2, longest - 1} if longest > LEAST else {longest - 1}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_is_whole_or_as_it_was(run_psotrack, world, place, name):
+    words = [*words_of(FILES[name], world), "--force"]
+    assert run_psotrack(*words).code == 0
+    whole = content_of(place)
+    for limit in limits(whole):
+        Path(name).write_bytes(OLDER)
+        with files_up_to(limit):
+            result = run_psotrack(*words)
+        # `init` keeps the older file under another name.
+        Path(f"{name}.bak").unlink(missing_ok=True)
+        assert content_of(place) == {name: OLDER}, limit
+        assert_refused(lambda result=result: result, name, unchanged=place)
+    assert run_psotrack(*words).code == 0
+    assert Path(name).read_bytes() == whole[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_folder_has_whole_files_only(run_psotrack, world, place, name):
+    words = words_of(FOLDERS[name], world)
+    assert run_psotrack(*words).code == 0
+    whole = content_of(place)
+    for limit in limits(whole):
+        Path(name).rename(place.parent / f"made {limit}")
+        with files_up_to(limit):
+            result = run_psotrack(*words)
+        # `overlay` may have written no video, because it tries codecs in the folder of temporary files.
+        assert result.code == 2, (limit, result)
+        assert result.err.count("\n") == 1, (limit, result.err)
+        assert name in result.err or "videos were tried there" in result.err, (limit, result.err)
+        assert content_of(place).items() <= whole.items(), limit
+        assert run_psotrack(*words, "--force").code == 0
+        assert content_of(place) == whole, limit
+
+
+# --- paths that are no plain files
+
+
+@pytest.fixture
+def convert(world, run_psotrack):
+    """Runs `calibrate convert`, whose output is a rig file, with a path of the output and options."""
+    return lambda *words: run_psotrack("calibrate", "convert", world / "flight" / "rig.toml", *words)
+
+
+@pytest.fixture
+def show(world, run_psotrack):
+    """Runs `init --show`, whose output is JSON at a path."""
+    return lambda path, *words: run_psotrack("init", "--show", world / "flight", "--json", path, *words)
+
+
+def is_device(path):
+    return stat.S_ISCHR(os.stat(path, follow_symlinks=False).st_mode)
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_devices_are_never_replaced(show, tmp_path, force):
+    assert show("/dev/null", *force).code == 0
+    full = "/dev/full: expected a path that can be written, found No space left on device"
+    assert_refused(lambda: show("/dev/full", *force), full, unchanged=tmp_path)
+    assert is_device("/dev/null")
+    assert is_device("/dev/full")
+
+
+def test_stdout_and_a_pipe_get_the_json_only(show, tmp_path):
+    for path in ("-", "/dev/stdout"):
+        assert isinstance(json.loads(show(path).out), dict)
+    pipe, got = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: got.append(pipe.read_text(encoding="utf-8")), daemon=True)
+    reader.start()
+    assert show(pipe).code == 0
+    reader.join(60)
+    assert isinstance(json.loads(got[0]), dict)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_link_is_written_through(convert, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    target, link = tmp_path / "elsewhere" / "mine.txt", tmp_path / "link.toml"
+    target.write_bytes(OLDER)
+    link.symlink_to(target)
+    assert_refused(lambda: convert(link), "--force", unchanged=tmp_path)
+    assert convert(link, "--force").code == 0
+    assert "c0" in target.read_text(encoding="utf-8")
+    # A link to nothing makes the file.
+    new = tmp_path / "new.toml"
+    new.symlink_to(tmp_path / "new" / "rig.toml")
+    assert convert(new).code == 0
+    assert link.is_symlink()
+    assert new.is_symlink()
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if not path.is_symlink()} == {
+        *("elsewhere", "elsewhere/mine.txt", "new", "new/rig.toml")
+    }
+
+
+def test_links_in_a_circle_and_to_a_folder_are_refused(convert, tmp_path):
+    (tmp_path / "a.toml").symlink_to(tmp_path / "b.toml")
+    (tmp_path / "b.toml").symlink_to(tmp_path / "a.toml")
+    circle = "a.toml: expected a link that leads to a file, found a link that leads to itself"
+    assert_refused(lambda: convert(tmp_path / "a.toml", "--force"), circle, unchanged=tmp_path)
+    (tmp_path / "folder.toml").mkdir()
+    (tmp_path / "folder.toml" / "mine").touch()
+    (tmp_path / "link.toml").symlink_to(tmp_path / "folder.toml")
+    folder = "link.toml: expected the path of a file, found a folder"
+    assert_refused(lambda: convert(tmp_path / "link.toml", "--force"), folder, unchanged=tmp_path)
+
+
+@pytest.mark.parametrize("words", ["detect {flight} --masks link", "overlay {tracks} {flight} --out link"])
+def test_a_link_to_a_folder_is_followed(run_psotrack, world, place, words):
+    Path("elsewhere").mkdir()
+    Path("link").symlink_to("elsewhere", target_is_directory=True)
+    assert run_psotrack(*words_of(words, world), "--force", "--jobs", 1).code == 0
+    assert Path("link").is_symlink()
+    assert {path.name.partition(".")[0] for path in Path("elsewhere").iterdir()} >= {"c0", "c1", "c2"}
+
+
+@pytest.mark.parametrize("name", ["tracks.csv", "tracks.json", "tracks.ambiguity.csv", "other.json"])
+def test_track_refuses_a_folder_before_it_tracks(run_psotrack, world, place, name):
+    Path(name).mkdir()
+    words = ("track", world / "flight", "--out", "tracks.csv", "--force", "--json", "other.json")
+    refusal = f"{name}: expected the path of a file, found a folder"
+    assert_refused(lambda: run_psotrack(*words), refusal, unchanged=place.parent)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "calibrate convert {flight}/rig.toml -",
+        "init {flight} --out -",
+        "simulate S02_D4_A --frames 2 --log -",
+    ],
+)
+def test_a_dash_makes_no_file_of_this_name(run_psotrack, world, place, words):
+    assert_refused(lambda: run_psotrack(*words_of(words, world)), unchanged=place.parent)
