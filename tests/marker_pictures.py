@@ -1,4 +1,4 @@
-"""Pictures of ArUco markers on flat and bent sheets, with their true corners."""
+"""Pictures of ArUco markers, with their true corners: on flat and bent sheets, and at any four corners."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from psotrack.foreground.markers import marker_dictionary
+from psotrack.geometry import undistort
 
 BLACK, WHITE, GAMMA = 35.0, 215.0, 2.2
 #: Samples per pixel along each side.
@@ -125,3 +126,54 @@ def rows_of_sheets(rng, count, size_wh, side_px, *, ids=50, tilt=0.6, bow=0.0):
         )
         for index, (x, y) in enumerate(places[:count])
     ]
+
+
+#: Grey levels of markers that are drawn at given corners, and of the wall.
+DRAWN_BLACK, DRAWN_WHITE, WALL = 40, 200, 140
+#: Pixels along a cell of a marker's own image.
+CELL_PX = 20
+
+
+def marker_image(marker, dictionary):
+    """Image of a marker with a white zone of one cell, and the corners of the marker's border in it, pixels."""
+    model = marker_dictionary(dictionary)
+    side_px = (model.markerSize + 2) * CELL_PX
+    own = cv2.aruco.generateImageMarker(model, marker, side_px)
+    low, high = CELL_PX - 0.5, CELL_PX + side_px - 0.5
+    return np.pad(own, CELL_PX, constant_values=255), np.array(
+        [[low, low], [high, low], [high, high], [low, high]]
+    )
+
+
+def draw(markers, *, size_wh=(640, 480), dictionary="4x4_1000", lens=None, exponent=2.0, fine=8):
+    """Grey picture of a wall with markers at given corners, pairs of id and (4, 2) pixels, one ray for each sample.
+
+    `fine` is the number of samples along each side of a pixel. The light of a pixel is the mean of its samples, and its
+    grey level is a root of the light. Corners are undistorted ones where a `lens` is given.
+    """
+    drawn = np.full(size_wh[::-1], WALL, np.uint8)
+    for marker, corners in markers:
+        image, own = marker_image(marker, dictionary)
+        towards = cv2.getPerspectiveTransform(corners.astype(np.float32), own.astype(np.float32))
+        # The block of whole pixels that holds the marker and its white zone.
+        margin = np.ptp(corners, axis=0).max() / 4
+        low = np.clip(np.floor(corners.min(axis=0) - margin), 0, size_wh).astype(int)
+        high = np.clip(np.ceil(corners.max(axis=0) + margin), 0, size_wh).astype(int)
+        ends = zip(low, high, strict=True)
+        axes = [np.arange(fine * start, fine * end) / fine + 0.5 / fine - 0.5 for start, end in ends]
+        grid = np.stack(np.meshgrid(*axes), axis=-1)
+        if lens is not None:
+            grid = undistort(lens, grid) @ lens.K[:2, :2].T + lens.K[:2, 2]
+        # Positions of the samples in the marker's image.
+        there = grid @ towards[:, :2].T + towards[:, 2]
+        there = np.round(there[..., :2] / there[..., 2:]).astype(int)
+        inside = ((there >= 0) & (there < image.shape[0])).all(axis=-1)
+        levels = np.where(inside, 0.0, float(WALL))
+        shown = image[there[inside][:, 1], there[inside][:, 0]] / 255
+        levels[inside] = DRAWN_BLACK + (DRAWN_WHITE - DRAWN_BLACK) * shown
+        blocks = high[1] - low[1], fine, high[0] - low[0], fine
+        light = (levels**exponent).reshape(blocks).mean(axis=(1, 3))
+        part = drawn[low[1] : high[1], low[0] : high[0]]
+        touched = inside.reshape(blocks).any(axis=(1, 3))
+        part[touched] = np.round(light ** (1 / exponent))[touched]
+    return drawn

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from camera_paths import make_paths_and_tracks
 from helpers import make_once, ring_rig
+from marker_worlds import make_drawn_flight
 from small_sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
 from test_cli_calibrate import film_board, pairs_of
-from test_fuse_command import make_files
-from test_map_markers import make_walk
 from test_synchronisation import make_recording
 from worlds import make_sequence, make_tracks_file
 
@@ -100,7 +100,11 @@ def inputs(tmp_path_factory, root):
         write_rig(folder / "lenses.yml", rig)
         pairs_of(folder / "pairs.csv", rig)
         film_board(folder / "board.avi")
-        for name, make_inputs in (("walk", make_walk), ("fuse", make_files), ("clocks", make_recording)):
+        for name, make_inputs in (
+            ("walk", make_drawn_flight),
+            ("fuse", make_paths_and_tracks),
+            ("clocks", make_recording),
+        ):
             (folder / name).mkdir()
             make_inputs(folder / name)
         tracked = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
@@ -153,10 +157,12 @@ COMMANDS = {
     "--out lens.toml --force --quiet",
     (
         "camera.csv",
-    ): "onboard localise {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
+    ): "onboard localise {walk} --markers {inputs}/walk/corners.csv --camera {inputs}/walk/lens.toml "
     "--out camera.csv --force --frames 8 --quiet",
-    ("corners.csv",): "onboard map {walk} --markers {inputs}/walk/truth.csv --camera {inputs}/walk/lens.toml "
-    "--known 7 --out corners.csv --force --quiet",
+    (
+        "corners.csv",
+    ): "onboard map {walk} --markers {inputs}/walk/corners.csv --camera {inputs}/walk/lens.toml "
+    "--known 17 --out corners.csv --force --quiet",
     (
         "markers.csv",
     ): "onboard detect {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
@@ -169,7 +175,7 @@ COMMANDS = {
 @pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
 def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, monkeypatch, names):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
-    words = COMMANDS[names].format(root=root, inputs=inputs, walk=inputs / "walk" / "walk.avi").split()
+    words = COMMANDS[names].format(root=root, inputs=inputs, walk=inputs / "walk" / "flight.avi").split()
 
     def reset():
         for path in disk.place.iterdir():

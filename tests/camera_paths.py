@@ -1,0 +1,166 @@
+"""Paths of cameras on drones, and tracks of the same drones by static cameras, with known errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from psotrack.inside_out import CameraPath, Flag, write_camera_path
+from psotrack.trajectories import Status, Trajectories, write_trajectories
+
+FPS = 25.0
+#: From the camera to the middle of the drone, in the camera's axes.
+ARM_M = np.array([0.01, 0.03, -0.12])
+INSIDE_M, OUTSIDE_M = np.array([0.001, 0.001, 0.003]), np.array([0.004, 0.004, 0.004])
+
+
+def example_path(with_velocity: bool = True) -> CameraPath:
+    """Path of six frames with random poses and all kinds of status and flags; frame 5 has no pose."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6, 6))
+    covariance = root @ root.swapaxes(-1, -2)
+    path = CameraPath(
+        frame=np.array([0, 1, 2, 4, 5, 6]),
+        time_s=np.array([0.0, 0.04, 0.08, 0.16, 0.2, 0.24]),
+        position_m=rng.normal(size=(6, 3)),
+        orientation_wxyz=Rotation.random(6, rng=rng).as_quat(scalar_first=True),
+        covariance=(covariance + covariance.swapaxes(-1, -2)) / 2,
+        num_markers=np.array([4, 5, 1, 0, 0, 7]),
+        reprojection_px=np.array([0.1, 0.2, 0.3, np.nan, np.nan, 0.4]),
+        ambiguity=np.array([0.0, 0.0, 0.3, np.nan, np.nan, 0.0]),
+        status=np.array([Status.TRACKED] * 3 + [Status.COASTING, Status.LOST, Status.TRACKED]),
+        flags=np.array([0, 0, Flag.FEW_MARKERS | Flag.AMBIGUOUS, Flag.GATED, 0, 0]),
+        velocity_m_s=rng.normal(size=(6, 3)) if with_velocity else None,
+    )
+    for values in (path.position_m, path.orientation_wxyz, path.covariance):
+        values[4] = np.nan
+    return path
+
+
+def camera_path(position_m, rotation, covariance, *, first_s=0.0, num_markers=8) -> CameraPath:
+    """A path at 25 Hz with a pose in each frame."""
+    count = len(position_m)
+    return CameraPath(
+        frame=np.arange(count),
+        time_s=np.arange(count) / FPS + first_s,
+        position_m=position_m,
+        orientation_wxyz=rotation.as_quat(scalar_first=True).reshape(count, 4),
+        covariance=covariance,
+        num_markers=np.full(count, num_markers),
+        reprojection_px=np.full(count, 0.3),
+        ambiguity=np.zeros(count),
+        status=np.full(count, int(Status.TRACKED)),
+        flags=np.zeros(count, int),
+    )
+
+
+def remove_poses(path: CameraPath, rows) -> CameraPath:
+    """The path with the poses of some frames lost."""
+    names = ("position_m", "orientation_wxyz", "covariance", "ambiguity", "reprojection_px")
+    values = {name: getattr(path, name).copy() for name in (*names, "status", "num_markers")}
+    for name in names:
+        values[name][rows] = np.nan
+    values["status"][rows], values["num_markers"][rows] = Status.LOST, 0
+    return replace(path, **values)
+
+
+def outside_tracks(middle_m, covariance_m2, first=0) -> Trajectories:
+    """Tracks at 25 Hz of the middles (frames, drones, 3)."""
+    frame = np.arange(first, first + len(middle_m))
+    return Trajectories(
+        frame=frame,
+        time_s=frame / FPS,
+        drones=tuple(str(drone) for drone in range(middle_m.shape[1])),
+        position_m=middle_m,
+        status=np.full(middle_m.shape[:2], int(Status.TRACKED)),
+        covariance_m2=covariance_m2,
+    )
+
+
+def remove_positions(tracks: Trajectories, rows, drone=0) -> Trajectories:
+    """The tracks with some frames of one track lost."""
+    status = tracks.status.copy()
+    status[rows, drone] = Status.LOST
+    return replace(tracks, status=status)
+
+
+def smooth_flight(rng, num_frames, offset_s=0.0):
+    """Positions (frames, 3) and rotations of a camera that flies and turns smoothly."""
+    time_s = np.arange(num_frames) / FPS + offset_s
+    frequency, phase = rng.uniform(0.1, 0.5, (3, 3, 1)), rng.uniform(0, 6, (3, 3, 1))
+    waves = np.sin(2 * np.pi * frequency * time_s + phase).sum(axis=0).T
+    knots_s = np.arange(-5.0, num_frames / FPS + 7.0)
+    turns = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.4, size=(len(knots_s), 3)), axis=0))
+    return 0.8 * waves + [0, 0, 2.0], Slerp(knots_s, turns)(time_s)
+
+
+def correlated_errors(rng, num_frames, time_s):
+    """Gauss-Markov errors with a variance of 1: (frames, 3)."""
+    left = np.exp(-1 / FPS / time_s)
+    values = rng.normal(size=(num_frames, 3))
+    for k in range(1, num_frames):
+        values[k] = left * values[k - 1] + np.sqrt(1 - left**2) * values[k]
+    return values
+
+
+#: Errors of both sources: standard deviations, metres, and factors on the stated ones; the parts of the variances that
+#: are correlated, over 0.3 s inside and `outside_s` outside.
+USUAL = {
+    "inside_m": INSIDE_M,
+    "inside_stated": 1.0,
+    "inside_part": 0.5,
+    "outside_stated": 1.0,
+    "outside_part": 1.0,
+    "outside_s": 0.3,
+}
+
+
+def fly_twice_seen(seed, num_frames=150, num_drones=1, *, distance_m=4.0, **given):
+    """Inside paths by name, outside tracks, and each drone's true camera positions (frames, 3) and rotations."""
+    given = USUAL | given
+    rng = np.random.default_rng(seed)
+
+    def errors(part, time_s):
+        white = rng.normal(size=(num_frames, 3))
+        return np.sqrt(1 - part) * white + np.sqrt(part) * correlated_errors(rng, num_frames, time_s)
+
+    paths, middles, truths = {}, [], []
+    for drone in range(num_drones):
+        position_m, rotation = smooth_flight(rng, num_frames)
+        position_m = position_m + np.array([distance_m * drone, 0, 0])
+        error_m = rotation.apply(errors(given["inside_part"], 0.3) * given["inside_m"])
+        covariance = np.zeros((num_frames, 6, 6))
+        root = rotation.as_matrix() * (given["inside_stated"] * np.asarray(given["inside_m"]))
+        covariance[:, :3, :3] = root @ root.mT
+        covariance[:, 3:, 3:] = 1e-6 * np.eye(3)
+        paths[f"dron{drone + 1}"] = camera_path(position_m + error_m, rotation, covariance)
+        outside_m = errors(given["outside_part"], given["outside_s"]) * OUTSIDE_M
+        middles.append(position_m + rotation.apply(ARM_M) + outside_m)
+        truths.append((position_m, rotation))
+    middle_m = np.stack(middles, axis=1)
+    stated_m2 = np.diag((given["outside_stated"] * OUTSIDE_M) ** 2)
+    return paths, outside_tracks(middle_m, np.tile(stated_m2, (*middle_m.shape[:2], 1, 1))), truths
+
+
+def fly_with_a_swap():
+    """Two camera paths, one with a gap, and tracks with another, whose identities are exchanged from frame 60 on."""
+    paths, outside, truths = fly_twice_seen(31, 100, num_drones=2, distance_m=1.5)
+    outside.position_m[60:, [0, 1]] = outside.position_m[60:, [1, 0]]
+    paths["dron1"] = remove_poses(paths["dron1"], slice(20, 30))
+    return paths, outside, truths
+
+
+def make_paths_and_tracks(folder: Path) -> Path:
+    """Write the flight with a swap: `dron1.csv`, `dron2.csv`, `tracks.csv`, and files that do not belong to it."""
+    paths, outside, _ = fly_with_a_swap()
+    write_trajectories(folder / "tracks.csv", remove_positions(outside, slice(80, 90)))
+    far = replace(outside, position_m=outside.position_m + np.array([0.0, 50.0, 0.0]))
+    write_trajectories(folder / "elsewhere.csv", far)
+    write_trajectories(folder / "later.csv", replace(outside, time_s=outside.time_s + 100))
+    write_camera_path(folder / "blind.csv", remove_poses(paths["dron1"], slice(0, 100)), "dron3")
+    for name, path in paths.items():
+        write_camera_path(folder / f"{name}.csv", path, name)
+    return folder

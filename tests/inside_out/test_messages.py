@@ -1,0 +1,374 @@
+"""Bad input of the room: each is refused in one line that says what was expected and found, where, and the remedy."""
+
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from camera_paths import example_path, fly_twice_seen, make_paths_and_tracks, remove_poses, remove_positions
+from helpers import assert_refused, make_once
+from marker_worlds import (
+    DRAWN_LENS,
+    PASSING_CAMERA,
+    any_room,
+    fly_past,
+    found_markers,
+    four_walls,
+    make_drawn_flight,
+    simple_lens,
+    wall_markers,
+)
+
+from psotrack.foreground.markers import MarkerDetector
+from psotrack.geometry import make_rig
+from psotrack.geometry.rig_files import write_calibration, write_rig
+from psotrack.inside_out import (
+    MarkerCentres,
+    MarkerMap,
+    PoseFilterParams,
+    PoseSettings,
+    build_map,
+    check_map,
+    corners_in_own_frame,
+    fit_squares,
+    fuse,
+    open_source,
+    read_camera_path,
+    read_marker_map,
+    read_marker_table,
+    read_measured_corners,
+    smooth,
+    write_camera_path,
+)
+from psotrack.inside_out.filtering import Agility, FilterRun, poses_of, step
+from psotrack.inside_out.lens_files import read_lens
+from psotrack.inside_out.mapping import complete_map
+from psotrack.inside_out.mapping.sightings import collect_sightings
+from psotrack.inside_out.pose import CornerNoise, estimate_pose
+from psotrack.recordings.datasets import write_marker_corners
+from psotrack.recordings.mocap import Markers, write_c3d
+
+ROOM = four_walls()
+
+
+def calls(function, *arguments, **options):
+    """A call that needs no file."""
+    return lambda folder, run: partial(function, *arguments, **options)
+
+
+def localises(options, video="{flight}", lens="--fov 70,55.4"):
+    return lambda folder, run: partial(
+        run, f"localise {video} --markers {{corners}} {lens} --out {{new}} {options}"
+    )
+
+
+def maps(options):
+    return lambda folder, run: partial(run, f"map {{flight}} {options}")
+
+
+def fuses(options):
+    return lambda folder, run: partial(run, f"fuse --out {{new}} {options}")
+
+
+def reads(text, read=read_marker_map, name="corners.csv"):
+    """A file of this text is read."""
+
+    def prepare(folder, run):
+        (folder / name).write_bytes(text.encode())
+        return partial(read, folder / name)
+
+    return prepare
+
+
+def reads_path(**values):
+    """The table of a camera's path is read, whose first row has other values."""
+
+    def prepare(folder, run):
+        path = folder / "path.csv"
+        write_camera_path(path, example_path(), "dron2")
+        table = pd.read_csv(path, dtype=str)
+        for column, value in values.items():
+            table.loc[0, column] = value
+        table.to_csv(path, index=False)
+        return partial(read_camera_path, path)
+
+    return prepare
+
+
+def reads_lens(size_wh, **options):
+    """A file of two lenses is read for images of a size."""
+
+    def prepare(folder, run):
+        write_rig(folder / "lens.toml", make_rig({"left": DRAWN_LENS, "right": DRAWN_LENS}))
+        return partial(read_lens, folder / "lens.toml", size_wh, **options)
+
+    return prepare
+
+
+def reads_lens_without_size(folder, run):
+    """The dataset's CSV has no size of the images."""
+    write_calibration(folder / "cameras.csv", make_rig({"cam1i": simple_lens(400.0, (640, 480))}))
+    return partial(read_lens, folder / "cameras.csv", (1920, 1080))
+
+
+def reads_c3d(names, position_m):
+    def prepare(folder, run):
+        write_c3d(folder / "room.c3d", Markers(names, position_m, 100.0))
+        return partial(read_measured_corners, folder / "room.c3d")
+
+    return prepare
+
+
+def opens_images_of_two_sizes(folder, run):
+    for number, shape in enumerate([(20, 30), (20, 32)]):
+        cv2.imwrite(str(folder / f"a{number}.png"), np.zeros(shape, np.uint8))
+    return lambda: list(open_source(folder, fps=25.0).frames())
+
+
+def opens_folder_that_is_not_readable(folder, run):
+    def refused(_):
+        raise PermissionError(13, "Permission denied")
+
+    def call():
+        # Tests may run as root, and root may read every folder.
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(Path, "iterdir", refused)
+            open_source(folder)
+
+    return call
+
+
+def read_squares(path):
+    return fit_squares(read_measured_corners(path))
+
+
+def wide(corners_m):
+    header = ["id", *(f"{axis}{corner}[m]" for corner in "1234" for axis in "xyz")]
+    rows = [";".join(map(str, (marker, *at.ravel().tolist()))) for marker, at in corners_m.items()]
+    return "\n".join([";".join(header), *rows]) + "\n"
+
+
+def third(corners):
+    """The table of the room with other corners of marker 3, in line 4."""
+    return wide({**ROOM, 3: corners})
+
+
+def bent(distance_m, axis):
+    return ROOM[3] + distance_m * np.outer(np.arange(4) == 2, np.arange(3) == axis)
+
+
+WIDE = wide(ROOM)
+LONG = "id,corner,x_m,y_m,z_m\n" + "".join(
+    f"{marker},{corner + 1},{x},{y},{z}\n"
+    for marker, at in ROOM.items()
+    for corner, (x, y, z) in enumerate(at.tolist())
+)
+CELLS = WIDE.splitlines()[3].split(";")
+MIRRORED = wide({marker: corners * [1.0, -1.0, 1.0] for marker, corners in ROOM.items()})
+IN_MILLIMETRES = wide({marker: 1e3 * corners for marker, corners in ROOM.items()})
+CORNERS_OF_3 = tuple(f"Marker3:{corner}" for corner in range(1, 5))
+UNSEEN_M = np.where(np.arange(4)[:, None] == 1, np.nan, np.ones((5, 4, 3)))
+TEN_COLUMNS = "\n".join(";".join(line.split(";")[:10]) for line in WIDE.splitlines())
+NEGATIVE_STD = re.sub("(?m)$", ";-2", WIDE.rstrip()).replace("4[m];-2", "4[m];std[mm]")
+SAME_CENTRE = "id,x_m,y_m,z_m\n3,1,2,0.5\n4,1,2,0.5\n"
+TRACKS = "frame,time_s,drone,x_m,y_m,z_m\n0,0,a,1,2,3\n"
+CENTRES_TWICE = "id,x_m,y_m,z_m\n3,1,2,0.5\n3,1.5,2,0.5\n"
+
+
+def with_cells(cells):
+    """The table with other cells of marker 3, in line 4."""
+    return reads(WIDE.replace(";".join(CELLS), ";".join(cells)))
+
+
+def in_frames(*ids):
+    """What two frames show."""
+    found = found_markers(ids, np.zeros((len(ids), 4, 2)))
+    return collect_sightings([(0, time_s, found) for time_s in (0.0, 0.2)], (DRAWN_LENS,))
+
+
+PATHS, OUTSIDE, _ = fly_twice_seen(17, 30)
+PATH = PATHS["dron1"]
+STILL = replace(PATH, position_m=np.tile(PATH.position_m[0], (30, 1)))
+UNSURE = replace(PATH, covariance=np.zeros((30, 6, 6)))
+FAR = replace(OUTSIDE, position_m=OUTSIDE.position_m + 20)
+STEPPED = partial(step, params=PoseFilterParams(), agility=Agility())
+BEGUN = STEPPED(FilterRun(), 0.04, poses_of(PATH)[0])
+CENTRES = MarkerCentres({name: corners.mean(axis=0) for name, corners in any_room().items()})
+THREE = [found.select(np.isin(found.ids, [1, 2, 3])) for _, _, found in fly_past(3)[0]]
+NOWHERE = np.full((4, 4, 2), np.nan), np.ones((4, 4, 3)), DRAWN_LENS
+
+#: Name of the case -> how the bad input is made, and words of the line.
+BAD = {
+    # Tables of markers.
+    "empty cell": (with_cells([*CELLS[:5], "", *CELLS[6:]]), "line 4, column y2[m]", "found nothing"),
+    "empty last cell": (with_cells([*CELLS[:-1], ""]), "line 4, column z4[m]", "found nothing"),
+    "three corners": (with_cells(CELLS[:10]), "line 4: expected 13 values, found 10; "),
+    "no fourth corner": (reads(TEN_COLUMNS), "expected a column x4, found only"),
+    "three rows": (
+        reads(re.sub("\n3,3,.*", "", LONG)),
+        "line 10 to 12, marker 3",
+        "found none of number 3; add",
+    ),
+    "marker twice": (reads(WIDE.replace("\n4;", "\n3;")), "line 5, column id", "once, found 3 again"),
+    "corner twice": (reads(LONG.replace("\n3,2,", "\n3,1,")), "line 11", "found corner 1 of marker 3 again"),
+    "corner 4 from 0": (reads(LONG.replace("\n3,1,", "\n3,0,")), "line 5, column corner", "0 to 3, or tl"),
+    "no number": (reads(WIDE.replace("\n3;", "\nthree;")), "line 4, column id", "found 'three'"),
+    "decimal commas": (reads(WIDE.replace("3.0;", "3,0;")), "column y1[m]: ", "decimals with a point"),
+    "another unit": (reads(WIDE.replace("x1[m]", "x1[in]")), "expected a column x1[m]", "found x1[in]"),
+    "column twice": (reads(WIDE.replace("y2[m]", "x_2[m]")), "line 1", "found x2[m] and x_2[m]"),
+    "no rows": (reads(WIDE.splitlines()[0]), "expected rows below the header, found none"),
+    "nothing": (reads("\n"), "expected a table of marker corners, found an empty file"),
+    "other numbers": (reads("1;2;3;4\n5;6;7;8\n"), "line 1: expected a header, or numbers in rows of 13"),
+    "negative std": (reads(NEGATIVE_STD), "line 2, column std[mm]: expected a standard deviation of 0"),
+    "not planar": (
+        reads(third(bent(0.05, 1))),
+        "line 4, marker 3",
+        "a flat square",
+        "25 mm off",
+        "side is 40",
+    ),
+    "not square": (reads(third(bent(0.06, 0))), "line 4, marker 3", "a flat square", "corners 4"),
+    "crossed": (reads(third(ROOM[3][[0, 1, 3, 2]])), "line 4, marker 3", "one after the other"),
+    "same place": (reads(third(ROOM[2] + 0.01)), "line 4, marker 3", "both markers at the place of marker 2"),
+    "one in mm": (reads(third(1e3 * ROOM[3])), "line 4, marker 3", "found 400 m; is it in mill", "x1[mm]"),
+    "all in mm": (reads(IN_MILLIMETRES), "line 2, marker 1: ", "found 400 m; is it in millimetres"),
+    "mirrored": (reads(MIRRORED), "16 of 16 markers face out of the room", "an axis is mirrored"),
+    "not finite": (calls(MarkerMap, {5: np.full((4, 3), np.nan)}), "marker 5: expected finite corners"),
+    "no markers": (calls(MarkerMap, {}), "at least one marker"),
+    "centre twice": (reads(CENTRES_TWICE, read_marker_table), "line 3, column id", "once, found 3 again"),
+    "same centre": (reads(SAME_CENTRE, read_marker_table), "centre of marker 3 for marker 4 as well"),
+    "measured, no square": (reads(third(bent(0.15, 0)), read_squares), "line 4, marker 3", "a flat square"),
+    "unseen corner": (reads_c3d(CORNERS_OF_3, UNSEEN_M), "room.c3d, marker 3: ", "number 2 is never seen"),
+    "labels of drones": (reads_c3d(("Dron1:Dron11",), np.ones((5, 1, 3))), "Marker7:1", "found Dron1"),
+    # Maps from videos and from centres.
+    "no frames": (calls(in_frames), "expected frames that show markers, found none in any frame"),
+    "unseen known": (
+        calls(build_map, in_frames(1, 2), {77: ROOM[7]}),
+        "marker 77 beside others, found only 1",
+    ),
+    "known alone": (calls(build_map, in_frames(7), {7: ROOM[7]}), "in no frame; name another one by --known"),
+    "no side": (calls(corners_in_own_frame, 0.0), "side_m: expected a number above 0"),
+    "no two of a map": (calls(check_map, in_frames(1, 2), MarkerMap({9: ROOM[1]})), "two markers of the map"),
+    "three centres": (calls(complete_map, THREE, CENTRES, PASSING_CAMERA), "expected 4 markers", "found 3"),
+    # Paths of cameras.
+    "unknown flag": (reads_path(flags="few"), "line 2, column flags: ", "few_markers"),
+    "unknown status": (reads_path(status="gone"), "line 2: expected one of ", "coasting", "in status"),
+    "another drone": (reads_path(drone="dron3"), "path.csv: ", "one drone"),
+    "no length": (reads_path(qw="1e-320", qx="0", qy="0", qz="0"), "a unit quaternion", "found length 0"),
+    "length 3": (reads_path(qw="0", qx="3", qy="0", qz="0"), "line 2", "in qw, qx, qy, qz, found length 3"),
+    "negative variance": (reads_path(cov_zz="-9e8"), "line 2: expected a covariance in cov_xx, "),
+    "no covariance": (reads_path(cov_xa="1e9"), "line 2, column cov_xx: ", "in cov_xx to cov_cc"),
+    "no time": (reads_path(time_s=""), "line 2: expected a time_s"),
+    "time again": (reads_path(time_s="0.04"), "line 3: expected a time after 0.04 s"),
+    "no orientations": (reads(TRACKS, read_camera_path), "orientations"),
+    # Poses, their settings, and the filter.
+    "no coordinates": (calls(estimate_pose, *NOWHERE, PoseSettings()), "finite coordinates"),
+    "min_markers": (calls(PoseSettings, min_markers=0), "min_markers: expected at least 1, found 0"),
+    "focal_error": (calls(PoseSettings, focal_error=-0.1), "a number from 0 to below 1, found -0.1"),
+    "map_error_m": (calls(PoseSettings, map_error_m=np.nan), "a number from 0 to below 1, found nan"),
+    "scale": (calls(CornerNoise, scale=0.0), "scale"),
+    "place_m": (calls(CornerNoise, place_m=np.inf), "place_m"),
+    "false_alarm": (calls(PoseFilterParams, false_alarm=0.0), "a probability above 0 and below 1, found 0"),
+    "longest_gap_s": (calls(PoseFilterParams, longest_gap_s=-1.0), "a number above 0, found -1"),
+    "confirm": (calls(PoseFilterParams, confirm=0), "confirm: expected at least 1, found 0"),
+    "restart_after": (calls(PoseFilterParams, restart_after=0), "expected at least 1, found 0"),
+    "earlier frame": (calls(STEPPED, BEGUN, 0.0, poses_of(PATH)[1]), "a time after 0.04 s, found 0 s"),
+    "no error": (calls(smooth, UNSURE), "covariance at 0 s: expected a positive definite matrix"),
+    # Fusion.
+    "far tracks": (calls(fuse, PATHS, FAR), "outside tracks: expected a track within 0.5 m ", "nearest is 3"),
+    "no pose": (calls(fuse, remove_poses(PATH, slice(30)), OUTSIDE), "inside paths: expected a pose in"),
+    "no position": (calls(fuse, PATHS, remove_positions(OUTSIDE, slice(30))), "outside tracks: expected a"),
+    "still": (calls(fuse, {"dron1": STILL}, OUTSIDE, max_offset_s=0.5), "the clock of dron1", "found none"),
+    "fused into text": (fuses("{dron1} {tracks} --out {tmp}/a.txt"), "expected a file that ends in .csv"),
+    "path twice": (fuses("{dron1} {dron1} {tracks}"), "a second path of dron1"),
+    "tracks for a path": (fuses("{tracks} {tracks}"), "a camera's path with orientations"),
+    "negative range": (fuses("{dron1} {tracks} --max-offset -1"), "expected a number above 0, found -1"),
+    "blind path": (fuses("{blind} {tracks}"), "blind.csv: expected a pose in at least"),
+    "blind tracks": (fuses("{dron1} {blind}"), "blind.csv, outside tracks: expected a pos"),
+    "elsewhere": (fuses("{dron1} {elsewhere}"), "elsewhere.csv, outside", "within 0.5 m", "one clock"),
+    "later": (fuses("{dron1} {later}"), "later.csv: ", "0.00 to 3.96 s of dron1, found 100.00 to 103.96 s; "),
+    # Lenses, images, and detection.
+    "another shape": (reads_lens((1920, 1080), name="left", scale=True), "640 x 480; ", "the shape differs"),
+    "axis off": (reads_lens_without_size, "for 1920 x 1080", "an optical axis at (320, 240)"),
+    "several lenses": (reads_lens((640, 480)), "one camera, found left, right; name it by --camera-name"),
+    "no such lens": (reads_lens((640, 480), name="up"), "expected a camera up, found left, right"),
+    "two sizes": (opens_images_of_two_sizes, "a1.png: expected 30 x 20 pixels as in a0.png, found 32 x 20"),
+    "unreadable folder": (opens_folder_that_is_not_readable, "folder to read, found permission denied"),
+    "no stream": (calls(open_source, "file:///nowhere.avi"), "nowhere.avi: expected a camera or a stream"),
+    "no dictionary": (calls(MarkerDetector, "9x9"), "dictionary: expected one of ", "4x4_1000", "found 9x9"),
+    "not in it": (calls(MarkerDetector, "4x4_50", ids=[50]), "markers of the map, found 4x4_50, 0 to 49"),
+    # The command `onboard localise`.
+    "no lens": (localises("", lens=""), "lens: expected --camera FILE or --fov H,V, found neither"),
+    "two lenses": (localises("--camera {lens}"), "lens: ", "found both"),
+    "large lens": (localises("", lens="--camera {large}"), "large.toml: ", "for 640 x 480", "--scale-camera"),
+    "sides of corners": (localises("--marker-size 0.3"), "a table of centres alone, found corners in"),
+    "one place": (localises("--markers {wrong}"), "line 11, marker 40: ", "at the place of marker 5"),
+    "frames": (localises("--frames 99"), "frames: expected 1 to 14, the frames of ", "avi, found 99"),
+    "drone": (localises("--drone dron1"), "--drone: expected a folder with videos of drones' own"),
+    "number": (localises("", "0"), "0: expected a video, ", "pass --live if it is a camera's number"),
+    "one output": (localises("--json {new}"), "--json: expected another file than --out"),
+    "no rate": (localises("", "{images}"), "--fps: expected the rate at which ", "such as --fps 25"),
+    "one image": (localises("", "{images}/frame0.png"), "frame0.png: expected a video, or a folder"),
+    "no images": (localises("", "{tmp}"), "images, which end in .png", "found neither; to use"),
+    "negative readout": (localises("--readout -0.01"), "--readout: expected 0 to 0.04 s"),
+    "readout nan": (localises("--readout nan"), "--readout: expected 0 to"),
+    "long readout": (localises("--readout 0.05"), "between two frames at 25 frames per second, found 0.05"),
+    # The command `onboard map`.
+    "build and check": (maps("--out {new} --check {corners}"), "--check MAP, found both"),
+    "no known": (maps("--out {new}"), "expected numbers of markers that are known"),
+    "no place": (maps("--out {new} --known 17"), "--markers with the corners of the known"),
+    "two and a side": (maps("--out {new} --known 17,8 --side 0.3"), "found no --markers"),
+    "not in table": (maps("--out {new} --known 9 --markers {corners}"), "expected the known marker 9"),
+    "no lens of it": (maps("--out {new} --known 17 --side 0.3"), "--camera FILE or --fov H,V, found nei"),
+    "negative side": (maps("--out {new} --known 17 --side -1"), "--side: expected a number above 0"),
+    "video as map": (maps("--check {flight}"), "flight.avi: expected UTF-8 text"),
+    "drone of a video": (maps("--drone dron1 --check {corners}"), "expected a sequence's folder as SOURCE"),
+    "dictionary": (
+        maps("--check {corners} --fov 70,55 --dictionary 5x5_50 --frames 3"),
+        "show markers, found none",
+    ),
+}
+
+
+def make_wrong_map_and_lens(folder):
+    """A map with two markers at one place, and a lens for larger images."""
+    write_marker_corners(folder / "wrong.csv", wall_markers() | {5: wall_markers()[40]})
+    write_rig(folder / "large.toml", make_rig({"front": simple_lens(914.0, (1280, 960))}))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The files of a drawn flight, and of paths and tracks."""
+    drawn = make_once(tmp_path_factory, "drawn_flight", make_drawn_flight)
+    flown = make_once(tmp_path_factory, "paths_and_tracks", make_paths_and_tracks)
+    other = make_once(tmp_path_factory, "wrong_map_and_lens", make_wrong_map_and_lens)
+    paths = [*drawn.iterdir(), *flown.iterdir(), *other.iterdir()]
+    return {path.stem: path for path in paths}
+
+
+@pytest.mark.parametrize(("prepare", "words"), [(one, words) for one, *words in BAD.values()], ids=BAD)
+def test_bad_input_is_refused_in_one_line(prepare, words, files, run_psotrack, tmp_path):
+    def run(line):
+        paths = files | {"tmp": tmp_path, "new": tmp_path / "new.csv"}
+        return run_psotrack("onboard", *(word.format(**paths) for word in line.split()))
+
+    assert_refused(prepare(tmp_path, run), *words, unchanged=tmp_path)
+
+
+def test_a_video_that_ends_early_is_used_as_its_message_says(files, run_psotrack, tmp_path):
+    content, short = files["flight"].read_bytes(), tmp_path / "short.avi"
+    short.write_bytes(content[: len(content) * 6 // 10])
+    words = ("onboard", "localise", short, "--markers", files["corners"], "--camera", files["lens"], "--out")
+    refused = run_psotrack(*words, tmp_path / "track.csv")
+    there = int(refused.err.partition("--frames ")[2].split()[0])
+    assert_refused(
+        lambda: run_psotrack(*words, tmp_path / "track.csv"),
+        f"short.avi: expected 14 frames, found that only {there} can be decoded",
+        unchanged=tmp_path,
+    )
+    assert run_psotrack(*words, tmp_path / "track.csv", "--frames", there).code == 0
+    assert read_camera_path(tmp_path / "track.csv")[0].num_frames == there

@@ -1,0 +1,529 @@
+"""Poses from the markers of one frame: exact cases, SciPy, random draws, wrong markers, second poses; and the errors of
+corners, which are learned from a recording."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import LENSES
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from marker_worlds import LENS, found_markers, marker_at, posed
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import binom, chi2
+
+from psotrack.geometry import make_camera, project
+from psotrack.inside_out import LocaliseSettings, MarkerMap, PoseSettings, RollingShutter
+from psotrack.inside_out.localising import localise_frames
+from psotrack.inside_out.pose import CameraPose, CornerNoise, estimate_pose
+from psotrack.inside_out.pose.estimating import FALSE_ALARM
+
+SIZE_WH = (1920, 1080)
+SETTINGS = PoseSettings()
+ANY_NUMBER = PoseSettings(min_markers=1)
+#: Standard deviation of the inset of all corners that the fit allows for, px.
+INSET_STD_PX = 0.5
+
+
+def two_walls(count=10):
+    """Corners (count, 4, 3) of markers on the walls y = 4 and x = 5, at three heights."""
+    corners = []
+    for i in range(5):
+        corners.append(marker_at((i, 4.0, 1.2 + 0.7 * (i % 3)), (0, -1, 0)))
+        corners.append(marker_at((5.0, 3.0 - i, 1.5 + 0.7 * (i % 3)), (-1, 0, 0)))
+    return np.array(corners)[:count]
+
+
+def camera_at(
+    centre_m=(-0.8, -2.5, 1.3), target_m=(3.0, 3.0, 1.8), dist=(), *, fisheye=False, focal_px=920.0
+):
+    """A camera that looks at the walls; its rows are a little taller than its columns are wide."""
+    K = np.array([[focal_px, 0, 959.5], [0, focal_px + 1, 539.5], [0, 0, 1]])
+    R, t_m = np.eye(3), np.zeros(3)
+    lens = make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH, dist=dist, fisheye=fisheye)
+    return posed(lens, centre_m, target_m)
+
+
+def longer_lens(view, by):
+    """The camera with a focal length that is longer by the share `by`."""
+    return replace(view, K=view.K * np.array([[1 + by, 1 + by, 1], [1 + by, 1 + by, 1], [1, 1, 1]]))
+
+
+def estimated(view, corners_px, corners_m, stated=SETTINGS, *others, **options):
+    """The pose of the camera, which is not told where it is."""
+    return estimate_pose(
+        corners_px, corners_m, replace(view, T_cam_world=np.eye(4)), stated, *others, **options
+    )
+
+
+def image_corners(view, corners_m, rng=None, noise_px=0.0):
+    pixels = project(view, corners_m)[0]
+    return pixels if rng is None else pixels + noise_px * rng.normal(size=pixels.shape)
+
+
+def pose_error(found, view):
+    """Errors (6,) in the covariance's order: position along the world's axes, and turn about the camera's axes."""
+    R_world_cam = view.T_cam_world[:3, :3].T
+    turn = Rotation.from_matrix(found.R_world_cam.T @ R_world_cam).as_rotvec()
+    return np.concatenate([view.centre_world - found.position_m, turn])
+
+
+def squared_deviations(found, view):
+    off = pose_error(found, view)
+    return off @ np.linalg.solve(found.covariance, off)
+
+
+@pytest.mark.parametrize("coefficients", sorted(LENSES))
+@pytest.mark.parametrize("count", [1, 2, 4, 10])
+def test_exact_corners_give_the_pose_exactly(coefficients, count):
+    view, corners_m = camera_at(dist=LENSES[coefficients]), two_walls(count)
+    found = estimated(view, image_corners(view, corners_m), corners_m, ANY_NUMBER)
+    # The last step converges quadratically, so the remaining error is far below a standard deviation.
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-9)
+    assert found.used.all()
+    assert found.reprojection_px < 1e-6
+    assert found.ambiguity < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("dist", "fisheye"),
+    [((-0.02, 0.01, -0.01, 0.002), True), ((-0.2, 0.05, 0.001, 0.0, 0.0, *7 * [0.001], 0.05, 0.02), False)],
+)
+def test_a_pose_through_wide_lens_models(dist, fisheye):
+    view, corners_m = camera_at(dist=dist, fisheye=fisheye, focal_px=620.0), two_walls(7)
+    found = estimated(view, image_corners(view, corners_m), corners_m, ANY_NUMBER)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-8)
+    assert found.used.all()
+
+
+def test_markers_where_the_lens_shows_nothing_are_not_used():
+    """x (1 - k r²) grows up to 2 / 3 / sqrt(3 k), which is 354 px: another marker is claimed outside of this circle."""
+    view, corners_m = camera_at(dist=(-0.19, 0.0, 0.0, 0.0), focal_px=400.0), two_walls(7)
+    corners_px = image_corners(view, corners_m)
+    corners_px[2] += [900.0, 0.0]
+    found = estimated(view, corners_px, corners_m, ANY_NUMBER)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-6)
+    assert found.used.tolist() == [number != 2 for number in range(7)]
+
+
+def inward(corners_px):
+    """Unit vectors from each corner into its marker."""
+    to_next = np.roll(corners_px, -1, axis=1) - corners_px
+    to_next /= np.linalg.norm(to_next, axis=-1, keepdims=True)
+    into = to_next - np.roll(to_next, 1, axis=1)
+    return into / np.linalg.norm(into, axis=-1, keepdims=True)
+
+
+def own_whitener(std_px):
+    """(8, 8), inverse root of the covariance of a marker's corners, whose mean has 0.48 of independent errors' std."""
+    mean = np.kron(np.full((4, 4), 0.25), np.eye(2))
+    return (np.eye(8) + (1 / 0.48 - 1) * mean) / std_px
+
+
+def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
+    """Unknowns: pose, inset, focal length, markers' offsets; the noise of each marker is another."""
+    rng = np.random.default_rng(0)
+    view, corners_m = camera_at(dist=LENSES[4]), two_walls(6)
+    count, focal_error, std_px = 6, 0.005, np.array([0.1, 0.2, 0.3, 0.2, 0.1, 0.4])
+    placed_m = corners_m + 0.003 * rng.normal(size=(count, 1, 3))
+    pixels = image_corners(longer_lens(view, 0.003), placed_m)
+    corners_px = pixels + 0.5 * std_px[:, None, None] * rng.normal(size=pixels.shape)
+    stated = PoseSettings(focal_error=focal_error, noise=CornerNoise(1.0, 0.0024))
+    map_std_m = np.full(count, 0.0018)
+    found = estimated(view, corners_px, corners_m, stated, std_px=std_px, map_std_m=map_std_m)
+    assert found.used.all()
+
+    def best_for(corners_px, start, factor=1.0):
+        def residuals(x):
+            turned = found.R_world_cam @ Rotation.from_rotvec(x[3:6]).as_matrix()
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = turned.T, -turned.T @ (found.position_m + x[:3])
+            there = longer_lens(replace(view, T_cam_world=T), focal_error * x[7])
+            pixels = project(there, corners_m + x[8:].reshape(count, 1, 3))[0] + x[6] * inward(corners_px)
+            off = (corners_px - pixels).reshape(count, 8)
+            white = np.concatenate([own_whitener(std) @ one for std, one in zip(std_px, off, strict=True)])
+            place = x[8:] / np.hypot(0.0024 * np.sqrt(factor), 0.0018)
+            return np.concatenate([white / np.sqrt(factor), place, [x[6] / INSET_STD_PX, x[7]]])
+
+        return least_squares(residuals, start, "3-point", x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-10)
+
+    result = best_for(corners_px, np.zeros(8 + 3 * count))
+    deviation = np.sqrt(np.diag(found.covariance))
+    scale = np.outer(deviation, deviation)
+    # Derivatives are those at the markers' positions in the map, 3 mm from their fitted positions at 5 m.
+    np.testing.assert_allclose(result.x[:6] / deviation, 0, atol=0.03)
+    # For the covariances, the stated variances weigh as much as 50 residuals of the frame.
+    factor = (50 + 2 * result.cost) / (50 + 8 * count - 6)
+    result = best_for(corners_px, result.x, factor)
+    expected = np.linalg.inv(result.jac.T @ result.jac)[:6, :6]
+    # A shift of all corners by 0.015 px, which no residual shows, adds a little to the turn.
+    np.testing.assert_allclose(found.covariance / scale, expected / scale, atol=0.05)
+    # The constant part is the effect of the markers' places in the map and of the focal length.
+    by_errors = []
+    for off in np.eye(3 * count + 1):
+        there = longer_lens(view, focal_error * off[-1])
+        moved = project(there, corners_m + 0.0018 * off[:-1].reshape(count, 1, 3))[0]
+        by_px = moved - project(view, corners_m)[0]
+        by_errors.append(best_for(corners_px + by_px, result.x, factor).x[:6] - result.x[:6])
+    constant = np.transpose(by_errors) @ np.array(by_errors)
+    np.testing.assert_allclose(found.constant / scale, constant / scale, atol=0.05)
+    assert np.linalg.eigvalsh(found.covariance - found.constant)[0] > 0
+
+
+def random_views(rng, number):
+    """Cameras at random places that look at the walls."""
+    for _ in range(number):
+        centre_m = rng.uniform((-1.5, -3, 0.8), (0.0, -1, 2))
+        yield camera_at(centre_m, rng.uniform((2.5, 3, 1.2), (3.5, 3.5, 2.2)))
+
+
+def test_markers_with_smaller_deviations_count_more():
+    """Found: `std_px`, which detection writes, had no effect on the pose."""
+    rng = np.random.default_rng(15)
+    off_m = {"stated": [], "equal": []}
+    for view in random_views(np.random.default_rng(16), 40):
+        corners_m, std_px = two_walls(8), np.array([0.05] * 4 + [1.0] * 4)
+        pixels = image_corners(view, corners_m)
+        corners_px = pixels + std_px[:, None, None] * rng.normal(size=pixels.shape)
+        for name, stated in (("stated", std_px), ("equal", np.full(8, 0.7))):
+            found = estimated(view, corners_px, corners_m, std_px=stated)
+            off_m[name].append(np.linalg.norm(found.position_m - view.centre_world))
+    assert np.median(off_m["stated"]) < 0.5 * np.median(off_m["equal"])
+
+
+@pytest.mark.parametrize(
+    ("place_m", "stated_m"),
+    # The means of corners with independent errors vary more than those of edges, as places that are off by 0.3 mm.
+    [pytest.param(0.0, 6e-4, id="corners"), pytest.param(0.003, 0.003, id="places")],
+)
+def test_covariances_agree_with_the_errors(place_m, stated_m):
+    rng, squares = np.random.default_rng(2), []
+    for view in random_views(rng, 120):
+        placed_m = two_walls(8) + place_m * rng.normal(size=(8, 1, 3))
+        stated = PoseSettings(noise=CornerNoise(1.0, stated_m))
+        found = estimated(view, image_corners(view, placed_m, rng, 0.2), two_walls(8), stated)
+        squares.append(squared_deviations(found, view))
+    # A limit of three standard deviations of a share of 120.
+    assert np.mean(squares < chi2.ppf(0.9, 6)) > 0.85 - 3 * np.sqrt(0.85 * 0.15 / 120)
+    # The covariance must not be too wide either: deviations are at most one and a half times too large.
+    assert np.median(squares) > chi2.median(6) / 1.5**2
+
+
+@pytest.mark.parametrize(
+    ("map_error_m", "focal_error"), [(0.002, 0.0), (0.0, 0.005), (0.002, 0.005)], ids=["map", "focal", "both"]
+)
+def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
+    """Six markers with noise of 0.1 px; each pose has another map and another lens."""
+    rng, corners_m = np.random.default_rng(12), two_walls(6)
+    with_errors = PoseSettings(map_error_m=map_error_m, focal_error=focal_error)
+    limit, inside, off_m = chi2.ppf(0.9, 3), {with_errors: [], SETTINGS: []}, {with_errors: [], SETTINGS: []}
+    for view in random_views(np.random.default_rng(13), 80):
+        placed_m = corners_m + map_error_m * rng.normal(size=(6, 1, 3))
+        corners_px = image_corners(longer_lens(view, focal_error * rng.normal()), placed_m, rng, 0.1)
+        for stated in (with_errors, SETTINGS):
+            found = estimated(view, corners_px, corners_m, stated)
+            miss_m = view.centre_world - found.position_m
+            inside[stated].append(miss_m @ np.linalg.solve(found.covariance[:3, :3], miss_m) < limit)
+            off_m[stated].append(np.linalg.norm(miss_m))
+            assert np.linalg.eigvalsh(found.covariance - found.constant)[0] > 0
+    # A limit of three standard deviations of a share of 80.
+    assert np.mean(inside[with_errors]) > 0.9 - 3 * np.sqrt(0.09 / 80)
+    assert np.mean(inside[SETTINGS]) < np.mean(inside[with_errors]) - 0.05
+    # Markers on two walls determine the focal length; one pose cannot separate the errors of the map.
+    assert np.median(off_m[with_errors]) < (0.8 if focal_error else 1.05) * np.median(off_m[SETTINGS])
+
+
+def test_inset_of_all_corners_does_not_move_the_camera():
+    view, corners_m = camera_at(), two_walls(8)
+    corners_px = image_corners(view, corners_m)
+    found = estimated(view, corners_px + 0.5 * inward(corners_px), corners_m)
+    assert squared_deviations(found, view) < 0.01
+    assert found.reprojection_px == pytest.approx(0.5, rel=0.01)
+
+
+@given(
+    axis=st.tuples(*[st.floats(-3, 3)] * 3),
+    shift_m=st.tuples(*[st.floats(-50, 50)] * 3),
+    seed=st.integers(0, 2**31),
+)
+@settings(max_examples=15)
+def test_pose_follows_a_transformed_world_and_reordered_markers(axis, shift_m, seed):
+    rng = np.random.default_rng(seed)
+    view, corners_m = camera_at(), two_walls(9)
+    corners_px = image_corners(view, corners_m, rng, 0.2)
+    corners_px[4] += 40.0
+    order = rng.permutation(9)
+    R = Rotation.from_rotvec(axis).as_matrix()
+    one = estimated(view, corners_px, corners_m)
+    other = estimated(view, corners_px[order], corners_m[order] @ R.T + shift_m)
+    np.testing.assert_array_equal(other.used, one.used[order])
+    # Both fits end within a tenth of a deviation of the same minimum; deviations are about 1 mm and 0.2 mrad.
+    np.testing.assert_allclose(R.T @ (other.position_m - shift_m), one.position_m, atol=1e-4)
+    np.testing.assert_allclose(R.T @ other.R_world_cam, one.R_world_cam, atol=2e-5)
+    turned = np.kron(np.eye(2), R)
+    turned[3:, 3:] = np.eye(3)
+    back = turned.T @ other.covariance @ turned
+    np.testing.assert_allclose(back, one.covariance, rtol=0.02, atol=0.02 * np.abs(one.covariance).max())
+
+
+# Wrong markers.
+
+
+@pytest.mark.parametrize("wrong", [1, 4])
+def test_markers_with_the_id_of_another_are_left_out(wrong):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        view, corners_m = camera_at(), two_walls(10)
+        corners_px = image_corners(view, corners_m, rng, 0.2)
+        swapped = rng.permutation(10)[:wrong]
+        mapped_m = corners_m.copy()
+        for index in swapped:
+            mapped_m[index] = corners_m[rng.choice([i for i in range(10) if i != index])]
+        found = estimated(view, corners_px, mapped_m)
+        np.testing.assert_array_equal(np.flatnonzero(~found.used), np.sort(swapped))
+        assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
+
+
+def test_one_bad_corner_excludes_the_corner_and_two_exclude_the_marker():
+    rng = np.random.default_rng(3)
+    view, corners_m = camera_at(), two_walls(8)
+    clean_px = image_corners(view, corners_m, rng, 0.2)
+    one_px, two_px = clean_px.copy(), clean_px.copy()
+    one_px[2, 1] += (4.0, -3.0)
+    two_px[2, 1:3] += (4.0, -3.0)
+    clean, one, two = (estimated(view, pixels, corners_m) for pixels in (clean_px, one_px, two_px))
+    without = estimated(view, np.delete(clean_px, 2, axis=0), np.delete(corners_m, 2, axis=0))
+    assert clean.used.all()
+    assert one.used.all()
+    np.testing.assert_array_equal(two.used, np.arange(8) != 2)
+    # Excluded corners have no effect: the pose equals that of the other markers to a tenth of a deviation.
+    np.testing.assert_allclose(two.position_m, without.position_m, atol=1e-4)
+    assert one.reprojection_px < 1.0
+    # 31 corners have almost the information of 32 corners.
+    assert np.trace(one.covariance[:3, :3]) == pytest.approx(np.trace(clean.covariance[:3, :3]), rel=0.5)
+
+
+def test_good_markers_are_excluded_as_seldom_as_stated():
+    rng, excluded = np.random.default_rng(4), 0
+    for view in random_views(rng, 60):
+        corners_m = two_walls(10)
+        excluded += (~estimated(view, image_corners(view, corners_m, rng, 0.3), corners_m).used).sum()
+    # A marker is excluded by the mean of its corners, or by two of its corners, which is much rarer.
+    assert excluded <= binom.ppf(0.9999, 600, 2 * FALSE_ALARM)
+
+
+def test_a_marker_that_the_map_places_behind_the_camera_is_left_out():
+    view, corners_m = camera_at(), two_walls(6)
+    corners_px = image_corners(view, corners_m)
+    mapped_m = corners_m.copy()
+    mapped_m[3] = marker_at((0.0, -4.0, 1.5), (0, 1, 0))
+    found = estimated(view, corners_px, mapped_m)
+    np.testing.assert_array_equal(found.used, np.arange(6) != 3)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-9)
+
+
+def test_too_few_markers_and_markers_that_determine_nothing_give_no_pose():
+    view, corners_m = camera_at(), two_walls(4)
+    corners_px = image_corners(view, corners_m)
+    assert estimated(view, np.zeros((0, 4, 2)), np.zeros((0, 4, 3)), ANY_NUMBER) is None
+    assert estimated(view, corners_px[:3], corners_m[:3]) is None
+    assert estimated(view, corners_px, corners_m) is not None
+    # All corners lie on one line, or in one point, in the image and in the map.
+    line_m = np.array([[[x + 0.1 * i, 4.0, 1.5] for i in range(4)] for x in range(5)])
+    for places_m in (line_m, np.tile([1.0, 4.0, 1.5], (5, 4, 1))):
+        assert estimated(view, image_corners(view, places_m), places_m) is None
+
+
+def test_markers_that_all_contradict_one_another_give_no_pose():
+    rng = np.random.default_rng(9)
+    view, corners_m = camera_at(), two_walls(10)
+    square = 30 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    for seed in range(5):
+        shuffled = np.roll(np.random.default_rng(seed).permutation(10), 1)
+        corners_px = rng.uniform((200, 200), (1700, 900), (10, 1, 2)) + square
+        assert estimated(view, corners_px, corners_m[shuffled]) is None
+
+
+# Second poses.
+
+
+def far_marker(rng, angle_deg=20.0, distance_m=7.0):
+    """A camera, a single small marker that is slightly turned from it, and the marker's corners in the image."""
+    angle = np.deg2rad(angle_deg)
+    view = camera_at((0.0, 0.0, 1.0), (0.0, distance_m, 1.0))
+    one = marker_at((0.0, distance_m, 1.0), (np.sin(angle), -np.cos(angle), 0))[None]
+    return view, one, image_corners(view, one, rng, 0.3)
+
+
+def is_mirrored(found, view):
+    """Whether the pose is the one in which the single marker is turned to the other side."""
+    return np.rad2deg(np.linalg.norm(pose_error(found, view)[3:])) > 20
+
+
+def test_the_ambiguity_of_a_single_marker_is_the_probability_of_the_other_pose():
+    rng = np.random.default_rng(5)
+    stated, wrong = [], []
+    for _ in range(120):
+        view, corners_m, corners_px = far_marker(rng)
+        found = estimated(view, corners_px, corners_m, ANY_NUMBER, std_px=np.array([0.3]))
+        stated.append(found.ambiguity)
+        wrong.append(is_mirrored(found, view))
+    assert 0.1 < np.mean(stated) < 0.5
+    # Three standard deviations of the count, plus a fifth for approximations.
+    limit = 3 * np.sqrt(np.mean(stated) / 120) + 0.2 * np.mean(stated)
+    assert abs(np.mean(wrong) - np.mean(stated)) < limit
+
+
+def test_expected_pose_decides_between_the_poses_of_a_single_marker_only():
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        view, corners_m, corners_px = far_marker(rng)
+        R, near_m = view.T_cam_world[:3, :3].T, view.centre_world + np.array([0.2, -0.1, 0.1])
+        expected = CameraPose(near_m, R, np.diag([0.1] * 3 + [0.01] * 3))
+        found = estimated(view, corners_px, corners_m, ANY_NUMBER, expected)
+        assert not is_mirrored(found, view)
+        assert found.ambiguity < 0.05
+    # Six markers outweigh a wrong expected pose.
+    view, corners_m = camera_at(), two_walls(6)
+    elsewhere = CameraPose(view.centre_world + 30.0, np.eye(3), 1e-6 * np.eye(6))
+    found = estimated(view, image_corners(view, corners_m), corners_m, SETTINGS, elsewhere)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-9)
+
+
+def test_markers_of_one_wall_are_ambiguous_from_far_away_only():
+    rng = np.random.default_rng(7)
+    corners_m = np.array([marker_at((x - 1, 4.0, z + 1), (0, -1, 0)) for x in range(3) for z in range(3)])
+    near = camera_at((1.5, -0.5, 1.5), (0.0, 4.0, 2.0))
+    assert estimated(near, image_corners(near, corners_m, rng, 0.3), corners_m).ambiguity < 1e-9
+    far = camera_at((12.0, -60.0, 1.5), (0.0, 4.0, 2.0))
+    ambiguities = [
+        estimated(far, image_corners(far, corners_m, rng, 0.5), corners_m).ambiguity for _ in range(20)
+    ]
+    assert max(ambiguities) > 0.05
+
+
+def test_two_markers_that_contradict_each_other_are_ambiguous_without_an_expected_pose():
+    rng = np.random.default_rng(8)
+    view, all_m = camera_at(), two_walls(10)
+    corners_px = image_corners(view, all_m[:2], rng, 0.2)
+    mapped_m = all_m[[0, 8]]
+    found = estimated(view, corners_px, mapped_m, ANY_NUMBER)
+    assert found is None or (found.used.sum() == 1 and found.ambiguity > 0.01)
+    R = view.T_cam_world[:3, :3].T
+    expected = CameraPose(view.centre_world + 0.05, R, np.diag([0.01] * 3 + [0.003] * 3))
+    found = estimated(view, corners_px, mapped_m, ANY_NUMBER, expected)
+    np.testing.assert_array_equal(found.used, [True, False])
+    assert found.ambiguity < 0.01
+    assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
+
+
+# Errors of corners, which are learned from a recording.
+
+#: Points along an edge, in units of half the edge, at which the edge is measured.
+ALONG = np.linspace(-0.7, 0.7, 16)
+#: Ten markers on a wall and on a pillar in front of it, by id.
+WALL = {
+    i: marker_at(
+        (-1.475 + 0.8 * (i // 2), 2.6 if i % 3 == 0 else 3.0, 1.025 + 0.7 * (i % 2)), (0, -1, 0), side_m=0.25
+    )
+    for i in range(10)
+}
+
+
+def independent(std_px=0.15):
+    return lambda rng, corners_px: std_px * rng.normal(size=corners_px.shape)
+
+
+def by_edges(rng, corners_px):
+    """Errors of the intersections of lines that are fitted to points with independent errors."""
+    next_px = np.roll(corners_px, -1, axis=1)
+    along = (next_px - corners_px) / np.linalg.norm(next_px - corners_px, axis=-1, keepdims=True)
+    across = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    off_px = 0.2 * rng.normal(size=(*corners_px.shape[:2], len(ALONG)))
+    shift = off_px.mean(axis=-1)
+    slope = (off_px * ALONG).sum(axis=-1) / (ALONG**2).sum()
+    # Each corner is where the end of one edge meets the start of the next.
+    ends, starts = (shift + slope)[..., None], (shift - slope)[..., None]
+    moved = np.zeros_like(corners_px)
+    for corner in range(4):
+        before = (corner - 1) % 4
+        normals = np.stack([across[:, before], across[:, corner]], axis=1)
+        offs = np.concatenate([ends[:, before], starts[:, corner]], axis=1)
+        moved[:, corner] = np.linalg.solve(normals, offs[..., None])[..., 0]
+    return moved
+
+
+def together(rng, corners_px):
+    """Small independent errors, and larger ones that all corners of a marker share, as of a lens that is not exact."""
+    return 0.1 * rng.normal(size=corners_px.shape) + 0.3 * rng.normal(size=(len(corners_px), 1, 2))
+
+
+def as_drawn(rng, corners_px):
+    """Errors as in drawn videos: by edges, 0.08 px, and a shift of 0.015 px that all corners of a frame share."""
+    return 0.6 * by_edges(rng, corners_px) + 0.015 * rng.normal(size=(1, 1, 2))
+
+
+def shaken(rng, corners_px):
+    return 0.1 * rng.normal(size=corners_px.shape) + 0.2 * rng.normal(size=(1, 1, 2))
+
+
+def fit_of_covariances(errors, markers=10, noise=None):
+    """For poses (6) and positions (3): mean squared error by the covariances, as a share of its expectation, and the
+    share of the truths in the 90 % ellipsoid; in 60 frames."""
+    rng, frames, truths = np.random.default_rng(0), [], []
+    points_m = np.array(list(WALL.values()))[:markers]
+    for number in range(60):
+        centre_m = np.array([0.0, -0.6, 1.4]) + rng.uniform(-0.5, 0.5, 3)
+        view = posed(LENS, centre_m, np.array([0.0, 3.0, 1.35]) + rng.uniform(-0.1, 0.1, 3))
+        pixels = project(view, points_m)[0]
+        found = found_markers(range(markers), pixels + errors(rng, pixels))
+        frames.append((number, number / 30, found))
+        truths.append(view.T_cam_world)
+    stated = LocaliseSettings(pose=PoseSettings(noise=noise), filter=None, shutter=RollingShutter(0.0))
+    path = localise_frames(frames, MarkerMap(WALL), LENS, stated).path
+    R = np.array(truths)[:, :3, :3].mT
+    centres_m = -np.einsum("nij,nj->ni", R, np.array(truths)[:, :3, 3])
+    turns = Rotation.from_quat(path.orientation_wxyz, scalar_first=True).inv() * Rotation.from_matrix(R)
+    off = np.concatenate([centres_m - path.position_m, turns.as_rotvec()], axis=1)
+    fits = []
+    for size in (6, 3):
+        inverse = np.linalg.inv(path.covariance[:, :size, :size])
+        squares = np.einsum("ni,nij,nj->n", off[:, :size], inverse, off[:, :size])
+        fits.append((np.mean(squares) / size, np.mean(squares < chi2.ppf(0.9, size))))
+    return fits
+
+
+@pytest.mark.parametrize(
+    ("errors", "markers"),
+    [
+        (by_edges, 10),
+        (independent(), 10),
+        (together, 10),
+        (as_drawn, 10),
+        (independent(0.05), 4),
+        (independent(0.5), 4),
+    ],
+    ids=[
+        "by edges",
+        "independent",
+        "of whole markers",
+        "as drawn",
+        "small, of four markers",
+        "large, of four",
+    ],
+)
+def test_covariances_fit_the_errors_of_a_recording(errors, markers):
+    """Two variances fit all of them; the residuals of four markers alone say little."""
+    for found, inside in fit_of_covariances(errors, markers):
+        # Measured 0.7 to 1.1, and 0.85 to 0.95; with 60 frames, 0.13 and 0.04 are one standard deviation.
+        assert 0.5 < found < 1.4
+        assert inside >= 0.78
+
+
+def test_a_shift_of_all_corners_of_a_frame_may_be_stated():
+    """Found: 0.015 px, as in drawn videos, whatever the camera."""
+    assert fit_of_covariances(shaken)[0][1] < 0.5
+    found, inside = fit_of_covariances(shaken, noise=CornerNoise(0.5, 3e-4, shift_px=0.2))[0]
+    assert 0.5 < found < 1.3
+    assert inside >= 0.8

@@ -1,0 +1,171 @@
+"""Rooms with markers, the cameras that look at them, what these detect, and the files of a drawn flight."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from marker_pictures import draw
+from scipy.spatial.transform import Rotation
+
+from psotrack.calibration import lens_of_view
+from psotrack.foreground.markers import DetectedMarkers
+from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.datasets import write_marker_corners
+
+#: Corners of a square of side 1, clockwise from the top left one, as seen from its front; z points out of the front.
+SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+RATE_HZ = 25.0
+
+
+def simple_lens(focal_px, size_wh, dist=()):
+    """A camera at the origin, whose axis meets the middle of the image."""
+    width, height = size_wh
+    K = np.array([[focal_px, 0, width / 2 - 0.5], [0, focal_px, height / 2 - 0.5], [0, 0, 1]])
+    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh, dist=dist)
+
+
+#: A camera with a little distortion.
+LENS = simple_lens(900.0, (1280, 720), (-0.08, 0.02, 0.0004, -0.0003))
+
+
+def posed(lens, centre_m, target_m):
+    """The camera at a place, looking at a point."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = look_at(tuple(centre_m), tuple(target_m))
+    return replace(lens, T_cam_world=T)
+
+
+def marker_at(centre_m, front, turn_deg=0.0, *, side_m=0.3):
+    """Corners (4, 3) of a marker whose front looks along `front`, turned in its plane, metres."""
+    front = np.array(front, float) / np.linalg.norm(front)
+    beside = np.cross([0, 0, 1.0] if abs(front[2]) < 0.9 else [0, 1.0, 0], front)
+    beside /= np.linalg.norm(beside)
+    axes = np.stack([beside, np.cross(front, beside), front])
+    spin = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+    return np.array(centre_m, float) + side_m * SQUARE @ spin.T @ axes
+
+
+def four_walls():
+    """Four markers of 0.4 m on each wall of a room of 8 x 6 m, at changing heights; ids from 1."""
+    walls = [((0, 3), (0, -1, 0)), ((4, 0), (-1, 0, 0)), ((0, -3), (0, 1, 0)), ((-4, 0), (1, 0, 0))]
+    corners = {}
+    for (x, y), inward in walls:
+        for index, along in enumerate((-2.1, -0.7, 0.8, 2.2)):
+            centre_m = (x + along * abs(inward[1]), y + along * abs(inward[0]), 1.2 + 0.5 * (index % 3))
+            corners[len(corners) + 1] = marker_at(centre_m, inward, side_m=0.4)
+    return corners
+
+
+def any_room():
+    """Markers on walls, on a pillar in front of a wall, on the floor and on the ceiling, turned any way."""
+    corners = {i: marker_at((-3 + 1.2 * i, 4, 1 + 0.5 * (i % 3)), (0, -1, 0), 37 * i) for i in range(6)}
+    for i in range(5):
+        corners[10 + i] = marker_at((4, -2 + 1.3 * i, 1.2 + 0.4 * (i % 2)), (-1, 0, 0), 90 * i)
+    corners |= {20: marker_at((0.2, 3.2, 1.3), (0, -1, 0)), 21: marker_at((0.5, 3.5, 1.4), (1, 0, 0), 10)}
+    corners |= {22: marker_at((-0.1, 3.5, 1.9), (-1, 0, 0)), 23: marker_at((0.2, 3.8, 1.6), (0, 1, 0), 45)}
+    corners |= {30: marker_at((1.5, 2.5, 0), (0, 0, 1), 20), 31: marker_at((-1.5, 2, 0), (0, 0, 1), 200)}
+    corners |= {40: marker_at((1, 2.5, 3), (0, 0, -1), 70), 41: marker_at((-1, 3, 3), (0, 0, -1))}
+    return corners
+
+
+def found_markers(ids, corners_px, std_px=np.nan):
+    """Detected markers, (markers, 4, 2), pixels."""
+    corners_px = np.array(corners_px, float).reshape(-1, 4, 2)
+    return DetectedMarkers(np.array(ids, int), corners_px, np.full(len(corners_px), std_px))
+
+
+def whole_markers(corners_m, camera, pixels, depth_m):
+    """(markers,), markers whose front and whole border a camera shows at (markers, 4, 2) pixels."""
+    front = np.cross(corners_m[:, 3] - corners_m[:, 1], corners_m[:, 2] - corners_m[:, 0])
+    faces = ((camera.centre_world - corners_m.mean(axis=1)) * front).sum(axis=-1) > 0.01
+    inside = ((pixels > 0) & (pixels < camera.image_size_wh - 1)).all(axis=(1, 2))
+    # The polynomial of the distortion folds back far outside of the image.
+    beside = np.abs((corners_m @ camera.T_cam_world[:3, :3].T + camera.T_cam_world[:3, 3])[..., :2])
+    narrow = (beside < 1.2 * depth_m[..., None]).all(axis=(1, 2))
+    return faces & inside & narrow & (depth_m > 0.3).all(axis=1)
+
+
+def seen_markers(corners_m, camera, rng, noise_px, std_px=np.nan):
+    """The markers that a camera detects, with errors of their corners."""
+    ids, points_m = np.array(list(corners_m)), np.array(list(corners_m.values()))
+    pixels, depth_m = project(camera, points_m)
+    seen = whole_markers(points_m, camera, pixels, depth_m)
+    return found_markers(ids[seen], pixels[seen] + noise_px * rng.standard_normal(pixels[seen].shape), std_px)
+
+
+#: A camera that flies past the markers of `any_room`.
+PASSING_CAMERA = simple_lens(700.0, (1280, 960))
+
+
+def fly_past(num_frames, noise_px=0.3):
+    """Number, time and detected markers of the frames of a camera that flies past `any_room`, and its positions."""
+    rng, frames, centres_m = np.random.default_rng(0), [], []
+    for number in range(num_frames):
+        share = number / num_frames
+        centre_m = np.array([-1.5 + 3 * share, -1.5 + 0.5 * share, 1.2 + 0.4 * np.sin(5 * share)])
+        ahead = np.array([np.sin(0.5 * share), np.cos(0.5 * share), 0.05])
+        view = posed(PASSING_CAMERA, centre_m, centre_m + ahead)
+        found = seen_markers(any_room(), view, rng, noise_px, std_px=noise_px)
+        frames.append((number, number / RATE_HZ, found))
+        centres_m.append(centre_m)
+    return frames, np.array(centres_m)
+
+
+# A drawn flight before two walls, as files that a user would have.
+
+DRAWN_LENS = lens_of_view(70.0, 55.4, (640, 480))
+NUM_FRAMES = 14
+#: Number of the frame with only three markers, and of the frame without markers.
+FEW_MARKERS_FRAME, NO_MARKERS_FRAME = 6, 8
+#: Markers of the frame with few, and a marker that is on no map.
+FEW, UNMAPPED = (5, 8, 17), 900
+
+
+def wall_markers():
+    """Nine markers on a wall at y = 4, and four on a wall at x = 3; ids with gaps."""
+    corners = {
+        5 + 3 * i: marker_at((-1.45 + 1.3 * (i % 3), 4, 0.85 + 0.75 * (i // 3)), (0, -1, 0)) for i in range(9)
+    }
+    for i in range(4):
+        corners[40 + i] = marker_at((3, 2.35 + 0.8 * (i % 2), 1.05 + 0.9 * (i // 2)), (-1, 0, 0))
+    return corners
+
+
+def drawn_cameras():
+    """The camera in each frame, which flies to the right, forward and up."""
+    return [
+        posed(DRAWN_LENS, (-0.9 + 0.12 * i, -0.3 + 0.04 * i, 1.2 + 0.04 * i), (0.5 + 0.03 * i, 4.0, 1.5))
+        for i in range(NUM_FRAMES)
+    ]
+
+
+def draw_markers(corners_m, camera):
+    """Colour image of the markers that a camera shows whole."""
+    size_wh = tuple(int(side) for side in camera.image_size_wh)
+    points_m = np.array(list(corners_m.values())).reshape(-1, 4, 3)
+    pixels, depth_m = project(camera, points_m)
+    seen = whole_markers(points_m, camera, pixels, depth_m)
+    shown = [(marker, at) for marker, at, there in zip(corners_m, pixels, seen, strict=True) if there]
+    return cv2.cvtColor(draw(shown, size_wh=size_wh, fine=4), cv2.COLOR_GRAY2BGR)
+
+
+def make_drawn_flight(folder: Path) -> Path:
+    """Write `flight.avi`, its `images`, the lens, `lens.toml`, and the markers' corners, `corners.csv`."""
+    write_marker_corners(folder / "corners.csv", wall_markers())
+    write_rig(folder / "lens.toml", make_rig({"front": DRAWN_LENS}))
+    (folder / "images").mkdir()
+    with VideoWriter(folder / "flight.avi", RATE_HZ, (640, 480)) as writer:
+        for number, camera in enumerate(drawn_cameras()):
+            shown = wall_markers() | {UNMAPPED: marker_at((0.15, 3.9, 0.45), (0, -1, 0))}
+            if number == FEW_MARKERS_FRAME:
+                shown = {marker: shown[marker] for marker in (*FEW, UNMAPPED)}
+            image = draw_markers({} if number == NO_MARKERS_FRAME else shown, camera)
+            # File names without leading zeros: 10 must come after 9.
+            cv2.imwrite(str(folder / "images" / f"frame{number}.png"), image)
+            writer.write(image)
+    return folder
