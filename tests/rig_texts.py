@@ -13,6 +13,82 @@ K = np.array([[900.0, 0.0, 650.5], [0.0, 905.0, 350.25], [0.0, 0.0, 1.0]])
 SIZE_WH = (1280, 720)
 RADTAN = (-0.12, 0.03, 0.0008, -0.0005)
 
+#: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
+ANIPOSE = """[cam_0]
+name = "A"
+size = [ 1280, 720,]
+matrix = [ [ 822.4, 0.0, 639.5,], [ 0.0, 822.4, 359.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.06, 0.0, 0.0, 0.0, 0.0,]
+rotation = [ 0.5, 0.25, -0.125,]
+translation = [ -94.5, 8.25, 500.0,]
+
+[cam_1]
+name = "B"
+size = [ 1280, 720,]
+matrix = [ [ 851.9, 0.0, 639.5,], [ 0.0, 851.9, 359.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.1, 0.0, 0.0, 0.0, 0.0,]
+rotation = [ 0.0, -0.5, 0.0,]
+translation = [ 318.0, 10.0, 400.0,]
+
+[metadata]
+adjusted = false
+error = 0.26
+"""
+
+#: File as caliscope writes it: numbers as names, and ignored cameras. Older files have rotation matrices, as camera 0.
+CALISCOPE = """[cameras.0]
+cam_id = 0
+size = [1280, 720]
+rotation_count = 0
+error = 0.541
+matrix = [[903.5, 0.0, 618.25], [0.0, 907.75, 394.5], [0.0, 0.0, 1.0]]
+distortions = [-0.33, 0.046, -0.0043, 0.0041, 0.066]
+translation = [0.125, -0.25, 0.5]
+rotation = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
+exposure = -8
+fisheye = false
+
+[cameras.1]
+port = 1
+ignore = true
+size = [640, 480]
+
+[cameras.2]
+port = 2
+size = [640, 480]
+error = "null"
+matrix = [[650.0, 0.0, 320.0], [0.0, 654.0, 240.0], [0.0, 0.0, 1.0]]
+distortions = [0.18, -0.25, 0.003, 0.002, 0.12]
+translation = "null"
+rotation = "null"
+"""
+
+#: File as a user writes it by hand.
+RIG_TOML = """[cameras.left]
+size = [1920, 1080]
+K = [[1160.2, 0, 961.0], [0, 1160.9, 541.2], [0, 0, 1]]
+distortion = [-0.28, 0.09, 0, 0, 0.01]
+rvec = [1.2, -0.4, 0.3]
+tvec = [0.1, 0.2, 5.0]
+"""
+
+#: File as OpenCV's sample program for calibration writes it.
+SAMPLE = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 6.5e+02, 0., 320., 0., 6.5e+02, 240., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 0.25, -0.5, 0., 0., 0.125 ]
+"""
+
 
 def poses():
     """Rotation and translation of each camera, world to camera, metres."""

@@ -149,11 +149,6 @@ def test_an_undetermined_unknown_has_no_covariance_and_is_not_moved():
     np.testing.assert_allclose(step.shared, [0.5, 0.0], rtol=1e-8)
 
 
-def test_equations_without_blocks_cannot_be_reduced():
-    with pytest.raises(TypeError, match="expected equations with blocks, found none"):
-        NormalEquations(np.eye(2), np.zeros(2)).reduced()
-
-
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_the_backward_step_conditions_on_the_next_frame(xp):
     """The smoothed first of two frames is the Gaussian conditioned on a measurement of the second frame.

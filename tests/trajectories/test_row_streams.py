@@ -130,13 +130,6 @@ def test_an_older_file_stays_until_the_first_row(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_session_without_rows_leaves_no_older_rows(tmp_path: Path) -> None:
-    (tmp_path / "rows.csv").write_text("older")
-    with RowStream(tmp_path / "rows.csv", force=True):
-        pass
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_killed_process_leaves_all_its_rows(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     done = _write_in_a_process(path, "", "if index == 99: os.kill(os.getpid(), signal.SIGKILL)")

@@ -2,13 +2,10 @@
 
 from dataclasses import fields, replace
 
-import jaxtyping
 import numpy as np
 import pandas as pd
-import pytest
 from scipy.spatial.transform import Rotation
 
-from psotrack.errors import InputError
 from psotrack.trajectories import Status, Trajectories, resample, write_trajectories
 
 FRAMES, DRONES = 5, 3
@@ -39,10 +36,6 @@ def random_covariances(rng):
     return root @ np.swapaxes(root, -1, -2)
 
 
-def test_counts():
-    assert (make_trajectories().num_frames, make_trajectories().num_drones) == (FRAMES, DRONES)
-
-
 def test_seen_needs_a_complete_position_that_is_not_lost():
     position_m = np.zeros((FRAMES, DRONES, 3))
     position_m[1, 0, 2] = np.nan
@@ -51,10 +44,6 @@ def test_seen_needs_a_complete_position_that_is_not_lost():
     unseen = np.argwhere(~make_trajectories(position_m=position_m, status=status).seen)
     assert unseen.tolist() == [[1, 0], [2, 1]]
     assert np.argwhere(~make_trajectories(position_m=position_m).seen).tolist() == [[1, 0]]
-
-
-def test_status_words():
-    assert [status.label for status in Status] == ["tracked", "coasting", "lost"]
 
 
 def test_at_frames_selects_the_same_rows_of_every_array():
@@ -68,33 +57,6 @@ def test_at_frames_selects_the_same_rows_of_every_array():
         np.testing.assert_array_equal(getattr(picked, name), getattr(full, name)[[1, 4]])
 
 
-def test_at_frames_keeps_none_for_unknown_quantities():
-    assert make_trajectories().at_frames(np.array([10])).velocity_m_s is None
-
-
-@pytest.mark.parametrize("wanted", [[11], [10, 20], [8]], ids=["between", "after", "before"])
-def test_at_frames_refuses_missing_frames(wanted):
-    with pytest.raises(InputError, match=f"expected frames {wanted[0]} to {wanted[-1]}"):
-        make_trajectories().at_frames(np.array(wanted))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"frame": np.array([0, 1, 1, 2, 3])}, "increasing frame numbers"),
-        ({"frame": np.array([0, 2, 1, 3, 4])}, "increasing frame numbers"),
-        ({"drones": ("a", "b", "a")}, "different names"),
-        (
-            {"covariance_m2": np.broadcast_to(np.eye(3) + np.eye(3, k=1), (FRAMES, DRONES, 3, 3))},
-            r"trajectories\.covariance_m2: expected symmetric matrices.*row 0 of drone 0",
-        ),
-    ],
-)
-def test_invalid_arrays_are_refused(changes, message):
-    with pytest.raises(InputError, match=message):
-        make_trajectories(**changes)
-
-
 def test_a_known_covariance_must_be_symmetric_within_rounding():
     """Matrices with NaN are not checked."""
     rng = np.random.default_rng(1)
@@ -105,12 +67,6 @@ def test_a_known_covariance_must_be_symmetric_within_rounding():
     rounded[2, 0, 0, 1] = np.nan
     kept = make_trajectories(covariance_m2=rounded).covariance_m2
     np.testing.assert_array_equal(kept, rounded)
-
-
-def test_a_covariance_of_wrong_shape_is_refused():
-    # With the tests' import hook the annotations are checked before the shapes; both messages name the field.
-    with pytest.raises((InputError, jaxtyping.TypeCheckError), match="covariance_m2"):
-        make_trajectories(covariance_m2=np.zeros((FRAMES, DRONES + 1, 3, 3)))
 
 
 def test_a_data_frame_has_the_columns_and_rows_of_a_file(tmp_path):
