@@ -10,11 +10,9 @@ from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from psotrack import cli
-from psotrack.errors import SettingsError
 from psotrack.evaluation import evaluate
 from psotrack.geometry import project, reconstruct
-from psotrack.settings import ErrorSettings, MotionSettings, TrackSettings
+from psotrack.settings import ErrorSettings, MotionSettings
 from psotrack.tracking.camera_errors import (
     Autocorrelation,
     CameraErrors,
@@ -31,7 +29,7 @@ from psotrack.tracking.camera_errors import (
     views_of_places,
 )
 from psotrack.tracking.motion import Measurements, MotionParams, filter_measurements
-from psotrack.trajectories import Trajectories, read_trajectories, write_trajectories
+from psotrack.trajectories import Trajectories
 
 FPS = 25.0
 USUAL = (0.7, 0.4)
@@ -82,6 +80,25 @@ def fitted_views(rig, stated, position_m, velocity_m_s, error_px):
     return replace(views, residual_px=residual_px), moved_m
 
 
+def views_at(rig, position_m, velocity_m_s, place_px=np.nan):
+    """Views of drones at positions, all of which count alike; no camera shows them unless their places are given."""
+    shape = (*position_m.shape[:2], len(rig), 2)
+    return views_of_places(
+        rig.cameras, np.broadcast_to(place_px, shape), np.ones(shape), position_m, velocity_m_s
+    )
+
+
+def rows_of(views):
+    """The places of all frames and drones as rows, and the derivatives of the views: turns, clocks."""
+    cameras = views.shown.shape[-1]
+    places = FittedPlaces(
+        views.residual_px.reshape(-1, cameras, 2),
+        views.jacobian.reshape(-1, cameras, 2, 3),
+        views.shown.reshape(-1, cameras),
+    )
+    return places, views.turn_px.reshape(-1, cameras, 2, 3), views.flow_px_s.reshape(-1, cameras, 2)
+
+
 def only_noise(noise_px, fading):
     """Errors of cameras that have no systematic errors; `fading` is the noise's fraction that fades, and its time."""
     unknowns = 4 * len(noise_px)
@@ -105,22 +122,22 @@ class TestViews:
             for axis in range(2):
                 step_px = np.zeros((4, 2))
                 step_px[camera, axis] = 0.5
-                fits = [
-                    reconstruct(
-                        rig.cameras, pixels + sign * step_px, noise_px=noise_px, robust=False
-                    ).position_m
-                    for sign in (1, -1)
-                ]
-                expected = fits[0][0] - fits[1][0]
-                np.testing.assert_allclose(views.gain[0, 0, camera, :, axis], expected, atol=1e-4)
+                after, before = (
+                    reconstruct(rig.cameras, moved_px, noise_px=noise_px, robust=False).position_m[0]
+                    for moved_px in (pixels + step_px, pixels - step_px)
+                )
+                np.testing.assert_allclose(views.gain[0, 0, camera, :, axis], after - before, atol=1e-4)
+        # One camera alone has no gain.
+        alone = views_at(ring_rig(1), position_m[None], np.zeros((1, 1, 3)), 0.0)
+        assert (alone.gain == 0).all()
+        # Learning asks block by block: 100,000 frames took half an hour, because each block computed all frames.
+        assert alone.shown is alone.shown
 
     @pytest.mark.parametrize("coefficients", [0, 5])
     def test_turns_are_derivatives_of_the_projection(self, coefficients):
         rig = ring_rig(3, coefficients=coefficients)
         position_m = np.array([[[0.4, 0.3, 0.9]]])
-        views = views_of_places(
-            rig.cameras, np.full((1, 1, 3, 2), np.nan), np.ones((1, 1, 3, 2)), position_m, np.zeros((1, 1, 3))
-        )
+        views = views_at(rig, position_m, np.zeros((1, 1, 3)))
         for axis in range(3):
             angle = np.zeros(3)
             angle[axis] = 1e-6
@@ -132,21 +149,6 @@ class TestViews:
                 views.turn_px[..., axis], (after - before) / 1e-6, rtol=1e-3, atol=1e-2
             )
 
-    def test_one_camera_alone_has_no_gain(self):
-        rig = ring_rig(1)
-        position_m = np.zeros((2, 1, 3)) + np.array([0, 0, 1.0])
-        views = views_of_places(
-            rig.cameras, np.zeros((2, 1, 1, 2)), np.ones((2, 1, 1, 2)), position_m, np.zeros((2, 1, 3))
-        )
-        assert (views.gain == 0).all()
-
-    def test_what_cameras_show_is_computed_once(self):
-        """Learning asks block by block: 100,000 frames took half an hour, because each block computed all frames."""
-        rig = ring_rig(2)
-        unknown = np.full((2, 1, 3), np.nan)
-        views = views_of_places(rig.cameras, np.zeros((2, 1, 2, 2)), np.ones((2, 1, 2, 2)), unknown, unknown)
-        assert views.shown is views.shown
-
     def test_a_long_recording_takes_little_more_memory_than_its_views(self):
         """Found: 1.6 GB, more than all of the tracking before, for 100,000 frames of 4 drones in 8 cameras."""
 
@@ -155,7 +157,7 @@ class TestViews:
             position_m, velocity_m_s = flights(rng, frames, 2)
             place_px = project(rig.cameras, position_m[:, :, None])[0] + rng.normal(size=(frames, 2, 6, 2))
             tracemalloc.start()
-            views = views_of_places(rig.cameras, place_px, np.ones(place_px.shape), position_m, velocity_m_s)
+            views = views_at(rig, position_m, velocity_m_s, place_px)
             errors = learn_camera_errors(views, FPS, USUAL)
             noise_covariance(views, errors)
             systematic_covariances(views, errors)
@@ -184,15 +186,11 @@ class TestLearning:
         # Few independent residuals tell cameras apart less.
         few = np.sqrt(camera_variances(places, inflation=400.0))
         assert few.max() / few.min() < found.max() / found.min() / 2
-
-    def test_a_camera_that_shows_nothing_has_no_variance(self):
-        rig, rng = ring_rig(3), np.random.default_rng(2)
-        position_m, velocity_m_s = flights(rng, 50, 1)
-        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(50, 1, 3, 2)))
-        shown = np.tile([True, True, False], (50, 1))
-        variance = camera_variances(FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], shown))
-        assert np.isfinite(variance[:2]).all()
-        assert np.isnan(variance[2]).all()
+        # A camera that shows nothing has no variance.
+        shown = np.tile([True, True, True, False], (800, 1))
+        variance = camera_variances(replace(places, shown=shown))
+        assert np.isfinite(variance[:3]).all()
+        assert np.isnan(variance[3]).all()
 
     @pytest.mark.parametrize(("fraction", "frames"), [(0.7, 10), (0.7, 25), (0.0, 10)])
     def test_correlated_errors_are_found(self, fraction, frames):
@@ -202,17 +200,14 @@ class TestLearning:
         assert found.white == pytest.approx(1 - fraction, abs=0.08)
         rho = toeplitz(np.where(np.arange(600) == 0, 1.0, fraction * np.exp(-np.arange(600) / frames)))
         assert found.inflation(1 / FPS) == pytest.approx(rho.mean() * 600, rel=0.35)
-
-    def test_errors_that_never_change_are_bias(self):
-        rng = np.random.default_rng(4)
-        values = 0.6 * rng.normal(size=(1, 3, 4, 2)) + 0.8 * rng.normal(size=(300, 3, 4, 2))
-        found = autocorrelation_of(values, np.ones((300, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
+        # Errors that never change are bias.
+        values = 0.6 * rng.normal(size=(1, 3, 4, 2)) + 0.8 * rng.normal(size=(600, 3, 4, 2))
+        biased = autocorrelation_of(values, np.ones((600, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
         true = np.square(values.mean(axis=0)).mean() / np.square(values).mean()
-        assert found.bias == pytest.approx(true, abs=0.06)
-
-    def test_too_few_frames_are_correlated_as_usual(self):
-        ones = np.ones((4, 1, 2, 2))
-        assert autocorrelation_of(ones, ones[..., 0] > 0, 1 / FPS, NOTHING_KNOWN) is NOTHING_KNOWN
+        assert biased.bias == pytest.approx(true, abs=0.06)
+        # Too few frames are correlated as usual.
+        few = autocorrelation_of(values[:4], np.ones((4, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
+        assert few is NOTHING_KNOWN
 
     def test_inflation_is_that_of_a_long_sum(self):
         correlation = Autocorrelation(0.4, np.array([0.6]), np.array([0.3]))
@@ -244,16 +239,7 @@ class TestLearning:
         exact, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((150, 2, 6, 2)))
         error_px = -exact.flow_px_s * late_s[:, None] + 0.5 * rng.normal(size=(150, 2, 6, 2))
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
-        rows = FittedPlaces(
-            views.residual_px.reshape(-1, 6, 2), views.jacobian.reshape(-1, 6, 2, 3), np.ones((300, 6), bool)
-        )
-        constant = fit_constant_errors(
-            rows,
-            views.turn_px.reshape(-1, 6, 2, 3),
-            views.flow_px_s.reshape(-1, 6, 2),
-            np.full((6, 2), 0.5),
-            1.0,
-        )
+        constant = fit_constant_errors(*rows_of(views), np.full((6, 2), 0.5), 1.0)
         apart_s = constant.clock_s - late_s
         np.testing.assert_allclose(apart_s - apart_s.mean(), 0.0, atol=0.002)
         assert constant.clock_std_s == pytest.approx(late_s.std(), rel=0.3)
@@ -266,13 +252,7 @@ class TestLearning:
         rig = ring_rig(4, image_size_wh=(1920, 1080))
         position_m, velocity_m_s = flights(rng, 2, 1)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(2, 1, 4, 2)))
-        rows = FittedPlaces(
-            views.residual_px.reshape(-1, 4, 2),
-            views.jacobian.reshape(-1, 4, 2, 3),
-            views.shown.reshape(-1, 4),
-        )
-        flow_px_s, turn_px = views.flow_px_s.reshape(-1, 4, 2), views.turn_px.reshape(-1, 4, 2, 3)
-        constant = fit_constant_errors(rows, turn_px, flow_px_s, np.full((4, 2), noise_px), 1.0)
+        constant = fit_constant_errors(*rows_of(views), np.full((4, 2), noise_px), 1.0)
         assert np.isfinite(constant.covariance).all()
         largest = np.abs(constant.covariance).max()
         assert np.linalg.eigvalsh(constant.covariance).min() > -1e-9 * largest
@@ -283,23 +263,16 @@ class TestLearning:
         rig = ring_rig(5, image_size_wh=(1920, 1080))
         position_m, velocity_m_s = flights(rng, frames, 2)
         error_px = correlated(rng, (frames, 2, 5, 2), 0.5, 8)
-        errors = learn_camera_errors(
-            fitted_views(rig, rig, position_m, velocity_m_s, error_px)[0], FPS, USUAL
-        )
+        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
+        errors = learn_camera_errors(views, FPS, USUAL)
         np.testing.assert_allclose(errors.noise_px, 1.0, rtol=0.2)
         assert errors.bias_px.max() < 0.5
         assert np.degrees(errors.turn_rad) < 0.03
         assert errors.clock_s < 0.004
-
-    def test_without_views_nothing_is_learned(self):
-        rig = ring_rig(3)
-        position_m = np.full((5, 1, 3), np.nan)
-        views = views_of_places(
-            rig.cameras, np.full((5, 1, 3, 2), np.nan), np.ones((5, 1, 3, 2)), position_m, position_m
-        )
-        errors = learn_camera_errors(views, FPS, USUAL)
-        assert np.isnan(errors.noise_px).all()
-        assert (errors.bias_px.max(), errors.turn_rad, errors.clock_s) == (0.0, 0.0, 0.0)
+        # Without views, nothing is learned.
+        nothing = learn_camera_errors(views_at(rig, position_m, velocity_m_s), FPS, USUAL)
+        assert np.isnan(nothing.noise_px).all()
+        assert (nothing.bias_px.max(), nothing.turn_rad, nothing.clock_s) == (0.0, 0.0, 0.0)
 
 
 class TestCovariances:
@@ -326,36 +299,32 @@ class TestCovariances:
         assert np.trace(systematic.relative_m2[0, 0]) < 0.05 * np.trace(systematic.absolute_m2[0, 0])
 
     def test_given_errors_count_where_the_cameras_show_less(self):
-        rng = np.random.default_rng(8)
-        rig = ring_rig(2)
-        position_m, velocity_m_s = flights(rng, 3, 2)
-        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((3, 2, 2, 2)))
+        rng, rig = np.random.default_rng(8), ring_rig(2)
+        position_m, velocity_m_s = flights(rng, 6, 2)
+        position_m[[0, 3, 4], 1] = np.nan
+        views = views_at(rig, position_m, velocity_m_s)
         none = only_noise(np.full((2, 2), np.nan), USUAL)
         some = replace(only_noise(np.ones((2, 2)), USUAL), bias_px=np.full((2, 2), 3.0))
-        nothing = systematic_covariances(views, none).absolute_m2
-        assert (nothing == 0).all()
+        assert (systematic_covariances(views, none).absolute_m2 == 0).all()
         given = systematic_covariances(views, none, ErrorSettings(pixel_px=2.0)).absolute_m2
-        expected = 4.0 * np.einsum("fdcik,fdcjk->fdij", views.gain, views.gain)
-        np.testing.assert_allclose(given, expected)
-        learned = systematic_covariances(views, some).absolute_m2
-        both = systematic_covariances(views, some, ErrorSettings(pixel_px=2.0)).absolute_m2
-        np.testing.assert_allclose(learned, both)
-        assert (
-            np.linalg.eigvalsh(systematic_covariances(views, some, ErrorSettings(rig_deg=1.0)).relative_m2)
-            > -1e-12
-        ).all()
+        expected = 4.0 * np.einsum("fcik,fcjk->fij", views.gain[:, 0], views.gain[:, 0])
+        np.testing.assert_allclose(given[:, 0], expected)
+        # A drone keeps its covariance while it is not seen.
+        np.testing.assert_array_equal(given[[0, 3, 4], 1], given[[1, 2, 2], 1])
+        assert (np.linalg.eigvalsh(given[:, 1])[:, 0] > 0).all()
+        learned = systematic_covariances(views, some)
+        both = systematic_covariances(views, some, ErrorSettings(pixel_px=2.0))
+        np.testing.assert_allclose(learned.absolute_m2, both.absolute_m2)
+        turned = systematic_covariances(views, some, ErrorSettings(rig_deg=1.0))
+        assert (np.linalg.eigvalsh(turned.relative_m2) > -1e-12).all()
 
     def test_covariances_of_a_long_recording_are_those_of_its_frames(self):
         """Covariances are computed in parts; the mean of the turns is that of all frames."""
         rng, rig = np.random.default_rng(11), ring_rig(3)
         position_m, velocity_m_s = flights(rng, 2300, 2)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((2300, 2, 3, 2)))
-        turn_rad, clock_s, noise_px, bias_px = (
-            0.01,
-            0.02,
-            rng.uniform(1, 2, (3, 2)),
-            rng.uniform(1, 2, (3, 2)),
-        )
+        turn_rad, clock_s = 0.01, 0.02
+        noise_px, bias_px = rng.uniform(1, 2, (2, 3, 2))
         constant = np.diag(np.tile(np.square([turn_rad, turn_rad, turn_rad, clock_s]), 3))
         errors = CameraErrors(noise_px, *USUAL, bias_px, turn_rad, clock_s, constant)
         gain, found = views.gain, systematic_covariances(views, errors)
@@ -374,47 +343,28 @@ class TestCovariances:
             found.relative_m2, turn_rad**2 * spread(turned - turned.mean(axis=0)) + other, rtol=1e-9
         )
 
-    def test_a_drone_keeps_its_systematic_covariance_while_it_is_not_seen(self):
-        rng = np.random.default_rng(9)
-        rig = ring_rig(3)
-        position_m, velocity_m_s = flights(rng, 6, 1)
-        position_m[[0, 3, 4]] = np.nan
-        views = views_of_places(
-            rig.cameras, np.full((6, 1, 3, 2), np.nan), np.ones((6, 1, 3, 2)), position_m, velocity_m_s
-        )
-        none = only_noise(np.ones((3, 2)), USUAL)
-        found = systematic_covariances(views, none, ErrorSettings(pixel_px=1.0)).absolute_m2[:, 0]
-        np.testing.assert_array_equal(found[[0, 3, 4]], found[[1, 2, 2]])
-        assert (np.linalg.eigvalsh(found)[:, 0] > 0).all()
-
-    @pytest.mark.slow
+    @pytest.mark.parametrize(
+        ("num_cameras", "num_rigs"),
+        [pytest.param(3, 20, marks=pytest.mark.slow), pytest.param(8, 40, marks=pytest.mark.nightly)],
+    )
     @pytest.mark.parametrize(
         ("angle_deg", "late_s", "noise_px", "frames"),
-        [
-            (0.0, 0.0, 1.0, 1),
-            (0.1, 0.0, 1.0, 1),
-            (0.3, 0.0, 1.0, 1),
-            (0.0, 0.02, 1.0, 1),
-            (0.0, 0.0, 3.0, 18),
-        ],
+        [(0.0, 0.0, 1.0, 1), (0.3, 0.0, 1.0, 1), (0.0, 0.02, 1.0, 1), (0.0, 0.0, 3.0, 18)],
     )
-    @pytest.mark.parametrize("num_cameras", [3, 8])
-    def test_positions_lie_in_their_ellipsoids(self, num_cameras, angle_deg, late_s, noise_px, frames):
-        # Errors that last are the same in all frames of a rig, so that many rigs are needed, and few frames of each.
+    def test_positions_lie_in_their_ellipsoids(
+        self, num_cameras, num_rigs, angle_deg, late_s, noise_px, frames
+    ):
+        """Errors that last are the same in all frames of a rig: many rigs are needed, and few frames of each."""
         # Noise that fades over 18 frames needs more frames.
-        num_rigs, num_frames = (20, 75) if frames > 1 else (40, 30)
+        num_frames = 75 if frames > 1 else 30
         rates = []
         for seed in range(num_rigs):
             rng = np.random.default_rng(seed)
             rig = ring_rig(num_cameras, image_size_wh=(1920, 1080))
             position_m, velocity_m_s = flights(rng, num_frames, 2)
-            exact, _ = fitted_views(
-                rig, rig, position_m, velocity_m_s, np.zeros((num_frames, 2, num_cameras, 2))
-            )
-            error_px = noise_px * correlated(
-                rng, (num_frames, 2, num_cameras, 2), 0.7 if frames > 1 else 0.0, frames
-            )
-            error_px -= exact.flow_px_s * rng.uniform(-late_s, late_s, num_cameras)[:, None]
+            noise = correlated(rng, (num_frames, 2, num_cameras, 2), 0.7 if frames > 1 else 0.0, frames)
+            flow_px_s = views_at(rig, position_m, velocity_m_s).flow_px_s
+            error_px = noise_px * noise - flow_px_s * rng.uniform(-late_s, late_s, num_cameras)[:, None]
             stated = turned(rig, angle_deg, rng)
             views, moved_m = fitted_views(rig, stated, position_m, velocity_m_s, error_px)
             errors = learn_camera_errors(views, FPS, USUAL)
@@ -425,28 +375,14 @@ class TestCovariances:
 
 
 class TestFilteredVariance:
-    def test_a_filter_that_assumes_right_errors_states_the_right_variance(self):
-        errors = MeasurementErrors(1e-4, 0.6, 0.4)
-        stated, real = filtered_variances(errors, errors, dt_s=0.04, jerk_density_m2_s5=1.0)
-        assert real == pytest.approx(stated, rel=1e-3)
-        assert 0 < stated < 1e-4
-
-    def test_errors_that_last_longer_than_assumed_make_the_variance_larger(self):
-        assumed = MeasurementErrors(1e-4, 0.3, 0.1)
-        variances = [
-            filtered_variances(
-                assumed, MeasurementErrors(1e-4, share, time_s), dt_s=0.04, jerk_density_m2_s5=1.0
-            )[1]
-            for share, time_s in ((0.0, 0.1), (0.7, 0.1), (0.95, 0.3))
-        ]
-        assert variances == sorted(variances)
-
-    @pytest.mark.slow
     def test_the_variance_is_that_of_filtered_flights(self):
         rng = np.random.default_rng(10)
-        frames, drones, dt_s = 300, 200, 0.04
+        frames, drones, dt_s = 200, 100, 0.04
         assumed, found = MeasurementErrors(4e-4, 0.7, 0.4), MeasurementErrors(1e-4, 0.8, 1.0)
         stated, real = filtered_variances(assumed, found, dt_s=dt_s, jerk_density_m2_s5=1.0)
+        # A filter that assumes the right errors states the right variance.
+        right = filtered_variances(found, found, dt_s=dt_s, jerk_density_m2_s5=1.0)
+        assert right[1] == pytest.approx(right[0], rel=1e-3)
         jerk = rng.normal(size=(frames, drones, 3)) / np.sqrt(dt_s)
         position_m = np.cumsum(np.cumsum(np.cumsum(jerk, axis=0), axis=0), axis=0) * dt_s**3
         error_m = 0.01 * correlated(rng, (frames, drones, 3), 0.8, 1.0 / dt_s)
@@ -461,7 +397,7 @@ class TestFilteredVariance:
         )
         filtered = filter_measurements(measured, params)
         assert filtered.covariance_m2[-1, 0, 0, 0] == pytest.approx(stated, rel=0.01)
-        late = slice(150, None)
+        late = slice(100, None)
         assert np.square(filtered.position_m - position_m)[late].mean() == pytest.approx(real, rel=0.15)
 
     def test_ratios_compare_found_and_stated_noise(self):
@@ -483,60 +419,21 @@ class TestFilteredVariance:
         np.testing.assert_allclose(filtered[[0, 70, 99], 2], [filtered[0, 0], 1.0, 1.0], rtol=1e-3)
 
 
-class TestSettings:
-    @pytest.mark.parametrize("name", ["rig_deg", "pixel_px"])
-    @pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
-    def test_impossible_errors_are_refused(self, name, value):
-        with pytest.raises(SettingsError, match=f"errors.{name}"):
-            ErrorSettings(**{name: value})
-
-    def test_settings_by_name(self):
-        changed = TrackSettings().changed({"errors.rig_deg": 0.2})
-        assert changed.errors == ErrorSettings(rig_deg=0.2)
-
-
-class TestFiles:
-    def flight(self):
-        covariance_m2 = np.tile(np.diag([4e-4, 1e-4, 9e-4]), (3, 2, 1, 1))
-        return Trajectories(
-            frame=np.arange(3),
-            time_s=np.arange(3) / FPS,
-            drones=("0", "1"),
-            position_m=np.zeros((3, 2, 3)) + np.array([[0.0, 0, 0], [1, 1, 1]]),
-            covariance_m2=covariance_m2,
-            relative_covariance_m2=covariance_m2 / 4,
-        )
-
-    def test_relative_covariances_are_written_and_read(self, tmp_path):
-        written = self.flight()
-        write_trajectories(tmp_path / "tracks.csv", written)
-        read = read_trajectories(tmp_path / "tracks.csv")
-        assert read.relative_covariance_m2 is not None
-        np.testing.assert_array_equal(read.relative_covariance_m2, written.relative_covariance_m2)
-        np.testing.assert_array_equal(read.covariance_m2, written.covariance_m2)
-
-    def test_errors_without_offset_are_compared_with_relative_covariances(self):
-        estimate = self.flight()
-        # An offset of 2 sigma, and changes of 1.5 relative sigma to either side of it.
-        change_m = 0.0225 * np.array([1.0, 0.0, -1.0])[:, None, None] * np.array([0.0, 0.0, 1.0])
-        moved = replace(estimate, position_m=estimate.position_m + np.array([0.0, 0.02, 0.0]) + change_m)
-        figures = evaluate(moved, estimate)
-        expected = np.mean([2.0**2 + 0.75**2, 2.0**2, 2.0**2 + 0.75**2])
-        assert figures.mean_nees == pytest.approx(expected)
-        assert figures.offset_removed_mean_nees == pytest.approx(np.mean([1.5**2, 0, 1.5**2]))
-        alone = replace(moved, relative_covariance_m2=None)
-        assert evaluate(alone, estimate).offset_removed_mean_nees == pytest.approx(
-            np.mean([0.75**2, 0, 0.75**2])
-        )
-
-
-@pytest.mark.parametrize("option", ["--rig-error", "--pixel-error"])
-def test_impossible_errors_are_one_line(tmp_path, option, monkeypatch, capsys):
-    words = ["track", str(tmp_path), "--out", str(tmp_path / "tracks.csv"), option, "-1"]
-    monkeypatch.setattr("sys.argv", ["psotrack", *words])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    assert stopped.value.code == 2
-    said = capsys.readouterr().err
-    assert "expected a number of at least 0, found -1" in said
-    assert len(said.strip().splitlines()) == 1
+def test_errors_without_offset_are_compared_with_relative_covariances():
+    covariance_m2 = np.tile(np.diag([4e-4, 1e-4, 9e-4]), (3, 2, 1, 1))
+    estimate = Trajectories(
+        frame=np.arange(3),
+        time_s=np.arange(3) / FPS,
+        drones=("0", "1"),
+        position_m=np.zeros((3, 2, 3)) + np.array([[0.0, 0, 0], [1, 1, 1]]),
+        covariance_m2=covariance_m2,
+        relative_covariance_m2=covariance_m2 / 4,
+    )
+    # An offset of 2 sigma, and changes of 1.5 relative sigma to either side of it.
+    change_m = 0.0225 * np.array([1.0, 0.0, -1.0])[:, None, None] * np.array([0.0, 0.0, 1.0])
+    moved = replace(estimate, position_m=estimate.position_m + np.array([0.0, 0.02, 0.0]) + change_m)
+    figures = evaluate(moved, estimate)
+    assert figures.mean_nees == pytest.approx(2.0**2 + 0.75**2 * 2 / 3)
+    assert figures.offset_removed_mean_nees == pytest.approx(1.5**2 * 2 / 3)
+    alone = replace(moved, relative_covariance_m2=None)
+    assert evaluate(alone, estimate).offset_removed_mean_nees == pytest.approx(0.75**2 * 2 / 3)

@@ -1,7 +1,6 @@
 """Fusion of the tracks of two methods: simulated tracks whose errors are known."""
 
 import numpy as np
-import pytest
 
 from psotrack.settings import MotionSettings
 from psotrack.tracking.camera_errors import CameraErrors, SystematicCovariances, TrackErrors
@@ -61,16 +60,17 @@ def fuse(swarm, lines, **options):
     return fusion.tracks, fusion
 
 
-def simulate_and_fuse(truth_m, swarm=None, lines=None, **options):
-    """Tracks of the swarm, tracks of the projection lines, and the fused tracks."""
-    first = simulate_method(truth_m, SWARM_STD_M, seed=0, **(swarm or {}))
-    second = simulate_method(truth_m, LINES_STD_M, seed=1, **(lines or {}))
-    return first, second, fuse(first, second, **options)[0]
+def both_methods(truth_m, **of_both):
+    """Tracks of the swarm and of the projection lines, whose errors are independent."""
+    return tuple(
+        simulate_method(truth_m, std_m, seed=seed, **of_both)
+        for seed, std_m in enumerate((SWARM_STD_M, LINES_STD_M))
+    )
 
 
 def test_information_adds_up():
     truth_m = circular_paths(3)
-    first, second, fused = simulate_and_fuse(truth_m)
+    fused, middles = fuse(*both_methods(truth_m))
     # Errors are relative to each drone's median, because the tracked point has an unknown offset. Their spread is
     # computed from a median, because one frame in 1000 is beyond the gate, where only the swarm's measurement is used.
     off_m = fused.measured_m - truth_m
@@ -79,19 +79,10 @@ def test_information_adds_up():
     # The spread of 600 errors, computed from a median, has an error of 4 %.
     np.testing.assert_allclose(std_m, expected_m, rtol=0.1)
     # The measurements of the projection lines also have the error of the offset between the middles.
-    _, middles = fuse(first, second)
     expected_m2 = 1 / (1 / SWARM_STD_M**2 + 1 / (LINES_STD_M**2 + middles.offset_std_m**2))
     diagonal_m2 = np.diagonal(fused.measured_covariance_m2, axis1=-2, axis2=-1)
     np.testing.assert_allclose(np.median(diagonal_m2, axis=0), expected_m2, rtol=1e-9)
     assert (fused.status == Status.TRACKED).all()
-
-
-def test_the_fused_point_is_the_middle_of_the_silhouette():
-    """Middles of the boxes are 8 cm above those of the silhouettes; the fused tracks do not have this offset."""
-    truth_m = circular_paths(2)
-    _, _, fused = simulate_and_fuse(truth_m, lines={"offset_m": (0.01, 0.0, 0.08)})
-    off_m = (fused.measured_m - truth_m).mean(axis=(0, 1))
-    np.testing.assert_allclose(off_m, 0.0, atol=0.003)
 
 
 def test_the_offset_between_the_middles_has_a_standard_error():
@@ -100,7 +91,9 @@ def test_the_offset_between_the_middles_has_a_standard_error():
     second = simulate_method(truth_m, LINES_STD_M, seed=1, offset_m=off_m)
     # In a tenth of the frames, the first drone's measurement is that of another object.
     second.measured_m[20:40, 0] += 0.2
-    _, middles = fuse(first, second)
+    fused, middles = fuse(first, second)
+    # The fused point is the middle of the silhouette: the tracks do not have this offset.
+    np.testing.assert_allclose((fused.measured_m - truth_m)[40:].mean(axis=(0, 1)), 0.0, atol=0.003)
     # Standard error of a median of 200 independent differences.
     expected_m = np.sqrt(np.pi / 2 * (SWARM_STD_M**2 + LINES_STD_M**2) / FRAMES)
     # The estimate may be a little smaller, because tails are clipped, and larger, if errors are correlated by chance.
@@ -121,30 +114,11 @@ def test_the_offset_is_less_certain_with_correlated_errors():
     np.testing.assert_allclose(middles.offset_std_m / expected_m, 1.0, atol=0.6)
 
 
-def test_a_drone_found_by_one_method_only_has_no_offset():
-    truth_m = circular_paths(3)
-    swarm, lines = (
-        simulate_method(truth_m[:, :2], SWARM_STD_M, seed=0),
-        simulate_method(truth_m[:, 1:], LINES_STD_M, seed=1),
-    )
-    _, middles = fuse(swarm, lines)
-    assert np.isfinite(middles.offset_m).all(axis=-1).tolist() == [False, True, False]
-    np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.offset_std_m))
-
-
-def test_a_position_from_lines_alone_has_the_offsets_uncertainty():
-    hidden = [(0, 50, 100)]
-    first = simulate_method(circular_paths(1), SWARM_STD_M, seed=0, hidden=hidden)
-    second = simulate_method(circular_paths(1), LINES_STD_M, seed=1)
-    fused, middles = fuse(first, second)
-    diagonal_m2 = np.diagonal(fused.measured_covariance_m2[60, 0])
-    np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.offset_std_m[0] ** 2, rtol=1e-9)
-
-
 def test_methods_with_the_same_foreground_have_correlated_errors():
     """The best linear estimate from correlated errors has a larger covariance than that from independent errors."""
-    first, second, independent = simulate_and_fuse(circular_paths(2))
-    correlated, middles = fuse(first, second, same_foreground=True)
+    methods = both_methods(circular_paths(2))
+    independent, _ = fuse(*methods)
+    correlated, middles = fuse(*methods, same_foreground=True)
     # The least variance of a weighted mean is 1 / (1ᵀ S⁻¹ 1) along each axis.
     swarm_m, lines_m = SWARM_STD_M + 0 * middles.offset_std_m, np.hypot(LINES_STD_M, middles.offset_std_m)
     cross_m2 = COMMON_CORRELATION * swarm_m * lines_m
@@ -156,34 +130,38 @@ def test_methods_with_the_same_foreground_have_correlated_errors():
     assert np.median(np.linalg.det(correlated.measured_covariance_m2)) > smaller
 
 
-def test_with_the_same_foreground_a_track_of_lines_alone_is_no_drone():
+def test_a_drone_found_by_one_method_only_has_no_offset():
     truth_m = circular_paths(3)
-    swarm, lines = (
-        simulate_method(truth_m[:, :2], SWARM_STD_M, seed=0),
-        simulate_method(truth_m, LINES_STD_M, seed=1),
-    )
-    assert fuse(swarm, lines)[0].status.shape[1] == 3
-    assert fuse(swarm, lines, same_foreground=True)[0].status.shape[1] == 2
+    swarm = simulate_method(truth_m[:, :2], SWARM_STD_M, seed=0)
+    lines = simulate_method(truth_m[:, 1:], LINES_STD_M, seed=1)
+    fused, middles = fuse(swarm, lines)
+    assert fused.num_drones == 3
+    assert np.isfinite(middles.offset_m).all(axis=-1).tolist() == [False, True, False]
+    np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.offset_std_m))
+    # With the same foreground, a track of lines alone is no drone.
+    assert fuse(swarm, lines, same_foreground=True)[0].num_drones == 2
 
 
 def test_where_one_method_has_no_measurement_the_other_is_used():
     truth_m = circular_paths(2)
     hidden = [(0, 50, 100)]
-    first, second, fused = simulate_and_fuse(
-        truth_m, swarm={"hidden": hidden}, lines={"hidden": [(1, 120, 150)]}
-    )
+    first = simulate_method(truth_m, SWARM_STD_M, seed=0, hidden=hidden)
+    second = simulate_method(truth_m, LINES_STD_M, seed=1, hidden=[(1, 120, 150)])
+    fused, middles = fuse(first, second)
     assert (fused.status == Status.TRACKED).all()
     # Measurements of the lines alone are only moved by the constant offset between the middles.
     moved_m = fused.measured_m[50:100, 0] - second.measured_m[50:100, 0]
     assert np.ptp(moved_m, axis=0).max() < 1e-12
+    # They have the uncertainty of the offset.
+    diagonal_m2 = np.diagonal(fused.measured_covariance_m2[60, 0])
+    np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.offset_std_m[0] ** 2, rtol=1e-9)
     np.testing.assert_array_equal(fused.measured_m[120:150, 1], first.measured_m[120:150, 1])
     assert np.linalg.norm(fused.position_m[50:100, 0] - truth_m[50:100, 0], axis=-1).max() < 0.06
 
 
 def test_a_drone_without_measurements_coasts_and_is_lost():
     truth_m = circular_paths(1)
-    hidden = {"hidden": [(0, 50, 100)]}
-    _, _, fused = simulate_and_fuse(truth_m, swarm=hidden, lines=hidden)
+    fused, _ = fuse(*both_methods(truth_m, hidden=[(0, 50, 100)]))
     status = fused.status[:, 0]
     frames = round(MAX_COASTING_S * FPS)
     assert (status[50 : 50 + frames] == Status.COASTING).all()
@@ -207,26 +185,17 @@ def test_drones_found_only_by_the_lines_come_last():
 
 def test_where_the_methods_disagree_the_swarm_is_used():
     truth_m = circular_paths(1)
-    swarm = simulate_method(truth_m, SWARM_STD_M, seed=0)
-    lines = simulate_method(truth_m, LINES_STD_M, seed=1)
+    swarm, lines = both_methods(truth_m)
     lines.measured_m[80:90] += 0.5
     fused, _ = fuse(swarm, lines)
     np.testing.assert_array_equal(fused.measured_m[80:90], swarm.measured_m[80:90])
 
 
-@pytest.mark.parametrize("method", ["swarm", "lines"])
-def test_one_method_may_have_no_tracks(method):
-    truth_m = circular_paths(2)
-    found, empty = (
-        simulate_method(truth_m, SWARM_STD_M, seed=0),
-        simulate_method(truth_m[:, :0], SWARM_STD_M, seed=0),
-    )
-    fused, _ = fuse(found, empty) if method == "swarm" else fuse(empty, found)
-    np.testing.assert_array_equal(fused.measured_m, found.measured_m)
-
-
-def test_both_methods_may_have_no_tracks():
+def test_methods_may_have_no_tracks():
+    found = simulate_method(circular_paths(2), SWARM_STD_M, seed=0)
     empty = simulate_method(circular_paths(0), SWARM_STD_M, seed=0)
+    for pair in ((found, empty), (empty, found)):
+        np.testing.assert_array_equal(fuse(*pair)[0].measured_m, found.measured_m)
     assert fuse(empty, empty)[0].status.shape == (FRAMES, 0)
 
 

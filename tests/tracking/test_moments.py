@@ -4,11 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same, draw_coverage, float32, ring_rig, silhouettes_in_memory, track_settings
+from helpers import assert_same, draw_coverage, float32, ring_rig
 
 from psotrack.geometry import look_at, make_camera, make_extents, make_rig, project_boxes
-from psotrack.tracking.births import InitialState
-from psotrack.tracking.swarm import RunInputs, track_silhouettes, tracker_settings
 from psotrack.tracking.swarm.moments import HALF_PER_STD, measure
 from psotrack.tracking.swarm.patches import ExpectedDrones, cut, make_pyramid
 
@@ -123,46 +121,3 @@ def test_the_order_of_drones_and_cameras_does_not_matter():
     # A median over the cameras is the same number.
     assert_same(turned.size_ratio, plain.size_ratio[order], atol=1e-6)
     assert_same(turned.middle_px, plain.middle_px[order][:, cameras], atol=1e-3)
-
-
-# --- How sizes are learned
-
-NUM_FRAMES = 50
-HOVER_M = np.array([0.3, -0.2, 1.3])
-
-
-def learned(size_of_frame, *, first=1.0, height_m=HOVER_M[2]):
-    """Learned lengths over `SIZE_M`, of a drone that hovers; its size in each frame is a multiple of `SIZE_M`."""
-    at = np.array([*HOVER_M[:2], height_m])
-    drawn = {factor: draw(at, factor * SIZE_M) for factor in set(size_of_frame)}
-    coverage = np.stack([drawn[factor] for factor in size_of_frame])
-    given = InitialState(at[None], np.zeros((1, 3)), first * SIZE_M[None], np.array([5.0]))
-    bounds_m = np.array([[-3.0, -3.0, 0.0], [3.0, 3.0, 3.0]])
-    settings = tracker_settings(track_settings(particles=20, iterations=15, drones=1))
-    silhouettes = silhouettes_in_memory(RIG, coverage, REDUCTION)
-    ((tracks, _),) = track_silhouettes(RIG, silhouettes, [RunInputs(bounds_m, settings, given)], fps=25.0)
-    return tracks.size_m[0] / SIZE_M, tracks
-
-
-@pytest.mark.slow
-def test_a_minority_of_bad_frames_hardly_moves_the_size():
-    """Two of five frames show a drone that is larger by half; the median is that of the others."""
-    bad, _ = learned([1.0, 1.5, 1.0, 1.0, 1.5] * (NUM_FRAMES // 5), first=LENGTH_RATIO)
-    good, _ = learned([1.0] * NUM_FRAMES, first=LENGTH_RATIO)
-    np.testing.assert_allclose(good, LENGTH_RATIO, rtol=2 * DRAWING_ERROR)
-    # A mean would be 20 % larger.
-    np.testing.assert_allclose(bad, good, rtol=0.08)
-
-
-@pytest.mark.slow
-def test_a_length_stays_within_a_factor_of_two_of_the_first_one():
-    ratio, _ = learned([1.0] * NUM_FRAMES, first=0.4)
-    assert (ratio <= 0.8 * (1 + 1e-5)).all()
-
-
-@pytest.mark.slow
-def test_close_above_the_floor_nothing_is_learned():
-    """Foreground close to the floor may be a drone together with its shadow. The drone is 0.5 m wide."""
-    ratio, tracks = learned([1.0] * 10, first=0.9, height_m=0.4)
-    np.testing.assert_allclose(ratio, 0.9, rtol=1e-6)
-    assert (tracks.size_frames == 0).all()

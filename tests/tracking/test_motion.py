@@ -7,8 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import float32
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from motion_textbook import (
     DT_S,
     TO_TEXTBOOK,
@@ -150,21 +148,6 @@ class TestAgainstTheTextbook:
             np.testing.assert_array_equal(still.covariance, state.covariance)
 
 
-class TestGaps:
-    def test_a_drone_without_a_measurement_keeps_its_state(self):
-        flown = simulate_flight(5, frames=2, drones=2, error_share=0.5)
-        measured, covariance, params = float32((flown.measured_m, flown.covariance_m2, flown.params))
-        state = init(measured[0], measured[0], covariance[0], params)
-        state = predict(state, jnp.float32(DT_S), params)
-        unknown = measured[1].at[0].set(jnp.nan), covariance[1].at[0].set(jnp.nan)
-        after, nis = update(state, *unknown, jnp.array([False, True]), params)
-        for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
-            np.testing.assert_array_equal(one[0], other[0])
-            assert not np.array_equal(one[1], other[1])
-        assert np.isnan(nis[0])
-        assert np.isfinite(nis[1])
-
-
 @pytest.mark.parametrize("flights", [0.0, 0.5], indirect=True)
 class TestConsistency:
     """On flights that obey the model, the filter's covariances must agree with its errors."""
@@ -197,28 +180,6 @@ class TestConsistency:
         assert low <= (value < chi2.ppf(0.9, 3)).sum() <= high
 
 
-@pytest.mark.parametrize("density", [1.0, 30.0])
-def test_lasting_errors_that_are_treated_as_white_make_the_filter_overconfident(density):
-    """This is why lasting errors are in the state: the same flights, filtered with and without them."""
-    drones, frames = 200, 60
-    flown = simulate_flight(6, frames=frames, drones=drones, density=density, error_share=0.5, steady=True)
-    inside, off_m = [], []
-    for model in (flown.model, replace(flown.model, error_share=0.0)):
-        states, _ = run(replace(flown, model=model))
-        error_m = states.position_m[-1] - flown.state[-1, :, :3]
-        value = nees(error_m, states.position_covariance_m2[-1].astype(np.float64))
-        inside.append(np.mean(value < chi2.ppf(0.9, 3)))
-        off_m.append(np.sqrt((error_m**2).mean()))
-    modelled, treated_as_white = inside
-    # The limits for 200 drones are exceeded by one seed in 1,000.
-    low, high = binom.ppf([0.0005, 0.9995], drones, 0.9) / drones
-    assert low <= modelled <= high
-    # Measured 0.73 and 0.80.
-    assert treated_as_white < low
-    # The positions are not better either.
-    assert off_m[0] < 1.02 * off_m[1]
-
-
 def least_correlation(covariance):
     """Smallest eigenvalue of the covariances in units of their standard deviations."""
     covariance = covariance.astype(np.float64)
@@ -226,31 +187,35 @@ def least_correlation(covariance):
     return np.linalg.eigvalsh(covariance / (unit[..., :, None] * unit[..., None, :])).min(axis=-1)
 
 
-class TestFloat32:
-    FRAMES, DRONES = 10_000, 6
+def at_rest(covariance_m2, was_measured, **model):
+    """A flight measured at the origin: apart from the gate, covariances do not depend on positions."""
+    shape = was_measured.shape
+    return SimulatedFlight(
+        time_s=np.arange(shape[0]) * DT_S,
+        state=np.zeros((*shape, 9)),
+        measured_m=np.zeros((*shape, 3)),
+        covariance_m2=covariance_m2,
+        was_measured=was_measured,
+        model=Model(**model),
+    )
 
+
+class TestFloat32:
     def long_flight(self, decades, flattest, error_share):
-        """A flight with measurements of all precisions, gaps of up to four seconds, and slow and fast drones."""
-        rng = np.random.default_rng(7)
-        shape = (self.FRAMES, self.DRONES)
-        turn = Rotation.random(self.FRAMES * self.DRONES, rng=rng).as_matrix().reshape(*shape, 3, 3)
+        """Ten thousand frames: measurements of all precisions, gaps of up to four seconds, slow and fast drones."""
+        rng, shape = np.random.default_rng(7), (10_000, 6)
+        turn = Rotation.random(np.prod(shape), rng=rng).as_matrix().reshape(*shape, 3, 3)
         std_m = 10.0 ** (rng.uniform(*decades, (*shape, 1)) - rng.uniform(0, flattest, (*shape, 3)))
         was_measured = np.ones(shape, bool)
-        for start in range(500, self.FRAMES, 700):
-            was_measured[start : start + rng.integers(1, 100), rng.integers(self.DRONES)] = False
-        return SimulatedFlight(
-            time_s=np.arange(self.FRAMES) * DT_S,
-            state=np.zeros((*shape, 9)),
-            # Apart from the gate, covariances do not depend on the measured positions.
-            measured_m=np.zeros((*shape, 3)),
-            covariance_m2=turn * std_m[..., None, :] ** 2 @ np.swapaxes(turn, -1, -2),
-            was_measured=was_measured,
-            model=Model(density=10.0 ** np.linspace(-2, 4, self.DRONES), error_share=error_share),
-        )
+        for start in range(500, shape[0], 700):
+            was_measured[start : start + rng.integers(1, 100), rng.integers(shape[1])] = False
+        covariance_m2 = turn * std_m[..., None, :] ** 2 @ np.swapaxes(turn, -1, -2)
+        density = 10.0 ** np.linspace(-2, 4, shape[1])
+        return at_rest(covariance_m2, was_measured, density=density, error_share=error_share)
 
-    @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.99])
     @pytest.mark.slow
-    def test_positive_definite_for_ten_thousand_frames(self, error_share, optimised):
+    @pytest.mark.parametrize("error_share", [0.0, 0.5, 0.99])
+    def test_positive_definite_and_right_for_ten_thousand_frames(self, error_share, optimised):
         """Deviations from a micrometre to a metre in one measurement are closer to singular than float32 resolves."""
         flown = self.long_flight((-3, 0), 4, error_share)
         assert np.linalg.cond(flown.covariance_m2).max() > 1 / np.finfo(np.float32).eps
@@ -260,12 +225,8 @@ class TestFloat32:
         assert least_correlation(states.position_covariance_m2).min() > 0
         for symmetric in (states.covariance, states.position_covariance_m2):
             np.testing.assert_array_equal(symmetric, np.swapaxes(symmetric, -1, -2))
-
-    @pytest.mark.parametrize("error_share", [0.0, 0.5])
-    @pytest.mark.slow
-    def test_right_for_ten_thousand_frames(self, error_share):
-        """Deviations from a millimetre to a decimetre, with axes in ratios up to 30, as from the cameras of a hall."""
-        flown = self.long_flight((-2, -1), 1.5, error_share)
+        # Deviations from a millimetre to a decimetre, with axes in ratios up to 30, as from the cameras of a hall.
+        flown = self.long_flight((-2, -1), 1.5, min(error_share, 0.5))
         both = [run(flown, dtype)[0] for dtype in (jnp.float32, jnp.float64)]
         for name in ("covariance", "position_covariance_m2"):
             variance, expected = (np.diagonal(getattr(states, name), axis1=-2, axis2=-1) for states in both)
@@ -313,16 +274,7 @@ class TestFloat32:
         for number in (0, 1):
             covariance_m2[50] = std_m**2 * np.eye(3)
             was_measured[50] = number
-            states, _ = run(
-                SimulatedFlight(
-                    time_s=np.arange(frames) * DT_S,
-                    state=np.zeros((frames, 1, 9)),
-                    measured_m=np.zeros((frames, 1, 3)),
-                    covariance_m2=covariance_m2,
-                    was_measured=was_measured,
-                    model=Model(density=1.0, error_share=0.5),
-                )
-            )
+            states, _ = run(at_rest(covariance_m2, was_measured, density=1.0, error_share=0.5))
             spread_m.append(np.sqrt(states.position_covariance_m2[:, 0, 0, 0]))
         # The next measurements have less weight, because the lasting error is new; this fades within ten frames.
         # Measured 10.8 mm at frame 50, 14.0 against 9.3 mm in the next frame, and 9.4 against 8.8 mm 10 frames later.
@@ -380,13 +332,11 @@ class TestOutliers:
             nis / (direction @ np.linalg.inv(S) @ direction)
         ), S
 
-    def test_the_gate(self):
-        assert pytest.approx(chi2.ppf(0.999, 3), rel=1e-12) == GATE_999
-
-    @pytest.mark.parametrize("nis", [1.0, 16.0, 17.0, 100.0, 1e4])
+    @pytest.mark.parametrize("nis", [1.0, 16.0, 17.0, 1e4])
     def test_beyond_the_gate_a_measurement_has_a_larger_covariance(self, predicted, nis):
         state, covariance, params = predicted
         measured, S = self.measurement_with_nis(predicted, nis)
+        assert pytest.approx(chi2.ppf(0.999, 3), rel=1e-12) == GATE_999
         excess = max(nis / GATE_999, 1)
         with jax.enable_x64(True):
             after, found = update(state, jnp.asarray(measured), covariance, jnp.array([True]), params)
@@ -401,18 +351,6 @@ class TestOutliers:
         expected = multivariate_normal(np.zeros(3), excess * S).logpdf(innovation)
         np.testing.assert_allclose(log_density, expected, rtol=1e-9)
 
-    def test_a_farther_outlier_moves_the_state_less(self, predicted):
-        state, covariance, params = predicted
-        moved = []
-        for nis in (GATE_999, 100.0, 1e4, 1e6):
-            with jax.enable_x64(True):
-                measured = jnp.asarray(self.measurement_with_nis(predicted, nis)[0])
-                after, _ = update(state, measured, covariance, jnp.array([True]), params)
-            moved.append(float(np.linalg.norm(after.apparent_m - state.apparent_m)))
-        assert moved == sorted(moved, reverse=True)
-        # A measurement at the gate moves the state by about four of its standard deviations.
-        assert moved[0] < 4.1 * np.sqrt(np.linalg.eigvalsh(np.asarray(state.covariance)[0, :3, :3]).max())
-
     @pytest.mark.parametrize("error_share", [0.0, 0.5])
     def test_a_drone_that_really_jumps_is_followed(self, error_share):
         """The jump is half a metre along each axis in frame 50."""
@@ -424,57 +362,6 @@ class TestOutliers:
         # or 0.04 m, as before the jump.
         assert off_m[49].min() > 0.8
         assert off_m[80:].max() < 0.06
-
-
-class TestSymmetries:
-    @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-3, 0.05]))
-    @settings(max_examples=15, deadline=None)
-    def test_a_turned_world_gives_turned_states(self, seed, std_m):
-        rng = np.random.default_rng(seed)
-        flown = remove_random_measurements(
-            simulate_flight(seed, frames=12, drones=2, std_m=std_m, error_share=0.5), seed
-        )
-        turn, shift_m = Rotation.random(rng=rng).as_matrix(), rng.uniform(-3, 3, 3)
-        turned = replace(
-            flown,
-            measured_m=flown.measured_m @ turn.T + shift_m,
-            covariance_m2=turn @ flown.covariance_m2 @ turn.T,
-        )
-        (here, nis), (there, nis_there) = run(flown, jnp.float64), run(turned, jnp.float64)
-        # Rounding errors of positions, 1e-10 m, are divided by dt² in accelerations.
-        np.testing.assert_allclose(there.position_m, here.position_m @ turn.T + shift_m, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(there.velocity_m_s, here.velocity_m_s @ turn.T, rtol=0, atol=1e-7)
-        np.testing.assert_allclose(
-            there.acceleration_m_s2, here.acceleration_m_s2 @ turn.T, rtol=0, atol=1e-5
-        )
-        np.testing.assert_allclose(nis_there, nis, rtol=1e-6)
-        expected_m2 = turn @ here.position_covariance_m2 @ turn.T
-        np.testing.assert_allclose(
-            there.position_covariance_m2, expected_m2, rtol=0, atol=1e-6 * expected_m2.max()
-        )
-
-    def test_drones_do_not_affect_each_other(self):
-        """A drone has the same states alone and with others, apart from float32 rounding in the compiler's order."""
-        flown = remove_random_measurements(simulate_flight(11, frames=60, drones=3, error_share=0.5), 12)
-        together, _ = run(flown)
-        alone, _ = run(
-            replace(
-                flown,
-                measured_m=flown.measured_m[:, 1:2],
-                covariance_m2=flown.covariance_m2[:, 1:2],
-                was_measured=flown.was_measured[:, 1:2],
-            )
-        )
-        np.testing.assert_allclose(alone.position_m[:, 0], together.position_m[:, 1], rtol=0, atol=1e-5)
-
-
-def test_a_mean_is_split_and_joined():
-    mean = jnp.arange(24.0).reshape(2, 12)
-    state = kalman.state_from_mean(mean, jnp.zeros((2, 12, 12)), jnp.zeros((2, 3, 3)))
-    assert state.velocity_m_s.tolist() == [[3, 4, 5], [15, 16, 17]]
-    assert state.error_m.tolist() == [[9, 10, 11], [21, 22, 23]]
-    assert state.position_m.tolist() == [[-9] * 3] * 2
-    np.testing.assert_array_equal(state.mean, mean)
 
 
 def test_the_initial_state_is_the_given_one():
@@ -489,30 +376,3 @@ def test_the_initial_state_is_the_given_one():
     # The covariance of the position does not depend on the share of the lasting error.
     np.testing.assert_allclose(state.position_covariance_m2, covariance, rtol=0, atol=2e-5)
     np.testing.assert_allclose(state.noise_m2, covariance, rtol=0, atol=1e-5)
-
-
-def test_other_values_need_no_compilation(caplog):
-    step = jax.jit(
-        lambda state, dt_s, params, *measured: update(predict(state, dt_s, params), *measured, params)
-    )
-
-    def call(seed, density, dt_s):
-        flown = simulate_flight(seed, frames=1, drones=3)
-        measured, covariance = float32((flown.measured_m[0], flown.covariance_m2[0]))
-        params = motion_params(density, 3, velocity_std=density, error_share=dt_s, error_time_s=density)
-        state = init(measured, measured, covariance, params)
-        state, _ = step(
-            state, jnp.float32(dt_s), params, measured, covariance, jnp.array([True, False, True])
-        )
-        return step(state, jnp.float32(dt_s), params, measured, covariance, jnp.array([False, False, True]))
-
-    def compiled():
-        lines = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
-        caplog.clear()
-        return lines
-
-    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
-        call(0, 1.0, 0.04)
-        assert any("lambda" in line for line in compiled())
-        call(1, 200.0, 0.01)
-        assert compiled() == []

@@ -16,7 +16,6 @@ from psotrack.recordings import Detections, write_detections
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import MotionSettings, StatusSettings, TrackSettings
 from psotrack.tracking.births import (
-    FlightVolume,
     find_cut_off,
     find_outside,
     flight_volume,
@@ -70,6 +69,16 @@ def sightings_of(rig, truth_m, seed=0, clutter=1, hidden=()):
     return Sightings(centre, np.where(np.isfinite(centre), 12.0, np.nan), noise)
 
 
+def joined(one, other, axis):
+    """The sightings of both, one after the other along frames (0) or boxes (2)."""
+    return Sightings(
+        *(
+            np.concatenate([getattr(each, name) for each in (one, other)], axis=axis)
+            for name in ("centre_px", "size_px", "noise_px")
+        )
+    )
+
+
 def tracked(rig, sightings, volume, size_m=None, **status):
     motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
     settings = TrackSettings(motion=motion, status=StatusSettings(**status))
@@ -109,21 +118,19 @@ def test_given_values_win():
     volume = flight_volume(rig, points, bounds_m=(-1.0, 1.0, -2.0, 2.0, 0.0, 3.0), max_speed_m_s=5.0)
     np.testing.assert_array_equal(volume.bounds_m, [[-1, -2, 0], [1, 2, 3]])
     assert (volume.bounds_from, volume.max_speed_m_s, volume.speed_from) == ("given", 5.0, "given")
+    assert volume.record["bounds_m"] == [[-1.0, -2.0, 0.0], [1.0, 2.0, 3.0]]
     assert "outside of the given bounds" in find_outside(volume)
     assert "--max-speed" in find_outside(flight_volume(rig, points, max_speed_m_s=5.0))
     assert find_outside(flight_volume(rig, points)) is None
 
 
-def test_false_alarms_alone_leave_the_room_of_the_cameras():
+def test_false_alarms_and_what_moves_below_a_floor_leave_the_room_of_the_cameras():
     rig = ground_rig(4)
     points = moving_points(rig, sightings_of(rig, flights(60, ()), clutter=3), FPS)
     volume = flight_volume(rig, points)
     np.testing.assert_array_equal(volume.bounds_m, room_bounds(rig))
     assert (volume.bounds_from, volume.max_speed_m_s) == ("cameras", 6.0)
-
-
-def test_what_moves_below_a_floor_does_not_lower_it():
-    """Reflections in the floor of a room agree in all cameras, and move with the drones."""
+    # Reflections in the floor of a room agree in all cameras, and move with the drones.
     rig = ground_rig(4, target_m=(0.0, 0.0, 1.0), height_m=9.0)
     real_m = flights(30, (2.0,), centre_m=(0.0, 0.0, 2.0))
     both_m = np.concatenate([real_m, real_m * (1, 1, -1)], axis=1)
@@ -151,13 +158,7 @@ def test_two_cameras_keep_a_track_that_three_began_and_begin_one_late_that_a_thi
     rig, truth_m = ground_rig(3), flights(50, (4.0,))
     volume = flight_volume(rig, None, bounds_m=(-20.0, 20.0, -20.0, 20.0, 0.0, 30.0))
     three, two = (sightings_of(rig, truth_m, hidden=hidden) for hidden in ((), (2,)))
-    later = Sightings(
-        *(
-            np.concatenate([getattr(three, name)[:12], getattr(two, name)[12:]])
-            for name in ("centre_px", "size_px", "noise_px")
-        )
-    )
-    kept = tracked(rig, later, volume)
+    kept = tracked(rig, joined(three[:12], two[12:], axis=0), volume)
     assert kept.num_drones == 1
     assert (kept.status[:, 0] == Status.TRACKED).all()
     assert tracked(rig, sightings_of(rig, truth_m[:25], hidden=(2,)), volume).num_drones == 0
@@ -173,12 +174,7 @@ def test_the_volume_holds_a_drone_that_something_hides_from_the_third_camera():
     rig = ground_rig(3)
     truth_m = np.concatenate([flights(60, (4.0,)), flights(60, (1.0,), centre_m=(0.0, 0.0, 22.0))], axis=1)
     low, high = sightings_of(rig, truth_m[:, :1]), sightings_of(rig, truth_m[:, 1:], hidden=(1,), clutter=0)
-    both = Sightings(
-        *(
-            np.concatenate([getattr(low, name), getattr(high, name)], axis=2)
-            for name in ("centre_px", "size_px", "noise_px")
-        )
-    )
+    both = joined(low, high, axis=2)
     volume = flight_volume(rig, moving_points(rig, both, FPS))
     assert 22.0 < volume.bounds_m[1, 2] < 27.0
     assert tracked(rig, both, volume).num_drones == 2
@@ -194,23 +190,16 @@ def test_a_fast_drone_far_away_is_not_two():
 
 
 @pytest.mark.parametrize(
-    ("bounds_m", "max_speed_m_s", "expected"),
+    ("largest_y_m", "max_speed_m_s", "expected"),
     [
-        ((-20.0, 20.0, -20.0, 20.0, 0.0, 30.0), 12.0, None),
-        (
-            (-20.0, 20.0, -20.0, 5.0, 0.0, 30.0),
-            12.0,
-            "was lost at the bound y = 5.0 m; if it flies on, pass wider --bounds",
-        ),
-        (
-            (-20.0, 20.0, -20.0, 20.0, 0.0, 30.0),
-            4.0,
-            "flies at the speed limit of 4 m/s; if it is faster, pass a higher --max-sp",
-        ),
+        (20.0, 12.0, None),
+        (5.0, 12.0, "was lost at the bound y = 5.0 m; if it flies on, pass wider --bounds"),
+        (20.0, 4.0, "flies at the speed limit of 4 m/s; if it is faster, pass a higher --max-sp"),
     ],
 )
-def test_a_track_that_is_cut_off_is_named_with_the_option(bounds_m, max_speed_m_s, expected):
+def test_a_track_that_is_cut_off_is_named_with_the_option(largest_y_m, max_speed_m_s, expected):
     rig, truth_m = ground_rig(4), flights(60, (5.0,))
+    bounds_m = (-20.0, 20.0, -20.0, largest_y_m, 0.0, 30.0)
     volume = flight_volume(rig, None, bounds_m=bounds_m, max_speed_m_s=max_speed_m_s)
     line = find_cut_off(tracked(rig, sightings_of(rig, truth_m, clutter=0), volume), volume, FPS)
     if expected is None:
@@ -256,8 +245,3 @@ def test_a_recording_of_detections_is_tracked_within_the_volume_that_is_found(tm
     with pytest.raises(InputError, match="found none in any frame"):
         track_recording(open_recording(tmp_path), told, cache=tmp_path / "cache")
     assert "100% of what moves is outside of the given bounds; pass wider --bounds" in caplog.text
-
-
-def test_the_record_of_a_volume_is_fit_for_json():
-    volume = FlightVolume(np.zeros((2, 3)), "given", 6.0, "default")
-    assert volume.record["bounds_m"] == [[0.0] * 3] * 2

@@ -23,7 +23,6 @@ from windows import (
     pixels,
 )
 
-from psotrack.foreground.silhouettes import box_sum
 from psotrack.tracking.swarm.fitness import camera_scores, filled_share
 from psotrack.tracking.swarm.patches import NUM_LEVELS, SIDE
 
@@ -97,32 +96,6 @@ def _rounded_mean(sums, cell):
     return (2 * sums + cell**2) // (2 * cell**2)
 
 
-@given(st.integers(0, 2**16))
-def test_boxes_on_the_grid_of_a_window_are_slice_sums(seed):
-    """Sums over boxes with edges on the windows' pixels equal NumPy's sums over the reduced silhouettes."""
-    rng = np.random.default_rng(seed)
-    patches = cut_at(far_rig(1), NOISE, PLACES_M, SIZES_M, occluding=None)
-    ends = np.sort(rng.integers(0, SIDE + 1, (2, 2, *patches.x_px.shape)), axis=1)
-    (x0, x1), (y0, y1) = ends
-    edges = float32([side[None] for side in (x0, y0, x1, y1)])
-    total = np.asarray(_box_sum(patches.tables, np.arange(20, dtype=np.int32).reshape(5, 4), *edges))[0]
-    cell = patches.pixel_px.astype(int)
-    for d, c in np.ndindex(total.shape):
-        (left, right), (top, bottom) = (
-            int(first[d, c]) + cell[d, c] * end[:, d, c]
-            for first, end in ((patches.x_px, ends[0]), (patches.y_px, ends[1]))
-        )
-        if right > SHAPE[1] // 8 * 8 or bottom > SHAPE[0] // 8 * 8:
-            continue  # The image border divides a pixel; the next test covers this case.
-        n = cell[d, c]
-        fine = NOISE[c, max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)].astype(int)
-        cells = fine.reshape(fine.shape[0] // n, n, fine.shape[1] // n, n).sum(axis=(1, 3))
-        assert total[d, c] == np.float32(_rounded_mean(cells, n).sum())
-
-
-_box_sum = jax.jit(box_sum)
-
-
 def test_at_the_image_border_a_divided_pixel_counts_in_full():
     """In images that are all foreground, every box is full at every level, up to the border of an odd image."""
     white = np.full_like(NOISE, 255)
@@ -146,7 +119,6 @@ SMALL_M = np.array([[0.4, 0.4, 0.25]]).repeat(2, axis=0)
 
 
 @pytest.mark.parametrize("where", ["in the room", "all about"])
-@pytest.mark.slow
 def test_scores_agree_with_those_from_whole_images(where):
     """Within reach of the expected position, a window of the finest level contains all pixels that the score reads."""
     rng = np.random.default_rng(1)

@@ -7,11 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same
+from helpers import ROOM_M, assert_same, draw_coverage, drawn_silhouettes, float32, ring_rig, track_settings
 from hypothesis import given
 from hypothesis import strategies as st
+from windows import cut_at
 
-from psotrack.tracking.swarm import optimiser
+from psotrack.geometry import make_extents
+from psotrack.settings import SwarmSettings
+from psotrack.tracking.births import InitialState
+from psotrack.tracking.swarm import (
+    DroneFitness,
+    RunInputs,
+    ScoreInputs,
+    SearchRegion,
+    SoftIoU,
+    find_search,
+    optimiser,
+    track_silhouettes,
+    tracker_settings,
+)
 
 #: Coefficients of a swarm where a test sets no others.
 COEFFICIENTS = {"inertia": 0.6, "cognitive": 1.5, "social": 1.5}
@@ -196,15 +210,7 @@ def test_a_single_defined_particle_leads():
     assert final.gbest_fitness[0] > -18
 
 
-def test_undefined_everywhere_stays_undefined_and_finite():
-    final = run(jax.random.key(0), undefined_everywhere, random_positions(7, 2, 3), params(2, 3), 10)
-    assert np.isneginf(final.gbest_fitness).all()
-    assert np.isneginf(final.pbest_fitness).all()
-    assert np.isfinite(final.gbest_position).all()
-    assert np.isfinite(final.position).all()
-
-
-def test_an_undefined_start_recovers():
+def test_an_undefined_start_recovers_or_stays_finite():
     """At first no particle is defined; the first particle that is defined leads."""
 
     def far_right(position):
@@ -217,13 +223,11 @@ def test_an_undefined_start_recovers():
     after = step(jax.random.key(0), far_right, moving, params(inertia=1.0))
     assert after.gbest_fitness[0] < -4
     assert after.gbest_position[0, 0] > 4
-
-
-def test_particles_outside_the_bounds_are_moved_to_the_bounds():
-    start = init(sphere, random_positions(20, 2, 3, scale=50.0), params(2, 3, low=-1.0, high=2.0))
-    assert start.position.min() == -1
-    assert start.position.max() == 2
-    np.testing.assert_array_equal(start.pbest_position, start.position)
+    never = run(jax.random.key(0), undefined_everywhere, position, params(), 10)
+    assert np.isneginf(never.gbest_fitness).all()
+    assert np.isneginf(never.pbest_fitness).all()
+    assert np.isfinite(never.gbest_position).all()
+    assert np.isfinite(never.position).all()
 
 
 def test_a_particle_does_not_stick_to_a_bound():
@@ -278,18 +282,6 @@ def test_groups_do_not_interact():
     np.testing.assert_array_equal(
         final.gbest_position[np.array([0, 2])], changed.gbest_position[np.array([0, 2])]
     )
-
-
-def test_groups_find_maxima_of_their_own():
-    targets = jnp.array([[1.0, -2.0], [3.0, 0.5], [-4.0, 4.0]])
-    final = run(
-        jax.random.key(0),
-        lambda x: -jnp.square(x - targets).sum(axis=-1),
-        random_positions(30, 3, 2),
-        params(3),
-        120,
-    )
-    np.testing.assert_allclose(final.gbest_position, targets, atol=1e-3)
 
 
 def test_run_is_init_steps_and_a_last_evaluation():
@@ -351,3 +343,64 @@ def test_other_settings_and_numbers_of_iterations_need_no_compilation():
     assert traces == once
     # The function is traced for the start and for the body of the loop, for any number of iterations.
     assert once <= 3
+
+
+# --- the same search as one kernel, by Pallas' interpreter on the CPU
+
+SIZE_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]], np.float32)
+#: The drones hide each other from some cameras.
+PLACE_M = np.array([[0.3, 0.0, 1.4], [-0.2, -0.5, 1.2]], np.float32)
+EFFORT = {"particles": 6, "iterations": 5}
+
+
+def search_case(name, *, coefficients=0, cameras=3, fisheye=None):
+    """A search of two runs, and its arguments: the keys, and first positions beside the drones."""
+    rig = ring_rig(cameras, coefficients=coefficients)
+    patches = cut_at(rig, draw_coverage(rig, PLACE_M, SIZE_M, 2), PLACE_M, SIZE_M, reduction=2)
+    seen = make_extents(float32(replace(rig.cameras, fisheye=fisheye)), SIZE_M)
+    objective = DroneFitness(ScoreInputs(seen, jax.tree.map(jnp.asarray, patches), SoftIoU()))
+    region = SearchRegion(PLACE_M - 0.3, PLACE_M + 0.3, jnp.full(3, 0.1))
+    search = find_search(SwarmSettings(search=name, **EFFORT))
+
+    def one_run(key, first):
+        return search(key, objective, first, region, jnp.int32(EFFORT["iterations"]))
+
+    noise = np.random.default_rng(0).normal(0, 0.1, (2, EFFORT["particles"], *PLACE_M.shape))
+    arguments = jax.random.split(jax.random.key(3), 2), np.float32(PLACE_M + noise)
+    return jax.jit(jax.vmap(one_run)), arguments
+
+
+def test_the_best_positions_are_those_of_the_swarm():
+    """Three cameras and six particles: the kernel fills up both."""
+    of_swarm, of_kernel = (
+        np.asarray(search(*arguments)) for search, arguments in map(search_case, ("pso", "pso-kernel"))
+    )
+    _, (_, first) = search_case("pso")
+    assert (np.abs(of_swarm[:, None] - first).max(axis=-1) > 1e-3).all()
+    # Roundings of single operations on metres.
+    np.testing.assert_allclose(of_kernel, of_swarm, atol=1e-5)
+
+
+@pytest.mark.parametrize(("coefficients", "cameras"), [(0, 8), (5, 3)])
+def test_it_compiles_to_triton(coefficients, cameras):
+    """The program for a GPU, up to Triton's code: no GPU is needed."""
+    search, arguments = search_case("pso-kernel", coefficients=coefficients, cameras=cameras)
+    text = search.trace(*arguments).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("custom_call @__gpu$xla.gpu.triton") == 1
+    # The blocks of threads: those of two drones in two runs.
+    assert "grid_x = 2 : i32, grid_y = 2 : i32, grid_z = 1 : i32" in text
+
+
+@pytest.mark.nightly
+def test_the_tracks_are_those_of_the_swarm():
+    rig, frames = ring_rig(3, coefficients=5), 4
+    silhouettes = drawn_silhouettes(rig, np.broadcast_to(PLACE_M, (frames, 2, 3)), SIZE_M, 2)
+    given = InitialState(PLACE_M + 0.02, np.zeros((2, 3)), SIZE_M, np.full(2, 5.0))
+
+    def tracked(search):
+        chosen = tracker_settings(track_settings(search=search, drones=2, **EFFORT))
+        ((tracks, _),) = track_silhouettes(rig, silhouettes, [RunInputs(ROOM_M, chosen, given)], fps=25.0)
+        return tracks.position_m
+
+    # Where rounding puts an edge into the next pixel of a window, the searches end at different corners.
+    np.testing.assert_allclose(tracked("pso-kernel"), tracked("pso"), atol=1e-4)

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from helpers import draw_coverage, float32, make_unnamed_rig, ring_rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -64,12 +63,11 @@ def test_the_vertex_is_that_of_the_least_squares_paraboloid():
     np.testing.assert_allclose(answer.dispersion[0], phi, rtol=0.02)
 
 
-@pytest.mark.slow
 def test_the_vertex_is_the_centre_of_an_ellipsoid():
     """From any start near the true centre, the vertex is closer to the centre than one pixel of the silhouettes."""
     rng = np.random.default_rng(0)
     errors_m = []
-    for _ in range(20):
+    for _ in range(10):
         truth = rng.uniform([-0.8, -0.8, 0.7], [0.8, 0.8, 1.8])[None]
         start = truth + rng.uniform(-0.02, 0.02, 3)
         errors_m.append(np.linalg.norm(found(score_view(truth), start).position_m[0] - truth[0]))
@@ -93,30 +91,11 @@ def test_cameras_on_one_side_know_that_the_depth_is_uncertain():
     assert variance[-1] > 80 * np.sqrt(variance[0] * variance[1])
 
 
-def test_the_vertex_stays_within_the_grid():
+def test_the_vertex_stays_within_the_grid_and_one_camera_has_no_dispersion():
     truth = np.array([[0.1, 0.2, 1.2]])
     start = truth + np.array([0.3, 0.0, 0.0])
     moved = np.abs(np.asarray(found(score_view(truth), start).position_m) - start)
     assert (moved <= SPAN * SIZE_M * (1 + 1e-5)).all()
-
-
-@pytest.mark.slow
-def test_two_views_from_one_side_are_uncertain_along_their_rays():
-    truth = np.array([[0.0, 0.0, 1.2]])
-    rig = ring_rig(36, image_size_wh=(960, 720))
-    near = rig.select((rig.names[0], rig.names[2]))
-    inverse = np.asarray(found(score_view(truth, rig=near), truth).inverse_curvature_m2[0], float)
-    axis = np.linalg.eigh(inverse)[1][:, -1]
-    ray = truth[0] - near.cameras.centre_world.mean(axis=0)
-    # The two rays are 20 degrees apart, and the ellipsoid's shape matters too: the axis is only roughly along the ray.
-    assert abs(axis @ ray) / np.linalg.norm(ray) > 0.8
-    wide = found(score_view(truth), truth).inverse_curvature_m2[0]
-    assert np.linalg.eigvalsh(inverse)[-1] > 3 * np.linalg.eigvalsh(np.asarray(wide, float))[-1]
-
-
-@pytest.mark.slow
-def test_the_dispersion_of_a_single_camera_is_infinite():
-    truth = np.array([[0.0, 0.0, 1.2]])
     alone = RIG.select(RIG.names[:1])
     assert np.isinf(found(score_view(truth, rig=alone), truth).dispersion[0])
 
@@ -138,11 +117,9 @@ def test_the_result_is_finite_everywhere(position_m):
 VIEW = score_view(np.array([[0.1, 0.2, 1.2]]))
 
 
-@pytest.mark.parametrize("order", [[2, 0, 1], [1, 2, 0]])
-@pytest.mark.slow
-def test_the_order_of_drones_does_not_matter(order):
+def test_the_order_of_drones_does_not_matter():
     """Whole images contain no occlusion by other drones, so each drone's result depends on that drone only."""
-    truth = np.array([[0.0, 0.0, 1.2], [0.9, -0.4, 1.0], [-0.8, 0.7, 1.5]])
+    truth, order = np.array([[0.0, 0.0, 1.2], [0.9, -0.4, 1.0], [-0.8, 0.7, 1.5]]), [2, 0, 1]
     size = np.tile(SIZE_M, (3, 1))
     one = found(score_view(truth, size_m=size), truth + 0.01, size)
     other = found(score_view(truth[order], size_m=size[order]), truth[order] + 0.01, size[order])

@@ -5,22 +5,34 @@ from itertools import product
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, make_unnamed_rig, move_world, ring_rig
+from helpers import (
+    LENSES,
+    draw_coverage,
+    make_unnamed_rig,
+    move_world,
+    project_points,
+    ring_rig,
+    silhouettes_in_memory,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from psotrack.geometry import project
-from psotrack.tracking.matching import NEW_GROUP_COST, SHARED_COST, UNEXPLAINED_COST, epipolar_distance, match
+from psotrack.recordings import Detections
+from psotrack.tracking.matching import (
+    NEW_GROUP_COST,
+    SHARED_COST,
+    UNEXPLAINED_COST,
+    epipolar_distance,
+    from_detections,
+    from_silhouettes,
+    match,
+)
 
 BOUNDS_M = np.array([[-4.0, -4.0, -1.0], [4.0, 4.0, 4.0]])
 LARGE_WH = (1280, 960)
-
-
-def pixels_of(rig, points):
-    """(..., cameras, 2), pixels of points in all cameras."""
-    return project(rig.cameras, np.asarray(points)[..., None, :])[0]
 
 
 def separate_points(count, rng, least_m=0.6):
@@ -35,7 +47,7 @@ def separate_points(count, rng, least_m=0.6):
 
 def observe(rig, drones, rng, *, noise_px, missed=0.0, false=0):
     """Simulate detections: per camera, their pixels in random order, and the number of each one's drone (-1: none)."""
-    pixels = pixels_of(rig, drones)
+    pixels = project_points(rig, drones)
     points, owners = [], []
     for c in range(len(rig)):
         seen = np.flatnonzero(rng.random(len(drones)) >= missed)
@@ -60,6 +72,35 @@ def match_points(rig, points, noise_px, bounds_m=BOUNDS_M, **options):
 def groups_of(matches):
     """Set of the groups; a group is a tuple with a detection's index per camera, or -1."""
     return {tuple(row) for row in matches.detection.tolist()}
+
+
+# --- sightings: the boxes of a detector, and blobs of foreground, as arrays
+
+
+def test_a_sighting_is_at_the_middle_of_its_box_and_is_less_certain_at_the_image_border():
+    rig = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))
+    boxes = np.array([[10.0, 20.0, 30.0, 60.0], [0.0, 20.0, 20.0, 60.0]])
+    given = {rig.names[2]: Detections(np.array([1, 1]), boxes, np.ones(2))}
+    sightings = from_detections(given, rig, 3)
+    assert sightings.centre_px.shape == (3, 8, 2, 2)
+    # The box covers columns 10 to 29; the middle of column 0 is at 0, so the box's middle is at 19.5.
+    np.testing.assert_array_equal(sightings.centre_px[1, 2], [[19.5, 39.5], [9.5, 39.5]])
+    np.testing.assert_array_equal(sightings.size_px[1, 2], [[20, 40], [20, 40]])
+    assert sightings.noise_px[1, 2, 1] > 3 * sightings.noise_px[1, 2, 0]
+    assert np.isnan(sightings.centre_px[[0, 2]]).all()
+    assert np.isnan(np.delete(sightings.noise_px[1], 2, axis=0)).all()
+    # Boxes of frames that no video has do not count.
+    assert np.isnan(from_detections(given, rig, 1).centre_px).all()
+
+
+def test_blobs_of_silhouettes_are_sightings():
+    rig, reduction, position_m = ring_rig(4), 2, np.array([[0.2, -0.3, 1.2]])
+    image = draw_coverage(rig, position_m, [0.6, 0.6, 0.6], reduction)
+    silhouettes = silhouettes_in_memory(rig, np.repeat(image[None], 30, axis=0), reduction)
+    sightings = from_silhouettes(silhouettes)
+    assert sightings.centre_px.shape == (30, 4, 1, 2)
+    # The image of a sphere is not exactly centred on the image of its middle, and cells are 2 px wide.
+    np.testing.assert_allclose(sightings.centre_px[-1, :, 0], project(rig.cameras, position_m)[0], atol=1.5)
 
 
 # --- epipolar lines
@@ -129,20 +170,7 @@ def least_total(rig, points, noise_px):
     return set(chosen), best
 
 
-def total_cost(rig, points, groups, noise_px):
-    """Total cost of an assignment: costs of groups, of shared detections and of unexplained detections."""
-    left = set().union(*({(c, i) for i in range(len(detections))} for c, detections in enumerate(points)))
-    total = 0.0
-    for group in groups:
-        taken = {(c, i) for c, i in enumerate(group) if i >= 0}
-        total += (
-            NEW_GROUP_COST + reprojection_cost(rig, points, group, noise_px) + SHARED_COST * len(taken - left)
-        )
-        left -= taken
-    return total + UNEXPLAINED_COST * len(left)
-
-
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(10))
 def test_groups_have_the_least_total_cost_of_all_assignments(seed):
     """Three cameras, two or three drones, and at most one false detection per camera."""
     rng = np.random.default_rng(seed)
@@ -153,27 +181,10 @@ def test_groups_have_the_least_total_cost_of_all_assignments(seed):
     assert groups_of(match_points(rig, points, 3.0)) == expected
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_the_total_cost_is_not_above_that_of_the_true_groups(seed):
-    """Six drones and seven cameras have too many assignments to try all of them."""
-    rng = np.random.default_rng(seed)
-    rig = ring_rig(7, image_size_wh=LARGE_WH)
-    drones = separate_points(6, rng)
-    points, owners = observe(rig, drones, rng, noise_px=2.0, missed=0.1, false=2)
-    truth = [
-        tuple(np.flatnonzero(owner == drone)[0] if (owner == drone).any() else -1 for owner in owners)
-        for drone in range(6)
-    ]
-    found = total_cost(rig, points, groups_of(match_points(rig, points, 2.0)), 2.0)
-    # `match` computes points from weighted linear equations, not from the least reprojection error. Measured excess
-    # 0.01; an unexplained detection costs 13.8.
-    assert found <= total_cost(rig, points, truth, 2.0) + 0.1
-
-
 # --- comparison with the truth
 
 
-@pytest.mark.parametrize("noise_px", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("noise_px", [1.0, 3.0])
 def test_drones_are_found_and_few_groups_are_false(noise_px):
     """Ten scenes of six drones and seven cameras; 10 % of detections are missing, two per image are false."""
     found = wrong = drones_seen = 0
@@ -186,6 +197,13 @@ def test_drones_are_found_and_few_groups_are_false(noise_px):
         detected = np.array([[(owner == drone).any() for owner in owners] for drone in range(6)])
         drones_seen += int((detected.sum(axis=1) >= 3).sum())
         distance = np.linalg.norm(matches.position_m[:, None] - drones, axis=-1)
+        for position_m, row in zip(matches.position_m, matches.detection, strict=True):
+            seen = np.flatnonzero(row >= 0)
+            picked = np.array([points[c][row[c]] for c in seen])
+            off_px = project_points(rig, position_m)[seen] - picked
+            least = reprojection_cost(rig, points, row, noise_px)
+            # Errors are least in the undistorted image, whose pixels differ in size by up to 5 % from those here.
+            assert least - 1e-9 <= np.square(off_px / noise_px).sum() < 1.1 * least + 1e-9
         # A pixel is 4 mm at 4 m. The limit is five standard deviations, because some groups have only three views that
         # are nearly in line.
         near = distance < 5 * 0.004 * noise_px
@@ -199,38 +217,13 @@ def test_drones_are_found_and_few_groups_are_false(noise_px):
     assert wrong <= 1
 
 
-def test_positions_fit_their_detections_as_well_as_the_best_points():
-    """Distances are those from OpenCV's projections, in standard deviations; SciPy finds the best points."""
-    rng = np.random.default_rng(4)
-    rig = ring_rig(5, image_size_wh=LARGE_WH, coefficients=5)
-    drones = separate_points(3, rng)
-    points, owners = observe(rig, drones, rng, noise_px=1.5)
-    noise = [rng.uniform(1.0, 4.0, len(detections)) for detections in points]
-    matches = match_points(rig, points, noise)
-    assert len(matches.position_m) == 3
-    for position, row in zip(matches.position_m, matches.detection, strict=True):
-        squared = []
-        for c, index in enumerate(row):
-            R, t = rig.cameras.T_cam_world[c, :3, :3], rig.cameras.T_cam_world[c, :3, 3]
-            pixel = cv2.projectPoints(
-                position[None], cv2.Rodrigues(R)[0], t, rig.cameras.K[c], np.array(rig.cameras.dist[c])
-            )[0][0, 0]
-            squared.append(np.sum(((pixel - points[c][index]) / noise[c][index]) ** 2))
-        least = reprojection_cost(rig, points, row, np.array([[noise[c][i]] for c, i in enumerate(row)]))
-        # Errors are least in the undistorted image, whose pixels differ in size by up to 5 % from those here.
-        assert least <= np.sum(squared) < 1.1 * least
-    assert {tuple(owners[c][i] for c, i in enumerate(row)) for row in matches.detection} == {
-        (drone,) * 5 for drone in range(3)
-    }
-
-
 # --- groups with two views
 
 
 def test_two_views_are_no_group_without_a_prediction():
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = separate_points(2, np.random.default_rng(0))
-    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    points = list(project_points(rig, drones).swapaxes(0, 1))
     points[1] = points[3] = points[4] = np.empty((0, 2))
     assert not len(match_points(rig, points, 1.0).position_m)
     # A prediction of one drone permits a group for that drone only.
@@ -244,13 +237,24 @@ def test_two_views_are_no_group_without_a_prediction():
     assert alone.expected.tolist() == [-1]
 
 
+def test_detections_that_are_not_finite_and_drones_out_of_bounds_are_ignored():
+    """The first drone is near the middle of all images, where NaN could be mistaken for a valid detection."""
+    rig = ring_rig(4, image_size_wh=LARGE_WH, coefficients=4)
+    drones = np.array([[0.1, -0.1, 1.2], [1.0, 0.5, 2.0]])
+    points = list(project_points(rig, drones).swapaxes(0, 1))
+    points[1][0], points[2][1, 0] = np.nan, np.inf
+    assert groups_of(match_points(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
+    upper = np.array([[-4.0, -4.0, 1.5], [4.0, 4.0, 4.0]])
+    assert groups_of(match_points(rig, points, 1.0, bounds_m=upper)) == {(1, 1, -1, 1)}
+
+
 @pytest.mark.parametrize("least", [3, 4])
 def test_cameras_at_one_place_count_as_one_view(least):
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = separate_points(2, np.random.default_rng(1))
     for places, enough in (((0,) * 3 + tuple(range(1, least - 1)), False), (range(least), True)):
         placed = make_unnamed_rig(*(rig.cameras[i] for i in places))
-        points = list(pixels_of(placed, drones).swapaxes(0, 1))
+        points = list(project_points(placed, drones).swapaxes(0, 1))
         assert len(match_points(placed, points, 1.0, min_views=least).position_m) == (2 if enough else 0)
 
 
@@ -263,12 +267,8 @@ def test_groups_have_the_number_of_their_prediction():
     order = np.array([2, 0, 3])
     expected_m = drones[order] + rng.normal(scale=0.03, size=(3, 3))
     expected_m[2] += (0.0, 0.0, 1.5)
-    matches = match_points(
-        rig,
-        points,
-        1.0,
-        expected=(expected_m, np.broadcast_to(0.05**2 * np.eye(3), (3, 3, 3))),
-    )
+    spread = np.broadcast_to(0.05**2 * np.eye(3), (3, 3, 3))
+    matches = match_points(rig, points, 1.0, expected=(expected_m, spread))
     named = dict(zip(matches.expected.tolist(), matches.position_m, strict=False))
     assert sorted(matches.expected.tolist()) == [-1, -1, 0, 1]
     for number in (0, 1):
@@ -276,13 +276,7 @@ def test_groups_have_the_number_of_their_prediction():
         assert np.linalg.norm(named[number] - drones[order[number]]) < 0.02
         row = matches.detection[matches.expected == number][0]
         assert all(owners[c][i] == order[number] for c, i in enumerate(row) if i >= 0)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_predictions_of_drones_that_pass_each_other(seed):
-    """Both predictions are nearest to the same detections, but each gets the detections of its own drone."""
-    rng = np.random.default_rng(seed)
-    rig = ring_rig(3, image_size_wh=LARGE_WH)
+    # Both predictions are nearest to the detections of one drone, but each gets those of its own.
     drones = np.array([[0.1, 0.0, 1.2], [0.1, 0.12, 1.25]])
     points, owners = observe(rig, drones, rng, noise_px=1.0)
     expected_m = drones + np.array([[0.0, 0.08, 0.0], [0.0, 0.02, 0.0]])
@@ -290,7 +284,7 @@ def test_predictions_of_drones_that_pass_each_other(seed):
     matches = match_points(rig, points, 1.0, expected=(expected_m, spread))
     assert sorted(matches.expected.tolist()) == [0, 1]
     for number, row in zip(matches.expected, matches.detection, strict=True):
-        assert [owners[c][i] for c, i in enumerate(row)] == [number] * 3
+        assert {owners[c][i] for c, i in enumerate(row)} == {number}
 
 
 # --- merged, false and ambiguous detections
@@ -305,7 +299,7 @@ def drones_in_line():
     centre = rig.cameras.centre_world[1]
     near = np.array([0.1, 0.3, 1.2])
     far = near + 0.8 * (near - centre) / np.linalg.norm(near - centre)
-    pixels = pixels_of(rig, np.stack([near, far + np.array([0.0, 0.0, 0.01])]))
+    pixels = project_points(rig, np.stack([near, far + np.array([0.0, 0.0, 0.01])]))
     return rig, list(pixels.swapaxes(0, 1)), np.linalg.norm(pixels[0, 1] - pixels[1, 1])
 
 
@@ -327,31 +321,9 @@ def test_random_detections_or_none_give_no_groups():
     assert not len(match_points(rig, [np.empty((0, 2))] * 6, 1.0).position_m)
     one_camera = [points[0], *[np.empty((0, 2))] * 5]
     assert match_points(rig, one_camera, 1.0).detection.shape == (0, 6)
-    predicted_only = match_points(
-        rig,
-        [np.empty((0, 2))] * 6,
-        1.0,
-        expected=(np.zeros((2, 3)), np.broadcast_to(np.eye(3), (2, 3, 3))),
-    )
+    prediction = np.zeros((2, 3)), np.broadcast_to(np.eye(3), (2, 3, 3))
+    predicted_only = match_points(rig, [np.empty((0, 2))] * 6, 1.0, expected=prediction)
     assert predicted_only.expected.shape == (0,)
-
-
-def test_detections_that_are_not_finite_are_ignored():
-    """The first drone is near the middle of all images, where NaN could be mistaken for a valid detection."""
-    rig = ring_rig(4, image_size_wh=LARGE_WH, coefficients=4)
-    drones = np.array([[0.1, -0.1, 1.2], [1.0, 0.5, 1.8]])
-    points = list(pixels_of(rig, drones).swapaxes(0, 1))
-    points[1][0], points[2][1, 0] = np.nan, np.inf
-    assert groups_of(match_points(rig, points, 1.0)) == {(0, -1, 0, 0), (1, 1, -1, 1)}
-
-
-def test_drones_out_of_bounds_are_ignored():
-    rig = ring_rig(5, image_size_wh=LARGE_WH)
-    drones = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 2.0]])
-    points = list(pixels_of(rig, drones).swapaxes(0, 1))
-    upper = np.array([[-4.0, -4.0, 1.5], [4.0, 4.0, 4.0]])
-    matches = match_points(rig, points, 1.0, bounds_m=upper)
-    assert matches.detection.tolist() == [[1] * 5]
 
 
 def test_a_drone_detected_twice_in_one_image_is_one_group():
@@ -374,10 +346,10 @@ def test_ambiguity_is_a_likelihood_ratio(off_px):
     rig = make_unnamed_rig(*(ring_rig(7, image_size_wh=LARGE_WH).cameras[i] for i in (0, 1, 3, 5)))
     crossing = np.array([0.3, -0.2, 1.1])
     drones = np.stack([0.8 * crossing + 0.2 * centre for centre in rig.cameras.centre_world[:2]])
-    points = list(pixels_of(rig, drones).swapaxes(0, 1))
+    points = list(project_points(rig, drones).swapaxes(0, 1))
     alone = match_points(rig, points, 1.0)
     assert alone.ambiguity.tolist() == [0.0, 0.0]
-    points[2] = np.vstack([points[2], pixels_of(rig, crossing)[2] + (0.0, off_px)])
+    points[2] = np.vstack([points[2], project_points(rig, crossing)[2] + (0.0, off_px)])
     matches = match_points(rig, points, 1.0)
     assert groups_of(matches) == groups_of(alone) == {(0, 0, 0, 0), (1, 1, 1, 1)}
     expected = np.exp(-reprojection_cost(rig, points, (0, 1, 2, -1), 1.0) / 2)
@@ -400,8 +372,8 @@ def test_ambiguity_of_the_other_pairing(off_px):
     other = crossed + 0.3 * (second - crossed)
     along = np.linalg.lstsq(np.stack([other - first, second - drone], axis=1), second - first)[0][0]
     crossed_too = first + along * (other - first)
-    points = [pixels_of(rig, np.stack([drone, other]))[:, c] for c in (0, 1)]
-    third = pixels_of(rig, np.stack([drone, other, crossed, crossed_too]))[:, 2]
+    points = [project_points(rig, np.stack([drone, other]))[:, c] for c in (0, 1)]
+    third = project_points(rig, np.stack([drone, other, crossed, crossed_too]))[:, 2]
     third[2:, 1] += off_px
     points.append(third)
     matches = match_points(rig, points, 1.0)
@@ -416,8 +388,8 @@ def test_two_boxes_of_one_drone_are_not_ambiguous():
     """Three of five cameras have a second box 1 cm higher; whichever box is in the group, the drone is the same."""
     rig = ring_rig(5, image_size_wh=LARGE_WH)
     drones = separate_points(2, np.random.default_rng(0))
-    points = list(pixels_of(rig, drones).swapaxes(0, 1))
-    higher = pixels_of(rig, drones[0] + np.array([0.0, 0.0, 0.01]))
+    points = list(project_points(rig, drones).swapaxes(0, 1))
+    higher = project_points(rig, drones[0] + np.array([0.0, 0.0, 0.01]))
     for c in range(3):
         points[c] = np.vstack([points[c], higher[c]])
     matches = match_points(rig, points, 2.0)
@@ -469,12 +441,8 @@ def test_invariants_of_groups(seed):
     points.append(points[0][:0])
     rig = make_unnamed_rig(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
     known = drones[: rng.integers(0, len(drones) + 1)]
-    matches = match_points(
-        rig,
-        points,
-        3.0,
-        expected=(known, np.broadcast_to(0.02 * np.eye(3), (len(known), 3, 3))),
-    )
+    spread = np.broadcast_to(0.02 * np.eye(3), (len(known), 3, 3))
+    matches = match_points(rig, points, 3.0, expected=(known, spread))
     assert ((matches.position_m >= BOUNDS_M[0]) & (matches.position_m <= BOUNDS_M[1])).all()
     assert ((matches.ambiguity >= 0) & (matches.ambiguity <= 1)).all()
     seen = matches.detection >= 0

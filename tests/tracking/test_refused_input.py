@@ -1,0 +1,109 @@
+"""Messages of the tracking room: settings, measurements and lenses that it cannot use."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_refused, draw_coverage, float32, ring_rig, track_settings
+from motion_textbook import simulate_flight
+from windows import cut_at
+
+from psotrack.geometry import make_extents
+from psotrack.pipeline import causal_settings
+from psotrack.settings import SwarmSettings, TrackSettings
+from psotrack.tracking.identity import resolve
+from psotrack.tracking.motion import estimate_jerk_density, smooth
+from psotrack.tracking.swarm import (
+    DroneFitness,
+    ScoreInputs,
+    SearchRegion,
+    SoftIoU,
+    find_search,
+    tracker_settings,
+)
+
+
+def with_setting(name: str, value: object) -> Callable[[], object]:
+    return lambda: TrackSettings().changed({name: value})
+
+
+def causal(name: str, value: object) -> Callable[[], object]:
+    return lambda: causal_settings(TrackSettings().changed({name: value}))
+
+
+def measured(function: Callable, array: str, index: object, value: object) -> Callable[[], object]:
+    """A call with measurements of two drones in 30 frames, of which one value is wrong."""
+
+    def call() -> object:
+        flown = simulate_flight(18, frames=30, drones=2)
+        getattr(flown, array)[index] = value
+        return function(flown.measurements, flown.params)
+
+    return call
+
+
+def relabel(measurements: object, params: object) -> object:
+    return resolve(measurements, params, 0.6)
+
+
+def search_through_a_fisheye() -> object:
+    rig = ring_rig(3, coefficients=5)
+    size_m, place_m = np.array([[0.5, 0.5, 0.3]]), np.array([[0.3, 0.0, 1.4]])
+    patches = cut_at(rig, draw_coverage(rig, place_m, size_m, 2), place_m, size_m, reduction=2)
+    cameras = replace(rig.cameras, fisheye=np.array([True, False, False]))
+    inputs = ScoreInputs(
+        make_extents(*float32((cameras, size_m))), jax.tree.map(jnp.asarray, patches), SoftIoU()
+    )
+    search = find_search(SwarmSettings(search="pso-kernel", particles=6, iterations=5))
+    region = SearchRegion(*float32((place_m - 0.3, place_m + 0.3, np.full(3, 0.1))))
+    return search(jax.random.key(3), DroneFitness(inputs), jnp.zeros((6, 1, 3)), region, jnp.int32(5))
+
+
+def kernel(**options: object) -> Callable[[], object]:
+    return lambda: tracker_settings(track_settings(search="pso-kernel", **options))
+
+
+KERNEL = "swarm.search pso-kernel: expected swarm.kind per-drone, score.kind soft and no fisheye lens, found "
+POSITION = "expected a position and a positive definite covariance where it was measured, found "
+TIMES = "time_s: expected increasing times, found repeats, steps back or no numbers"
+#: Name of the case -> how the bad input is made, words of the line.
+BAD = {
+    "negative rig error": (with_setting("errors.rig_deg", -0.1), "errors.rig_deg: expected", "found -0.1"),
+    "unknown pixel error": (with_setting("errors.pixel_px", float("nan")), "errors.pixel_px: expected"),
+    "negative rate": (with_setting("rate_hz", -5.0), "rate_hz: expected a number above 0, found -5"),
+    "rate 0": (with_setting("rate_hz", 0.0), "rate_hz: expected a number above 0, found 0"),
+    "clocks": (with_setting("clocks", "guessed"), "clocks: expected one of given, auto, found guessed"),
+    "causal method": (causal("method", "fused"), "method: expected swarm without the future, found fused"),
+    "causal smoothing": (causal("smooth", True), "smooth: expected False without the future, found True"),
+    "causal start": (causal("init", "truth"), "init: expected auto without the future, found truth"),
+    "causal clocks": (causal("clocks", "auto"), "clocks: expected given without the future, found auto"),
+    "causal background": (causal("silhouettes.background", "mog2"), "first_look: expected"),
+    "kernel, joint swarm": (kernel(swarm="joint"), KERNEL + "swarm.kind joint"),
+    "kernel, hard score": (kernel(score="hard"), KERNEL + "another score"),
+    "kernel, fisheye": (search_through_a_fisheye, KERNEL + "a fisheye lens"),
+    "time that steps back": (measured(smooth, "time_s", 3, 0.01), TIMES),
+    "endless time": (measured(estimate_jerk_density, "time_s", 29, np.inf), TIMES),
+    "no position": (measured(smooth, "measured_m", (4, 1, 2), np.nan), "row 4, drone 1: " + POSITION),
+    "endless variance": (
+        measured(estimate_jerk_density, "covariance_m2", (4, 1, 2), np.inf),
+        "measurements, row 4, drone 1: " + POSITION,
+    ),
+    "negative variance": (
+        measured(smooth, "covariance_m2", (5, 0), np.diag([1, 1, -1])),
+        "measurements, row 5, drone 0: " + POSITION,
+    ),
+    "no position of tracks": (
+        measured(relabel, "measured_m", (7, 1, 2), np.nan),
+        "row 7, drone 1: " + POSITION,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    make, *words = BAD[case]
+    assert_refused(make, *words, unchanged=tmp_path)
