@@ -6,8 +6,6 @@ from functools import cache, partial
 import numpy as np
 import pytest
 from helpers import ROOM_M, draw_coverage, float32, make_unnamed_rig, ring_rig, silhouettes_in_memory
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from psotrack.foreground.silhouettes import (
     Exposures,
@@ -32,7 +30,7 @@ from psotrack.tracking.births import (
     reidentify,
     unexplained,
 )
-from psotrack.tracking.matching import NOISE_PX, Sightings
+from psotrack.tracking.matching import NOISE_PX
 from psotrack.trajectories import Trajectories
 
 FPS = 25.0
@@ -182,9 +180,6 @@ def test_a_drone_that_is_not_known_is_found(two_drones):
     assert found.moves
     # The size of the known drone need not be known.
     assert_found(candidates_in(two_drones, ONE, size_m=np.full(3, np.nan), boxes_size_m=SIZE_M), OTHER)
-
-
-NONE = KnownDrones(np.empty((0, 3)), np.empty((0, 3)))
 
 
 @pytest.mark.parametrize(
@@ -353,14 +348,6 @@ def test_a_drone_departs_that_the_background_model_has_learned(departure):
         np.testing.assert_allclose(drone.position_m, flight[drone.instant - 60], atol=2 * CELL_M)
 
 
-def test_a_ghost_that_a_drone_left_behind_is_marked(departure):
-    rig, coverage, flight = departure
-    ghost, away = np.repeat(coverage[-1:], NUM_FRAMES, axis=0), np.repeat(flight[-1:], NUM_FRAMES, axis=0)
-    (found,) = candidates_in(ghost, away, rig=rig, ghosts_from=0)
-    assert not found.moves
-    np.testing.assert_allclose(found.position_m, flight[0], atol=CELL_M)
-
-
 # --- several drones at once, few cameras
 
 FIVE = ring_rig(5, coefficients=5)
@@ -410,26 +397,15 @@ def test_two_drones_that_hide_each_other_in_one_view():
     np.testing.assert_allclose(sizes_m[:, :2], SIZES_M[:2, :2], atol=2 * CELL_5_M)
 
 
-@settings(max_examples=3)
-@given(st.permutations(range(5)), st.randoms(use_true_random=False))
-def test_the_order_of_cameras_and_of_blobs_does_not_matter(order, random):
-    def found_in(rig, rows, arrange):
-        births, borders = new_births(rig), border_cells(rig.cameras.image_size_wh, REDUCTION)
-        images = three_drones()[:, rows]
-        blobs = FrameBlobs.of(images, REDUCTION, borders)
-        shown = unexplained(blobs, np.empty((len(images), 0, 5, 4)))
-        for frame in range(len(images)):
-            view = shown[frame]
-            boxes = arrange(range(view.noise_px.shape[1]))
-            view = Sightings(view.centre_px[:, boxes], view.size_px[:, boxes], view.noise_px[:, boxes])
-            births.step(frame, view, NONE)
-        return sorted(births.candidates(), key=lambda one: one.position_m[0])
-
+def test_the_order_of_cameras_does_not_matter():
+    order = [2, 0, 4, 1, 3]
     mixed_rig = FIVE.select([FIVE.names[row] for row in order])
-    mixed = found_in(mixed_rig, list(order), lambda boxes: random.sample(boxes, len(boxes)))
-    for one, other in zip(found_in(FIVE, list(range(5)), list), mixed, strict=True):
+    found, mixed = (
+        sorted(candidates_in(images, rig=rig), key=lambda one: one.position_m[0])
+        for images, rig in ((three_drones(), FIVE), (three_drones()[:, order], mixed_rig))
+    )
+    for one, other in zip(found, mixed, strict=True):
         np.testing.assert_allclose(one.position_m, other.position_m, atol=1e-3)
-        np.testing.assert_allclose(one.velocity_m_s, other.velocity_m_s, atol=0.02)
         np.testing.assert_allclose(one.size_m, other.size_m, atol=1e-3)
         assert one.num_cameras == other.num_cameras
 

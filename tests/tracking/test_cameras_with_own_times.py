@@ -26,7 +26,7 @@ from psotrack.geometry import make_extents, project, project_boxes
 from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
 from psotrack.tracking.births import Births, FlightLimits, InitialState, KnownDrones
 from psotrack.tracking.lines import track_detections
-from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings, moved_to_instant
+from psotrack.tracking.matching import NOISE_PX, Sightings, moved_to_instant
 from psotrack.tracking.swarm import track_silhouettes
 from psotrack.trajectories import Status, Trajectories
 
@@ -283,20 +283,6 @@ def test_cameras_that_are_exposed_at_different_times_or_are_slower(tracks_of, fr
     assert error_m < 1.6 * synchronous_m + 0.001
     assert inside > 0.8
     assert found == 1.0
-
-
-def test_a_drone_that_comes_later_is_found_by_cameras_with_times_of_their_own():
-    times = exposed_later([0.1, 0.5, -0.4, 0.3, -0.2], 50)
-    shown = sightings_of(times)
-    noise_px = NOISE_PX + NOISE_SHARE * np.sqrt(shown.size_px.prod(axis=-1))
-    noise_px[:20, :, 1] = np.nan
-    timeline = make_timeline(times)
-    given = replace(shown, noise_px=noise_px).at_instants(timeline)
-    tracks = track_detections(RIG.cameras, given, SETTINGS, fps=timeline.rate_hz, bounds_m=ROOM_M)[0]
-    (new,) = tracks.arrivals
-    assert abs(timeline.time_s[new.frame] - 20 / FPS) <= 2 / FPS
-    # At the last instant, only some of the cameras are there.
-    assert (tracks.status[new.frame : -1] == Status.TRACKED).all()
 
 
 def test_drones_are_found_by_cameras_with_times_of_their_own():

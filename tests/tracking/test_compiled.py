@@ -2,12 +2,16 @@
 
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
+import jax
 import pytest
 from helpers import environment_without_jax_settings
 
-from psotrack.support import compiled, drop_programs_if_many
+from psotrack.pipeline import speed_in_words
+from psotrack.support import compiled, drop_programs_if_many, measured_compiling
 
 #: A program that is stored although it compiles fast; it prints its result and the folder of JAX's compile cache.
 PROGRAM = """
@@ -60,21 +64,15 @@ def entry(folder: Path) -> Path:
     return found
 
 
-def test_a_program_is_compiled_once(tmp_path: Path) -> None:
-    folder = tmp_path / "compiled"
-    assert run(folder) == [RESULT, str(folder)]
-    written = entry(folder).stat().st_mtime_ns
-    assert run(folder) == [RESULT, str(folder)]
-    assert entry(folder).stat().st_mtime_ns == written
-
-
-def test_a_damaged_entry_is_named_and_replaced(tmp_path: Path) -> None:
+def test_a_program_is_compiled_once_and_a_damaged_entry_is_named_and_replaced(tmp_path: Path) -> None:
     """JAX by itself never replaces an entry, such as one that a full disk cut short."""
-    run(tmp_path)
-    whole = entry(tmp_path).read_bytes()
+    assert run(tmp_path) == [RESULT, str(tmp_path)]
+    written, whole = entry(tmp_path).stat().st_mtime_ns, entry(tmp_path).read_bytes()
     damaged = [b"", whole[:300], whole[:-1], b"foreign" * 99]
     for number, content in enumerate(damaged):
         (tmp_path / f"{number}.damaged").write_bytes(content)
+    assert run(tmp_path) == [RESULT, str(tmp_path)]
+    assert entry(tmp_path).stat().st_mtime_ns == written
     printed, said = run_program(PROGRAM + AGAIN, tmp_path)
     assert printed.splitlines()[1:] == [RESULT] * len(damaged)
     line = "damaged entry jit_twice_the_sine; the program is compiled again"
@@ -82,12 +80,9 @@ def test_a_damaged_entry_is_named_and_replaced(tmp_path: Path) -> None:
     assert entry(tmp_path).stat().st_size == pytest.approx(len(whole), rel=0.1)  # It holds its compile time.
 
 
-def test_a_folder_that_cannot_be_created_is_no_error(tmp_path: Path) -> None:
+def test_a_users_own_cache_folder_is_kept_and_one_that_cannot_be_created_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert run(tmp_path / "file" / "compiled")[0] == RESULT
-
-
-def test_a_users_own_cache_folder_is_kept(tmp_path: Path) -> None:
     own = tmp_path / "own"
     assert run(tmp_path / "default", JAX_COMPILATION_CACHE_DIR=str(own)) == [RESULT, str(own)]
     assert not (tmp_path / "default").exists()
@@ -106,8 +101,52 @@ def test_programs_are_dropped_when_the_process_has_many_memory_maps(monkeypatch,
     assert calls == ["cleared"] * dropped
     assert drop_programs_if_many(most_maps=60) is False
     assert drop_programs_if_many(most_maps=59) is True
-
-
-def test_nothing_is_dropped_where_the_system_has_no_limit(monkeypatch, tmp_path):
+    # Nothing is dropped where the system has no limit.
     monkeypatch.setattr(compiled, "_MAPS", tmp_path / "absent")
     assert not drop_programs_if_many(most_maps=0)
+
+
+# --- the time of compiling, measured over all threads
+
+#: Time that JAX needs to trace a function of the test, seconds.
+TRACING_S = 0.3
+
+
+def compile_something(x: float = 1.0) -> None:
+    """Call a new compiled function, whose tracing takes `TRACING_S`."""
+
+    def slow_to_trace(x: jax.Array) -> jax.Array:
+        time.sleep(TRACING_S)
+        return x + 1
+
+    jax.jit(slow_to_trace)(x)
+
+
+def test_threads_that_compile_at_the_same_time_count_once() -> None:
+    with measured_compiling() as compile_s:
+        assert compile_s() == 0
+        threads = [threading.Thread(target=compile_something) for _ in range(2)]
+        began = time.monotonic()
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        wall_s = time.monotonic() - began
+        measured_s = compile_s()
+    assert TRACING_S <= measured_s <= wall_s + 0.1
+    # Nobody measures any longer.
+    compile_something()
+    assert compile_s() == measured_s
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (0.061, "16 times slower than the video"),
+        (0.0077, "130 times slower than the video"),
+        (2.0, "2 times faster than the video"),
+        (0.99, "as fast as the video"),
+    ],
+)
+def test_a_speed_in_words(factor: float, words: str) -> None:
+    assert speed_in_words(factor) == words

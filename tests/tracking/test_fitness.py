@@ -255,22 +255,6 @@ def test_a_particle_costs_the_same_among_many(settings):
     assert operations(1000) < 1.2 * 10 * operations(100)
 
 
-@given(st.lists(st.floats(-20, 20, width=32), min_size=6, max_size=6), st.integers(0, 2**16))
-def test_fitness_is_in_0_to_1_or_undefined(position_m, seed):
-    """Positions are inside and outside the room, behind and inside cameras; silhouettes are noise."""
-    images = np.random.default_rng(seed).integers(0, 256, (5, 12, 16)).astype(np.uint8)
-    settings = Score(reduction=20)
-    position_m = np.array(position_m).reshape(2, 3)
-    for places_m in (position_m, RIG.cameras.centre_world[seed % 4 : seed % 4 + 2]):
-        fitness = evaluate(drone_fitness, RIG, images, places_m, SIZES_M, settings)
-        assert not np.isinf(fitness).any()
-        defined = fitness[np.isfinite(fitness)]
-        # Sums have errors of 1e-6 of a box.
-        assert ((defined >= 0) & (defined <= 1 + 1e-5)).all()
-        joint = evaluate(joint_fitness, RIG, images, places_m, SIZES_M, settings)
-        np.testing.assert_allclose(joint, np.nan_to_num(fitness).mean(), atol=1e-6)
-
-
 def pixels_in(image, x0, y0, x1, y1):
     """Sum over a box with fractional edges in float64: each pixel is weighted by its share inside the box."""
     shares = []

@@ -1,7 +1,7 @@
 """Identity swaps: compared with all label histories, tested on simulated flights, and frequencies of wrong labels."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise, permutations, product
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_textbook import DT_S, Model
 from scipy.special import logsumexp
-from scipy.stats import binom
 
 from psotrack.tracking.identity import LabelOutcome, relabelled, resolve
 from psotrack.tracking.motion import Measurements
@@ -382,82 +381,3 @@ class TestAmbiguity:
                 exchanged = found.ambiguity[9 + number, 0]
                 assert (found.order[9 + number] == [0, 1]).all()
                 assert exchanged == pytest.approx(exact[1], abs=limit)
-
-
-class TestFrequencies:
-    @pytest.mark.slow
-    def test_ambiguities_are_the_frequencies_of_wrong_labels(self):
-        """A hundred encounters whose flights, errors and swaps follow the model.
-
-        While two drones are near, their tracks are exchanged five times per second, and measurement errors are as large
-        as the model assumes. In each interval of the ambiguity, the number of wrong labels agrees with the ambiguity,
-        to within 4 standard deviations of the binomial distribution, which is exceeded by chance in one of some
-        thousand tests. Labels with a low ambiguity are rarely wrong: measured 1 and 2 % of four hundred, because label
-        histories are merged.
-        """
-        rate = 5.0 * DT_S
-        probability, wrong = [], []
-        for seed in range(6):
-            rng = np.random.default_rng(seed)
-            flown_m, near = white_jerk_meetings(rng, pairs=20)
-            std_m = rng.uniform(0.005, 0.03)
-            nearness = np.clip(1 - nearest_distance_m(flown_m) / ENCOUNTER_M, 0, 1)
-            noise_m = np.hypot(std_m, 0.1 * ENCOUNTER_M * nearness**2)
-            truth = np.tile(np.arange(40), (len(flown_m), 1))
-            for frame, pair in np.argwhere(near & (rng.random(near.shape) < rate / (1 + rate))):
-                truth[frame:, 2 * pair : 2 * pair + 2] = truth[frame:, 2 * pair : 2 * pair + 2][:, ::-1]
-            tracks = simulate_tracks(flown_m + noise_m[..., None] * rng.normal(size=flown_m.shape), 0.0)
-            covariance_m2 = np.broadcast_to(std_m**2 * np.eye(3), (*noise_m.shape, 3, 3))
-            found = resolve_tracks(order_by_tracks(replace(tracks, covariance_m2=covariance_m2), truth))
-            for pair in range(20):
-                column = (found.pairs == [2 * pair, 2 * pair + 1]).all(axis=1).argmax()
-                # One frame per encounter, soon after the closest frame, because neighbouring frames are dependent.
-                row = 25 + rng.integers(10)
-                if found.ambiguity[row, column] > 0:
-                    swapped = found.order[row, 2 * pair] != 2 * pair
-                    ambiguity = found.ambiguity[row, column]
-                    probability.append(1 - ambiguity if swapped else ambiguity)
-                    wrong.append(truth[row, 2 * pair] != 2 * pair)
-        probability, wrong = np.array(probability), np.array(wrong)
-        assert len(wrong) > 90
-        edges = [0, 0.02, 0.2, 0.8, 0.98, 1]
-        for low, high in pairwise(edges):
-            inside = (probability >= low) & (probability <= high)
-            number, expected = inside.sum(), np.clip(probability[inside].mean(), 0.04, 0.96)
-            least, most = binom.ppf([3e-5, 1 - 3e-5], number, expected)
-            # Labels that are nearly certain may be right more often than in 96 of 100 encounters.
-            assert wrong[inside].sum() >= (0 if high <= 0.02 else least), (low, high)
-            assert wrong[inside].sum() <= (number if low >= 0.98 else most), (low, high)
-            assert number >= 4, (low, high)
-        # The probabilities are informative: probable labels are right, improbable labels are wrong.
-        assert ((probability > 0.5) == wrong).mean() > 0.85
-
-
-def white_jerk_meetings(rng, pairs, frames=50, density=AGILITY):
-    """Flights of pairs of drones with white jerk; the pairs are far from each other.
-
-    Returns positions, (frames, 2 * pairs, 3), and whether the drones of a pair are near each other, (frames, pairs).
-    """
-    F, Q = Model(density=density).transition(DT_S, np.eye(3))
-    root = np.linalg.cholesky(Q)
-    middle = frames // 2
-    start = np.concatenate(
-        [
-            0.1 * rng.normal(size=(2 * pairs, 3)),
-            0.5 * 0.5 * rng.normal(size=(2 * pairs, 3)),
-            rng.normal(size=(2 * pairs, 3)),
-        ],
-        axis=1,
-    )
-    state = np.empty((frames, 2 * pairs, 9))
-    for direction in (1, -1):
-        # In reversed time, velocities have the opposite sign.
-        mirror = np.repeat([1.0, direction, 1.0], 3)
-        now = start * mirror
-        for frame in range(middle, frames if direction > 0 else -1, direction):
-            state[frame] = now * mirror
-            now = now @ F.T + rng.normal(size=now.shape) @ root.T
-    flown_m = state[..., :3].copy()
-    near = np.linalg.norm(flown_m[:, ::2] - flown_m[:, 1::2], axis=-1) < 0.8 * ENCOUNTER_M
-    flown_m[..., 0] += 100 * (np.arange(2 * pairs) // 2)
-    return flown_m, near

@@ -425,29 +425,3 @@ def test_order_and_world_frame_do_not_matter(seed):
     there = match_points(move_world(rig, R, shift_m), points, 2.0, bounds_m=wide)
     here = match_points(rig, points, 2.0, bounds_m=wide - shift_m)
     assert groups_of(there) == groups_of(here)
-
-
-@settings(max_examples=25)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_invariants_of_groups(seed):
-    """Positions are in bounds, costs and ambiguities are valid, and each group has enough views.
-
-    Two of the cameras are at the same place, and one of these two has no detections.
-    """
-    rng = np.random.default_rng(seed)
-    rig = ring_rig(int(rng.integers(2, 6)), image_size_wh=LARGE_WH)
-    drones = separate_points(int(rng.integers(1, 6)), rng, least_m=0.1)
-    points, _ = observe(rig, drones, rng, noise_px=3.0, missed=0.3, false=int(rng.integers(0, 4)))
-    points.append(points[0][:0])
-    rig = make_unnamed_rig(*(rig.cameras[c] for c in [*range(len(rig)), 0]))
-    known = drones[: rng.integers(0, len(drones) + 1)]
-    spread = np.broadcast_to(0.02 * np.eye(3), (len(known), 3, 3))
-    matches = match_points(rig, points, 3.0, expected=(known, spread))
-    assert ((matches.position_m >= BOUNDS_M[0]) & (matches.position_m <= BOUNDS_M[1])).all()
-    assert ((matches.ambiguity >= 0) & (matches.ambiguity <= 1)).all()
-    seen = matches.detection >= 0
-    single = max(map(len, points)) < 2 and len(known) < 2
-    assert (seen.sum(axis=1) >= np.where((matches.expected >= 0) | single, 2, 3)).all()
-    named = matches.expected[matches.expected >= 0]
-    assert len(set(named.tolist())) == len(named)
-    assert (matches.detection < np.array([len(detections) for detections in points])).all()

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same, draw_coverage, float32, ring_rig
+from helpers import draw_coverage, float32, ring_rig
 
 from psotrack.geometry import look_at, make_camera, make_extents, make_rig, project_boxes
 from psotrack.tracking.swarm.moments import HALF_PER_STD, measure
@@ -107,17 +107,3 @@ def test_only_drones_that_are_shown_alone_and_whole_are_measured():
     empty = seen_in(np.zeros_like(coverage), at, SIZE_M)
     assert np.isnan(empty.size_ratio).all()
     assert np.isnan(empty.middle_px).all()
-
-
-def test_the_order_of_drones_and_cameras_does_not_matter():
-    at = np.array([[0.8, 0.0, 1.2], [-0.6, 0.4, 1.4], [-0.2, -0.9, 1.0]])
-    believed = np.array([[0.5, 0.5, 0.2], [0.4, 0.4, 0.3], [0.6, 0.6, 0.2]])
-    coverage = draw_coverage(RIG, at, believed, REDUCTION)
-    order, cameras = [2, 0, 1], [3, 1, 4, 0, 2]
-    plain = seen_in(coverage, at, believed)
-    other = RIG.select([RIG.names[i] for i in cameras])
-    turned = seen_in(coverage[cameras], at[order], believed[order], rig=other)
-    assert np.isfinite(plain.size_ratio).all()
-    # A median over the cameras is the same number.
-    assert_same(turned.size_ratio, plain.size_ratio[order], atol=1e-6)
-    assert_same(turned.middle_px, plain.middle_px[order][:, cameras], atol=1e-3)

@@ -29,8 +29,6 @@ from psotrack.trajectories import Status
 FORMULA = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "accuracy" / "formula_flights.py"))
 SCENES, make_flight = FORMULA["SCENES"], FORMULA["make_flight"]
 
-pytestmark = pytest.mark.slow
-
 FPS = 25.0
 K = np.array([[1000.0, 0, 960], [0, 1000.0, 540], [0, 0, 1]])
 SKY_M = (0.0, 0.0, 15.0)
@@ -98,6 +96,7 @@ def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
     assert 11.0 < volume.max_speed_m_s < 2 * 11.0
 
 
+@pytest.mark.slow
 def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
     """Balls of 5 cm: 2 px wide in the cameras, 28 m away."""
     rig, truth_m, size_m = ground_rig(4), flights(60, (4.0, 11.0)), (0.05, 0.05, 0.05)
@@ -180,6 +179,7 @@ def test_the_volume_holds_a_drone_that_something_hides_from_the_third_camera():
     assert tracked(rig, both, volume).num_drones == 2
 
 
+@pytest.mark.slow
 def test_a_fast_drone_far_away_is_not_two():
     """A sharp turn brings a drone out of its gate; three cameras that agree beside the place keep its track."""
     flight = make_flight(SCENES["outdoors, 4 cameras, 3 drones on 100 m"], 250, 54)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import jax
 import numpy as np
 import pytest
 from drawn_flights import (
@@ -19,13 +16,13 @@ from drawn_flights import (
     TRUTH_M,
     comings_and_goings,
     draw,
-    first_drone,
     run_inputs,
     track,
 )
 from helpers import ROOM_M, ring_rig, track_settings
 
 from psotrack.foreground.silhouettes import Exposures
+from psotrack.geometry import Rig
 from psotrack.tracking.births import InitialState
 from psotrack.tracking.swarm import StepwiseTracker, block, stepwise, tracker_settings
 from psotrack.tracking.swarm.run import SwarmRun
@@ -41,9 +38,18 @@ def exposures(missing: tuple[int, ...] = ()) -> Exposures:
     return Exposures(zero, ~np.isin(np.arange(len(RIG)), missing), zero + 1, zero)
 
 
-def new_tracker(**settings: object) -> StepwiseTracker:
-    chosen = tracker_settings(track_settings(**(EFFORT | settings)))
-    return StepwiseTracker(RIG, chosen, fps=FPS, bounds_m=ROOM_M, reduction=REDUCTION, shape=SHAPE)
+def new_tracker(
+    rig: Rig = RIG, shape: tuple[int, int] = SHAPE, most_drones: int = 16, **settings: object
+) -> StepwiseTracker:
+    return StepwiseTracker(
+        rig,
+        tracker_settings(track_settings(**(EFFORT | settings))),
+        fps=FPS,
+        bounds_m=ROOM_M,
+        reduction=REDUCTION,
+        shape=shape,
+        most_drones=most_drones,
+    )
 
 
 def step_by_step(
@@ -168,36 +174,6 @@ def test_a_track_may_wait_for_a_slot_that_the_next_frame_adds() -> None:
     assert run.known == [start.slot for start in waiting] == [0, 1, 2]
 
 
-@pytest.mark.slow
-def test_blocks_of_25_and_of_1_agree() -> None:
-    """From the same slots, where no track begins."""
-    whole, _ = in_blocks(25)
-    single, slots = in_blocks(1)
-    # Equal to the last bit, but for the XLA of the tests (conftest.py), which rounds otherwise in another program:
-    # particles then take other ways to the same maximum. Measured 0.1 mm, 1 mm/s, 0.02 px; a cell has 30 mm and 2 px.
-    limits = {"position_m": 1e-3, "velocity_m_s": 0.01, "box_px": 0.1}
-    for name, limit in limits.items():
-        np.testing.assert_allclose(getattr(single, name), getattr(whole, name), rtol=0, atol=limit)
-    np.testing.assert_allclose(single.covariance_m2, whole.covariance_m2, rtol=0.1, atol=1e-6)
-    np.testing.assert_array_equal(single.status, whole.status)
-    assert len(slots) == 2
-
-
-def in_blocks(length: int) -> tuple:
-    """Rows of 25 frames that are tracked in blocks of some length, and the slots after them."""
-    setting, frames = block.Setting(RIG, REDUCTION, np.array([SHAPE[::-1]] * len(RIG)), FPS), np.arange(25)
-    inputs = run_inputs(first_drone())
-    engine, run = block.Engine(setting), SwarmRun(setting, inputs)
-    starts, rows = run.given_starts(inputs.given, 0), []
-    for first in range(0, len(frames), length):
-        chosen = frames[first : first + length]
-        of_block = block.make_block(setting, chosen, comings_and_goings()[chosen], None)
-        ((slots, found),) = engine.track([run.job(of_block, starts)], of_block)
-        run.finish(of_block, slots, found)
-        rows.append(found)
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *rows), run.slots
-
-
 # --- compilations: one per capacity of the slots and shape of the images, for all values of the inputs
 
 SMALL = ring_rig(3, image_size_wh=(80, 60))
@@ -237,22 +213,12 @@ def test_a_new_number_of_drones_within_a_capacity_and_other_values_compile_nothi
 
 @pytest.mark.slow
 def test_no_frame_waits_for_a_compilation() -> None:
-    settings = tracker_settings(track_settings(particles=7, iterations=3))
-    tracker = StepwiseTracker(
-        SMALL,
-        settings,
-        fps=FPS,
-        bounds_m=ROOM_M,
-        reduction=REDUCTION,
-        shape=SMALL_SHAPE,
-        most_drones=4,
-    )
+    tracker = new_tracker(rig=SMALL, shape=SMALL_SHAPE, most_drones=4, particles=7, iterations=3)
     tracker.compile()
-    before, shown = compiled(), exposures()
-    parts = {name: value[: len(SMALL)] for name, value in vars(shown).items()}
+    before, zero = compiled(), np.zeros(len(SMALL), np.float32)
     for frame in range(3):
         images = np.full((len(SMALL), *SMALL_SHAPE), 40 * frame, np.uint8)
         there = np.arange(len(SMALL)) != frame
-        tracker.step(2 * frame, 0.08 * frame, images, replace(shown, **(parts | {"is_there": there})))
+        tracker.step(2 * frame, 0.08 * frame, images, Exposures(zero, there, zero + 1, zero))
         tracker.look_ahead()
     assert compiled() == before

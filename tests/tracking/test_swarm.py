@@ -7,24 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOM_M, assert_same, draw_coverage, drawn_silhouettes, float32, ring_rig, track_settings
+from helpers import assert_same, draw_coverage, float32, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 from windows import cut_at
 
 from psotrack.geometry import make_extents
 from psotrack.settings import SwarmSettings
-from psotrack.tracking.births import InitialState
 from psotrack.tracking.swarm import (
     DroneFitness,
-    RunInputs,
     ScoreInputs,
     SearchRegion,
     SoftIoU,
     find_search,
     optimiser,
-    track_silhouettes,
-    tracker_settings,
 )
 
 #: Coefficients of a swarm where a test sets no others.
@@ -193,23 +189,6 @@ def test_invariants_hold_for_any_settings(seed, inertia, cognitive, social, max_
     assert (np.abs(np.diff(states.position, axis=0)) <= max_step * (1 + 1e-6) + 1e-6).all()
 
 
-def test_a_single_defined_particle_leads():
-    """Two of three particles are undefined at first: the third is the best and attracts the others."""
-
-    def right_half(position):
-        return jnp.where(position[..., 0] > 0, sphere(position), jnp.nan)
-
-    position = jnp.array([[[-4.0, 1.0]], [[3.0, 3.0]], [[-2.0, -2.0]]])
-    start = init(right_half, position, params())
-    assert start.gbest_position.tolist() == [[3, 3]]
-    assert np.isneginf(start.pbest_fitness).ravel().tolist() == [True, False, True]
-    final = run(jax.random.key(0), right_half, position, params(), 60)
-    assert np.isfinite(final.gbest_fitness).all()
-    assert final.gbest_position[0, 0] > 0
-    # The leader alone would stay at its place with a fitness of -18; the attracted particles found better places.
-    assert final.gbest_fitness[0] > -18
-
-
 def test_an_undefined_start_recovers_or_stays_finite():
     """At first no particle is defined; the first particle that is defined leads."""
 
@@ -261,29 +240,6 @@ def test_the_same_key_gives_the_same_result_and_another_key_another_result():
     assert not np.array_equal(first.position, other.position)
 
 
-def test_groups_do_not_interact():
-    """Another objective in the second of three groups changes nothing in the other groups."""
-
-    def objective(position, weight):
-        return sphere(position - weight[:, None])
-
-    @jax.jit
-    def search(weight):
-        start = random_positions(9, 3, 2)
-        return optimiser.run(
-            jax.random.key(0), lambda position: objective(position, weight), start, params(3), 30
-        )
-
-    final, changed = search(jnp.array([0.0, 0.0, 1.0])), search(jnp.array([0.0, 2.0, 1.0]))
-    for name in ("position", "velocity", "pbest_position", "pbest_fitness"):
-        one, two = np.asarray(getattr(final, name)), np.asarray(getattr(changed, name))
-        np.testing.assert_array_equal(one[:, [0, 2]], two[:, [0, 2]])
-        assert not np.array_equal(one[:, 1], two[:, 1])
-    np.testing.assert_array_equal(
-        final.gbest_position[np.array([0, 2])], changed.gbest_position[np.array([0, 2])]
-    )
-
-
 def test_run_is_init_steps_and_a_last_evaluation():
     """With 0 iterations, the result is the evaluated start; more iterations continue the same path."""
     position, knobs, key = random_positions(6, 2, 2), params(2), jax.random.key(0)
@@ -321,28 +277,6 @@ def test_random_factors_are_uniform_and_independent():
     for factor in (r1, r2):
         counts = np.histogram(factor, bins=256, range=(0, 1))[0]
         assert (np.square(counts - 70_000 / 256) / (70_000 / 256)).sum() < 255 + 5 * np.sqrt(2 * 255)
-
-
-def test_other_settings_and_numbers_of_iterations_need_no_compilation():
-    traces = 0
-
-    def counted(position):
-        nonlocal traces
-        traces += 1
-        return sphere(position)
-
-    compiled = jax.jit(lambda key, position, knobs, n: optimiser.run(key, counted, position, knobs, n))
-    compiled(jax.random.key(0), random_positions(6, 2, 2), params(2), jnp.int32(3))
-    once = traces
-    compiled(
-        jax.random.key(1),
-        random_positions(6, 2, 2, 1),
-        params(2, inertia=0.3, low=-1.0, max_step=0.1),
-        jnp.int32(50),
-    )
-    assert traces == once
-    # The function is traced for the start and for the body of the loop, for any number of iterations.
-    assert once <= 3
 
 
 # --- the same search as one kernel, by Pallas' interpreter on the CPU
@@ -389,18 +323,3 @@ def test_it_compiles_to_triton(coefficients, cameras):
     assert text.count("custom_call @__gpu$xla.gpu.triton") == 1
     # The blocks of threads: those of two drones in two runs.
     assert "grid_x = 2 : i32, grid_y = 2 : i32, grid_z = 1 : i32" in text
-
-
-@pytest.mark.nightly
-def test_the_tracks_are_those_of_the_swarm():
-    rig, frames = ring_rig(3, coefficients=5), 4
-    silhouettes = drawn_silhouettes(rig, np.broadcast_to(PLACE_M, (frames, 2, 3)), SIZE_M, 2)
-    given = InitialState(PLACE_M + 0.02, np.zeros((2, 3)), SIZE_M, np.full(2, 5.0))
-
-    def tracked(search):
-        chosen = tracker_settings(track_settings(search=search, drones=2, **EFFORT))
-        ((tracks, _),) = track_silhouettes(rig, silhouettes, [RunInputs(ROOM_M, chosen, given)], fps=25.0)
-        return tracks.position_m
-
-    # Where rounding puts an edge into the next pixel of a window, the searches end at different corners.
-    np.testing.assert_allclose(tracked("pso-kernel"), tracked("pso"), atol=1e-4)

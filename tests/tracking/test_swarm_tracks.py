@@ -28,7 +28,7 @@ from helpers import (
     track_settings,
 )
 
-from psotrack.geometry import Rig, look_at, make_camera
+from psotrack.geometry import look_at, make_camera
 from psotrack.pipeline import track_runs
 from psotrack.recordings import FrameTimes, Recording, Reference
 from psotrack.tracking.births import InitialState
@@ -305,12 +305,11 @@ LEARNED = 1.1
 
 def learned(size_of_frame, *, first=LEARNED, height_m=1.3, **settings):
     """Learned lengths over true ones, and the tracks of a hovering drone with a size of its own in each frame."""
-    at, sizes = np.array([0.3, -0.2, height_m]), np.array(size_of_frame)
+    at = np.array([0.3, -0.2, height_m])
     drawn = {factor: draw(at[None, None], factor * SIZE_M[:1])[0] for factor in set(size_of_frame)}
     images = np.stack([drawn[factor] for factor in size_of_frame])
     given = InitialState(at[None], np.zeros((1, 3)), first * SIZE_M[:1], np.array([5.0]))
     tracks = track(images, given, drones=1, **settings)
-    assert tracks.status.shape == (len(sizes), 1)
     return tracks.size_m[0] / SIZE_M[0], tracks
 
 
@@ -339,29 +338,7 @@ def test_what_sizes_are_not_learned_from():
     assert (tracks.size_frames == 0).all()
 
 
-# --- drones of a few cells
-
-#: Half a metre at 4 m is six to nine pixels: three or four cells wide, and one or two high.
-SMALL = ring_rig(6, image_size_wh=(64, 48))
-SMALL_CELL_M = 0.16
-
-
-@pytest.mark.slow
-def test_drones_of_a_few_cells_are_tracked():
-    """Each cell has 4 x 4 pixels."""
-    truth_m = np.array([[0.6, -0.5, 1.5], [-0.7, 0.6, 0.9]]) + TIME_S[:, None, None] * [
-        [0.8, 0.2, 0.1],
-        [0.3, -1.0, 0.2],
-    ]
-    K = SMALL.cameras.K * np.array([[2], [2], [1]])
-    # The corner of the image stays half a pixel before the middle of the first pixel.
-    K[:, :2, 2] += 0.5
-    cameras = replace(SMALL.cameras, K=K, image_size_wh=2 * np.asarray(SMALL.cameras.image_size_wh))
-    images = draw(truth_m, np.array([[0.5, 0.5, 0.25]] * 2), SMALL)
-    tracks = track(images, rig=Rig(SMALL.names, cameras), reduction=2 * REDUCTION)
-    assert tracks.num_drones == 2
-    apart_m = np.linalg.norm(tracks.position_m[:, :, None] - truth_m[:, None], axis=-1)
-    assert np.median(apart_m.min(axis=1), axis=0).max() < SMALL_CELL_M / 2
+# --- poor silhouettes, and lenses
 
 
 @pytest.mark.slow
@@ -371,12 +348,11 @@ def test_a_silhouette_with_many_gaps_is_a_drone_and_noise_everywhere_is_none():
     images = draw(CURVE_M[:, :1], SIZE_M[:1])
     tracks = track(images * (random.random(images.shape) < 0.22))
     assert tracks.num_drones == 1
-    assert np.nanmedian(errors_m(tracks, CURVE_M[:, :1])) < SMALL_CELL_M / 2
+    assert np.nanmedian(errors_m(tracks, CURVE_M[:, :1])) < 2 * CELL_M
     # A few random cells in every image: no place has more foreground than its surroundings.
-    assert track(255 * (random.random(images.shape) < 0.03).astype(np.uint8)).num_drones == 0
+    noise = 255 * (random.random((25, 6, 45, 60)) < 0.03).astype(np.uint8)
+    assert track(noise, rig=ring_rig(6, image_size_wh=(120, 90))).num_drones == 0
 
-
-# --- lenses
 
 #: Focal length in pixels, coefficients, and whether the lens is a fisheye. The barrel folds at 49 degrees off the axis,
 #: the others show 60 degrees and more.

@@ -115,13 +115,3 @@ def test_the_result_is_finite_everywhere(position_m):
 
 
 VIEW = score_view(np.array([[0.1, 0.2, 1.2]]))
-
-
-def test_the_order_of_drones_does_not_matter():
-    """Whole images contain no occlusion by other drones, so each drone's result depends on that drone only."""
-    truth, order = np.array([[0.0, 0.0, 1.2], [0.9, -0.4, 1.0], [-0.8, 0.7, 1.5]]), [2, 0, 1]
-    size = np.tile(SIZE_M, (3, 1))
-    one = found(score_view(truth, size_m=size), truth + 0.01, size)
-    other = found(score_view(truth[order], size_m=size[order]), truth[order] + 0.01, size[order])
-    # The sums have another order of terms.
-    np.testing.assert_allclose(other.position_m, np.asarray(one.position_m)[order], atol=1e-6)
