@@ -52,42 +52,29 @@ _HIDDEN_PER_S, _HIDDEN_S, _SWAPPED_S = 0.1, 0.08, 0.2
 _REFLECTION_M = (1.3, -1.1, 0.02)
 
 
-def write_as_real(
-    sequence: Path,
-    root: Path,
-    *,
-    rate_hz: float = 100.0,
-    offset_s: float = 0.37,
-    three_videos: bool = False,
-    seed: int = 0,
-) -> Path:
+def write_as_real(sequence: Path, root: Path, *, offset_s: float) -> Path:
     """Write a simulated sequence in the folder ROOT/Real_Data/RXX_Dn, where XX is the number in the sequence's name.
 
     The lens shows more than the simulated image: 8 % of the pixels, at the edges, repeat its border. Marker positions
     between the frames of the simulation are cubic splines; before frame 0 the drones stand still.
 
     Args:
-        sequence: folder of the simulated sequence; its first four cameras are used.
+        sequence: folder of the simulated sequence, of four cameras.
         root: root folder of the data.
-        rate_hz: rate of the C3D file, hertz.
         offset_s: time in the C3D file at frame 0 of the videos, seconds; positive if the C3D file begins first.
-        three_videos: whether to leave out the last camera's video, as in R17_D1_A.
-        seed: seed of the markers' noise, gaps and swapped labels.
     """
     simulated = read_sequence(sequence)
-    names = simulated.rig.names[: len(SERIALS)]
-    rig = _real_rig(simulated.rig.select(names))
+    rig = _real_rig(simulated.rig)
     paths = sorted(Path(sequence).glob("dron*_markers_*.csv"))
     markers_m = np.stack([read_mocap_markers(path) for path in paths], axis=1)
     number = re.match(r"[A-Za-z]*(\d+)", simulated.name)[1]
     folder = Path(root) / "Real_Data" / f"R{int(number):02d}_D{len(paths)}"
     folder.mkdir(parents=True)
     write_calibration(folder / CALIBRATION, rig, unit="mm")
-    rng = np.random.default_rng(seed)
-    write_c3d(folder / f"{folder.name}.c3d", _recording(markers_m, simulated.fps, rate_hz, offset_s, rng))
-    for index in range(len(SERIALS) - three_videos):
-        name, serial = names[index], SERIALS[index]
-        before, lens = simulated.rig.cameras[simulated.rig.names.index(name)], rig.cameras[index]
+    rng = np.random.default_rng(0)
+    write_c3d(folder / f"{folder.name}.c3d", _recording(markers_m, simulated.fps, 100.0, offset_s, rng))
+    for index, (name, serial) in enumerate(zip(simulated.rig.names, SERIALS, strict=True)):
+        before, lens = simulated.rig.cameras[index], rig.cameras[index]
         _write_video(folder / f"{serial}.avi", simulated.videos[name], before, lens)
         boxes = _distort_boxes(read_detections(simulated.detections[name]), before, lens)
         write_detections(folder / DETECTIONS / f"{serial}.csv", boxes)

@@ -1,18 +1,18 @@
-"""A recording as a laboratory makes it: the board's place in the images, and the files of the folder."""
+"""Recordings as a laboratory makes them: own cameras and a board; and the layout of the dataset's real half."""
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from helpers import make_once
+from real_form import SERIALS, write_as_real
 
-from psotrack.cli.simulate import simulate
-from psotrack.errors import OutputError, SettingsError
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.geometry.rig_files import read_rig
 from psotrack.recordings import probe
-from psotrack.simulation import OWN_CAMERAS, SimulationSettings, simulate_own_cameras
+from psotrack.simulation import OWN_CAMERAS, SimulationSettings, change_scenario, scenario, simulate
 from psotrack.simulation.imaging.lens_image import lens_image
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.raster import pinhole
@@ -84,24 +84,11 @@ def test_neighbours_see_the_board_together_and_it_is_tilted():
     assert min(shared[left, gopro], shared[gopro, serial], shared[serial, right]) >= 4
 
 
-@pytest.mark.slow
-def test_the_folder_of_a_laboratory(tmp_path):
+def test_the_folder_of_a_laboratory(tmp_path, run_psotrack):
     folder = tmp_path / "lab"
-    words = [
-        "S01_D2_A",
-        "--as-own-cameras",
-        "--out",
-        folder,
-        "--scale",
-        0.1,
-        "--frames",
-        6,
-        "--jobs",
-        1,
-        "-q",
-    ]
-    result = CliRunner().invoke(simulate, [str(word) for word in words], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    small = ("--scale", 0.1, "--frames", 6, "--jobs", 1, "-q")
+    result = run_psotrack("simulate", "S01_D2_A", "--as-own-cameras", "--out", folder, *small)
+    assert result.code == 0, result.err
     for camera in OWN_CAMERAS:
         flight, calibration = probe(folder / camera.flight), probe(folder / "board" / f"{camera.name}.avi")
         size = tuple(round(side * 0.1) for side in camera.size)
@@ -122,10 +109,66 @@ def test_the_folder_of_a_laboratory(tmp_path):
         assert (flight.position_m[..., 2] > 0.3).all()
     heights = rig.cameras.centre_world[:, 2]
     np.testing.assert_allclose(heights, [camera.position_m[2] for camera in OWN_CAMERAS], atol=1e-9)
-    with pytest.raises(OutputError, match="--force"):
-        simulate_own_cameras("S01_D2_A", folder)
 
 
-def test_own_cameras_stand_in_the_laboratory(tmp_path):
-    with pytest.raises(SettingsError, match="hall: expected laboratory, found large_hall"):
-        simulate_own_cameras("S03_D10_A", tmp_path / "lab", SimulationSettings(1, 0.1))
+# --- the real half
+
+
+#: The reference's clock is ahead of the videos by this time, seconds: 9.4 frames of 25 Hz.
+OFFSET_S = 0.377
+
+
+#: Largest error of the offset that is estimated from the drones' motion, seconds: a tenth of a frame.
+OFFSET_TOLERANCE_S = 0.004
+
+
+@pytest.mark.slow
+def test_a_sequence_in_the_layout_of_the_real_half_through_every_command(
+    tmp_path_factory, tmp_path, run_psotrack
+):
+    """The reference's clock is ahead of the videos; `doctor` finds by how much, and `evaluate` removes it."""
+
+    def make(folder):
+        recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
+        size = SimulationSettings(num_frames=120, scale=0.25, masks=False, onboard=False)
+        write_as_real(simulate(recipe, folder, size, jobs=1), folder, offset_s=OFFSET_S)
+
+    def run(*words):
+        result = run_psotrack(*words, "--json", "-")
+        # `doctor` ends with 1 where it finds something.
+        assert result.code in ((0, 1) if words[0] == "doctor" else (0,)), result.err
+        return json.loads(result.out)
+
+    sequence = make_once(tmp_path_factory, "real_half", make) / "Real_Data" / "R02_D4"
+    content = run("init", "--show", sequence)
+    assert list(content["cameras"]) == list(SERIALS)
+    assert content["cameras"][SERIALS[0]]["focal_length_px"] == pytest.approx(0.25 * 1158.7)
+    (finding,) = run("doctor", sequence)["findings"]
+    assert finding["kind"] == "reference"
+    assert "`psotrack doctor --tracks`" in finding["remedy"]
+    # The clock is 9 frames late, and the drones fly at about 1.4 m/s.
+    far = re.match(r"the reference: it is ([0-9.]+) m from what the cameras see", finding["message"])
+    assert far is not None
+    assert 0.36 < float(far[1]) < 0.72
+    tracks = tmp_path / "lines.csv"
+    assert run_psotrack("track", sequence, "--out", tracks, "--method", "projection-lines", "-q").code == 0
+    offset_s = run("doctor", sequence, "--tracks", tracks)["offset_s"]
+    assert offset_s == pytest.approx(OFFSET_S, abs=OFFSET_TOLERANCE_S)
+    late, auto, given = (
+        run("evaluate", tracks, sequence, *words)
+        for words in ((), ("--offset", "auto"), ("--offset", OFFSET_S))
+    )
+    assert "reference_offset_s" not in late
+    assert given["reference_offset_s"] == OFFSET_S
+    assert auto["reference_offset_s"] == offset_s
+    # Drones at about 1 m/s fly more than a third of a metre in 0.377 s.
+    assert late["offset_removed_mean_error_m"] > 0.15
+    for errors in (auto, given):
+        assert (errors["id_switches"], errors["missed_rate"]) == (0, 0.0)
+        # Measured 26 mm with four cameras at a third of the full image size.
+        assert errors["offset_removed_mean_error_m"] < 0.04
+        # The reference is the marker cross above the body; the tracked point is the centre of the whole drone's box.
+        assert all(drone["offset_m"][2] < -0.03 for drone in errors["per_drone"])
+    refused = run_psotrack("evaluate", tracks, sequence, "--offset", "soon")
+    assert (refused.code, refused.out) == (2, "")
+    assert "expected a number of seconds, or auto, found 'soon'" in refused.err

@@ -6,37 +6,30 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from placed_drones import cube, drone_masks, straight_flight, with_drones
+from placed_drones import (
+    PLAIN,
+    S02,
+    cube,
+    hovering,
+    laboratory,
+    number_image,
+    with_drones,
+    with_imaging,
+)
 
-from psotrack.errors import SettingsError
 from psotrack.simulation import (
     RESTLESS,
     CameraRenderer,
     SimulationSettings,
     build,
     change_scenario,
-    scenario,
     simulate,
 )
 from psotrack.simulation.imaging import sensor
 from psotrack.simulation.imaging.scenery import Scenery
-from psotrack.simulation.labels.masks import silhouettes
-from psotrack.simulation.scenarios import CameraPlace, Imaging, Surroundings
+from psotrack.simulation.scenarios import CameraPlace, Surroundings
 
-S02 = scenario("S02_D4_A")
 SHAPE = (270, 480)
-#: No other effects: what changes is the scenery.
-PLAIN = Imaging(
-    shutter_s=0.0,
-    lens_blur_px=0.0,
-    shadows=False,
-    reflections=0.0,
-    exposure_drift=0.0,
-    white_balance_drift=0.0,
-    flicker=0.0,
-    read_noise=0.0,
-    shot_noise=0.0,
-)
 EVERYTHING = Surroundings(lamp_drop=0.2, screen=0.03, foliage=0.03, person=0.5)
 
 
@@ -56,13 +49,10 @@ def scenery(stream=0, seed=0, blur_px=0.0, **settings):
     return Scenery(Surroundings(**settings), seed, stream, SHAPE, blur_px)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def still_scene():
     """The laboratory with one black cube in the middle and no other effects."""
-    scene = build(S02, scale=0.25)
-    recipe = msgspec.structs.replace(S02, imaging=PLAIN)
-    placed = (cube(0.3), straight_flight((0.3, -0.2, 1.4)), (0.0, 0.0, 0.0))
-    return with_drones(replace(scene, scenario=recipe), placed)
+    return with_drones(with_imaging(laboratory(), PLAIN), hovering(cube(0.3), (0.3, -0.2, 1.4)))
 
 
 def with_surroundings(scene, **settings):
@@ -82,11 +72,11 @@ def test_a_screen_covers_the_stated_share(share):
         assert np.count_nonzero(lit[0]) == pytest.approx(share * SHAPE[0] * SHAPE[1], rel=0.03)
 
 
-@pytest.mark.parametrize("share", [0.025, 0.1, 0.4, 0.9])
+@pytest.mark.parametrize("share", [0.025, 0.4])
 def test_leaves_cover_the_stated_share(share):
-    for stream in range(4):
+    for stream in range(2):
         one = scenery(stream, foliage=share)
-        found = np.mean([covered(one.layers(time_s)).mean() for time_s in np.arange(0, 5, 0.31)])
+        found = np.mean([covered(one.layers(time_s)).mean() for time_s in np.arange(0, 5, 0.71)])
         # Leaves sway over the border of the image and over each other; measured within 4 %.
         assert found == pytest.approx(share, rel=0.08)
 
@@ -130,18 +120,6 @@ def test_all_scales_show_the_same():
 # --- what changes
 
 
-@pytest.mark.parametrize("settings", [{"screen": 0.03}, {"foliage": 0.03}, {"person": 0.5}])
-def test_everything_moves_and_stays_where_it_is(still_scene, settings):
-    scene = with_surroundings(still_scene, person_period_s=4.0, **settings)
-    calm, restless = CameraRenderer(still_scene, 0), CameraRenderer(scene, 0)
-    frames = np.stack([restless.clean_frame(frame) for frame in range(0, 100, 4)])
-    changed = (frames != calm.clean_frame(0)).any(axis=(0, -1))
-    moving = (frames != frames[:1]).any(axis=(0, -1))
-    assert moving.mean() > 0.02
-    # A person walks through a third of the width; leaves sway by a part of the plant.
-    assert changed.mean() < 0.35
-
-
 def test_a_screen_shows_another_scene_after_a_while():
     one = scenery(screen=0.03)
     shown = np.stack([one.layers(time_s)[0].seen[..., :3] for time_s in np.arange(0, 6, 0.04)])
@@ -152,11 +130,10 @@ def test_a_screen_shows_another_scene_after_a_while():
     np.testing.assert_allclose(np.diff(cuts) * 0.04, 1.7, atol=0.05)
 
 
-@pytest.mark.parametrize("index", [0, 3])
-def test_a_lamp_darkens_half_of_the_image_while_it_is_off(still_scene, index):
+def test_a_lamp_darkens_half_of_the_image_while_it_is_off(still_scene):
     scene = with_surroundings(still_scene, lamp_drop=0.25, lamp_s=(1.0, 2.0))
-    calm, restless = CameraRenderer(still_scene, index), CameraRenderer(scene, index)
-    for time_s, off in ((0.0, False), (0.96, False), (1.0, True), (1.96, True), (2.0, False), (3.0, False)):
+    calm, restless = CameraRenderer(still_scene, 3), CameraRenderer(scene, 3)
+    for time_s, off in ((0.96, False), (1.0, True), (1.96, True), (2.0, False)):
         frame = round(25 * time_s)
         before, after = (one.clean_frame(frame).astype(float) for one in (calm, restless))
         if not off:
@@ -187,53 +164,27 @@ def test_the_halves_and_places_differ_between_cameras_and_seeds():
         assert places[0] != places[1]
 
 
-# --- exposure
-
-
-def test_an_automatic_exposure_swings_by_the_stated_factors():
-    imaging = msgspec.structs.replace(PLAIN, exposure=(0.7, 1.36), exposure_period_s=7.0)
-    times_s = np.arange(0, 14, 0.04)
-    gains = []
-    for stream in range(8):
-        gain = np.array([sensor.Sensor(imaging, 0, stream, (8, 8)).gains(time_s) for time_s in times_s])
-        assert gain.min() == pytest.approx(0.7, rel=1e-3)
-        assert gain.max() == pytest.approx(1.36, rel=1e-3)
-        np.testing.assert_allclose(gain[175:], gain[:175], rtol=1e-9)
-        # The fastest change of a sinusoid from log 0.7 to log 1.36 in 7 s, per frame.
-        assert np.abs(np.diff(np.log(gain), axis=0)).max() < 0.04 * np.pi / 7 * np.log(1.36 / 0.7) * 1.01
-        gains.append(gain[:, 0])
-    assert np.ptp(gains, axis=0).max() > 0.5, "cameras do not swing together"
-    # In grey levels, +-15 % as the comment of RESTLESS says.
-    grey = np.array([0.7, 1.36]) ** (1 / sensor.GAMMA)
-    np.testing.assert_allclose(grey, [0.85, 1.15], atol=0.001)
-    assert (1 - RESTLESS["surroundings.lamp_drop"]) ** (1 / sensor.GAMMA) == pytest.approx(0.88, abs=0.001)
-
-
-def test_an_exposure_needs_the_smaller_factor_first():
-    with pytest.raises(SettingsError, match=r"imaging.exposure: expected the smaller factor first"):
-        build(change_scenario(S02, {"imaging.exposure": [1.2, 0.8]}))
-
-
 # --- what does not change
 
 
 def test_drones_are_in_front_and_masks_are_theirs(still_scene):
     scene = with_surroundings(still_scene, foliage=0.9, screen=0.25, person=1.0)
     calm, restless = CameraRenderer(still_scene, 0), CameraRenderer(scene, 0)
-    inside = drone_masks(still_scene, calm.cam, calm.backdrop.depth_m, 0) > 0
-    inside = cv2.erode(inside.astype(np.uint8), np.ones((3, 3))) > 0
+    inside = cv2.erode((number_image(calm) > 0).astype(np.uint8), np.ones((3, 3))) > 0
     assert inside.sum() > 100
     for frame in (0, 60):
         assert not restless.clean_frame(frame)[inside].any(), "the cube is black"
-        masks = [silhouettes(one.scene, one.cam, one.backdrop.depth_m, frame) for one in (calm, restless)]
-        for before, after in zip(*masks, strict=True):
-            np.testing.assert_array_equal(before.mask(), after.mask())
+        np.testing.assert_array_equal(number_image(restless, frame), number_image(calm, frame))
 
 
 def test_sequences_have_the_same_masks_truth_and_rig(tmp_path):
-    settings = SimulationSettings(num_frames=3, scale=0.1, onboard=False)
-    calm = simulate(S02, tmp_path / "calm", settings, jobs=1)
-    restless = simulate(change_scenario(S02, RESTLESS), tmp_path / "restless", settings, jobs=1)
+    # The comment of RESTLESS says what these factors of light are in grey levels: 15 % and 12 %.
+    grey = np.array([0.7, 1.36, 1 - RESTLESS["surroundings.lamp_drop"]]) ** (1 / sensor.GAMMA)
+    np.testing.assert_allclose(grey, [0.85, 1.15, 0.88], atol=0.001)
+    recipe = change_scenario(S02, {"cameras": "laboratory_corners"})
+    settings = SimulationSettings(num_frames=2, scale=0.04, onboard=False)
+    calm = simulate(recipe, tmp_path / "calm", settings, jobs=1)
+    restless = simulate(change_scenario(recipe, RESTLESS), tmp_path / "restless", settings, jobs=1)
     names = {path.relative_to(calm) for path in calm.rglob("*") if path.is_file()}
     assert names == {path.relative_to(restless) for path in restless.rglob("*") if path.is_file()}
     for name in names:
@@ -241,41 +192,20 @@ def test_sequences_have_the_same_masks_truth_and_rig(tmp_path):
         assert same == (name.suffix != ".avi" and name.name != "simulation.json"), name
 
 
-def test_frames_do_not_depend_on_the_order_of_rendering(still_scene):
-    scene = replace(still_scene, scenario=msgspec.structs.replace(S02, surroundings=EVERYTHING))
-    one, other = CameraRenderer(scene, 2), CameraRenderer(scene, 2)
-    forward = [one.frame(frame) for frame in (5, 90, 130)]
-    backward = [other.frame(frame) for frame in (130, 90, 5)]
-    np.testing.assert_array_equal(forward, backward[::-1])
-    assert (CameraRenderer(scene, 3).frame(5) != forward[0]).any()
-
-
-# --- lenses with distortion
-
-
-@pytest.mark.parametrize(
-    ("distortion", "fisheye"), [((-0.2, 0.05, 0.0, 0.0), False), ((0.02, 0.01, 0.0, 0.0), True)]
-)
-def test_a_lens_with_distortion_shows_the_scenery_at_the_same_pixels(distortion, fisheye):
+def test_a_lens_with_distortion_shows_the_scenery_at_the_same_pixels():
     """Scenery has its place in the image, whatever the lens."""
     place = CameraPlace(
         position_m=(-4.7, -3.7, 3.1),
         target_m=(0.1, 0.0, 1.25),
         focal_length_px=700.0,
-        distortion=distortion,
-        fisheye=fisheye,
+        distortion=(0.02, 0.01, 0.0, 0.0),
+        fisheye=True,
     )
-    # Whole images of leaves of the same seed: where they are does not depend on the camera.
-    changes = {
-        "imaging": msgspec.to_builtins(PLAIN),
-        "surroundings.foliage": 0.2,
-        "surroundings.screen": 0.05,
-    }
-    plain = {"imaging": msgspec.to_builtins(PLAIN)}
-    recipe = msgspec.structs.replace(S02, cameras=(place,))
-    shown, empty = (
-        CameraRenderer(build(change_scenario(recipe, each), scale=0.25), 0) for each in (changes, plain)
+    recipe = change_scenario(
+        msgspec.structs.replace(S02, cameras=(place,)), {"imaging": msgspec.to_builtins(PLAIN)}
     )
+    leaves = change_scenario(recipe, {"surroundings.foliage": 0.2, "surroundings.screen": 0.05})
+    shown, empty = (CameraRenderer(build(each, scale=0.25), 0) for each in (leaves, recipe))
     assert shown.lens is not None
     changed = (shown.clean_frame(7) != empty.clean_frame(7)).any(axis=-1)
     wanted = covered(shown.scenery.layers(shown.scene.time_s(7)), changed.shape)
@@ -285,4 +215,4 @@ def test_a_lens_with_distortion_shows_the_scenery_at_the_same_pixels(distortion,
     seen = shown.lens.face >= 0
     assert inside.sum() > 300
     assert changed[inside & seen].mean() > 0.99
-    assert not changed[seen & ~near].any() or changed[seen & ~near].mean() < 0.02
+    assert changed[seen & ~near].mean() < 0.02

@@ -1,0 +1,398 @@
+"""Masks, mask archives and detections of the simulator.
+
+Masks are compared with OpenCV's projection and polygons, archives with `zipfile`, detections with their settings.
+"""
+
+import math
+import zipfile
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import asdict
+from placed_drones import (
+    PLAIN,
+    S02,
+    cube,
+    hovering,
+    laboratory,
+    mean_and_variance,
+    number_image,
+    opencv_pixels,
+    with_drones,
+)
+from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
+
+from psotrack.recordings.datasets import MaskWriter, join_archives, read_masks
+from psotrack.simulation import CameraRenderer, build, change_scenario
+from psotrack.simulation.imaging.raster import RasterView, pinhole
+from psotrack.simulation.labels.detector import detect, iou
+from psotrack.simulation.labels.masks import Silhouette, silhouettes
+
+NO_ROOM_M = 90.0
+
+
+@pytest.fixture
+def scene():
+    return laboratory(0.5)
+
+
+def empty_room_view(scene, index):
+    """Return a camera and the depth image, metres, of a room in which nothing hides a drone."""
+    cam = pinhole(scene.rig.cameras[index])
+    return cam, np.full((cam.height, cam.width), NO_ROOM_M, np.float32)
+
+
+def seen(scene, *placed, index=0, depth_m=None):
+    """The silhouettes of cubes, each as (side, position), metres; in a room in which nothing hides a drone."""
+    cam, nothing_m = empty_room_view(scene, index)
+    scene = with_drones(scene, *(hovering(cube(side_m), position_m) for side_m, position_m in placed))
+    return silhouettes(scene, cam, nothing_m if depth_m is None else depth_m, 0)
+
+
+# --- masks
+
+
+@pytest.mark.parametrize(("index", "frame"), [(0, 3), (4, 120), (7, 249)])
+def test_masks_of_the_models_agree_with_polygons_filled_by_opencv(scene, index, frame):
+    cam, depth_m = empty_room_view(scene, index)
+    turn = Rotation.from_quat(scene.orientations_wxyz(frame + 1)[-1], scalar_first=True).as_matrix()
+    at_m = scene.positions_m(frame + 1)[-1]
+    found = silhouettes(scene, cam, depth_m, frame)
+    assert found
+    for silhouette in found:
+        if silhouette.xyxy is None or not (silhouette.xyxy[0] > 0 and silhouette.xyxy[2] < cam.width):
+            continue
+        drone = silhouette.number - 1
+        alone = replace(scene, models=(scene.models[drone],), flights=(scene.flights[drone],))
+        (mask,) = (each.mask() for each in silhouettes(alone, cam, depth_m, frame))
+        model = scene.models[drone]
+        angle = np.linspace(0, 2 * np.pi, 60)[:, None]
+        rim = np.hstack([np.cos(angle), np.sin(angle), 0 * angle])
+        rotors = zip(model.rotor_centres_m, model.rotor_radii_m, strict=True)
+        polygons_m = [*model.triangles_m, *(hub + radius * rim for hub, radius in rotors)]
+        # Draw 32 times as large, because OpenCV's polygons include their outline: half a pixel on every side.
+        x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+        corner = np.array([x - 2, y - 2])
+        canvas = np.zeros((32 * (height + 4), 32 * (width + 4)), np.uint8)
+        for polygon in polygons_m:
+            pixels = opencv_pixels(cam, polygon @ turn[drone].T + at_m[drone])
+            cv2.fillConvexPoly(canvas, (32 * (pixels - corner + 0.5) - 0.5).round().astype(np.int32), 1)
+        middle = (mean_and_variance(canvas)[0] + 0.5) / 32 - 0.5 + corner
+        # Measured 0.4 px at most: with one sample per pixel, a thin arm is drawn fully or not at all.
+        assert np.linalg.norm(mean_and_variance(mask)[0] - middle) < 1.0
+        # Measured 4 % at most, for the smallest mask: 100 of its 200 px lie on the edge.
+        assert mask.sum() == pytest.approx(canvas.sum() / 32**2, rel=0.07)
+        assert silhouette.whole_px >= mask.sum()
+
+
+def test_the_nearer_drone_hides_the_farther_drone_in_either_order(scene):
+    centre = scene.rig.cameras.centre_world[0]
+    towards = np.array([0.0, 0.0, 1.4]) - centre
+    near, far = (0.3, centre + 0.5 * towards), (0.3, centre + 0.9 * towards + np.array([0.0, 0.0, 0.3]))
+    first, second = seen(scene, near, far), seen(scene, far, near)
+    np.testing.assert_array_equal(first[0].mask(), second[1].mask())
+    np.testing.assert_array_equal(first[1].mask(), second[0].mask())
+    (alone,), (behind,) = seen(scene, near), seen(scene, far)
+    np.testing.assert_array_equal(first[0].mask(), alone.mask())
+    assert first[0].seen_share == alone.seen_share == 1.0
+    np.testing.assert_array_equal(first[1].mask(), behind.mask() & ~alone.mask())
+    assert 0.05 < first[1].seen_share < 0.95, "the far drone must be partly hidden"
+
+
+def test_the_room_hides_drones_and_parts_outside_the_image_are_unseen(scene):
+    cam, depth_m = empty_room_view(scene, 0)
+    middle = (0.3, (0.0, 0.0, 1.4))
+    (free,) = seen(scene, middle)
+    x = round(mean_and_variance(free.mask())[0][0])
+    depth_m[:, :x] = 1.0
+    (half,) = seen(scene, middle, depth_m=depth_m)
+    expected = free.mask()
+    expected[:, :x] = False
+    np.testing.assert_array_equal(half.mask(), expected)
+    assert half.seen_share == pytest.approx(0.5, abs=0.1)
+    assert half.whole_px == free.whole_px
+    depth_m[:] = 1.0
+    (hidden,) = seen(scene, middle, depth_m=depth_m)
+    assert (hidden.seen_share, hidden.xyxy) == (0.0, None)
+    for x, share in ((-0.5, 0.5), (cam.width - 0.5, 0.5), (cam.width / 2, 1.0)):
+        ray = np.linalg.inv(cam.K) @ [x, cam.height / 2, 1.0]
+        (silhouette,) = seen(scene, (0.3, cam.R.T @ (4.0 * ray - cam.t_m)))
+        assert silhouette.seen_share == pytest.approx(share, abs=0.1)  # a turned cube is not symmetric
+    assert seen(scene, (0.3, cam.R.T @ (np.array([0.0, 0.0, -2.0]) - cam.t_m))) == []
+    # A cube around the camera fills the whole image.
+    (whole,) = seen(scene, (3.0, scene.rig.cameras.centre_world[0]))
+    assert whole.seen_share == 1.0
+
+
+def test_masks_and_frames_agree():
+    """Without shadows, reflections and noise, a frame differs from the empty room exactly inside the masks."""
+    red = {f"drones[{i}].paint_bgr": [0.0, 0.0, 0.9] for i in range(4)}
+    bright = build(change_scenario(S02, {"imaging": asdict(PLAIN)} | red), scale=0.5)
+    empty = replace(bright, flights=(), models=())
+    for index in (1, 5):
+        renderer = CameraRenderer(bright, index)
+        room = CameraRenderer(empty, index).frame(0).astype(int)
+        for frame in (10, 200):
+            difference = np.abs(renderer.frame(frame) - room).max(axis=-1)
+            numbers = number_image(renderer, frame)
+            assert np.median(difference[numbers > 0]) > 20
+            near = cv2.dilate((numbers > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            assert not difference[~near].any()
+            # Masks have one sample per pixel and frames eight, so the edges of thin arms differ. Measured 0.88 to 0.90.
+            changed = difference > 10
+            assert (changed & (numbers > 0)).sum() > 0.8 * (changed | (numbers > 0)).sum()
+            # Masks are disjoint, and boxes bound them.
+            for silhouette in silhouettes(bright, renderer.cam, renderer.backdrop.depth_m, frame):
+                np.testing.assert_array_equal(silhouette.mask(), numbers == silhouette.number)
+                if silhouette.xyxy is not None:
+                    x, y, width, height = cv2.boundingRect((numbers == silhouette.number).astype(np.uint8))
+                    assert silhouette.xyxy.tolist() == [x, y, x + width, y + height]
+
+
+# --- archives
+
+
+def random_mask(seed, shape=(54, 97)):
+    return np.random.default_rng(seed).random(shape) > 0.7
+
+
+def write_part(path, camera, frames):
+    with MaskWriter(path) as writer:
+        for frame in frames:
+            writer.write(camera, 1, frame, random_mask(frame))
+            writer.write(camera, 2, frame, np.zeros((54, 97), bool))
+    return path
+
+
+def test_joined_archives_are_read_as_one_archive(tmp_path):
+    parts = [
+        write_part(tmp_path / "0.zip", "cam1i", range(0, 3)),
+        write_part(tmp_path / "1.zip", "cam1i", range(3, 5)),
+        write_part(tmp_path / "2.zip", "cam2i", range(0, 5)),
+    ]
+    for name in ("all.zip", "again.zip"):
+        join_archives(tmp_path / name, parts)
+    assert (tmp_path / "again.zip").read_bytes() == (tmp_path / "all.zip").read_bytes()
+    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+        assert archive.testzip() is None
+        assert len(archive.namelist()) == 20
+        assert archive.namelist()[:2] == ["cam1i/dron1/000000.png", "cam1i/dron2/000000.png"]
+        data = archive.read("cam1i/dron1/000000.png")
+        # Width, height, bit depth and colour type as the PNG standard defines them: one bit, grey.
+        assert data[16:26] == (97).to_bytes(4, "big") + (54).to_bytes(4, "big") + b"\x01\x00"
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert set(np.unique(image)) == {0, 255}
+    with read_masks(tmp_path / "all.zip") as masks:
+        assert (masks.cameras, masks.drones, masks.frames) == (("cam1i", "cam2i"), (1, 2), (0, 1, 2, 3, 4))
+        for camera in masks.cameras:
+            for frame in masks.frames:
+                np.testing.assert_array_equal(masks.mask(camera, 1, frame), random_mask(frame))
+                assert not masks.mask(f"{camera}_s", 2, frame).any()
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        "cam{camera}i/dron{drone}/{frame:06d}.png",
+        "S02_D4_A/drone_masks/cam{camera}i_s/drone{drone}/frame_{frame}.png",
+        "Dron_{drone}/cam{camera}i_{frame:04d}.bmp",
+        "cam{camera}i_dron{drone}_{frame:05d}.PNG",
+        "{frame:06d}/cam{camera}i_s_drone{drone}.png",
+        "6088125{camera}/dron{drone}/{frame}.png",
+    ],
+)
+def test_layouts_that_name_camera_drone_and_frame_are_read(tmp_path, layout):
+    with zipfile.ZipFile(tmp_path / "masks.zip", "w") as archive:
+        archive.writestr("__MACOSX/._0.png", b"")
+        archive.writestr("readme.txt", b"")
+        for drone in (1, 2):
+            for frame in (0, 7):
+                _, png = cv2.imencode(".png", 255 * random_mask(10 * drone + frame).astype(np.uint8))
+                archive.writestr(layout.format(camera=2, drone=drone, frame=frame), png.tobytes())
+    camera = "60881252" if layout.startswith("6088125") else "cam2i"
+    with read_masks(tmp_path / "masks.zip") as masks:
+        assert (masks.cameras, masks.drones, masks.frames) == ((camera,), (1, 2), (0, 7))
+        np.testing.assert_array_equal(masks.mask(camera, 2, 7), random_mask(27))
+
+
+@pytest.mark.slow
+def test_archives_of_more_than_65535_entries_are_read(tmp_path):
+    """More than 65,535 entries need the 64-bit records of ZIP."""
+    counts = (40_000, 26_000)
+    halves = [tmp_path / f"half_{number}.zip" for number in range(2)]
+    for number, (path, count) in enumerate(zip(halves, counts, strict=True)):
+        with zipfile.ZipFile(path, "w") as half:
+            for index in range(count):
+                half.writestr(zipfile.ZipInfo(f"{number}/{index}"), str(index))
+    join_archives(tmp_path / "all.zip", halves)
+    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+        names = archive.namelist()
+        assert names == [f"{number}/{index}" for number in range(2) for index in range(counts[number])]
+        for name in (names[0], names[65_535], names[65_536], names[-1]):
+            assert archive.read(name) == name[2:].encode()
+
+
+# --- detections
+
+
+def make_silhouette(scene, xyxy, number=1, share=1.0):
+    """Make the silhouette of a drone: a full rectangle, which is the share `share` of the unoccluded silhouette."""
+    x0, y0, x1, y1 = xyxy
+    window = RasterView(pinhole(scene.rig.cameras[0]), x0, y0, x1 - x0, y1 - y0)
+    return Silhouette(number, window, np.ones(window.shape, bool), round((x1 - x0) * (y1 - y0) / share))
+
+
+def scene_with_detector(scene, **values):
+    quiet = {"jitter": 0, "miss_rate": 0, "double_rate": 0, "false_alarms_per_frame": 0} | values
+    recipe = change_scenario(S02, {f"detector.{field}": value for field, value in quiet.items()})
+    return replace(scene, scenario=recipe)
+
+
+LARGE = (300, 200, 380, 250)
+
+
+def detected(scene, count, *others, share=1.0, **values):
+    """The detections in so many frames of a large drone, which is seen to a share, and of other silhouettes."""
+    made, silhouette = scene_with_detector(scene, **values), make_silhouette(scene, LARGE, share=share)
+    return [detect(made, 0, frame, [silhouette, *others]) for frame in range(count)]
+
+
+def assert_binomial(found, count, rate):
+    """A count is within five standard deviations of its mean; a correct detector stays inside."""
+    assert abs(found - count * rate) <= 5 * math.sqrt(count * rate * (1 - rate)) + 1
+
+
+def test_without_noise_the_detector_reports_the_boxes_that_are_seen(scene):
+    other = make_silhouette(scene, (500, 100, 590, 160), 2)
+    hidden = replace(other, seen=np.zeros_like(other.seen))
+    for shown, expected in ((other, [list(LARGE), [500, 100, 590, 160]]), (hidden, [list(LARGE)])):
+        found = detected(scene, 18, shown)[17]
+        assert found.frame.tolist() == [17] * len(expected)
+        assert sorted(found.xyxy.tolist()) == expected
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3, 1.0])
+def test_misses_and_double_detections_have_their_set_rates(scene, rate):
+    count = 400
+    assert_binomial(sum(map(len, detected(scene, count, miss_rate=rate))), count, 1 - rate)
+    doubled = detected(scene, count, double_rate=rate)
+    assert_binomial(sum(len(each) == 2 for each in doubled), count, rate)
+    for each in doubled:
+        # A network's non-maximum suppression, with a threshold of 0.45, would have merged boxes of a larger IoU.
+        assert len(each) < 2 or iou(each.xyxy[0], each.xyxy[1]) < 0.45
+    if rate == 1.0:
+        larger = [np.argsort(np.prod(each.xyxy[:, 2:] - each.xyxy[:, :2], axis=1)) for each in doubled]
+        confidences = [each.confidence[order] for each, order in zip(doubled, larger, strict=True)]
+        # Confidence is 0.25 + 0.75 (0.1 + 0.8 q) with q = 0.4 and 1; a mean of 400 values has a standard error of
+        # 0.004.
+        expected = [0.25 + 0.75 * 0.42, 0.25 + 0.75 * 0.9]
+        np.testing.assert_allclose(np.mean(confidences, axis=0), expected, atol=0.016)
+
+
+@pytest.mark.parametrize(
+    ("side_px", "share", "rate"),
+    # Values of 1 - (1 - v)^2 for the visible share v, and of 1 - exp(-(s / 10)^2) for the size s.
+    [(20, 1.0, 0.9817), (10, 1.0, 0.6321), (5, 1.0, 0.2212), (100, 0.5, 0.75), (100, 0.1, 0.19)],
+)
+def test_small_and_occluded_drones_are_missed_more_often(scene, side_px, share, rate):
+    silhouette = make_silhouette(scene, (300, 200, 300 + side_px, 200 + side_px), share=share)
+    quiet = scene_with_detector(scene)
+    assert_binomial(sum(len(detect(quiet, 0, frame, [silhouette])) for frame in range(400)), 400, rate)
+
+
+def test_jitter_is_a_share_of_the_size_of_the_box(scene):
+    boxes = np.concatenate([each.xyxy for each in detected(scene, 1000, jitter=0.05)])
+    size = boxes[:, 2:] - boxes[:, :2]
+    shift = ((boxes[:, :2] + boxes[:, 2:]) / 2 - [340, 225]) / [80, 50]
+    # With 1000 draws the standard error is 2.2 % of the deviation and 0.0016 of the mean; tolerances are four times
+    # that.
+    np.testing.assert_allclose(shift.std(axis=0), 0.05, rtol=0.09)
+    np.testing.assert_allclose(shift.mean(axis=0), 0.0, atol=0.0064)
+    np.testing.assert_allclose((size / [80, 50]).std(axis=0), 0.05, rtol=0.09)
+    np.testing.assert_allclose((size / [80, 50]).mean(axis=0), 1.0, atol=0.0085)
+
+
+def test_false_alarms_are_poisson_distributed_and_spread_over_the_image(scene):
+    found = detected(scene, 1000, false_alarms_per_frame=0.7, miss_rate=1.0)
+    counts = np.array([len(each) for each in found])
+    # The mean of 1000 Poisson numbers has a standard error of 0.026, their variance of 0.048.
+    assert counts.mean() == pytest.approx(0.7, abs=0.11)
+    assert counts.var() == pytest.approx(0.7, abs=0.2)
+    boxes = np.concatenate([each.xyxy for each in found])
+    size = boxes[:, 2:] - boxes[:, :2]
+    np.testing.assert_allclose(np.median(size, axis=0), [80, 50], rtol=0.1)
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2 / scene.rig.cameras.image_size_wh[0]
+    np.testing.assert_allclose(middle.mean(axis=0), 0.5, atol=0.06)
+    assert np.all(np.ptp(middle, axis=0) > 0.8)
+    # False alarms also come in frames without a drone.
+    noisy = scene_with_detector(scene, false_alarms_per_frame=0.7)
+    assert sum(len(detect(noisy, 0, frame, [])) for frame in range(200)) > 90
+
+
+@pytest.mark.parametrize(("right", "merged"), [(20, True), (27, True), (33, False), (60, False), (90, False)])
+def test_boxes_with_large_overlap_are_merged(scene, right, merged):
+    # A shift by 20, 27 or 33 of 80 px gives an IoU of 0.6, 0.49 or 0.42.
+    x0, y0, x1, y1 = LARGE
+    pair = [make_silhouette(scene, LARGE), make_silhouette(scene, (x0 + right, y0, x1 + right, y1), 2)]
+    found = detect(scene_with_detector(scene, merge_iou=0.45), 0, 0, pair)
+    assert len(found) == (1 if merged else 2)
+    if merged:
+        assert found.xyxy.tolist() == [[x0, y0, x1 + right, y1]]
+
+
+def test_confidence_grows_with_the_visible_share_and_the_quality_of_the_box(scene):
+    confidences = [
+        [each.confidence for each in detected(scene, 400, share=share)] for share in (1.0, 0.6, 0.3)
+    ]
+    alarms = scene_with_detector(scene, false_alarms_per_frame=1.0)
+    confidences.append([detect(alarms, 0, frame, []).confidence for frame in range(400)])
+    means = [np.concatenate(each).mean() for each in confidences]
+    assert means[0] > 0.85
+    # Each mean has a standard error of 0.01.
+    assert np.all(np.diff(means) < -0.05)
+    assert np.concatenate(confidences[-1]).min() >= 0.25
+    shaky = [each for each in detected(scene, 600, jitter=0.15) if len(each)]
+    quality = [iou(each.xyxy[0], np.array(LARGE, float)) for each in shaky]
+    # Measured rank correlation 0.66.
+    assert spearmanr(quality, [each.confidence[0] for each in shaky]).statistic > 0.5
+
+
+def test_boxes_lie_inside_the_image_in_order_of_confidence(scene):
+    wild = scene_with_detector(scene, jitter=0.5, double_rate=0.5, false_alarms_per_frame=2.0)
+    width, height = (int(side) for side in scene.rig.cameras.image_size_wh[0])
+    places = ((0, 0, 60, 40), (width - 30, height - 50, width, height))
+    at_edges = [make_silhouette(scene, place, number) for number, place in enumerate(places, 1)]
+    for frame in range(200):
+        found = detect(wild, 0, frame, at_edges)
+        assert np.all(found.xyxy >= 0)
+        assert np.all(found.xyxy <= [width, height, width, height])
+        assert np.all(found.xyxy[:, 2:] > found.xyxy[:, :2])
+        assert np.all(np.diff(found.confidence) <= 0)
+        assert np.all((found.confidence >= 0) & (found.confidence <= 1))
+
+
+def test_detections_depend_only_on_seed_camera_and_frame(scene):
+    drone, shaky = make_silhouette(scene, LARGE), scene_with_detector(scene, jitter=0.1)
+    first = detect(shaky, 0, 5, [drone]).xyxy.tolist()
+    for arguments in ((shaky, 1, 5), (shaky, 0, 6), (replace(shaky, seed=1), 0, 5)):
+        assert detect(*arguments, [drone]).xyxy.tolist() != first
+    assert detect(shaky, 0, 5, [drone]).xyxy.tolist() == first
+
+
+@given(st.lists(st.integers(0, 12), min_size=8, max_size=8))
+@settings(max_examples=60, deadline=None)
+def test_iou_agrees_with_counted_pixels(corners):
+    boxes = np.sort(np.reshape(corners, (2, 2, 2)), axis=1).reshape(2, 4)
+    canvases = []
+    for x0, y0, x1, y1 in boxes:
+        canvas = np.zeros((12, 12), bool)
+        canvas[y0:y1, x0:x1] = True
+        canvases.append(canvas)
+    union = (canvases[0] | canvases[1]).sum()
+    expected = (canvases[0] & canvases[1]).sum() / union if union else 0.0
+    assert iou(*boxes.astype(float)) == pytest.approx(expected, abs=1e-12)

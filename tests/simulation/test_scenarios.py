@@ -1,0 +1,149 @@
+"""Scenarios: the thirteen presets of the dataset, scenario files, and changed fields."""
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from placed_drones import S02
+
+from psotrack.simulation import build, catalogue, change_scenario, load, preset_names, preset_text, scenario
+from psotrack.simulation.flights.planning import frame_times_s, plan
+from psotrack.simulation.scenarios import FlightFromFile, Mesh, NearPass
+from psotrack.simulation.world.halls import RIGS
+
+#: Name -> drones (the published S05 ships ten pose files), cameras, frames.
+DATASET = {
+    "S01_D2_A": (2, 8, 500),
+    "S02_D4_A": (4, 8, 250),
+    "S03_D10_A": (10, 8, 400),
+    "S04_D10": (10, 8, 250),
+    "S05_D8": (10, 8, 246),
+    "S06_D6": (6, 8, 500),
+    "S07_D8": (8, 8, 500),
+    "S08_D8": (8, 8, 3000),
+    "S09_D6": (6, 8, 3000),
+    "S10_D6": (6, 8, 3000),
+    "S11_D4": (4, 4, 3878),
+    "S12_D3": (3, 4, 5600),
+    "S13_D3": (3, 4, 8951),
+}
+
+
+def test_the_presets_are_the_sequences_of_the_dataset():
+    """The paper states 20 min 3 s in total, and 91 min 25 s when each sequence is counted once per drone."""
+    assert preset_names() == tuple(DATASET)
+    recipes = [scenario(name) for name in preset_names()]
+    assert sum(recipe.num_frames for recipe in recipes) / 25 == 20 * 60 + 3
+    assert sum(recipe.num_frames * len(recipe.drones) for recipe in recipes) / 25 == 91 * 60 + 25
+    models = set()
+    for recipe, (name, (num_drones, cameras, frames)) in zip(recipes, DATASET.items(), strict=True):
+        drones = recipe.drones
+        assert (recipe.name, len(drones), recipe.num_frames) == (name, num_drones, frames)
+        assert len(RIGS[recipe.cameras]) == cameras
+        assert (recipe.fps, recipe.image_size_wh) == (25.0, (1920, 1080))
+        assert recipe.markers == (recipe.onboard is not None) == name.endswith("_A")
+        assert recipe.hall == ("large_hall" if 3 <= int(name[1:3]) <= 10 else "laboratory")
+        assert recipe.description
+        assert len({(drone.model, drone.paint_bgr) for drone in drones}) == len(drones)
+        models |= {drone.model for drone in drones}
+        assert recipe.limits.min_distance_m >= 0.8
+        near = any(isinstance(drone.flight, NearPass) for drone in drones)
+        assert near == (name in {"S01_D2_A", "S04_D10", "S06_D6"})
+    assert models == {"x_frame", "x_frame_racer", "camera_drone", "hexacopter", "tall_cross"}
+
+
+def test_the_two_drones_of_s01_pass_each_other_at_30_cm():
+    recipe = scenario("S01_D2_A")
+    time_s = frame_times_s(recipe, recipe.num_frames)
+    for seed in (0, 1, 2):
+        first, second = (flight.position_m(time_s) for flight in plan(recipe, seed))
+        gap_m = np.linalg.norm(first - second, axis=-1)
+        meetings = (gap_m[1:-1] < gap_m[:-2]) & (gap_m[1:-1] < gap_m[2:])
+        assert np.count_nonzero(meetings) >= 5
+        # At up to 1.1 m/s, a frame is at most half a frame time from the closest approach: sqrt(0.3^2 + 0.022^2) m.
+        np.testing.assert_allclose(gap_m[1:-1][meetings], 0.3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["S01_D2_A", "S06_D6", "S13_D3"])
+def test_all_cameras_see_the_drones_of_every_preset_most_of_the_time(name):
+    scene = build(scenario(name), scale=0.1)
+    position_m = scene.positions_m(scene.scenario.num_frames)[::25].reshape(-1, 3)
+    for cam in (scene.rig.cameras[index] for index in range(len(scene.rig))):
+        points = position_m @ cam.T_cam_world[:3, :3].T + cam.T_cam_world[:3, 3]
+        pixel = (points / points[:, 2:]) @ cam.K.T
+        seen = (points[:, 2] > 0) & np.all((pixel[:, :2] > 0) & (pixel[:, :2] < cam.image_size_wh), axis=-1)
+        assert seen.mean() > 0.5
+
+
+def test_a_file_is_read_and_its_paths_are_relative_to_its_folder(tmp_path, monkeypatch):
+    path = tmp_path / "mine" / "mine.toml"
+    path.parent.mkdir()
+    for name in ("S02_D4_A", "S06_D6", "S13_D3"):
+        path.write_text(preset_text(name), encoding="utf-8")
+        assert load(path) == scenario(name)
+    head, _, _, third = preset_text("S12_D3").split("[[drones]]")
+    path.write_text(
+        head
+        + '[[drones]]\nmodel = { file = "shapes/a.obj", scale = 0.01 }\n'
+        + 'flight = { kind = "recording", file = "r.csv" }\n'
+        + '[[drones]]\nflight = { kind = "recording", file = "/elsewhere/r.csv", start_s = 2.5 }\n'
+        + f"[[drones]]{third}"
+    )
+    monkeypatch.chdir(tmp_path)
+    for given_path in (path, Path("mine/mine.toml")):
+        first, second, third_drone = load(given_path).drones
+        assert first.model == Mesh(file=str(tmp_path / "mine/shapes/a.obj"), scale=0.01)
+        assert first.flight == FlightFromFile(file=str(tmp_path / "mine/r.csv"))
+        assert second.flight == FlightFromFile(file="/elsewhere/r.csv", start_s=2.5)
+        assert third_drone == scenario("S12_D3").drones[2]
+
+
+def test_change_scenario_changes_only_the_given_fields():
+    changes = {
+        "imaging.reflections": 0,
+        "surroundings.screen": 0.02,
+        "drones[1].flight.terms[0].period_s": 8.0,
+        "drones[2].model": {"file": "a.obj"},
+        "onboard": None,
+    }
+    changed = change_scenario(S02, changes)
+    assert changed.imaging == msgspec.structs.replace(S02.imaging, reflections=0.0)
+    assert changed.surroundings.screen == 0.02
+    assert changed.drones[1].flight.terms[0].period_s == 8.0
+    assert changed.drones[2].model == Mesh(file="a.obj")
+    assert changed.onboard is None
+    old = {
+        "imaging.reflections": S02.imaging.reflections,
+        "surroundings": {},
+        "drones[1].flight.terms[0].period_s": S02.drones[1].flight.terms[0].period_s,
+        "drones[2].model": S02.drones[2].model,
+        "onboard": {},
+    }
+    assert change_scenario(changed, old) == change_scenario(S02, {}) == S02
+    # A part that is missing starts from its defaults.
+    with_camera = change_scenario(scenario("S04_D10"), {"onboard.pitch_deg": -20})
+    assert with_camera.onboard == msgspec.structs.replace(S02.onboard, pitch_deg=-20.0)
+    # Angles that are equal fit a square image.
+    build(
+        change_scenario(S02, {"onboard.fov_deg": [90.0, 90.0], "onboard.image_size_wh": [800, 800]}),
+        scale=0.1,
+    )
+
+
+def test_the_catalogue_and_the_text_are_those_of_the_presets(run_psotrack):
+    rows = catalogue()
+    assert [row["name"] for row in rows] == list(DATASET)
+    shown = run_psotrack("simulate", "--list").out
+    for row in rows:
+        drones, cameras, frames = DATASET[row["name"]]
+        assert (row["drones"], row["cameras"], row["frames"]) == (drones, cameras, frames)
+        assert row["markers"] == row["onboard"] == row["name"].endswith("_A")
+        assert f"{row['name']}: {drones} drones, {cameras} cameras, {frames} frames, {row['hall']}" in shown
+        assert row["description"] in shown
+    speed_m_s = {row["name"][:3]: row["mean_speed_m_s"] for row in rows}
+    assert 3.4 <= speed_m_s["S08"] <= 4.0
+    assert 0.25 <= speed_m_s["S11"] <= 0.43
+    assert run_psotrack("simulate", "S01_D2_A", "--show").out == preset_text("S01_D2_A")
+    assert tomllib.loads(preset_text("S01_D2_A"))["name"] == "S01_D2_A"

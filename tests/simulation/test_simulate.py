@@ -1,0 +1,466 @@
+"""Simulated sequences on disk: file layout, determinism, resuming after interruptions, and the command."""
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from helpers import assert_refused, make_once, read_mocap_markers
+from placed_drones import S02, number_image
+from scipy.spatial.transform import Rotation
+
+from psotrack import __version__
+from psotrack.errors import OutputError
+from psotrack.geometry import project
+from psotrack.recordings import VideoWriter, probe, read_detections, read_frames
+from psotrack.recordings.datasets import (
+    DETECTIONS,
+    MARKER_CORNERS,
+    read_marker_corners,
+    read_masks,
+    read_sequence,
+)
+from psotrack.simulation import (
+    CameraRenderer,
+    SimulationSettings,
+    build,
+    change_scenario,
+    preset_text,
+    segments,
+    simulate,
+)
+from psotrack.simulation.imaging.onboard import OnboardRenderer
+from psotrack.simulation.segments import unfinished
+
+NAME = "S02_D4_A"
+CORNERS = change_scenario(S02, {"cameras": "laboratory_corners"})
+SMALL = SimulationSettings(num_frames=3, scale=0.1)
+#: A scenario of two cameras and two drones, for the tests that interrupt the simulation.
+PAIR = msgspec.structs.replace(
+    change_scenario(
+        S02,
+        {
+            "cameras": [
+                {"position_m": [3.0, -2.5, 2.6], "target_m": [0.0, 0.0, 1.2]},
+                {"position_m": [-3.0, -2.5, 2.6], "target_m": [0.0, 0.0, 1.2]},
+            ]
+        },
+    ),
+    drones=S02.drones[:2],
+)
+TINY = SimulationSettings(num_frames=7, scale=0.04)
+ONE_FRAME = replace(TINY, num_frames=1)
+#: Smallest accepted similarity of a decoded and a rendered frame, dB. The MPEG-4 encoder at its lowest quality in
+#: use is above this limit; a wrong frame is near 15 dB.
+MIN_PSNR_DB = 28.0
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    made = make_once(
+        tmp_path_factory, "small_sequence", lambda folder: simulate(CORNERS, folder, SMALL, jobs=1)
+    )
+    return made / "Simulated_Data" / NAME
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return build(CORNERS, scale=0.1)
+
+
+@pytest.fixture(scope="module")
+def pair_folder(tmp_path_factory):
+    """Folder of an uninterrupted simulation, to which interrupted simulations are compared."""
+
+    def make(folder):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(segments, "SEGMENT_FRAMES", 2)
+            simulate(PAIR, folder, TINY, jobs=1)
+
+    return make_once(tmp_path_factory, "pair_sequence", make) / "Simulated_Data" / NAME
+
+
+@pytest.fixture
+def short_segments(monkeypatch):
+    monkeypatch.setattr(segments, "SEGMENT_FRAMES", 2)
+
+
+def read_contents(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_read_sequence_finds_every_file(sequence, scene):
+    recording = read_sequence(sequence).usable()
+    names = [f"cam{i}" for i in range(1, 5)]
+    assert list(recording.videos) == list(recording.rig.names) == list(recording.detections) == names
+    assert [video.path.name for video in recording.videos.values()] == [f"{name}i_s.avi" for name in names]
+    for video in recording.videos.values():
+        assert (video.num_frames, video.fps, video.image_size_wh) == (3, 25.0, (192, 108))
+    assert {path.name for path in (sequence / DETECTIONS).iterdir()} == {f"{name}i_s.csv" for name in names}
+    assert set(recording.onboard) == {"dron1", "dron2", "dron3", "dron4"}
+    for field in ("T_cam_world", "K"):
+        found, made = (getattr(rig.cameras, field) for rig in (recording.rig, scene.rig))
+        np.testing.assert_allclose(found, made, atol=1e-9)
+    assert set(read_marker_corners(sequence / MARKER_CORNERS)) == set(range(1, 42))
+    assert [path.name for path in sequence.parent.iterdir()] == [NAME], "no temporary file is left"
+    record = json.loads((sequence / "simulation.json").read_text())
+    inputs = {"frames": 3, "scale": 0.1, "seed": 0, "masks": True, "onboard": True}
+    assert {key: record[key] for key in inputs} == inputs
+    # Another version starts an unfinished sequence again, because its two halves might differ.
+    assert record["version"] == __version__
+    assert record["libraries"] == {"numpy": np.__version__, "opencv": cv2.__version__}
+    assert msgspec.convert(record["scenario"], type(PAIR)) == CORNERS
+
+
+def test_the_reference_is_the_flight_and_is_missing_in_frame_0(sequence, scene):
+    truth = read_sequence(sequence).truth
+    assert np.isnan(truth.position_m[0]).all()
+    # Fewer frames are the first frames of the same flight. The text files hold sixteen digits.
+    np.testing.assert_allclose(truth.position_m[1:], scene.positions_m(250)[1:3], atol=1e-12)
+    np.testing.assert_allclose(truth.orientation_wxyz[1:], scene.orientations_wxyz(3)[1:], atol=1e-9)
+    for drone, model in enumerate(scene.models):
+        markers = read_mocap_markers(sequence / f"dron{drone + 1}_markers_25.csv")
+        assert markers.shape == (3, 4, 3)
+        body = Rotation.from_quat(truth.orientation_wxyz[1:, drone], scalar_first=True)
+        on_body = np.stack([body.inv().apply(each) for each in np.moveaxis(markers[1:], 1, 0)]) - np.stack(
+            [body.inv().apply(truth.position_m[1:, drone])] * 4
+        )
+        # Markers are fixed to the body, on top of it. Quaternions are rounded to sixteen digits.
+        np.testing.assert_allclose(on_body[:, 0], on_body[:, 1], atol=1e-12)
+        assert np.all(on_body[..., 2] > model.triangles_m[..., 2].max())
+        assert np.all(np.linalg.norm(on_body, axis=-1) < 0.35)
+
+
+def test_videos_show_the_rendered_frames(sequence, scene):
+    drawn = {f"cam{i + 1}i_s.avi": CameraRenderer(scene, i) for i in (1, 3)}
+    drawn["dron3_cam_s.avi"] = OnboardRenderer(scene, 2)
+    for name, renderer in drawn.items():
+        frames = list(read_frames(probe(sequence / name)))
+        assert len(frames) == 3
+        for frame, shown in enumerate(frames):
+            assert cv2.PSNR(shown, renderer.frame(frame)) > MIN_PSNR_DB
+
+
+def test_masks_agree_with_the_renderer_and_detections_lie_on_the_drones(sequence, scene):
+    recording = read_sequence(sequence)
+    num_near = num_boxes = 0
+    with read_masks(sequence) as masks:
+        assert masks.cameras == tuple(f"{name}i" for name in scene.rig.names)  # named like the video files
+        assert (masks.drones, masks.frames) == ((1, 2, 3, 4), (0, 1, 2))
+        for index, camera in enumerate(scene.rig.names):
+            renderer, found = CameraRenderer(scene, index), read_detections(recording.detections[camera])
+            for frame in masks.frames:
+                numbers = number_image(renderer, frame)
+                for drone in masks.drones:
+                    np.testing.assert_array_equal(masks.mask(camera, drone, frame), numbers == drone)
+                pixels, _ = project(recording.rig.cameras[index], scene.positions_m(3)[frame])
+                for box in found.in_frame(frame).xyxy:
+                    middle, diagonal = (box[:2] + box[2:]) / 2 - 0.5, np.linalg.norm(box[2:] - box[:2])
+                    num_boxes += 1
+                    # A box's centre differs from the body's origin by less than the box's diagonal.
+                    num_near += np.linalg.norm(pixels - middle, axis=-1).min() < diagonal
+    # Few of the 48 drones, boxes of about 10 px, are detected: 10; at most two boxes may be false detections.
+    assert num_boxes >= 8
+    assert num_near >= num_boxes - 2
+
+
+def test_the_record_holds_digests_of_the_files_of_the_scenario(tmp_path):
+    path = tmp_path / "hover.csv"
+    rows = [f"{k},{k / 10},a,0.0,0.0,1.5" for k in range(40)]
+    path.write_text("\n".join(["frame,time_s,drone,x_m,y_m,z_m", *rows]) + "\n")
+    drones = [{"flight": {"kind": "recording", "file": str(path)}}]
+    recipe = change_scenario(PAIR, {"drones": drones, "num_frames": 2})
+    settings = replace(ONE_FRAME, masks=False, onboard=False)
+    folder = simulate(recipe, tmp_path, settings, jobs=1)
+    record = json.loads((folder / "simulation.json").read_text())
+    assert record["sha256"] == {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
+    # Masks and on-board videos can be left out.
+    names = set(read_contents(folder))
+    assert {"cam1i_s.avi", "dl_data/cam1i_s.csv"} <= names
+    assert not any("mask" in name or "_cam" in name or name.startswith("drone") for name in names)
+
+
+def test_the_frame_rate_stands_in_file_names_and_is_read_back(tmp_path):
+    recipe = change_scenario(PAIR, {"fps": 12.5})
+    progress = []
+
+    @contextlib.contextmanager
+    def report(description, total):
+        progress.append(total)
+        yield lambda steps: progress.append(-steps)
+
+    folder = simulate(recipe, tmp_path, replace(TINY, num_frames=2), jobs=1, report=report)
+    # Every frame of every video counts.
+    assert progress[0] == 2 * (2 + 2)
+    assert sum(progress) == 0
+    names = {"dron1_pos_12.5.csv", "dron1_markers_12.5.csv", "dron1_cam_12.5.csv"}
+    assert names <= set(read_contents(folder))
+    recording = read_sequence(folder)
+    assert recording.videos["cam1"].fps == 12.5
+    assert recording.truth.time_s.tolist() == [0.0, 0.08]
+    assert np.isfinite(recording.onboard["dron1"].position_m[1]).all()
+
+
+def test_scale_keeps_the_world_and_shrinks_the_images(tmp_path):
+    large, small = (build(S02, scale=scale) for scale in (1.0, 0.3))
+    np.testing.assert_array_equal(large.positions_m(5), small.positions_m(5))
+    np.testing.assert_array_equal(large.rig.cameras.T_cam_world, small.rig.cameras.T_cam_world)
+    assert large.rig.cameras.K[0].tolist() == [[1156.3, 0, 960], [0, 1156.3, 540], [0, 0, 1]]
+    # The image's corner is at -0.5 px, and the distance of a point from that corner shrinks by the scale.
+    np.testing.assert_allclose(small.rig.cameras.K[0, :2, 2] + 0.5, 0.3 * np.array([960.5, 540.5]))
+    assert np.all(small.rig.cameras.image_size_wh % 2 == 0)
+    # The largest scale is the limit of the video writer: images of 8190 pixels.
+    with VideoWriter(tmp_path / "fits.avi", 25.0, (8190, 32)) as video:
+        video.write(np.zeros((32, 8190, 3), np.uint8))
+    with pytest.raises(OutputError), VideoWriter(tmp_path / "wide.avi", 25.0, (8192, 32)):
+        pass
+
+
+def test_segments_change_only_the_encoded_videos(pair_folder, tmp_path):
+    """A video that is encoded in segments differs in bytes; all other files are equal to the byte."""
+    unsegmented, segmented = read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)), read_contents(pair_folder)
+    assert unsegmented.keys() == segmented.keys()
+    assert {name for name in unsegmented if unsegmented[name] != segmented[name]} == {
+        "cam1i_s.avi", "cam2i_s.avi", "dron1_cam_s.avi", "dron2_cam_s.avi",
+    }  # fmt: skip
+
+
+@pytest.mark.usefixtures("short_segments")
+@pytest.mark.slow
+def test_the_number_of_jobs_changes_no_byte(pair_folder, tmp_path):
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=2)) == read_contents(pair_folder)
+
+
+# --- interruptions
+
+
+def interrupt_after(after_frames):
+    """Return a progress report that raises KeyboardInterrupt (Ctrl-C) after `after_frames` frames."""
+    done = 0
+
+    @contextlib.contextmanager
+    def report(description, num_boxes):
+        def advance(steps):
+            nonlocal done
+            done += steps
+            if done >= after_frames:
+                raise KeyboardInterrupt
+
+        yield advance
+
+    return report
+
+
+@pytest.mark.usefixtures("short_segments")
+def test_an_interrupted_simulation_continues_at_its_segment(pair_folder, tmp_path):
+    parent = tmp_path / "Simulated_Data"
+    # Segments of other settings are not used.
+    with pytest.raises(KeyboardInterrupt):
+        simulate(PAIR, tmp_path, replace(TINY, seed=5), jobs=1, report=interrupt_after(4))
+    with pytest.raises(KeyboardInterrupt):
+        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupt_after(12))
+    assert [path.name for path in parent.iterdir()] == [f".{NAME}.unfinished"]
+    # Seven frames of the first camera, and the segments of frames 0-1 and 2-3 of the second camera.
+    kept = {path: path.stat().st_mtime_ns for path in parent.rglob("video.avi")}
+    assert sorted("/".join(path.parts[-3:-1]) for path in kept) == [
+        *(f"cam1i/{start:06d}" for start in (0, 2, 4, 6)), *(f"cam2i/{start:06d}" for start in (0, 2)),
+    ]  # fmt: skip
+    assert not list(parent.rglob("*.partial*"))
+    with pytest.raises(KeyboardInterrupt):
+        # The existing frames are reported as done at the start, which raises the interruption.
+        simulate(PAIR, tmp_path, TINY, jobs=1, report=interrupt_after(12))
+    assert kept == {path: path.stat().st_mtime_ns for path in parent.rglob("video.avi")}
+    folder = simulate(PAIR, tmp_path, TINY, jobs=1)
+    assert read_contents(folder) == read_contents(pair_folder)
+    assert [path.name for path in parent.iterdir()] == [NAME]
+
+
+@pytest.mark.usefixtures("short_segments")
+@pytest.mark.parametrize(
+    "step", ["segments.join_videos", "segments.join_archives", "generate.write_onboard_calibration"]
+)
+def test_an_interruption_after_the_last_frame_renders_no_frame_again(
+    pair_folder, tmp_path, monkeypatch, step
+):
+    """The interruption comes while videos or masks are joined, or tables are written."""
+
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"psotrack.simulation.{step}", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(PAIR, tmp_path, TINY, jobs=1)
+    monkeypatch.setattr("psotrack.simulation.segments.CameraRenderer", interrupt)
+    folder = simulate(PAIR, tmp_path, TINY, jobs=1)
+    assert read_contents(folder) == read_contents(pair_folder)
+    assert [path.name for path in folder.parent.iterdir()] == [NAME]
+
+
+#: Script that simulates into a folder with `jobs` processes and kills itself `delay_s` seconds after `frames` frames,
+#: or at the next frame if that comes earlier.
+KILLED_SCRIPT = """
+    import contextlib
+    import os
+    import signal
+    import sys
+    import threading
+    from pathlib import Path
+    import msgspec
+    from psotrack.simulation import Scenario, SimulationSettings, segments, simulate
+
+    def kill():
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    @contextlib.contextmanager
+    def report(description, total):
+        done = 0
+
+        def advance(steps):
+            nonlocal done
+            if done >= frames:
+                kill()
+            done += steps
+            if done >= frames:
+                threading.Timer(delay_s, kill).start()
+
+        yield advance
+
+    if __name__ == "__main__":
+        segments.SEGMENT_FRAMES = 2
+        folder, jobs, frames, delay_s = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
+        recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
+        simulate(recipe, Path(folder), SimulationSettings(num_frames=7, scale=0.04), jobs=jobs, report=report)
+"""
+
+
+@pytest.mark.usefixtures("short_segments")
+@pytest.mark.nightly
+def test_a_simulation_killed_at_random_moments_ends_with_the_same_bytes(pair_folder, tmp_path):
+    (tmp_path / "run.py").write_text(textwrap.dedent(KILLED_SCRIPT))
+    rng = np.random.default_rng(0)
+    parent = tmp_path / "Simulated_Data"
+    num_segments = [0]
+    for jobs in (2, 1):
+        # The process is killed a few frames after the frames that existed at its start, plus a random delay.
+        moment = 2 * num_segments[-1] + rng.integers(4, 9), rng.uniform(0, 0.04)
+        command = [sys.executable, tmp_path / "run.py", tmp_path, *map(str, (jobs, *moment))]
+        # `run` waits until stderr is closed, that is until the process and all of its workers have ended.
+        killed = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True, check=False)
+        assert killed.returncode == -signal.SIGKILL, killed
+        # The lock file remains, but the lock ended with the process.
+        assert sorted(path.name for path in parent.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
+        num_segments.append(len(list(parent.rglob("[0-9]*/video.avi"))))
+    assert num_segments[-1] > 1, "complete segments are kept"
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
+    assert [path.name for path in parent.iterdir()] == [NAME]
+
+
+@pytest.mark.usefixtures("short_segments")
+def test_a_full_disk_leaves_no_sequence_and_keeps_complete_segments(pair_folder, tmp_path):
+    """A limit on the file size stands for a full disk: above a segment, a few kilobytes, and below a joined video."""
+    limit, before = (
+        (pair_folder / "cam1i_s.avi").stat().st_size - 1000,
+        resource.getrlimit(resource.RLIMIT_FSIZE),
+    )
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        with pytest.raises(OutputError, match="earlier results are unchanged"):
+            simulate(PAIR, tmp_path, TINY, jobs=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not (tmp_path / "Simulated_Data" / NAME).exists()
+    assert list(tmp_path.rglob("video.avi"))
+    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
+
+
+def test_the_old_sequence_stays_until_the_new_one_is_complete(pair_folder, tmp_path, monkeypatch):
+    folder = shutil.copytree(pair_folder, tmp_path / "Simulated_Data" / NAME)
+    before, move, moves = read_contents(folder), os.replace, []
+
+    def refuse(source, target):
+        moves.append(target)
+        if moves.count(folder) == 1 and target == folder:
+            raise OSError(errno.EIO, "Input/output error")
+        move(source, target)
+
+    other = replace(ONE_FRAME, seed=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", refuse)
+        with pytest.raises(
+            OutputError, match="S02_D4_A: expected a path that can be written, found Input/output"
+        ):
+            simulate(PAIR, tmp_path, other, jobs=1, force=True)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(PAIR, tmp_path, replace(TINY, seed=2), jobs=1, force=True, report=interrupt_after(2))
+    assert read_contents(folder) == before
+    simulate(PAIR, tmp_path, other, jobs=1, force=True)
+    after = read_contents(folder)
+    assert after.keys() == before.keys()
+    for name in ("dron1_pos_25.csv", "cam1i_s.avi"):
+        assert after[name] != before[name]
+    assert after["cameras_calibration.csv"] == before["cameras_calibration.csv"]
+
+
+def test_a_second_simulation_of_the_same_sequence_is_refused(tmp_path):
+    folder = tmp_path / "Simulated_Data" / NAME
+    with unfinished(folder, b"another record") as parts:
+        parts.mkdir(parents=True)
+        words = (
+            "expected no other simulation of this sequence at the same time, found another simulation; wait"
+        )
+        assert_refused(
+            lambda: simulate(PAIR, tmp_path, ONE_FRAME, jobs=1), f"{NAME}: {words}", unchanged=tmp_path
+        )
+    # The lock ended with the other simulation, so a new simulation can start.
+    simulate(PAIR, tmp_path, ONE_FRAME, jobs=1)
+    assert [path.name for path in folder.parent.iterdir()] == [NAME]
+    (tmp_path / "full" / "Simulated_Data").parent.mkdir()
+    (tmp_path / "full" / "Simulated_Data").write_text("a file where the folder should be")
+    with pytest.raises(OutputError, match="Simulated_Data"):
+        simulate(PAIR, tmp_path / "full", ONE_FRAME, jobs=1)
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EIO])
+def test_a_file_system_without_locks_is_accepted_and_a_broken_one_is_an_error(tmp_path, monkeypatch, code):
+    def fail(descriptor, operation):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("fcntl.flock", fail)
+    refused = pytest.raises(
+        OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
+    )
+    allowed = contextlib.nullcontext() if code == errno.ENOLCK else refused
+    with allowed, unfinished(tmp_path / NAME, b"record") as parts:
+        assert parts.is_relative_to(tmp_path)
+
+
+# --- the command
+
+
+def test_a_preset_can_be_edited_into_a_new_scenario(run_psotrack, tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(preset_text("S11_D4").replace('name = "S11_D4"', 'name = "MINE"'))
+    small = ("--frames", 2, "--scale", 0.05, "--jobs", 1, "--no-onboard", "--set", "image_size_wh=[1280,960]")
+    result = run_psotrack("simulate", "--scenario", mine, "--out", tmp_path, "--json", "-", "--quiet", *small)
+    folder = tmp_path / "Simulated_Data" / "MINE"
+    assert json.loads(result.out) == {"sequence": str(folder)}
+    recording = read_sequence(folder).usable()
+    assert (len(recording.rig), recording.num_frames, len(recording.truth.drones)) == (4, 2, 4)
+    np.testing.assert_array_equal(recording.rig.cameras.image_size_wh, np.tile([64, 48], (4, 1)))

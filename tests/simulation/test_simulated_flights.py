@@ -1,0 +1,525 @@
+"""Flights of the simulator: derivatives, attitude, near passes, groups, limits, variation, recorded flights."""
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from made_flights import ORBIT, WIDE, make_scenario, write_tracks
+from placed_drones import S02
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from psotrack.errors import SettingsError
+from psotrack.simulation import change_scenario, preset_names, scenario, write_recorded_flight
+from psotrack.simulation.flights.motion import GRAVITY_M_S2, HarmonicFlight, Heading, quaternions_wxyz
+from psotrack.simulation.flights.planning import frame_times_s, plan
+from psotrack.simulation.flights.recordings import (
+    Recorded,
+    RecordedFlight,
+    read_recorded_flight,
+)
+from psotrack.simulation.scenarios import (
+    Crossing,
+    FlightFromFile,
+    FollowingFlight,
+    Formation,
+    Harmonic,
+    Harmonics,
+    NearPass,
+    Variation,
+    Waypoints,
+)
+
+TIME_S = np.linspace(0.0, 10.0, 301)
+#: Step of the central differences, seconds.
+STEP_S = 1e-3
+
+#: One flight of every kind; a flight that another flight refers to comes later in the tuple.
+FLIGHTS_OF_EVERY_KIND = (
+    NearPass(
+        other=7, distance_m=0.7, side=(0.0, 0.0, -2.0), swing_m=(1.1, 0.4, 0.0), period_s=5.1, phase_deg=33.0
+    ),
+    Formation(leader=1, offset_m=(0.0, 0.9, 0.2)),
+    FollowingFlight(leader=2, delay_s=1.3),
+    Harmonics(
+        centre_m=(0.0, 0.1, 1.2),
+        terms=(
+            Harmonic(amplitude_m=(0.9, 0.7, 0.2), period_s=5.0, phase_deg=(90.0, 0.0, 45.0)),
+            Harmonic(amplitude_m=(0.0, 0.2, 0.3), period_s=3.7, phase_deg=(0.0, 10.0, 200.0)),
+        ),
+    ),
+    Crossing(start_m=(-2.0, -1.0, 0.9), end_m=(1.8, 1.2, 2.0), period_s=6.6, phase_deg=70.0),
+    Waypoints(
+        points_m=((0.0, 0.0, 1.0), (1.5, 0.4, 1.6), (0.2, 1.4, 1.9), (-1.0, 0.1, 0.9)),
+        speed_m_s=0.9,
+        hover_s=0.4,
+    ),
+    ORBIT,
+)
+FLIGHT_KINDS = [type(record).__name__ for record in FLIGHTS_OF_EVERY_KIND]
+WAYPOINTS = FLIGHTS_OF_EVERY_KIND[FLIGHT_KINDS.index("Waypoints")]
+
+
+@pytest.fixture(scope="module")
+def planned_flights():
+    return dict(
+        zip(FLIGHT_KINDS, plan(make_scenario(*FLIGHTS_OF_EVERY_KIND, variation=Variation()), 3), strict=True)
+    )
+
+
+def positions(recipe, seed, stride=1):
+    time_s = frame_times_s(recipe, recipe.num_frames)[::stride]
+    return np.stack([flight.position_m(time_s) for flight in plan(recipe, seed)])
+
+
+def pairwise_distances_m(position_m):
+    """Return the distances between all pairs of drones, (pairs, times), metres."""
+    first, second = np.triu_indices(len(position_m), 1)
+    return np.linalg.norm(position_m[first] - position_m[second], axis=-1)
+
+
+def central_differences(flight, order):
+    """Return the first or second derivative of the position by central differences."""
+    before, here, after = (flight.position_m(TIME_S + shift) for shift in (-STEP_S, 0.0, STEP_S))
+    return (after - before) / (2 * STEP_S) if order == 1 else (after - 2 * here + before) / STEP_S**2
+
+
+# --- motion
+
+
+@pytest.mark.parametrize("flight_kind", FLIGHT_KINDS)
+def test_attitude_follows_the_thrust_and_derivatives_the_position(planned_flights, flight_kind):
+    flight = planned_flights[flight_kind]
+    # The first difference errs by at most h^2 / 6 times the third derivative. The second difference of waypoints errs
+    # by h times the step of their third derivative, 60 d / T^3 with d = 1.7 m and T = 1.9 s: 15 m/s^3.
+    step = flight_kind == "Waypoints"
+    acceleration_m_s2 = flight.acceleration_m_s2(TIME_S)
+    np.testing.assert_allclose(flight.velocity_m_s(TIME_S), central_differences(flight, 1), atol=1e-5)
+    np.testing.assert_allclose(acceleration_m_s2, central_differences(flight, 2), atol=2e-2 if step else 2e-4)
+    assert np.abs(acceleration_m_s2).max() > 0.3, "the flight must accelerate to test the second derivative"
+    thrust, rotation = acceleration_m_s2 + np.array([0.0, 0.0, GRAVITY_M_S2]), flight.rotation(TIME_S)
+    # Sine of the angle between body z and thrust.
+    sine = np.linalg.norm(np.cross(rotation[:, :, 2], thrust), axis=-1) / np.linalg.norm(thrust, axis=-1)
+    assert sine.max() < 1e-12
+    assert np.all((rotation[:, :, 2] * thrust).sum(axis=-1) > 0)
+    wxyz = flight.orientation_wxyz(TIME_S)
+    np.testing.assert_allclose(np.linalg.norm(wxyz, axis=-1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1.0, atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), rotation, atol=1e-12)
+    assert (wxyz[1:] * wxyz[:-1]).sum(axis=-1).min() > 0.99, "no quaternion changes its sign"
+
+
+def test_quaternions_stay_unit_across_half_a_turn():
+    turns = np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0]), np.eye(3)])
+    np.testing.assert_array_equal(np.abs(quaternions_wxyz(turns)), [[1, 0, 0, 0], [0, 0, 0, 1], [1, 0, 0, 0]])
+
+
+def test_the_x_axis_looks_along_the_heading():
+    recipe = change_scenario(
+        make_scenario(ORBIT), {"drones[0].yaw_deg": 70.0, "drones[0].yaw_sway_deg": 30.0}
+    )
+    (flight,) = plan(recipe, 0)
+    rotation = flight.rotation(TIME_S)
+    yaw = np.radians(70.0) + np.radians(30.0) * np.sin(2 * np.pi / 9.0 * TIME_S + flight.heading.phase_rad)
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=-1)
+    # The body's x axis is the direction perpendicular to z that is nearest to the heading, so y is perpendicular to
+    # the heading.
+    np.testing.assert_allclose((rotation[:, :, 1] * ahead).sum(axis=-1), 0.0, atol=1e-12)
+    assert np.all((rotation[:, :, 0] * ahead).sum(axis=-1) > 0.9)
+
+
+# --- kinds of flights, compared with formulas
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_an_orbit_starts_at_plus_x_and_turns_in_the_given_direction(clockwise):
+    record = msgspec.structs.replace(ORBIT, phase_deg=0.0, clockwise=clockwise, rise_phase_deg=90.0)
+    (flight,) = plan(make_scenario(record), 0)
+    angle = 2 * np.pi * TIME_S / 6.3
+    y = -0.2 + (-1 if clockwise else 1) * 1.1 * np.sin(angle)
+    rise = 1.4 + 0.3 * np.cos(2 * np.pi * TIME_S / 5.0)
+    np.testing.assert_allclose(
+        flight.position_m(TIME_S), np.stack([0.3 + 1.5 * np.cos(angle), y, rise], axis=-1), atol=1e-12
+    )
+
+
+def test_a_crossing_goes_straight_from_end_to_end_and_rests_at_both():
+    start, end = np.array([-2.0, -1.0, 0.9]), np.array([1.8, 1.2, 2.0])
+    (flight,) = plan(make_scenario(Crossing(start_m=tuple(start), end_m=tuple(end), period_s=6.0)), 0)
+    at_s = np.array([0.0, 1.5, 3.0, 4.5, 6.0])
+    expected = [start, (start + end) / 2, end, (start + end) / 2, start]
+    np.testing.assert_allclose(flight.position_m(at_s), expected, atol=1e-12)
+    np.testing.assert_allclose(flight.velocity_m_s(at_s[::2]), 0.0, atol=1e-12)
+
+
+def test_formations_keep_their_offset_and_followers_their_delay(planned_flights):
+    first, second, third = (
+        planned_flights[flight_kind] for flight_kind in ("NearPass", "Formation", "FollowingFlight")
+    )
+    np.testing.assert_allclose(
+        second.position_m(TIME_S) - first.position_m(TIME_S), np.tile([0.0, 0.9, 0.2], (301, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(third.position_m(TIME_S + 1.3), second.position_m(TIME_S), atol=1e-12)
+
+
+def test_waypoints_are_reached_on_time_and_hovered_at():
+    (flight,) = plan(make_scenario(WAYPOINTS), 0)
+    points, hover_s = np.array(WAYPOINTS.points_m), WAYPOINTS.hover_s
+    leg_s = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=-1) / WAYPOINTS.speed_m_s + hover_s
+    # Two rounds: the first point follows the last point.
+    arrival_s = np.concatenate([[0.0], np.cumsum(np.tile(leg_s, 2))[:-1]])
+    for wait_s in (0.0, 0.2, 0.399):
+        np.testing.assert_allclose(flight.position_m(arrival_s + wait_s), np.tile(points, (2, 1)), atol=1e-9)
+        np.testing.assert_allclose(flight.velocity_m_s(arrival_s + wait_s), 0.0, atol=1e-9)
+    halfway_s = arrival_s[:3] + hover_s + (leg_s[:3] - hover_s) / 2
+    np.testing.assert_allclose(flight.position_m(halfway_s), (points[:3] + points[1:4]) / 2, atol=1e-12)
+
+
+@given(
+    distance_m=st.floats(0.2, 2.0),
+    angle_deg=st.floats(0.0, 360.0),
+    tilt_deg=st.floats(-80.0, 80.0),
+    length=st.floats(0.1, 10.0),
+    phase_deg=st.floats(-400.0, 400.0),
+    seed=st.integers(0, 10_000),
+)
+def test_a_near_pass_reaches_its_distance_twice_a_period(
+    distance_m, angle_deg, tilt_deg, length, phase_deg, seed
+):
+    axes = Rotation.from_euler("zy", [angle_deg, tilt_deg], degrees=True).as_matrix()
+    record = NearPass(
+        other=1,
+        distance_m=distance_m,
+        side=tuple((axes[:, 0] * length).tolist()),
+        swing_m=tuple((axes[:, 1] * 1.5).tolist()),
+        period_s=4.0,
+        phase_deg=phase_deg,
+    )
+    # The limits demand at least 0.9 m between drones, but they exempt a near pass from this distance.
+    limits = msgspec.structs.replace(WIDE, min_distance_m=0.9)
+    variation = Variation(period=0.0)
+    other, passing = plan(make_scenario(ORBIT, record, limits=limits, variation=variation), seed)
+    time_s = np.linspace(0.0, 4.0, 40_001)
+    gap_m = np.linalg.norm(passing.position_m(time_s) - other.position_m(time_s), axis=-1)
+    # On a grid of 0.1 ms, the minimum is too large by at most (2.5 m/s * 0.05 ms)^2 / (2 * 0.2 m) = 4e-8 m.
+    assert gap_m.min() == pytest.approx(distance_m, abs=1e-6)
+    assert gap_m.min() >= distance_m - 1e-9
+    near = gap_m[:-1] < distance_m + 1e-6
+    assert np.count_nonzero(near & ~np.roll(near, 1)) == 2
+
+
+# --- what a seed changes
+
+
+def test_flights_are_determined_by_the_seed_and_without_variation_not_even_by_it():
+    first, again, other = (plan(S02, seed)[0].position_m(TIME_S) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 0.1
+    pairs = zip(*(plan(make_scenario(*FLIGHTS_OF_EVERY_KIND), seed) for seed in (0, 1)), strict=True)
+    for flight, other_flight in pairs:
+        np.testing.assert_array_equal(flight.position_m(TIME_S), other_flight.position_m(TIME_S))
+        assert flight.heading.yaw_rad == other_flight.heading.yaw_rad == 0.0
+
+
+@given(seed=st.integers(0, 10_000))
+def test_variation_stays_within_what_the_scenario_allows(seed):
+    variation = Variation(phase_deg=10.0, centre_m=0.1, size=0.05, period=0.02, yaw_deg=30.0)
+    orbit, flight = plan(make_scenario(ORBIT, WAYPOINTS, variation=variation), seed)
+    assert np.all(np.abs(orbit.centre_m - ORBIT.centre_m) <= 0.1)
+    assert np.all(np.abs(np.rad2deg(orbit.phase_rad[0]) - [110.0, 20.0, 0.0])[:2] <= 10.0 + 1e-9)
+    assert np.all(np.abs(orbit.amplitude_m[0, :2] / ORBIT.radius_m - 1) <= 0.05 + 1e-12)
+    assert np.all(np.abs(2 * np.pi / orbit.angular_rad_s / [6.3, 5.0] - 1) <= 0.02 + 1e-12)
+    assert abs(np.degrees(orbit.heading.yaw_rad)) <= 30.0
+    assert np.all(np.abs(flight.points_m - WAYPOINTS.points_m) <= 0.1)
+    # The variation of the period scales the flying time and the hovering time of the whole round.
+    slower = flight.hover_s / WAYPOINTS.hover_s
+    assert abs(slower - 1) <= 0.02 + 1e-12
+    way_m = np.linalg.norm(np.roll(flight.points_m, -1, axis=0) - flight.points_m, axis=-1)
+    np.testing.assert_allclose(flight.moving_s, slower * way_m / WAYPOINTS.speed_m_s, rtol=1e-12)
+
+
+def circling(*phases_deg, group="", num_frames=250):
+    """Drones on one circle of 1.5 m, with variation."""
+    records = [msgspec.structs.replace(ORBIT, phase_deg=each, radius_m=(1.5, 1.5)) for each in phases_deg]
+    groups = (group,) * len(records)
+    return make_scenario(*records, groups=groups, variation=Variation(), num_frames=num_frames)
+
+
+@given(seed=st.integers(0, 10_000), frames=st.sampled_from([250, 9000]))
+def test_drones_of_one_group_keep_their_spacing_on_an_orbit(seed, frames):
+    """On a circle of radius r, n evenly spaced drones stay 2 r sin(pi / n) apart; the seed varies r."""
+    ring = circling(0.0, 120.0, 240.0, group="ring", num_frames=frames)
+    distance_m = pairwise_distances_m(positions(ring, seed, stride=10))
+    # The tolerance covers the rounding of angles up to 400 rad.
+    np.testing.assert_allclose(distance_m, distance_m[0, 0], atol=1e-9)
+    assert 1.5 * np.sqrt(3) * (1 - 0.06) <= distance_m[0, 0] <= 1.5 * np.sqrt(3) * (1 + 0.06)
+
+
+def test_a_group_shares_its_variation_but_no_headings():
+    alone = circling(0.0, 120.0, num_frames=9000)
+    assert np.ptp(pairwise_distances_m(positions(alone, 0, stride=10))) > 0.5
+    first, other = plan(circling(0.0, 120.0, group="ring"), 0)
+    assert first.heading.yaw_rad != other.heading.yaw_rad
+    assert first.heading.phase_rad != other.heading.phase_rad
+    # Kinds of flights may differ within a group.
+    line = Crossing(start_m=(-1.0, 0.0, 1.0), end_m=(1.0, 0.0, 1.0), period_s=6.3)
+    orbit, crossing = plan(make_scenario(ORBIT, line, groups=("a", "a"), variation=Variation()), 1)
+    moved_m = crossing.centre_m - [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(orbit.centre_m - ORBIT.centre_m, moved_m, atol=1e-12)
+    assert orbit.angular_rad_s[0] == crossing.angular_rad_s[0]
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_limits_hold_in_every_preset_for_every_seed(name):
+    recipe = scenario(name)
+    limits = recipe.limits
+    # Check all frames of short sequences and every seventh frame of long sequences.
+    time_s = frame_times_s(recipe, recipe.num_frames)[:: 1 if recipe.num_frames < 600 else 7]
+    for seed in (0, 17):
+        flights = plan(recipe, seed)
+        here, there = (np.stack([f.position_m(time_s + shift) for f in flights]) for shift in (0.0, STEP_S))
+        speed = np.linalg.norm(there - here, axis=-1) / STEP_S
+        acceleration = np.stack([flight.acceleration_m_s2(time_s) for flight in flights])
+        thrust = acceleration + np.array([0.0, 0.0, GRAVITY_M_S2])
+        tilt_deg = np.degrees(np.arctan2(np.hypot(thrust[..., 0], thrust[..., 1]), thrust[..., 2]))
+        # The difference is the speed half a millisecond later, which differs by at most 9 m/s^2 times 0.5 ms.
+        assert speed.max() <= limits.max_speed_m_s + 0.005
+        assert np.linalg.norm(acceleration, axis=-1).max() <= limits.max_acceleration_m_s2
+        assert tilt_deg.max() <= limits.max_tilt_deg
+        assert np.all(here >= limits.lower_m)
+        assert np.all(here <= limits.upper_m)
+        pairs = itertools.combinations(range(len(flights)), 2)
+        distance_m = dict(zip(pairs, pairwise_distances_m(here), strict=True))
+        for index, drone in enumerate(recipe.drones):
+            if isinstance(drone.flight, NearPass):
+                passed = distance_m.pop(tuple(sorted((index, drone.flight.other - 1))))
+                assert drone.flight.distance_m - 1e-9 <= passed.min() < drone.flight.distance_m + 0.1
+        assert (
+            min(each.min() for each in distance_m.values()) >= limits.min_distance_m if distance_m else True
+        )
+        # Speeds measured on the dataset: the fast sequences, the sequences flown by hand, and all others.
+        fast = {"S08": (3.4, 4.0), "S09": (3.4, 4.0), "S10": (3.4, 4.0)}
+        by_hand = {"S11": (0.25, 0.43), "S12": (0.25, 0.43), "S13": (0.25, 0.43)}
+        least, most = (fast | by_hand).get(name[:3], (0.5, 3.0))
+        assert least <= speed.mean() <= most
+
+
+# --- recorded flights
+
+
+HEADING = Heading(0.4, 0.6, 0.8, 0.1)
+
+
+#: A flight with up to 2.4 m/s, 4 m/s^2 and 23 degrees of tilt, similar to the scenarios of the dataset.
+FORMULA = HarmonicFlight(
+    centre_m=np.array([0.1, -0.2, 1.5]),
+    amplitude_m=np.array([[1.5, 1.2, 0.2], [0.2, 0.1, 0.1]]),
+    angular_rad_s=np.array([1.2, 2.9]),
+    phase_rad=np.array([[0.0, 1.5, 0.3], [0.5, 2.0, 1.0]]),
+    heading=HEADING,
+)
+EVEN_S = np.arange(1001) / 100
+#: Uneven sample times at rates of 70 to 160 Hz, seconds.
+UNEVEN_S = np.cumsum(np.random.default_rng([5]).uniform(0.006, 0.0145, 1001))
+FRAMES_S = np.arange(240) / 25
+
+
+def sample_formula(time_s, *, oriented=False, noise_m=0.0):
+    position_m = FORMULA.position_m(time_s)
+    position_m = position_m + np.random.default_rng([7]).normal(0.0, noise_m, position_m.shape)
+    return Recorded(time_s, position_m, FORMULA.orientation_wxyz(time_s) if oriented else None)
+
+
+def make_replay(recorded, heading=HEADING, start_s=0.0, offset_m=(0.0, 0.0, 0.0)):
+    return RecordedFlight(recorded, heading, start_s, np.array(offset_m), "loop.csv")
+
+
+def angle_deg(a, b):
+    """Return the angles between two stacks of rotation matrices, (times,), degrees."""
+    return np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
+
+
+@pytest.mark.parametrize("time_s", [EVEN_S, UNEVEN_S, np.arange(260) / 25], ids=["100 Hz", "uneven", "25 Hz"])
+def test_a_recording_without_noise_replays_the_formula_at_any_time(time_s):
+    replay = make_replay(sample_formula(time_s))
+    query_s = FRAMES_S + 0.0137
+    true_s = query_s + time_s[0]
+    # The error of a quintic spline has order h^6 x^(6), and its derivatives have one and two orders less. The largest
+    # errors, at 25 Hz near the ends: measured 2e-8 m, 2e-6 m/s and 2e-4 m/s^2.
+    np.testing.assert_allclose(replay.position_m(query_s), FORMULA.position_m(true_s), atol=1e-6)
+    np.testing.assert_allclose(replay.velocity_m_s(query_s), FORMULA.velocity_m_s(true_s), atol=1e-4)
+    np.testing.assert_allclose(
+        replay.acceleration_m_s2(query_s), FORMULA.acceleration_m_s2(true_s), atol=5e-3
+    )
+
+
+def test_without_orientations_the_attitude_follows_acceleration_and_heading():
+    replay = make_replay(sample_formula(EVEN_S))
+    # An error of 1e-4 m/s^2 relative to 9.81 m/s^2 tilts the thrust by 6e-4 degrees.
+    assert angle_deg(replay.rotation(FRAMES_S), FORMULA.rotation(FRAMES_S)).max() < 6e-4
+
+
+@pytest.mark.parametrize("rate_hz", [25, 100])
+def test_recorded_orientations_are_kept_for_any_heading(rate_hz):
+    replay = make_replay(
+        sample_formula(np.arange(10 * rate_hz) / rate_hz, oriented=True), heading=Heading(2.0)
+    )
+    between_s = FRAMES_S + 0.0137
+    # The error of a cubic spline of rotations is h^4 / 384 times the fourth derivative, about 25 rad/s^4: 1e-5 degrees
+    # at 25 Hz, as measured. Near the ends the spline sets the curvature to 0: measured 0.014 degrees.
+    assert angle_deg(replay.rotation(between_s), FORMULA.rotation(between_s))[20:-20].max() < 3e-5
+    assert angle_deg(replay.rotation(between_s), FORMULA.rotation(between_s)).max() < 0.03
+    signs = (replay.orientation_wxyz(between_s) * FORMULA.orientation_wxyz(between_s)).sum(axis=1)
+    np.testing.assert_allclose(np.abs(signs), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("time_s", "oriented"), [(EVEN_S, False), (UNEVEN_S, False), (EVEN_S, True)])
+def test_noise_of_a_millimetre_gives_small_errors_of_the_acceleration(time_s, oriented):
+    noisy = sample_formula(time_s, oriented=oriented, noise_m=1e-3)
+    replay, query_s = make_replay(noisy), FRAMES_S + 0.1
+    true_s = query_s + time_s[0]
+    interpolated = make_interp_spline(noisy.time_s, noisy.position_m, k=5)(true_s, 2)
+    assert np.abs(interpolated - FORMULA.acceleration_m_s2(true_s)).max() > 100, (
+        "interpolation must amplify the noise"
+    )
+    wrong_m_s2 = replay.acceleration_m_s2(query_s) - FORMULA.acceleration_m_s2(true_s)
+    # Least squares with 25 samples per knot: measured standard deviation 0.015 m/s^2, largest error 0.06 m/s^2.
+    assert np.abs(wrong_m_s2).max() < 0.2
+    assert wrong_m_s2.std() < 0.03
+    # A third of the noise of the positions remains, measured 0.8 mm at most.
+    assert np.abs(replay.position_m(query_s) - FORMULA.position_m(true_s)).max() < 1.2e-3
+    # An error of 0.2 m/s^2 relative to 9.81 m/s^2 tilts the thrust by 1.2 degrees.
+    assert angle_deg(replay.rotation(query_s), FORMULA.rotation(true_s)).max() < 1.2
+    # At the two ends, with samples on one side only: measured 0.18 and 0.54 m/s^2.
+    end_s = np.array([0.0, noisy.duration_s])
+    assert np.abs(replay.acceleration_m_s2(end_s) - FORMULA.acceleration_m_s2(time_s[[0, -1]])).max() < 1.0
+
+
+def test_two_nearly_simultaneous_samples_give_small_errors_of_the_acceleration():
+    """Noise of 0.01 mm is harmless at 100 Hz, but harmful between two samples that are half a millisecond apart."""
+    time_s = np.sort(np.append(EVEN_S, 4.0005))
+    noisy, query_s = sample_formula(time_s, noise_m=1e-5), np.linspace(3.9, 4.1, 401)
+    true_m_s2 = FORMULA.acceleration_m_s2(query_s)
+    interpolated = make_interp_spline(noisy.time_s, noisy.position_m, k=5)(query_s, 2)
+    assert np.abs(interpolated - true_m_s2).max() > 5, "interpolation must amplify the noise"
+    # Least squares with 25 samples per knot: measured 0.0005 m/s^2.
+    assert np.abs(make_replay(noisy).acceleration_m_s2(query_s) - true_m_s2).max() < 0.01
+
+
+def test_a_gap_in_a_noisy_recording_is_bridged_without_an_excursion():
+    kept = (EVEN_S < 4.0) | (EVEN_S > 4.4)
+    complete = sample_formula(EVEN_S, noise_m=1e-3)
+    replay = make_replay(Recorded(EVEN_S[kept], complete.position_m[kept], None))
+    missing_s = np.linspace(4.0, 4.4, 21)
+    # Largest measured error 0.5 mm.
+    assert np.abs(replay.position_m(missing_s) - FORMULA.position_m(missing_s)).max() < 2e-3
+
+
+@pytest.mark.parametrize("count", [6, 7, 8, 30])
+def test_the_shortest_recordings_are_replayed_with_noise(count):
+    time_s = np.arange(count) / 100
+    replay = make_replay(sample_formula(time_s, noise_m=1e-3))
+    # The tolerance is the largest value of the noise, about 3.5 mm, and the shift by smoothing.
+    np.testing.assert_allclose(replay.position_m(time_s), FORMULA.position_m(time_s), atol=5e-3)
+
+
+@given(
+    st.integers(10, 120),
+    st.tuples(*[st.floats(-5, 5)] * 3),
+    st.floats(-100.0, 1000.0),
+)
+def test_shifting_a_recording_in_space_and_time_shifts_the_flight(rate_hz, offset_m, later_s):
+    time_s = np.arange(2 * rate_hz) / rate_hz
+    original = sample_formula(time_s)
+    shifted = Recorded(time_s + later_s, original.position_m + offset_m, None)
+    query_s = np.linspace(0.0, 1.9, 20)
+    # Times near 1000 s are rounded to 1e-13 s; the spline's equations amplify this by less than 1e4, at 2 m/s.
+    np.testing.assert_allclose(
+        make_replay(shifted).position_m(query_s),
+        make_replay(original, offset_m=offset_m).position_m(query_s),
+        atol=1e-8,
+    )
+
+
+def test_a_flight_is_extrapolated_by_half_an_exposure():
+    replay = make_replay(sample_formula(EVEN_S))
+    edge_s = np.array([-0.02, -0.004, 10.004, 10.02])
+    # The jerk j is below 7.5 m/s^3 per axis: j t^3 / 6 is 10 micrometres, and j t^2 / 2 is 1.5 mm/s.
+    np.testing.assert_allclose(replay.position_m(edge_s), FORMULA.position_m(edge_s), atol=1.1e-5)
+    np.testing.assert_allclose(replay.velocity_m_s(edge_s), FORMULA.velocity_m_s(edge_s), atol=1.6e-3)
+
+
+def test_a_recorded_flight_is_flown_from_its_start_with_an_offset_and_can_be_followed(tmp_path):
+    path = tmp_path / "loop.csv"
+    write_recorded_flight(path, EVEN_S + 3.0, FORMULA.position_m(EVEN_S), FORMULA.orientation_wxyz(EVEN_S))
+    record = FlightFromFile(file=str(path), start_s=2.5, offset_m=(1.0, -2.0, 0.5))
+    recipe = make_scenario(
+        record,
+        Formation(leader=1, offset_m=(0.0, 0.9, 0.0)),
+        FollowingFlight(leader=1, delay_s=1.5),
+        variation=Variation(),
+        num_frames=180,
+    )
+    time_s = frame_times_s(recipe, 180)
+    for seed in (0, 1):
+        first, wingman, behind = plan(recipe, seed)
+        moved_m = FORMULA.position_m(time_s + 2.5) + np.array([1.0, -2.0, 0.5])
+        np.testing.assert_allclose(first.position_m(time_s), moved_m, atol=1e-6)
+        assert angle_deg(first.rotation(time_s), FORMULA.rotation(time_s + 2.5)).max() < 0.06
+        np.testing.assert_allclose(wingman.position_m(time_s) - moved_m, [[0.0, 0.9, 0.0]] * 180, atol=1e-6)
+        np.testing.assert_allclose(
+            behind.position_m(time_s[40:]), first.position_m(time_s[40:] - 1.5), atol=1e-9
+        )
+
+
+def test_the_end_of_a_recording_is_noticed_by_every_method():
+    replay = make_replay(sample_formula(EVEN_S), start_s=2.0)
+    time_s = np.arange(500) / 25
+    replay.check(time_s[:201])
+    with pytest.raises(
+        SettingsError, match=r"at least 10\.04 s, found 10 s; 201 of the 202 frames would fit$"
+    ):
+        replay.check(time_s[:202])
+    for method in (replay.position_m, replay.velocity_m_s, replay.acceleration_m_s2, replay.rotation):
+        with pytest.raises(SettingsError, match=r"expected a recording of at least 21\.96 s, found 10 s"):
+            method(time_s)
+
+
+@pytest.mark.parametrize("oriented", [True, False])
+def test_a_written_recording_is_read_back_exactly(tmp_path, oriented):
+    path = tmp_path / "new" / "loop.csv"
+    recorded = sample_formula(UNEVEN_S, oriented=oriented)
+    write_recorded_flight(path, recorded.time_s, recorded.position_m, recorded.orientation_wxyz)
+    again = read_recorded_flight(path)
+    np.testing.assert_array_equal(again.time_s, recorded.time_s)
+    np.testing.assert_array_equal(again.position_m, recorded.position_m)
+    if oriented:
+        # Reading normalises the quaternions again, which may change the last digit.
+        np.testing.assert_allclose(again.orientation_wxyz, recorded.orientation_wxyz, atol=1e-15)
+    else:
+        assert again.orientation_wxyz is None
+
+
+def test_a_tum_file_is_read_with_and_without_orientations(tmp_path):
+    time_s = np.arange(40) / 25
+    quaternion = FORMULA.orientation_wxyz(time_s)[:, [1, 2, 3, 0]]
+    for name, xyzw in (("turned.tum", quaternion), ("level.txt", np.tile([0.0, 0, 0, 1], (40, 1)))):
+        np.savetxt(tmp_path / name, np.column_stack([time_s, FORMULA.position_m(time_s), xyzw]), fmt="%.17g")
+    turned, level = (read_recorded_flight(tmp_path / name) for name in ("turned.tum", "level.txt"))
+    np.testing.assert_allclose(turned.time_s, time_s, atol=1e-12)
+    np.testing.assert_array_equal(turned.position_m, FORMULA.position_m(time_s))
+    np.testing.assert_allclose(turned.orientation_wxyz, FORMULA.orientation_wxyz(time_s), atol=1e-12)
+    # The identity in every row says that no orientation is known: the attitude follows the acceleration.
+    assert level.orientation_wxyz is None
+
+
+def test_rows_without_a_position_are_left_out(tmp_path):
+    path = tmp_path / "loop.csv"
+    write_tracks(path)
+    lines = path.read_text().splitlines()
+    lines[4] = lines[4].replace(",3.0,6.0,9.0,", ",,,,")
+    path.write_text("\n".join(lines))
+    np.testing.assert_allclose(read_recorded_flight(path).time_s, [0, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7])

@@ -1,0 +1,352 @@
+"""Labels, compared with boxes computed by hand, by OpenCV and from rendered masks; data sets as trainers read them."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from helpers import assert_refused, far_camera, make_once, ring_rig, with_cameras
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from psotrack.foreground.detection import LabelSettings, box_corners, label_boxes, write_data_set
+from psotrack.geometry import look_at, make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import Reference, VideoWriter, read_frames
+from psotrack.recordings.datasets import open_recording, read_sequence
+from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
+from psotrack.trajectories import Trajectories
+from psotrack.trajectories.tum import write_tum
+
+#: A distant camera at y = -1000 m with 100 x 80 pixels and 10 pixels per metre; x is to the right, z is up.
+FAR = far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)
+
+
+CUBE = LabelSettings(drone_size_m=(2.0, 2.0, 2.0))
+
+
+SIZE_M = (0.6, 0.4, 0.3)
+
+
+def make_reference(position_m, orientation_wxyz=None):
+    """Make a reference from positions (frames, drones, 3) in metres and orientations (frames, drones, 4)."""
+    position_m = np.asarray(position_m, np.float64)
+    frame = np.arange(len(position_m))
+    names = tuple(f"dron{number + 1}" for number in range(position_m.shape[1]))
+    if orientation_wxyz is not None:
+        orientation_wxyz = np.asarray(orientation_wxyz, np.float64)
+    return Trajectories(frame, frame / 25, names, position_m, orientation_wxyz=orientation_wxyz)
+
+
+def compute_labels(*position_m, camera=FAR, settings=CUBE, orientation_wxyz=None):
+    """Return the label boxes in an image, (drones, 4), pixels."""
+    truth = make_reference([position_m], None if orientation_wxyz is None else [orientation_wxyz])
+    return label_boxes(camera, box_corners(truth, settings), settings)[0]
+
+
+def labels_in_rig(rig, truth, settings):
+    """Return the label boxes of all cameras, (frames, drones, cameras, 4), pixels."""
+    corners_m = box_corners(truth, settings)
+    boxes = [label_boxes(rig.cameras[index], corners_m, settings) for index in range(len(rig))]
+    return np.stack(boxes, axis=2)
+
+
+# --- boxes in one image, computed by hand
+
+
+def test_missing_orientations():
+    """A drone without any orientation has a level box; a drone with gaps has no box in the gaps."""
+    truth = make_reference(np.zeros((2, 2, 3)), np.full((2, 2, 4), np.nan))
+    truth.orientation_wxyz[0, 1] = (1, 0, 0, 0)
+    corners_m = box_corners(truth, CUBE)
+    assert np.isfinite(corners_m[:, 0]).all()
+    assert np.isfinite(corners_m[0, 1]).all()
+    assert np.isnan(corners_m[1, 1]).all()
+
+
+NONE = [np.nan] * 4
+#: Of the nearer drone of two, half a metre beside the farther one: it covers three quarters.
+NEAR = [45, 30, 65, 50]
+
+
+@pytest.mark.parametrize(
+    ("places_m", "change", "expected"),
+    [
+        # Three quarters of a box from 85 to 105 are in an image of 100 pixels.
+        ([(4.5, 0, 0)], {"min_inside": 0.7}, [[85, 30, 100, 50]]),
+        ([(4.5, 0, 0)], {"min_inside": 0.8}, [NONE]),
+        ([(7, 0, 0), (0, 0, -6)], {"min_inside": 0.0}, [NONE, NONE]),
+        # Behind the camera, around the camera, and with one corner behind the camera.
+        ([(0, -2000, 0), (0, -1000, 0), (0, -999.5, 0)], {"min_inside": 0.0}, [NONE, NONE, NONE]),
+        ([(0, 5, 0), (0.5, 0, 0)], {"max_hidden": 0.74}, [NONE, NEAR]),
+        ([(0, 5, 0), (0.5, 0, 0)], {"max_hidden": 0.76}, [[40, 30, 60, 50], NEAR]),
+        # Drones without an image or a pose hide no other drone.
+        ([(0, 0, 0), (0, -1500, 0), (math.nan,) * 3], {"max_hidden": 0.0}, [[40, 30, 60, 50], NONE, NONE]),
+    ],
+)
+def test_drones_at_the_border_behind_the_camera_and_behind_each_other(places_m, change, expected):
+    found = compute_labels(*places_m, settings=msgspec.structs.replace(CUBE, **change))
+    np.testing.assert_allclose(found, expected, atol=0.06)
+
+
+@pytest.mark.parametrize("coefficients", [0, 8])
+def test_boxes_agree_with_corners_projected_by_opencv(coefficients):
+    rig = ring_rig(3, coefficients=coefficients)
+    rng = np.random.default_rng(0)
+    position_m = rng.uniform((-1, -1, 0.8), (1, 1, 1.8), (7, 1, 3))
+    wxyz = Rotation.random(7, rng=1).as_quat(scalar_first=True)[:, None]
+    size_m, offset_m = np.array([0.5, 0.3, 0.2]), np.array([0.05, -0.1, 0.02])
+    chosen = LabelSettings(tuple(size_m.tolist()), tuple(offset_m.tolist()))
+    found = labels_in_rig(rig, make_reference(position_m, wxyz), chosen)
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    for f in range(7):
+        turn = Rotation.from_quat(wxyz[f, 0], scalar_first=True)
+        corners_m = position_m[f, 0] + turn.apply(offset_m + signs * size_m / 2)
+        for c in range(3):
+            camera, (R, t_m) = rig.cameras[c], np.split(rig.cameras[c].T_cam_world[:3], [3], axis=1)
+            dist = camera.dist if coefficients else None
+            pixels = cv2.projectPoints(corners_m, cv2.Rodrigues(R)[0], t_m, camera.K, dist)[0][:, 0]
+            expected = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]) + 0.5
+            expected = np.clip(expected, 0, [320, 240, 320, 240])
+            np.testing.assert_allclose(found[f, 0, c], expected, atol=1e-9)
+
+
+def test_points_far_outside_are_not_mapped_into_the_image():
+    """The lens polynomial decreases far from the axis: it maps 65 degrees to the radius of 28 degrees."""
+    R, t_m = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    K = np.array([[1158.0, 0, 962], [0, 1158, 541], [0, 0, 1]])
+    bent = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1924, 1082), dist=(-0.17, 0.0, 0.0, 0.0))
+    far_outside_m = (2.0, -2.0 * math.tan(math.radians(65)), 0.0)
+    pixel, _ = project(bent, np.array(far_outside_m))
+    assert (pixel > 0).all()
+    assert (pixel < (1924, 1082)).all()
+    small = LabelSettings(drone_size_m=(0.3, 0.3, 0.2))
+    assert np.isnan(compute_labels(far_outside_m, camera=bent, settings=small)).all()
+    # A drone in the corner of the image has a label.
+    corner = np.array([1.0, -0.8, 0.4]) * 4
+    assert np.isfinite(compute_labels(tuple(corner), camera=bent, settings=small)).all()
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_labels_are_inside_the_image_and_do_not_depend_on_the_order(seed):
+    rng = np.random.default_rng(seed)
+    rig = ring_rig(3, coefficients=4)
+    position_m = rng.uniform((-6, -6, -1), (6, 6, 4), (2, 5, 3))
+    chosen = LabelSettings((0.8, 0.6, 0.4), min_inside=rng.uniform(), max_hidden=rng.uniform())
+    order = rng.permutation(5)
+
+    def compute_boxes(position_m):
+        return labels_in_rig(rig, make_reference(position_m), chosen)
+
+    found = compute_boxes(position_m)
+    np.testing.assert_array_equal(compute_boxes(position_m[:, order]), found[:, order])
+    visible_boxes = found[np.isfinite(found).all(axis=-1)]
+    assert np.isfinite(found).all(axis=-1).sum() == np.isfinite(found).any(axis=-1).sum()
+    assert ((visible_boxes >= 0) & (visible_boxes <= (320, 240, 320, 240))).all()
+    assert (visible_boxes[:, 2:] > visible_boxes[:, :2]).all()
+
+
+# --- simulated sequences, in which drones are boxes
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two sequences in which every drone is a box, so that labels are the bounds of the renderer's masks."""
+
+    def make(folder):
+        trimesh.creation.box(SIZE_M).export(folder / "box.ply", encoding="ascii")
+        for name, num_frames in (("S01_D2_A", 3), ("S12_D3", 3)):
+            models = {
+                f"drones[{drone}].model": {"file": str(folder / "box.ply")}
+                for drone in range(len(scenario(name).drones))
+            }
+            recipe = change_scenario(scenario(name), {"cameras": "laboratory_corners"} | models)
+            size = SimulationSettings(num_frames=num_frames, scale=0.25, onboard=False)
+            simulate(recipe, folder, size, jobs=1)
+
+    return make_once(tmp_path_factory, "boxes", make) / "Simulated_Data"
+
+
+@pytest.fixture
+def first(data):
+    return read_sequence(data / "S01_D2_A")
+
+
+@pytest.fixture
+def second(data):
+    return read_sequence(data / "S12_D3")
+
+
+@pytest.fixture
+def run_labels(data, run_psotrack):
+    """Runs `simulate labels` for some of the sequences."""
+
+    def run(names, *words):
+        sequences = [data / name for name in names]
+        return run_psotrack(
+            "simulate", "labels", *sequences, "--drone-size", "0.6,0.4,0.3", "--quiet", *words
+        )
+
+    return run
+
+
+BOTH = ("S01_D2_A", "S12_D3")
+
+
+def load_data_set(out):
+    """Read the data set like a trainer: (part, path of the image) -> rows of labels.
+
+    A trainer reads the image folders from `data.yaml` by PyYAML's `safe_load`, and finds the labels of an image by
+    replacing the last /images/ by /labels/ and the suffix by .txt. A row has five numbers from 0 to 1, and no row is
+    repeated.
+    """
+    content = yaml.safe_load((out / "data.yaml").read_text(encoding="utf-8"))
+    assert set(content) == {"path", "train", "val", "nc", "names"}
+    assert content["nc"] == len(content["names"]) == 1
+    found = {}
+    for part in ("train", "val"):
+        folder = Path(content["path"]) / content[part]
+        assert folder.is_dir()
+        for image in sorted(folder.iterdir()):
+            assert image.suffix == ".jpg"
+            before, after = str(image).rsplit("/images/", 1)
+            text = Path(f"{before}/labels/{after}").with_suffix(".txt").read_text()
+            rows = np.array([line.split() for line in text.splitlines()], float).reshape(-1, 5)
+            assert (rows[:, 0] == 0).all()
+            assert ((rows[:, 1:] >= 0) & (rows[:, 1:] <= 1)).all()
+            assert len(np.unique(rows, axis=0)) == len(rows)
+            found[part, image] = rows
+    return found
+
+
+def test_the_data_set_can_be_loaded_by_a_trainer(first, second, run_labels, tmp_path):
+    out = tmp_path / "set"
+    result = run_labels(BOTH, "--out", out, "--jobs", 2, "--json", "-")
+    assert result.code == 0
+    counts, found = json.loads(result.out), load_data_set(out)
+    assert len(list((out / "labels").glob("*/*.txt"))) == len(found)
+    for part, recording in (("train", first), ("val", second)):
+        rows = [value for (part_of_image, _), value in found.items() if part_of_image == part]
+        # Frame 0 has no pose in the dataset, so it is left out.
+        assert counts[part] == {"images": 2 * 4, "labels": sum(map(len, rows))}
+        assert len(rows) == 2 * 4
+        boxes = labels_in_rig(recording.rig, recording.truth, LabelSettings(SIZE_M))
+        for index, camera in enumerate(recording.rig.names):
+            for frame, shown in enumerate(read_frames(recording.videos[camera])):
+                image = out / "images" / part / f"{recording.name}_{camera}_{frame:06d}.jpg"
+                assert image.exists() == (frame > 0)
+                if not frame:
+                    continue
+                expected = boxes[frame, :, index]
+                expected = expected[np.isfinite(expected).all(axis=-1)]
+                middle, size = found[part, image][:, 1:3], found[part, image][:, 3:]
+                corners = np.hstack([middle - size / 2, middle + size / 2]) * [480, 270, 480, 270]
+                # The file holds shares of 480 pixels with six decimals.
+                np.testing.assert_allclose(corners, expected, atol=5e-4)
+                # The limit is above the error of JPEG at quality 95; at the drones, another frame differs more.
+                assert np.abs(cv2.imread(str(image)).astype(int) - shown).mean() < 2.0
+    # An offset of one kilometre moves all drones out of all images: their label files are empty.
+    options = ["--every", 2, "--validation", "S01_D2_A", "--offset", "0,0,-1000", "--jobs", 1, "--force"]
+    assert run_labels(BOTH, "--out", out, *options) == (0, "", "")
+    found = load_data_set(out)
+    assert len(found) == 8
+    parts = {(part, image.name[:3], image.stem[-6:]) for part, image in found}
+    assert parts == {("val", "S01", "000002"), ("train", "S12", "000002")}
+    assert not any(map(len, found.values()))
+
+
+#: Name of the case -> sequences, options, and words of the line.
+BAD = {
+    "one sequence": (BOTH[:1], [], "found S01_D2_A, of which S01_D2_A for validation"),
+    "all for validation": (
+        BOTH,
+        ["--validation", "S12_D3,S01_D2_A"],
+        "found S01_D2_A, S12_D3, of which S01_D2_A, S12_D3 for",
+    ),
+    "an unknown sequence": (
+        BOTH,
+        ["--validation", "S99"],
+        "found S01_D2_A, S12_D3, of which S99 for validation",
+    ),
+    "the same sequence": (
+        ("S01_D2_A",) * 2,
+        [],
+        "found S01_D2_A, S01_D2_A, of which S01_D2_A for validation",
+    ),
+    "no frame": (BOTH, ["--every", 0], "every"),
+    "a folder of other files": (
+        BOTH,
+        ["--force", "--out", "home"],
+        "only a folder with a data.yaml can be replaced",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_data_sets_that_cannot_be_written(name, run_labels, tmp_path, monkeypatch):
+    sequences, options, words = BAD[name]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("x")
+    assert_refused(lambda: run_labels(sequences, "--out", "set", *options), words, unchanged=tmp_path)
+
+
+def test_recordings_without_poses_or_frames_leave_nothing_behind(first, second, tmp_path):
+    truth = first.truth
+    no_pose = replace(truth, position_m=np.full_like(truth.position_m, np.nan))
+    short = {name: replace(video, num_frames=9) for name, video in first.videos.items()}
+    longer = Trajectories(
+        np.arange(9), np.arange(9) / 25, truth.drones, np.broadcast_to(truth.position_m[1], (9, 2, 3))
+    )
+    for recording, words in (
+        (replace(first, reference=None), "S01_D2_A: expected a reference "),
+        (replace(first, reference=Reference(no_pose)), "a frame in which the poses of all drones are known"),
+        (replace(with_cameras(first, video=short), reference=Reference(longer)), "only 3 can be decoded"),
+    ):
+        assert_refused(
+            lambda recording=recording: write_data_set(
+                [recording, second], tmp_path / "set", LabelSettings(SIZE_M), jobs=1
+            ),
+            words,
+            unchanged=tmp_path,
+        )
+
+
+def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
+    """A drone flies to the right at 1 m/s, 5 m before two cameras with frames between the instants."""
+    R, t_m = look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    K = np.array([[100.0, 0, 99.5], [0, 100, 49.5], [0, 0, 1]])
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(200, 100))
+    starts_s, rates_hz = {"slow": 0.03, "quick": 0.0}, {"slow": 25.0, "quick": 50.0}
+    flights = tmp_path / "a", tmp_path / "b"
+    for folder in flights:
+        folder.mkdir()
+        write_rig(folder / "rig.toml", make_rig(dict.fromkeys(starts_s, camera)))
+        tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.tum"]']
+        for name, start_s in starts_s.items():
+            with VideoWriter(folder / f"{name}.avi", rates_hz[name], (200, 100)) as video:
+                for _ in range(int(rates_hz[name] // 5)):
+                    video.write(np.zeros((100, 200, 3), np.uint8))
+            tables.append(f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {start_s}')
+        (folder / "recording.toml").write_text("\n".join(tables))
+        time_s = np.arange(60) / 100
+        position_m = np.stack([time_s, np.full(60, 5.0), np.zeros(60)], axis=-1)[:, None]
+        write_tum(folder, Trajectories(np.arange(60), time_s, ("drone",), position_m))
+    small = LabelSettings(drone_size_m=(0.1, 0.1, 0.1))
+    write_data_set([open_recording(folder) for folder in flights], tmp_path / "set", small, jobs=1)
+    for name, start_s in starts_s.items():
+        files = sorted((tmp_path / "set" / "labels").glob(f"*/*_{name}_*.txt"))
+        assert len(files) == 2 * int(rates_hz[name] // 5)
+        for file in files:
+            middle_px = 200 * float(file.read_text().split()[1])
+            time_s = start_s + int(file.stem[-6:]) / rates_hz[name]
+            # The near and the far side of the cube, 0.1 m apart, shift the middle by up to 0.02 px.
+            assert middle_px == pytest.approx(100 + 100 * time_s / 5, abs=0.03)
