@@ -17,7 +17,6 @@ from psotrack.simulation.imaging.lens_image import lens_image
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.raster import pinhole
 from psotrack.simulation.own_cameras import own_rig
-from psotrack.trajectories.tum import read_tum
 
 
 def lens():
@@ -104,9 +103,10 @@ def test_the_folder_of_a_laboratory(tmp_path, run_psotrack):
     assert record["board"]["squares_wh"] == [4, 5]
     # The board's corner on the floor is the origin of the world in which rig and reference are written.
     for name in ("dron1", "dron2"):
-        flight = read_tum(folder / f"{name}.tum")
-        assert flight.num_frames == 25
-        assert (flight.position_m[..., 2] > 0.3).all()
+        # Columns of TUM files: time, x, y, z, quaternion.
+        rows = np.loadtxt(folder / f"{name}.tum")
+        assert rows.shape == (25, 8)
+        assert (rows[:, 3] > 0.3).all()
     heights = rig.cameras.centre_world[:, 2]
     np.testing.assert_allclose(heights, [camera.position_m[2] for camera in OWN_CAMERAS], atol=1e-9)
 

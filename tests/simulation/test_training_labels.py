@@ -22,8 +22,7 @@ from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import Reference, VideoWriter, read_frames
 from psotrack.recordings.datasets import open_recording, read_sequence
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
-from psotrack.trajectories import Trajectories
-from psotrack.trajectories.tum import write_tum
+from psotrack.trajectories import Trajectories, write_trajectories
 
 #: A distant camera at y = -1000 m with 100 x 80 pixels and 10 pixels per metre; x is to the right, z is up.
 FAR = far_camera(image_size_wh=(100, 80), pixels_per_m=10.0)
@@ -330,7 +329,7 @@ def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
     for folder in flights:
         folder.mkdir()
         write_rig(folder / "rig.toml", make_rig(dict.fromkeys(starts_s, camera)))
-        tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.tum"]']
+        tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.csv"]']
         for name, start_s in starts_s.items():
             with VideoWriter(folder / f"{name}.avi", rates_hz[name], (200, 100)) as video:
                 for _ in range(int(rates_hz[name] // 5)):
@@ -339,7 +338,8 @@ def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
         (folder / "recording.toml").write_text("\n".join(tables))
         time_s = np.arange(60) / 100
         position_m = np.stack([time_s, np.full(60, 5.0), np.zeros(60)], axis=-1)[:, None]
-        write_tum(folder, Trajectories(np.arange(60), time_s, ("drone",), position_m))
+        truth = Trajectories(np.arange(60), time_s, ("drone",), position_m)
+        write_trajectories(folder / "drone.csv", truth)
     small = LabelSettings(drone_size_m=(0.1, 0.1, 0.1))
     write_data_set([open_recording(folder) for folder in flights], tmp_path / "set", small, jobs=1)
     for name, start_s in starts_s.items():
