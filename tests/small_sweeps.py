@@ -9,6 +9,9 @@ import pandas as pd
 import pytest
 from helpers import make_once
 
+from psotrack.simulation import SimulationSettings, simulate
+from psotrack.sweeps import sweep
+
 #: All cells use one compiled program: the number of iterations is no shape.
 GRID = """
 sequences = ["S01_D2_A"]
@@ -71,12 +74,9 @@ def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
 
     def make(root: Path) -> None:
-        made = psotrack(
-            root, "simulate", "S01_D2_A", "--out", root, "--scale", 0.25, "--frames", 6, "--no-onboard"
-        )
-        assert made.returncode == 0, made.stderr
-        swept = psotrack(root, "sweep", grid_file(root, [2]), "--data", root, "--out", root / "warm_results")
-        assert swept.returncode == 0, swept.stderr
+        simulate("S01_D2_A", root, SimulationSettings(num_frames=6, scale=0.25, onboard=False), jobs=1)
+        swept = sweep(grid_file(root, [2]), root / "warm_results", data=root, cache=root / "cache", jobs=1)
+        assert swept.count("finished") == 1, swept.errors
 
     return make_once(tmp_path_factory, "small_sequence", make)
 

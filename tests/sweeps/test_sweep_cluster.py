@@ -1,5 +1,6 @@
 """Sweeps as tasks of a Dask cluster: when a worker is killed, its cell runs again, and the results are complete."""
 
+import functools
 import json
 import re
 import shutil
@@ -10,15 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
-import test_signals
-from helpers import listening_at
+from helpers import assert_refused, listening_at
 from small_sweeps import all_rows, environment, grid_file, psotrack, small_sequence
 
-from psotrack.errors import InputError, SettingsError
-from psotrack.sweeps import Cluster, Inputs, Store, read_grid
-from psotrack.sweeps.cluster import run_on_cluster
+from psotrack.sweeps import Cluster, Inputs, Store, cluster, read_grid
 
 pytest.importorskip("distributed")
+psutil = pytest.importorskip("psutil", reason="comes with Dask")
 
 #: Code that every worker runs first: one worker kills itself just before it moves its cell's file to its place.
 DYING = """
@@ -33,6 +32,20 @@ def die_once(event, arguments):
 
 sys.addaudithook(die_once)
 """
+#: `psotrack` as at a terminal: shells start programs in the background with Ctrl-C ignored.
+AT_A_TERMINAL = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from psotrack.__main__ import main
+main()
+"""
+
+
+def wait_until(happened) -> None:
+    end_s = time.monotonic() + 300
+    while not happened():
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
 
 
 @pytest.mark.slow
@@ -43,27 +56,25 @@ def test_a_worker_is_killed_and_its_cell_runs_again(tmp_path_factory, tmp_path):
     # The test must not fail on a slow machine: Dask's default timeout is half a minute.
     dask |= {"COMM__TIMEOUTS__CONNECT": "600s", "COMM__TIMEOUTS__TCP": "600s"}
     more = {f"DASK_DISTRIBUTED__{name}": value for name, value in dask.items()} | {"DIED": str(died)}
-    grid = grid_file(tmp_path, [2, 3, 4, 5])
-    words = ("sweep", grid, "--data", root, "--out", results, "--json", "-", "--cluster")
-    done = psotrack(root, *words, "local", "--workers", 2, **more)
+    words = ("sweep", grid_file(tmp_path, [2, 3, 4]), "--data", root, "--out", results, "--json", "-")
+    done = psotrack(root, *words, "--cluster", "local", "--workers", 2, **more)
     assert done.returncode == 0, done.stderr
     assert died.exists()
-    assert json.loads(done.stdout) == {"finished": 4, "failed": 0, "left": 0}
-    assert sorted(all_rows(results)["settings.swarm.iterations"]) == [2, 3, 4, 5]
+    assert json.loads(done.stdout) == {"finished": 3, "failed": 0, "left": 0}
+    assert sorted(all_rows(results)["settings.swarm.iterations"]) == [2, 3, 4]
     (run,) = (json.loads(path.read_text()) for path in (results / "_runs").glob("*.json"))
-    assert run["cells"] == 4
+    assert run["cells"] == 3
     # All cells are finished, so no cluster is needed, and the address without a cluster is no error.
-    again = psotrack(root, *words, "tcp://127.0.0.1:1")
-    assert json.loads(again.stdout) == {"finished": 0, "failed": 0, "left": 4}
+    again = psotrack(root, *words, "--cluster", "tcp://127.0.0.1:1")
+    assert json.loads(again.stdout) == {"finished": 0, "failed": 0, "left": 3}
 
 
-def test_without_dask_one_line_says_what_to_install(monkeypatch):
+def test_without_dask_one_line_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(SettingsError, match=r"expected Dask, found .*; pip install '\.\[dask\]'"):
-        Cluster()
+    assert_refused(Cluster, "expected Dask, found ", "; pip install '.[dask]'", unchanged=tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_local_cluster_listens_on_the_loopback_only_and_ctrl_c_ends_it_with_one_line(
     start_python, tmp_path_factory, tmp_path
 ):
@@ -71,21 +82,21 @@ def test_a_local_cluster_listens_on_the_loopback_only_and_ctrl_c_ends_it_with_on
     # A cell of minutes, so that Ctrl-C comes while a worker computes.
     grid = grid_file(tmp_path, [100_000], runs=100)
     words = ("sweep", grid, "--data", root, "--out", results, "--cluster", "local", "--workers", 2)
-    process = start_python("-c", test_signals.AT_A_TERMINAL, *words, env=environment(root))
+    process = start_python("-c", AT_A_TERMINAL, *words, env=environment(root))
     line = process.stderr.readline()
-    end_s = time.monotonic() + 120
-    while not list(results.glob("cells/*.lock")) and time.monotonic() < end_s:
-        time.sleep(0.1)
+    wait_until(lambda: list(results.glob("cells/*.lock")))
     time.sleep(1.0)  # The worker is in the computation.
+    workers = psutil.Process(process.pid).children(recursive=True)
     addresses = listening_at(process.pid)
-    err, took_s = test_signals.end(process, signal.SIGINT)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate()
     listens = r"the cluster listens at tcp://127\.0\.0\.1:\d+, for programs on this computer only\n"
     assert re.fullmatch(listens, line)
     assert addresses == {"127.0.0.1"}
     assert err == "psotrack: interrupted; earlier results are unchanged; run the command again to finish\n"
     assert process.returncode == 130
-    assert took_s < test_signals.LONGEST_S
-    test_signals.assert_nothing_left(process)
+    _, alive = psutil.wait_procs(workers, timeout=60)
+    assert alive == []
 
 
 @pytest.mark.parametrize(
@@ -107,9 +118,9 @@ def test_an_address_that_is_neither_tls_nor_this_machine_warns_in_a_line(
         raise OSError("nobody listens")
 
     monkeypatch.setattr("distributed.Client", refuse)
-    cells = read_grid(grid_file(tmp_path, [2])).cells()
-    with pytest.raises(InputError, match="nobody listens"):
-        next(run_on_cluster(Cluster(address), list(cells), Inputs(tmp_path, tmp_path), Store(tmp_path)))
+    cells = list(read_grid(grid_file(tmp_path, [2])).cells())
+    ran = cluster.run_on_cluster(Cluster(address), cells, Inputs(tmp_path, tmp_path), Store(tmp_path))
+    assert_refused(functools.partial(next, ran), "nobody listens", unchanged=tmp_path)
     lines = [record.getMessage() for record in caplog.records if "TLS" in record.getMessage()]
     assert len(lines) == warned
     assert all(line.startswith(f"--cluster {address}: ") for line in lines)
@@ -126,34 +137,23 @@ def _certificates(folder: Path) -> dict[str, str]:
     return {f"DASK_DISTRIBUTED__COMM__TLS__{name}": str(path) for name, path in settings.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
-def test_a_sweep_on_a_cluster_with_tls(tmp_path_factory, tmp_path):
+def test_a_sweep_on_a_cluster_with_tls(start_python, tmp_path_factory, tmp_path):
     """The commands of the page about clusters: a scheduler and a worker with TLS, and a sweep."""
     root, tls = small_sequence(tmp_path_factory), _certificates(tmp_path)
     file = tmp_path / "scheduler.json"
-    program = [sys.executable, "-m"]
     listening = ["--protocol", "tls", "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file]
-    scheduler = [*program, "distributed.cli.dask_scheduler", "--port", "0", *listening]
-    worker = [*program, "distributed.cli.dask_worker", "--nthreads", "1", *listening]
-    processes = []
-    try:
-        processes.append(subprocess.Popen(scheduler, env=environment(root) | tls))
-        deadline = time.monotonic() + 60
-        while not file.exists() and time.monotonic() < deadline:
-            time.sleep(0.1)
-        address = json.loads(file.read_text())["address"]
-        assert address.startswith("tls://127.0.0.1:")
-        processes.append(subprocess.Popen(worker, env=environment(root) | tls))
-        words = ("sweep", grid_file(tmp_path, [2]), "--data", root, "--cluster", address, "--json", "-")
-        done = psotrack(root, *words, "--out", tmp_path / "results", **tls)
-        assert done.returncode == 0, done.stderr
-        assert json.loads(done.stdout) == {"finished": 1, "failed": 0, "left": 0}
-        stranger = psotrack(root, *words, "--out", tmp_path / "other")
-        assert stranger.returncode == 2
-        assert stranger.stderr.startswith("psotrack: --cluster: expected a Dask scheduler"), stranger.stderr
-    finally:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.wait(30)
+    start = functools.partial(start_python, "-m", env=environment(root) | tls)
+    start("distributed.cli.dask_scheduler", "--port", "0", *listening)
+    wait_until(file.exists)
+    address = json.loads(file.read_text())["address"]
+    assert address.startswith("tls://127.0.0.1:")
+    start("distributed.cli.dask_worker", "--nthreads", "1", *listening)
+    words = ("sweep", grid_file(tmp_path, [2]), "--data", root, "--cluster", address, "--json", "-")
+    done = psotrack(root, *words, "--out", tmp_path / "results", **tls)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"finished": 1, "failed": 0, "left": 0}
+    stranger = psotrack(root, *words, "--out", tmp_path / "other")
+    assert stranger.returncode == 2
+    assert stranger.stderr.startswith("psotrack: --cluster: expected a Dask scheduler"), stranger.stderr

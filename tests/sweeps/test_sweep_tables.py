@@ -1,18 +1,28 @@
-"""Tables: figures equal those of the standard library and of pandas; layouts equal texts written by hand."""
+"""Tables: figures equal those of the standard library and of pandas; layouts equal texts written by hand.
+
+And the figure of Table 5, whose lines and bars must equal the results.
+"""
 
 import csv
+import functools
 import io
 import logging
 import math
 import statistics
+import sys
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from helpers import assert_refused
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psotrack.errors import SettingsError
 from psotrack.sweeps import pivot, render_table
+
+sys.path.append(str(Path(__file__).parents[2] / "experiments" / "table5"))
+import _pareto
 
 #: Two methods at two swarm sizes, three runs each; errors in metres.
 ERRORS_M = {
@@ -21,27 +31,25 @@ ERRORS_M = {
     ("ours", 20): [0.010, 0.012, 0.011],
     ("ours", 100): [0.0050, 0.0070, 0.0060],
 }
+FIGURES = "mean_error_mm: mean ± standard deviation over 3 runs"
 
 
 def results(errors_m=ERRORS_M, **more):
-    return pd.DataFrame(
-        [
-            {
-                "sequence": "S01_D2_A",
-                "method": method,
-                "settings.swarm.particles": particles,
-                "settings.seed": seed,
-                "mean_error_m": error_m,
-            }
-            | more
-            for (method, particles), runs in errors_m.items()
-            for seed, error_m in enumerate(runs)
-        ]
-    )
+    names = ("sequence", "method", "settings.swarm.particles", "settings.seed", "mean_error_m")
+    table = [
+        ("S01_D2_A", method, particles, seed, error_m)
+        for (method, particles), runs in errors_m.items()
+        for seed, error_m in enumerate(runs)
+    ]
+    return pd.DataFrame(table, columns=names).assign(**more)
 
 
 def in_mm(rows, rows_by=("method",), columns_by=("particles",)):
     return pivot(rows, rows_by=list(rows_by), columns_by=list(columns_by), value="mean_error_m", scale=1000.0)
+
+
+def labels(rows, name, value="v"):
+    return list(pivot(rows, rows_by=[name], columns_by=[], value=value).index)
 
 
 def test_figures_equal_the_standard_librarys():
@@ -56,34 +64,26 @@ def test_figures_equal_the_standard_librarys():
     assert list(table.columns.names) == ["particles", "figure"]
 
 
-def test_labels_are_sorted_by_numbers_and_words_for_every_order_of_rows():
+def test_labels_are_numbers_and_words_in_their_order_lists_and_what_is_missing():
     rows = pd.DataFrame({"cameras": ["all", "10", "4", "cam10", "cam2"], "n": [100, 20, 3, 1, 2], "v": 1.0})
     for shuffled in (rows, rows.iloc[::-1]):
-        assert list(pivot(shuffled, rows_by=["n"], columns_by=[], value="v").index) == [1, 2, 3, 20, 100]
-        table = pivot(shuffled, rows_by=["cameras"], columns_by=[], value="v")
-        assert list(table.index) == ["4", "10", "all", "cam2", "cam10"]
+        assert labels(shuffled, "n") == [1, 2, 3, 20, 100]
+        assert labels(shuffled, "cameras") == ["4", "10", "all", "cam2", "cam10"]
+    windows = pd.DataFrame({"settings.windows": [(0.5, 1.0), (1.0,), None], "v": [1, 2, 3]})
+    assert labels(windows, "windows") == ["0.5 1", "1", "-"]
+    assert labels(pd.DataFrame({"frames": [100.0, None], "v": [1, 2]}), "frames") == [100, "-"]
+    # A column with the exact name is preferred.
+    assert labels(pd.DataFrame({"frames": [1], "settings.frames": [2], "v": [3]}), "frames") == [1]
 
 
-def test_failed_runs_do_not_count():
-    rows = results({("paper", 20): [0.070, None, 0.074], ("paper", 100): [None, None]})
-    table = in_mm(rows)
+def test_failed_runs_do_not_count_and_a_single_run_has_no_spread():
+    table = in_mm(results({("paper", 20): [0.070, None, 0.074], ("paper", 100): [None, None]}))
     assert table.loc["paper", (20, "mean")] == pytest.approx(72.0)
     assert table.loc["paper", (20, "runs")] == 2
     assert math.isnan(table.loc["paper", (100, "mean")])
     assert render_table(table).splitlines()[-1].split() == ["paper", "72.0", "±", "2.8", "-"]
-
-
-def test_a_single_run_has_no_spread():
     table = in_mm(results({("paper", 20): [0.0712], ("paper", 100): [0.0412]}))
     assert render_table(table) == ("mean_error_mm\n\nparticles    20   100\nmethod\npaper      71.2  41.2\n")
-
-
-def test_labels_that_are_lists_or_missing():
-    rows = pd.DataFrame({"settings.windows": [(0.5, 1.0), (1.0,), None], "v": [1, 2, 3]})
-    table = pivot(rows, rows_by=["windows"], columns_by=[], value="v")
-    assert list(table.index) == ["0.5 1", "1", "-"]
-    frames = pd.DataFrame({"frames": [100.0, None], "v": [1, 2]})
-    assert list(pivot(frames, rows_by=["frames"], columns_by=[], value="v").index) == [100, "-"]
 
 
 @pytest.mark.parametrize(
@@ -97,119 +97,101 @@ def test_labels_that_are_lists_or_missing():
     ],
 )
 def test_the_name_of_scaled_numbers(value, scale, name):
-    rows = pd.DataFrame({"a": [1], value: [0.5]})
-    table = pivot(rows, rows_by=["a"], columns_by=[], value=value, scale=scale)
+    table = pivot(
+        pd.DataFrame({"a": [1], value: [0.5]}), rows_by=["a"], columns_by=[], value=value, scale=scale
+    )
     assert table.attrs["value"] == name
     assert table.loc[1, "mean"] == 0.5 * scale
 
 
-# --- names
+#: Name of the case -> what is wrong in the call, and words of the line.
+BAD = {
+    "rows": (
+        {"rows_by": ["methd"]},
+        "rows: expected the name of one column",
+        "found methd; did you mean method?",
+    ),
+    "columns": ({"columns_by": ["partcles"]}, "found partcles; did you mean settings.swarm.particles?"),
+    "a typing error": ({"value": "mean_eror_m"}, "value: ", "found mean_eror_m; did you mean mean_error_m?"),
+    "a beginning": ({"value": "mean"}, "value: ", "found mean; did you mean mean_error_m?"),
+    "two beginnings": ({"value": "median"}, "found median; it may be median_a_m or median_b_m"),
+    "two ends": ({"columns_by": ["share"]}, "columns: ", "found share; it may be a.share or b.share"),
+    "nothing near": ({"value": "zzz"}, "found zzz; there are sequence, method, settings.swarm.particles, "),
+    "words": ({"value": "sequence"}, "value: expected a column of numbers, found sequence"),
+    "no rows": ({"rows_by": []}, "rows: expected at least one column, and each only once, found none"),
+    "twice": ({"rows_by": ["particles"]}, "rows: ", "found settings.swarm.particles twice"),
+}
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"rows_by": ["methd"]}, "rows: expected the name of one column, found methd; did you mean method?"),
-        ({"columns_by": ["partcles"]}, "columns: .*found partcles; did you mean settings.swarm.particles?"),
-        ({"value": "mean_eror_m"}, "value: .*found mean_eror_m; did you mean mean_error_m?"),
-        ({"value": "mean"}, "value: .*found mean; did you mean mean_error_m?"),
-        ({"value": "median"}, "value: .*found median; it may be median_a_m or median_b_m"),
-        ({"value": "zzz"}, "value: .*found zzz; there are sequence, method, settings.swarm.particles, .*"),
-        ({"value": "sequence"}, "value: expected a column of numbers, found sequence"),
-        ({"rows_by": []}, "rows: expected at least one column, and each only once, found none"),
-        ({"rows_by": ["particles"]}, "rows: .*, found settings.swarm.particles twice"),
-        ({"columns_by": ["share"]}, "columns: .*found share; it may be a.share or b.share"),
-    ],
-)
-def test_wrong_columns_are_one_line(changes, message):
+@pytest.mark.parametrize("case", BAD)
+def test_wrong_columns_are_one_line(case, tmp_path):
+    changes, *words = BAD[case]
     rows = results(**{"a.share": 1, "b.share": 1, "median_a_m": 1.0, "median_b_m": 1.0})
-    arguments = {
-        "rows_by": ["method"],
-        "columns_by": ["settings.swarm.particles"],
-        "value": "mean_error_m",
-    } | changes
-    with pytest.raises(SettingsError, match=f"^{message.replace('?', '[?]')}$"):
-        pivot(rows, **arguments)
+    sound = {"rows_by": ["method"], "columns_by": ["settings.swarm.particles"], "value": "mean_error_m"}
+    assert_refused(functools.partial(pivot, rows, **sound | changes), *words, unchanged=tmp_path)
 
 
-def test_a_column_with_the_exact_name_is_preferred():
-    rows = pd.DataFrame({"frames": [1], "settings.frames": [2], "v": [3]})
-    assert list(pivot(rows, rows_by=["frames"], columns_by=[], value="v").index) == [1]
-
-
-def test_a_warning_names_settings_that_a_figure_mixes(caplog):
+def test_a_warning_names_what_a_figure_mixes_besides_draws(caplog):
+    said = "figures are not only over runs: they mix different"
+    rows = results().assign(**{"perturbation.draw": results()["settings.seed"]})
     with caplog.at_level(logging.WARNING):
-        in_mm(results())
+        in_mm(rows)
         assert caplog.messages == []
-        in_mm(results(), columns_by=())
-    assert caplog.messages == ["figures are not only over runs: they mix different settings.swarm.particles"]
-
-
-def test_mixing_draws_gives_no_warning_and_mixing_code_does(caplog):
-    rows = results(**{"perturbation.draw": 0})
-    rows["perturbation.draw"] = rows["settings.seed"]
-    in_mm(rows)
-    assert caplog.messages == []
-    in_mm(rows.assign(code=rows["settings.seed"].map({0: "a", 1: "b", 2: "b"})))
-    assert caplog.messages == ["figures are not only over runs: they mix different code"]
+        in_mm(rows, columns_by=())
+        in_mm(rows.assign(code=rows["settings.seed"].map({0: "a", 1: "b", 2: "b"})))
+    assert caplog.messages == [f"{said} settings.swarm.particles", f"{said} code"]
 
 
 # --- layouts
 
 
 def test_text():
-    assert render_table(in_mm(results(), ("sequence", "method"))) == (
-        "mean_error_mm: mean ± standard deviation over 3 runs\n"
+    table = in_mm(results(), ("sequence", "method"))
+    assert render_table(table) == (
+        f"{FIGURES}\n"
         "\n"
         "particles                20         100\n"
         "sequence method\n"
         "S01_D2_A ours    11.0 ± 1.0   6.0 ± 1.0\n"
         "         paper   72.0 ± 2.0  41.0 ± 1.0\n"
     )
-
-
-def test_decimals_can_be_chosen_and_whole_numbers_have_none():
-    assert "72 ± 2" in render_table(in_mm(results()), decimals=0)
-    assert "72.000 ± 2.000" in render_table(in_mm(results()), decimals=3)
+    assert "72 ± 2" in render_table(table, decimals=0)
+    assert "72.000 ± 2.000" in render_table(table, decimals=3)
+    # Whole numbers have no decimals.
     rows = pd.DataFrame({"a": [1, 2], "switches": [0, 12]})
     text = render_table(pivot(rows, rows_by=["a"], columns_by=[], value="switches"))
     assert [line.split() for line in text.splitlines()[-2:]] == [["1", "0"], ["2", "12"]]
 
 
+@settings(max_examples=12)
 @given(
     widths=st.tuples(st.integers(1, 3), st.integers(1, 12)),
     magnitude=st.sampled_from([1e-4, 1.0, 1e3]),
 )
 def test_text_is_at_most_80_characters_wide_and_complete(widths, magnitude):
     """For any number of columns, no line is wider than 80, and every figure is printed once per row."""
-    rows = pd.DataFrame(
-        [
-            {
-                "sequence": f"S{row}",
-                "outer": outer,
-                "inner": inner,
-                "v": magnitude * (100 + 10 * outer + inner + run),
-            }
-            for row in range(2)
-            for outer in range(widths[0])
-            for inner in range(widths[1])
-            for run in (-1, 1)
-        ]
-    )
-    table = pivot(rows, rows_by=["sequence"], columns_by=["outer", "inner"], value="v")
-    text = render_table(table)
+    table = [
+        (f"S{row}", outer, inner, magnitude * (100 + 10 * outer + inner + run))
+        for row in range(2)
+        for outer in range(widths[0])
+        for inner in range(widths[1])
+        for run in (-1, 1)
+    ]
+    rows = pd.DataFrame(table, columns=["sequence", "outer", "inner", "v"])
+    text = render_table(pivot(rows, rows_by=["sequence"], columns_by=["outer", "inner"], value="v"))
     assert max(map(len, text.splitlines())) <= 80
     assert text.count("±") == 1 + 2 * math.prod(widths)
     # Where columns are continued, the outer level's labels are repeated.
-    blocks = text.split("\n\n")[1:]
-    assert all(block.splitlines()[0].split()[0] == "outer" for block in blocks)
-    assert all(len(block.splitlines()[0].split()) > 1 for block in blocks)
+    for block in text.split("\n\n")[1:]:
+        name, *labels = block.splitlines()[0].split()
+        assert name == "outer"
+        assert labels
 
 
 def test_markdown():
     rows = results(sequence="S|1*")
     assert render_table(in_mm(rows, ("sequence",), ("method", "particles")), "markdown") == (
-        "mean_error_mm: mean ± standard deviation over 3 runs\n"
+        f"{FIGURES}\n"
         "\n"
         "| sequence | method ours, particles 20 | method ours, particles 100 |"
         " method paper, particles 20 | method paper, particles 100 |\n"
@@ -221,7 +203,7 @@ def test_markdown():
 def test_latex():
     table = in_mm(results(), ("sequence",), ("method", "particles"))
     assert render_table(table, "latex") == (
-        "% mean_error_mm: mean ± standard deviation over 3 runs; \\usepackage{booktabs}\n"
+        f"% {FIGURES}; \\usepackage{{booktabs}}\n"
         "\\begin{tabular}{lrrrr}\n"
         "\\toprule\n"
         "method & \\multicolumn{2}{c}{ours} & \\multicolumn{2}{c}{paper} \\\\\n"
@@ -232,26 +214,69 @@ def test_latex():
         "\\bottomrule\n"
         "\\end{tabular}\n"
     )
-
-
-def test_special_characters_of_latex_are_escaped():
     rows = pd.DataFrame({"name": [r"a\b~c^d&%$#_{}"], "v": [None]}).astype({"v": float})
     line = render_table(pivot(rows, rows_by=["name"], columns_by=[], value="v"), "latex").splitlines()[-3]
-    escaped = r"a\textbackslash b\textasciitilde c\textasciicircum d\&\%\$\#\_\{\}"
-    assert line == rf"{escaped} & -- \\"
+    assert line == r"a\textbackslash b\textasciitilde c\textasciicircum d\&\%\$\#\_\{\} & -- \\"
 
 
-def test_csv_has_all_digits():
+def test_csv_has_all_digits(tmp_path):
     table = in_mm(results({("a, b", 20): [0.1, 0.2], ("a, b", 100): [1 / 3]}))
     head, row = csv.reader(io.StringIO(render_table(table, "csv")))
     assert head == ["method", *(f"particles {n} {of}" for n in (20, 100) for of in ("mean", "std", "runs"))]
     assert row[0] == "a, b"
     assert [float(row[1]), float(row[2]), float(row[4])] == [*table.iloc[0, [0, 1, 3]]]
     assert (row[3], row[5], row[6]) == ("2", "", "1")
+    words = "format: expected one of text, ", "found latx; did you mean latex"
+    assert_refused(functools.partial(render_table, table, "latx"), *words, unchanged=tmp_path)
 
 
-def test_an_unknown_format_is_one_line():
-    with pytest.raises(
-        SettingsError, match=r"format: expected one of text, .*, found latx; did you mean latex"
-    ):
-        render_table(in_mm(results()), "latx")
+# --- the figure of Table 5
+
+numbers = st.one_of(st.integers(0, 5).map(float), st.just(float("nan")))
+
+
+@given(st.lists(st.tuples(numbers, numbers), max_size=12))
+def test_no_cell_dominates_a_cell_of_the_front(cells):
+    """Compared with a search through all pairs of cells; of equal cells only the first is on the front."""
+    work, error = np.array(cells, float).reshape(-1, 2).T
+    expected = [
+        one
+        for one, cell in enumerate(cells)
+        if np.isfinite(cell).all()
+        and cell not in cells[:one]
+        and not any(other != cell and other[0] <= cell[0] and other[1] <= cell[1] for other in cells)
+    ]
+    front = _pareto.pareto_front(work, error)
+    assert sorted(front) == expected
+    assert (np.diff(work[front]) > 0).all()
+    assert (np.diff(error[front]) < 0).all()
+
+
+def test_points_front_and_published():
+    """The paper's method with 20 x 50 has the smallest work, ours with 30 x 50 the smallest error."""
+    cells = (("paper", 20, 0.05), ("paper", 50, 0.03), ("ours", 30, 0.02))
+    table = [
+        (sequence, method, particles, 50, seed, particles / 2, error_m + 0.001 * seed)
+        for sequence in ("S01", "S02")
+        for method, particles, error_m in cells
+        for seed in (0, 1)
+    ]
+    names = ("sequence", "method", "settings.swarm.particles", "settings.swarm.iterations", "seed")
+    rows = pd.DataFrame(table, columns=[*names, "track_ms_per_frame", "mean_error_m"])
+    colours = []
+    for each in (rows, rows.sort_values("seed", ascending=False).sort_values("sequence", kind="stable")):
+        first, second = _pareto.error_against_work(each, published={"S02": (0.068, 0.068)}).axes
+        assert [axes.get_title(loc="left") for axes in (first, second)] == ["S01", "S02"]
+        lines = {line.get_label(): line.get_xydata() for line in first.lines}
+        np.testing.assert_allclose(lines["Pareto front"], [(10, 50.5), (15, 20.5)])
+        assert [text.get_text() for text in first.texts] == ["20 x 50", "30 x 50"]
+        bars = {container.get_label(): container.lines[0] for container in first.containers}
+        np.testing.assert_allclose(np.sort(bars["paper"].get_xydata(), axis=0), [(10, 30.5), (25, 50.5)])
+        np.testing.assert_allclose(bars["ours"].get_xydata(), [(15, 20.5)])
+        assert [patch.get_label() for patch in second.patches] == ["published"]
+        assert not first.patches
+        labels = (first.get_xlabel(), first.get_ylabel())
+        assert labels == ("track stage (ms per frame)", "mean error (mm)")
+        colours.append({label: bar.get_color() for label, bar in bars.items()})
+    # Found: the order, and so the colours, was that of digests.
+    assert colours[0] == colours[1]
