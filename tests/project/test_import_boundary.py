@@ -267,11 +267,6 @@ NOT_YET_MENDED = {
     "recordings/test_own_recordings.py",
     "recordings/test_recording_file.py",
     "show/test_results_in_notebooks.py",
-    "tracking/test_compile_time.py",
-    "tracking/test_compiled.py",
-    "tracking/test_identity.py",
-    "tracking/test_late_and_early.py",
-    "windows.py",
 }
 
 

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from helpers import ROOM_M, draw_coverage, float32, make_unnamed_rig, ring_rig, silhouettes_in_memory
 
-from psotrack.foreground.silhouettes import (
-    Exposures,
-    ForegroundSettings,
-    Mog2,
-    border_cells,
-    learning_step,
-)
+from psotrack.foreground.silhouettes import Exposures, ForegroundSettings, Mog2, border_cells, learning_step
 from psotrack.geometry import Rig, make_extents, project, project_boxes
 from psotrack.settings import DroneSettings
 from psotrack.tracking.births import (

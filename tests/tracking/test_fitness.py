@@ -18,7 +18,6 @@ from psotrack.foreground.silhouettes import summed_area_table
 from psotrack.tracking.swarm import SoftIoU
 from psotrack.tracking.swarm.fitness import (
     PAPER_SCORE,
-    camera_scores,
     drone_fitness,
     filled_share,
     joint_fitness,
@@ -76,36 +75,27 @@ def score_at(image, x_px=0.0, settings=ONE_BOX):
 DRONE = (22, 19, 42, 29)
 
 
+#: What the silhouette shows -> the silhouette, and the fitness: foreground in the box over the union of both.
+BY_HAND = {
+    "the drone": (silhouette(DRONE), 1),
+    "left half": (silhouette((22, 19, 32, 29)), 1 / 2),
+    "an L": (silhouette((22, 19, 42, 21), (22, 21, 24, 29)), (40 + 16) / 200),
+    "elsewhere": (silhouette((0, 0, 10, 10), (50, 30, 64, 48)), 0),
+    "nothing": (silhouette(), 0),
+    "a fifth covered": (silhouette(DRONE, value=51), 1 / 5),
+    # Foreground beside the box, within the ring of 30 x 15 pixels, makes the union larger.
+    "twice as wide": (silhouette((12, 19, 52, 29)), 200 / (200 + 300 - 200)),
+    "everything": (silhouette((0, 0, 64, 48)), 200 / (200 + 30 * 15 - 200)),
+    # Foreground beside the box, but none inside.
+    "beside": (silhouette((42, 19, 46, 29)), 0 / (200 + 40)),
+}
+
+
 @pytest.mark.parametrize("settings", [ONE_BOX, HARD], ids=["soft", "hard"])
-@pytest.mark.parametrize(
-    ("image", "expected"),
-    [
-        (silhouette(DRONE), 1),
-        (silhouette((22, 19, 32, 29)), 1 / 2),
-        (silhouette((22, 19, 42, 21), (22, 21, 24, 29)), (40 + 16) / 200),
-        (silhouette((0, 0, 10, 10), (50, 30, 64, 48)), 0),
-        (silhouette(), 0),
-        (silhouette(DRONE, value=51), 1 / 5),
-        # Foreground beside the box, within the ring of 30 x 15 pixels, makes the union larger.
-        (silhouette((12, 19, 52, 29)), 200 / (200 + 300 - 200)),
-        (silhouette((0, 0, 64, 48)), 200 / (200 + 30 * 15 - 200)),
-        # Foreground beside the box, but none inside.
-        (silhouette((42, 19, 46, 29)), 0 / (200 + 40)),
-    ],
-    ids=[
-        "perfect",
-        "left half",
-        "an L",
-        "elsewhere",
-        "empty",
-        "a fifth covered",
-        "twice as wide",
-        "all",
-        "beside",
-    ],
-)
-def test_one_box_by_hand(image, expected, settings):
-    if settings.whole_pixels and expected == 200 / 450:
+@pytest.mark.parametrize("shown", BY_HAND)
+def test_one_box_by_hand(shown, settings):
+    image, expected = BY_HAND[shown]
+    if settings.whole_pixels and shown == "everything":
         # The ring's rows 16.5 to 31.5 are rounded half to even: 16 to 32.
         expected = 200 / (30 * 16)
     assert score_at(image, settings=settings) == pytest.approx(expected, abs=HAND)
@@ -149,26 +139,6 @@ def test_reduced_silhouettes_score_the_same():
     settings = Score(windows=(0.5, 1.1), ring=1.5, reduction=4, min_cameras=1)
     score = evaluate(drone_fitness, rig, silhouette(DRONE), np.zeros((1, 3)), settings=settings)
     assert score.item() == pytest.approx((0.5**2 + 1 / 1.1**2) / 2, abs=HAND)
-
-
-@pytest.mark.parametrize("whole_view", [1, 0])
-def test_a_camera_is_weighted_by_the_share_of_the_box_in_its_image(whole_view):
-    """Two images contain the whole box, and a third image contains half of the box, so its weight is 1/2.
-
-    The box is filled either in the first two images, with the mean (1 + 1 + 0 / 2) / (5 / 2), or in the third only.
-    """
-    cut_view = 1 - whole_view
-    centred = far_camera(**FAR)
-    K = centred.K.copy()
-    K[0, 2] += 32
-    rig = make_unnamed_rig(centred, centred, replace(centred, K=K))
-    full, half = silhouette(DRONE), silhouette((54, 19, 64, 29))
-    images = np.concatenate([full * whole_view, full * whole_view, half * cut_view]).astype(np.uint8)
-    scores, weights = evaluate(camera_scores, rig, images, np.zeros((1, 3)))
-    np.testing.assert_allclose(scores, [[whole_view, whole_view, cut_view]], atol=HAND)
-    np.testing.assert_allclose(weights, [[1, 1, 1 / 2]], atol=HAND)
-    fitness = evaluate(drone_fitness, rig, images, np.zeros((1, 3)))
-    assert fitness.item() == pytest.approx((2 * whole_view + cut_view / 2) / (5 / 2), abs=HAND)
 
 
 def test_fitness_is_undefined_with_too_few_cameras():

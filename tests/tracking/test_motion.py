@@ -380,8 +380,7 @@ class TestSmoothing:
                 np.testing.assert_allclose(part[born:, drone], expected, rtol=0, atol=limit)
                 assert np.isnan(part[:born, drone]).all()
 
-    @pytest.mark.parametrize("unknown", [0.0, 0.4])
-    @pytest.mark.parametrize("error_share", [0.0, 0.5])
+    @pytest.mark.parametrize(("unknown", "error_share"), [(0.0, 0.5), (0.4, 0.0), (0.4, 0.5)])
     @pytest.mark.slow
     def test_covariances_cover_the_errors(self, unknown, error_share):
         """NEES of independent drones is chi-square with 3 degrees each; one seed in 1,000 fails by chance."""
@@ -437,8 +436,7 @@ class TestSmoothing:
 class TestJerkDensity:
     FRAMES = 600
 
-    @pytest.mark.parametrize("error_share", [0.0, 0.5])
-    @pytest.mark.parametrize("density", [0.3, 30.0, 3000.0])
+    @pytest.mark.parametrize(("density", "error_share"), [(0.3, 0.5), (30.0, 0.5), (3000.0, 0.0)])
     @pytest.mark.slow
     def test_the_density_is_found_from_the_measurements(self, density, error_share):
         flown = simulate_flight(
@@ -471,17 +469,6 @@ class TestJerkDensity:
         found = estimate_jerk_density(flown.measurements, motion_params(70.0, 2))
         # The prior alone is a parabola, whose vertex is found to rounding.
         np.testing.assert_allclose(found, 70.0, rtol=1e-6)
-
-    def test_a_hovering_drone_has_a_small_density(self):
-        rng = np.random.default_rng(17)
-        flown = simulate_flight(17, frames=self.FRAMES, drones=8)
-        still = replace(
-            flown,
-            measured_m=rng.normal(scale=0.01, size=flown.measured_m.shape),
-            covariance_m2=np.broadcast_to(1e-4 * np.eye(3), flown.covariance_m2.shape),
-        )
-        # The density is 300 times below the prior; it corresponds to accelerations below 1 m/s² within 24 s.
-        assert (estimate_jerk_density(still.measurements, flown.params) < 0.1).all()
 
 
 def test_double_precision_does_not_leave_the_call_and_what_was_not_measured_is_ignored():

@@ -15,13 +15,7 @@ from psotrack.pipeline import track_recording
 from psotrack.recordings import Detections, write_detections
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import MotionSettings, StatusSettings, TrackSettings
-from psotrack.tracking.births import (
-    find_cut_off,
-    find_outside,
-    flight_volume,
-    moving_points,
-    room_bounds,
-)
+from psotrack.tracking.births import find_cut_off, find_outside, flight_volume, moving_points, room_bounds
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.matching import Sightings, from_detections, match
 from psotrack.trajectories import Status

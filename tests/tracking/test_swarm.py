@@ -14,14 +14,7 @@ from windows import cut_at
 
 from psotrack.geometry import make_extents
 from psotrack.settings import SwarmSettings
-from psotrack.tracking.swarm import (
-    DroneFitness,
-    ScoreInputs,
-    SearchRegion,
-    SoftIoU,
-    find_search,
-    optimiser,
-)
+from psotrack.tracking.swarm import DroneFitness, ScoreInputs, SearchRegion, SoftIoU, find_search, optimiser
 
 #: Coefficients of a swarm where a test sets no others.
 COEFFICIENTS = {"inertia": 0.6, "cognitive": 1.5, "social": 1.5}
