@@ -32,11 +32,11 @@ def box_sums(images, camera, boxes):
     return np.asarray(sum_of(table_of(images), jnp.asarray(camera, jnp.int32), *edges))
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (3, 13, 11), (5, 2, 17)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 13, 11)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32])
 def test_table_is_the_cumulative_sum_with_a_border_of_zeros(shape, dtype):
     images = random_images(shape).astype(dtype)
-    table = table_of(images.astype(np.int32) if dtype is bool else images)
+    table = table_of(images)
     assert table.dtype == jnp.int32
     expected = np.pad(images.astype(np.int64).cumsum(-1).cumsum(-2), ((0, 0), (1, 0), (1, 0)))
     np.testing.assert_array_equal(table, expected.swapaxes(0, 1))
@@ -54,9 +54,8 @@ def test_whole_boxes_are_slice_sums(dtype):
     np.testing.assert_array_equal(box_sums(images, np.arange(2), boxes.astype(dtype)), expected)
     # Edges beyond the image, and in the wrong order.
     beyond = np.array([[[-3, -2, 9, 8]] * 2, [[4, 3, 2, 1]] * 2], dtype)
-    np.testing.assert_array_equal(
-        box_sums(images, np.arange(2), beyond), [images.sum(axis=(1, 2), dtype=int), [0, 0]]
-    )
+    whole_and_none = [images.sum(axis=(1, 2), dtype=int), [0, 0]]
+    np.testing.assert_array_equal(box_sums(images, np.arange(2), beyond), whole_and_none)
 
 
 box_edges = st.tuples(*[st.floats(-5, 25, width=32)] * 4)
@@ -84,55 +83,46 @@ def test_exact_where_sums_exceed_float32():
 # Two images in one table.
 
 
+@jax.jit
+def packed_sums(low, high, *edges):
+    table = summed_area_table(pack(low, high))
+    return packed_box_sums(table, jnp.zeros(edges[0].shape[1], jnp.int32), *edges)
+
+
 def both_sums(low, high, boxes):
     """(2, sets, boxes), of the low and the high image, from one table; boxes (sets, boxes, 4)."""
-
-    @jax.jit
-    def sums(low, high, *edges):
-        table = summed_area_table(pack(low, high))
-        return packed_box_sums(table, jnp.zeros(edges[0].shape[1], jnp.int32), *edges)
-
-    return np.stack(sums(low, high, *jnp.moveaxis(jnp.asarray(boxes, jnp.float32), -1, 0)))
+    return np.stack(packed_sums(low, high, *jnp.moveaxis(jnp.asarray(boxes, jnp.float32), -1, 0)))
 
 
-def test_packed_sums_are_those_of_either_image():
+def test_packed_sums_are_those_of_either_image_to_the_last_bit():
     rng = np.random.default_rng(7)
     low, high = rng.integers(0, 256, (1, 64, 64)), rng.integers(0, 2, (1, 64, 64))
-    boxes = rng.uniform(-5, 69, (3, 40, 4))
+    boxes = rng.uniform(-5, 69, (1, 40, 4))
     found = both_sums(low.astype(np.int32), high.astype(bool), boxes)
     for part, image in zip(found, (low, high), strict=True):
         expected = [[area_weighted_sum(image[0], *box) for box in one_set] for one_set in boxes]
         # Sums of up to 64 pixels of 255, weighted in float32: 16320 * 6e-8, a few times over.
         np.testing.assert_allclose(part, expected, atol=1e-2)
-
-
-def test_packed_sums_are_exact_to_the_last_bit():
-    """The largest sums: 64 x 64 pixels of 255 take 20 bits, and 4095 pixels of the other image the rest."""
+    # The largest sums: 64 x 64 pixels of 255 take 20 bits, and 4095 pixels of the other image the rest.
     low, high = np.full((1, 64, 64), 255, np.int32), np.ones((1, 64, 64), bool)
     high[0, 5, 9] = False
-    whole = np.array([[[0.0, 0, 64, 64]]])
+    whole = np.tile([0.0, 0, 64, 64], (1, 40, 1))
     assert 2**LOW_BITS > 64 * 64 * 255
-    assert both_sums(low, high, whole).ravel().tolist() == [64 * 64 * 255, 64 * 64 - 1]
+    np.testing.assert_array_equal(both_sums(low, high, whole)[:, 0, 0], [64 * 64 * 255, 64 * 64 - 1])
 
 
 def test_gradient_of_packed_sums_is_that_of_either_image():
     low, high = random_images((1, 13, 17)), random_images((1, 13, 17))[:, ::-1] > 127
-    edges = np.array([2.3, 3.6, 9.4, 11.2])
+    edges = jnp.asarray([2.3, 3.6, 9.4, 11.2], jnp.float32)
 
     def packed_product(edges):
-        table = summed_area_table(pack(jnp.asarray(low), jnp.asarray(high)))
-        low_sum, high_sum = packed_box_sums(table, jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1))
-        return (low_sum * high_sum).sum()
+        return jnp.prod(jnp.stack(packed_sums(low, high, *edges.reshape(4, 1, 1))))
 
     def separate_product(edges):
-        box_sums = (
-            box_sum(summed_area_table(image), jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum()
-            for image in (low, high.astype(np.uint8))
-        )
-        return jnp.prod(jnp.stack(list(box_sums)))
+        tables = [summed_area_table(image) for image in (low, high.astype(np.uint8))]
+        sums = [box_sum(table, jnp.zeros(1, jnp.int32), *edges.reshape(4, 1, 1)).sum() for table in tables]
+        return jnp.prod(jnp.stack(sums))
 
-    found, expected = (
-        jax.jit(jax.grad(of))(jnp.asarray(edges, jnp.float32)) for of in (packed_product, separate_product)
-    )
+    found, expected = (jax.jit(jax.grad(of))(edges) for of in (packed_product, separate_product))
     # The same float32 arithmetic, but the compiler may fuse it differently.
     np.testing.assert_allclose(found, expected, rtol=1e-4)

@@ -261,7 +261,6 @@ NOT_YET_MENDED = {
     "cli/test_messages_name_files.py",
     "cli/test_names_as_paths.py",
     "cli/test_small_disks.py",
-    "foreground/test_detector.py",
     "fuzz/formats.py",
     "recordings/test_exchange.py",
     "recordings/test_own_recordings.py",

@@ -1,4 +1,4 @@
-"""Sweeps on a very small sequence: cells, rows, resuming, failures and kills.
+"""Sweeps on a very small sequence: cells, rows, resuming and failures.
 
 Some tests replace the tracker by a tracker that finds no drones, because they do not look at the tracks.
 """
@@ -6,9 +6,7 @@ Some tests replace the tracker by a tracker that finds no drones, because they d
 import importlib
 import json
 import os
-import random
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -23,7 +21,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from helpers import Output, assert_refused, with_cameras
-from small_sweeps import SETTINGS, all_rows, grid_file, psotrack, python, small_sequence, stamps
+from small_sweeps import SETTINGS, all_rows, grid_file, small_sequence, stamps
 
 from psotrack.errors import InputError
 from psotrack.recordings.datasets import open_recording
@@ -37,24 +35,6 @@ METHODS = """
 [methods.usual]
 [methods.calm]
 swarm.inertia = 0.4
-"""
-#: Program that runs `psotrack WORDS` and kills itself before its N-th operation on a file in FOLDER:
-#: python -c KILLED N FOLDER WORDS.
-KILLED = """
-import os, signal, sys
-
-left, folder = int(sys.argv.pop(1)), sys.argv.pop(1)
-
-def on_event(event, arguments):
-    global left
-    if event in ("open", "os.mkdir", "os.remove", "os.rename") and str(arguments[0]).startswith(folder):
-        left -= 1
-        if left == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-sys.addaudithook(on_event)
-from psotrack.cli import main
-main()
 """
 
 
@@ -418,24 +398,3 @@ def test_a_commit_is_empty_outside_of_a_checkout(tmp_path: Path, monkeypatch: py
     (tracked / "__init__.py").write_text("changed")
     assert commit(tracked).endswith("-dirty")
     assert commit(tracked / "site-packages") == ""
-
-
-@pytest.mark.nightly
-def test_kills_lose_nothing_and_repeat_nothing(root: Path, tmp_path: Path) -> None:
-    """Runners are killed at random file operations, of which one has about 60 for the three cells of its own."""
-    rng, results, iterations = random.Random(3), tmp_path / "results", list(range(2, 11))
-    words = ("sweep", grid_file(tmp_path, iterations), "--data", root, "--out", results)
-    finished: dict[str, tuple[int, bytes]] = {}
-    for _ in range(3):
-        killed = python(root, "-c", KILLED, rng.randrange(1, 60), results, *words)
-        assert killed.returncode == -signal.SIGKILL, killed
-        assert finished.items() <= stamps(results).items(), "a finished cell was lost or written again"
-        finished = stamps(results)
-    with ThreadPoolExecutor(2) as threads:
-        two = list(threads.map(lambda _: psotrack(root, *words, "--json", "-"), range(2)))
-    assert [runner.returncode for runner in two] == [0, 0], two
-    counts = [json.loads(runner.stdout)["finished"] for runner in two]
-    assert sum(counts) == len(iterations) - len(finished)
-    assert finished.items() <= stamps(results).items()
-    assert sorted(all_rows(results)["settings.swarm.iterations"]) == iterations
-    assert Store(results).status()["at_work"] == []
