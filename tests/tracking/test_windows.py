@@ -14,7 +14,6 @@ from windows import (
     PIXELS_PER_M,
     RING,
     SHAPE,
-    best_place,
     cut_at,
     enumerate_windows,
     evaluate,
@@ -325,66 +324,19 @@ def test_drones_smaller_than_a_pixel_are_occluded_too():
     np.testing.assert_array_equal(cut_at(far_rig(1), NOISE, apart_m, size_m).clear, 1)
 
 
-# Tests in a room, with cameras at usual distances.
-
-#: Rig in which a silhouette's pixel is 2.4 cm in the middle of the room.
-EIGHT = ring_rig(8, image_size_wh=(480, 270), radius_m=4.5)
-THERE_M = np.array([0.3, -0.2, 1.3])
-
-
-def draw_in_room(position_m, size_m):
-    return draw_coverage(EIGHT, position_m, size_m, REDUCTION)
-
-
-def cut_in_room(images, expected_m, size_m, **how):
-    return cut_at(EIGHT, images, expected_m, size_m, reach_m=REACH_M, reduction=REDUCTION, **how)
-
-
-def flat_size(width_m, height_m=None):
-    return np.array([width_m, width_m, height_m or 0.6 * width_m])
-
-
-def directions(count):
-    """(count, 3), unit vectors in all horizontal directions, three quarters of them also up or down."""
-    angle = 2 * np.pi * (np.arange(count) + 0.3) / count
-    rise = np.resize([0.0, 0.3, -0.3, 0.6], count)
-    vector = np.stack([np.cos(angle), np.sin(angle), rise], axis=-1)
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
-
-
 def test_a_drone_has_no_score_on_another_drones_silhouette():
     """Two drones are expected at one silhouette: the occluding one keeps its score, the other has no score."""
-    size_m = np.stack([flat_size(0.4)] * 2)
-    expected_m = np.stack([THERE_M, THERE_M])
-    images = draw_in_room(THERE_M, size_m[0])
-    patches = cut_in_room(images, expected_m, size_m, occluding=[True, False])
-    _, weight = evaluate(camera_scores, EIGHT, patches, expected_m, size_m)
+    rig = ring_rig(8, image_size_wh=(480, 270), radius_m=4.5)
+    size_m, expected_m = np.array([[0.4, 0.4, 0.24]] * 2), np.array([[0.3, -0.2, 1.3]] * 2)
+    images = draw_coverage(rig, expected_m[0], size_m[0], REDUCTION)
+    occluded, free = (
+        cut_at(rig, images, expected_m, size_m, reach_m=REACH_M, reduction=REDUCTION, occluding=occluding)
+        for occluding in ([True, False], False)
+    )
+    _, weight = evaluate(camera_scores, rig, occluded, expected_m, size_m)
     np.testing.assert_allclose(weight[1], 0, atol=1e-6)
-    fitness = evaluate(drone_fitness, EIGHT, patches, expected_m, size_m)
-    free = cut_in_room(images, expected_m, size_m, occluding=False)
-    unoccluded = evaluate(drone_fitness, EIGHT, free, expected_m, size_m)
+    fitness = evaluate(drone_fitness, rig, occluded, expected_m, size_m)
+    unoccluded = evaluate(drone_fitness, rig, free, expected_m, size_m)
     assert np.isnan(fitness[1])
     np.testing.assert_allclose([fitness[0], *unoccluded], fitness[0], atol=1e-6)
     assert fitness[0] > 0.3
-
-
-@pytest.mark.parametrize(("apart_m", "share", "free_share"), [(0.3, 0.6, 0.65), (0.6, 0.1, 0.15)])
-def test_an_absent_drone_has_a_low_score_beside_a_passing_neighbour(apart_m, share, free_share):
-    """The best score of an absent drone within reach is at most a share of its neighbour's score.
-
-    Measured 0.51, 0.13 and 0.08; without occlusion 0.69, 0.39 and 0.17. At 0.3 m the share is large, because the
-    neighbour's silhouette covers the core of the absent drone's ellipse.
-    """
-    size_m = np.stack([flat_size(0.45)] * 2)
-    found, free = [], []
-    for direction in directions(4):
-        pair = THERE_M + apart_m * np.stack([0 * direction, direction])
-        images = draw_in_room(pair[1], size_m[1])
-        for scores, occluding in ((found, True), (free, False)):
-            patches = cut_in_room(images, pair, size_m, occluding=occluding)
-            best = best_place(EIGHT, patches, pair, size_m)
-            scores.append(evaluate(drone_fitness, EIGHT, patches, best, size_m))
-    gone, passing = np.transpose(found)
-    assert gone.mean() < share * passing.mean()
-    assert np.transpose(free)[0].mean() > free_share * passing.mean()
-    assert passing.min() > 0.5
