@@ -9,6 +9,7 @@ with the videos of the drones' own cameras.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 from psotrack.simulation import SimulationSettings, simulate
@@ -23,6 +24,12 @@ def simulated(name: str, data: Path, seed: int, *, onboard: bool = False) -> Pat
         settings = SimulationSettings(seed=seed, masks=False, onboard=onboard)
         simulate(name, folder.parents[1], settings, report=progress_bar)
     return folder
+
+
+def simulated_root(names: Iterable[str], data: Path) -> Path:
+    """The root folder of the first flight of each of these sequences, which are made if they are missing."""
+    folders = [simulated(name, data, 0) for name in names]
+    return folders[0].parents[1]
 
 
 def main() -> None:

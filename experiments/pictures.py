@@ -13,7 +13,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import _results
 import cv2
 import numpy as np
 
@@ -57,7 +56,6 @@ def main() -> None:
     options = parser.parse_args()
     from playwright.sync_api import sync_playwright
 
-    started = _results.Run("pictures")
     with tempfile.TemporaryDirectory() as temporary, sync_playwright() as playwright:
         root = Path(temporary)
         sequence, tracks = root / "Simulated_Data" / SCENARIO, root / "tracks.csv"
@@ -80,11 +78,8 @@ def main() -> None:
             page.evaluate(f"document.querySelector('.scene').scene.seek({MOMENT * options.frames / 25})")
             pictures[name] = look(page)
         chromium.close()
-    paths = []
     for name, picture in pictures.items():
-        paths.append(options.out / f"{name}.png")
-        paths[-1].write_bytes(small_png(picture))
-    started.save(options.out, files=paths)
+        (options.out / f"{name}.png").write_bytes(small_png(picture))
 
 
 def run(*arguments: object) -> None:

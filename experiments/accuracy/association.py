@@ -1,7 +1,7 @@
 """Detections without labels: psotrack's defaults beside Stone Soup's GNN and JPDA, each at its best of a grid.
 
     pip install '.[bench]'
-    python experiments/accuracy/association.py --data data [--real real] [--seeds 20 21] [--scenes slow 2] [--quick]
+    python experiments/accuracy/accuracy.py association --data data [--real real] [--seeds 20 21] [--quick]
 
 Flights by a formula (`formula_flights`) and, where --real names a folder of public repositories, parts of real flights
 (`bat_flights`). Of each flight psotrack is given the rig and the detections as files, with `psotrack track SEQ --method
@@ -14,6 +14,7 @@ CLEAR MOT. Frames without a reference do not count.
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import time
@@ -22,24 +23,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import _runs
 import numpy as np
+import pandas as pd
 import stone_soup
 from bat_flights import RealFlight, read_flight, write_recording
 from formula_flights import FPS, SCENES, make_flight
 from jaxtyping import Float
+from reference import BATS
 
 from psotrack.tracking.births import FlightVolume, flight_volume, moving_points
 from psotrack.tracking.matching import Sightings, from_detections
 from psotrack.trajectories import read_trajectories
 from psotrack.trajectories.association import GATE_M, identity_switches, partners_per_frame
 
-#: Flights of the real recording: name, first frame, number of frames.
-REAL = [
-    ("Turbine2_Setup5_2022-06-25_21-03", 3000, 450),
-    ("Turbine2_Setup6_2022-06-26_20-46", 2000, 450),
-    ("Turbine2_Setup4_2022-06-23_21-41", 2000, 450),
-]
 REAL_GATE_M = 5.0
 
 
@@ -139,30 +135,31 @@ def rows_of(
         yield f"{name} {seed} {method}", lambda method=method: row(method)
 
 
-def main() -> None:
-    """Track all flights by all methods, and print the means."""
-    parser = _runs.parser(__doc__)
-    parser.add_argument("--real", type=Path, help="folder of the real recordings, as OWNER/NAME")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[20, 21, 22], help="seeds of the flights")
-    parser.add_argument("--scenes", nargs="+", default=[""], help="words that are in the names of the scenes")
-    parser.add_argument("--quick", action="store_true", help="one short flight, and a quarter of the grid")
-    options = parser.parse_args()
-    run = _runs.start("association")
-    flights: list[tuple[str, int, RealFlight, float]] = []
+def add_options(options: argparse.ArgumentParser) -> None:
+    """Options of this study."""
+    options.add_argument("--seeds", type=int, nargs="+", default=[20, 21, 22], help="seeds of the flights")
+    options.add_argument(
+        "--scenes", nargs="+", default=[""], help="words that are in the names of the scenes"
+    )
+    options.add_argument("--quick", action="store_true", help="one short flight, and a quarter of the grid")
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Name and function of each row."""
     names = [name for name in SCENES if any(word in name for word in options.scenes)]
     for seed in options.seeds[: 1 if options.quick else None]:
         for name in names[: 1 if options.quick else None]:
             made = make_flight(SCENES[name], 50 if options.quick else 250, seed)
-            flights.append((name, seed, RealFlight(made.rig, made.detections, made.truth, FPS), GATE_M))
-    for name, first, count in REAL if options.real else ():
-        flights.append((name, 0, read_flight(options.real, name, first, count), REAL_GATE_M))
-    rows = (one for flight in flights for one in rows_of(*flight, options.data, options.quick))
-    table = _runs.save_rows(run, rows, options.data, options.out)
-    shown = ["recall", "precision", "id_changes", "mota"]
-    print(
-        table.groupby(["flight", "method"], sort=False)[shown].mean().to_string(float_format="{:.3f}".format)
-    )
+            flight = RealFlight(made.rig, made.detections, made.truth, FPS)
+            yield from rows_of(name, seed, flight, GATE_M, options.data, options.quick)
+    for name, part in BATS.items() if options.real else ():
+        flight = read_flight(options.real, *part)
+        yield from rows_of(name, 0, flight, REAL_GATE_M, options.data, options.quick)
 
 
-if __name__ == "__main__":
-    main()
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print the means."""
+    means = table.groupby(["flight", "method"], sort=False)[
+        ["recall", "precision", "id_changes", "mota"]
+    ].mean()
+    print(means.to_string(float_format="{:.3f}".format))

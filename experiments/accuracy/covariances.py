@@ -1,19 +1,10 @@
 """How often true positions lie in the 90 % ellipsoid: sound rigs, turned rigs, late clocks, labels whose noise lasts.
 
-    python experiments/accuracy/covariances.py --data data
-    python experiments/accuracy/covariances.py --data data --videos       # simulated videos as well, hours
-    python experiments/accuracy/covariances.py --data data --quick        # few frames, two draws
+    python experiments/accuracy/accuracy.py covariances --draws 8
 
 Synthetic labels of drones on smooth paths before the rig of a simulated sequence, whose truth is known exactly, are
-tracked by the projection lines.
-
-With --videos, simulated sequences with perturbed rigs and clocks are also tracked from their videos. Their drones'
-origins are not the middles of their silhouettes, so a drone's offset in the run of the sound rig is subtracted from the
-errors of all runs (`inside_90_rate`), or each run's own offset (`offset_removed_inside_90_rate`). Their cameras are
-late by 0 to half a frame. No residual shows what all cameras are late by, so the truth of these runs is late by a
-quarter of a frame.
-
-An error that lasts is one draw for a whole run: the mean over draws counts, not the share of one run.
+tracked by the projection lines. An error that lasts is one draw for a whole run: the mean over draws counts, not the
+share of one run.
 """
 
 from __future__ import annotations
@@ -24,39 +15,20 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import _runs
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from psotrack.evaluation import evaluate
 from psotrack.evaluation.consistency import consistency
-from psotrack.foreground.silhouettes import Silhouettes
 from psotrack.geometry import Rig, project
-from psotrack.pipeline import track_runs
-from psotrack.recordings import Recording
 from psotrack.settings import TrackSettings
 from psotrack.simulation import build, scenario
-from psotrack.sweeps import Perturbation, perturb
 from psotrack.tracking.camera_errors import views_of_places, with_camera_errors
 from psotrack.tracking.lines import track_detections
 from psotrack.tracking.matching import NOISE_PX, NOISE_SHARE, Sightings
-from psotrack.trajectories import Status, Trajectories
+from psotrack.trajectories import Status
 
-SEQUENCES = ("S01_D2_A", "S02_D4_A")
-#: Methods that are tracked from videos, and their settings.
-METHODS: dict[str, dict[str, Any]] = {
-    "swarm": {},
-    "projection lines": {"method": "projection-lines", "detections": "blobs"},
-    "fused": {"method": "fused", "detections": "blobs"},
-}
-#: Perturbations of sequences; the clocks are late by 0 to half a frame.
-CASES: dict[str, dict[str, float]] = {
-    "sound": {},
-    "turned 0.1 degrees": {"extrinsics_deg": 0.1},
-    "turned 0.3 degrees": {"extrinsics_deg": 0.3},
-    "clocks half a frame off": {"clock_frames": 0.5},
-}
 #: Errors of synthetic labels: turn of the cameras, degrees; clocks off by at most, frames; standard deviation, pixels;
 #: share of the variance that fades, and over how many frames.
 LABELS = {
@@ -73,87 +45,6 @@ NUM_LABELLED = 3
 RIGS = {8: None, 4: ["cam1", "cam3", "cam5", "cam7"], 3: ["cam1", "cam3", "cam5"], 2: ["cam1", "cam3"]}
 #: Sequence whose rig sees the synthetic labels.
 LABELLED = "S02_D4_A"
-
-
-def offsets(estimate: Trajectories, truth: Trajectories) -> dict[str, list[float]]:
-    """Each drone's mean error in its body, metres."""
-    return {each.drone: list(each.offset_m or ()) for each in evaluate(estimate, truth).per_drone}
-
-
-def without_offsets(truth: Trajectories, offset_m: dict[str, list[float]]) -> Trajectories:
-    """The reference at the points that the tracks of the sound rig follow."""
-    assert truth.orientation_wxyz is not None
-    position_m = truth.position_m.copy()
-    for drone, name in enumerate(truth.drones):
-        turned = np.isfinite(truth.orientation_wxyz[:, drone]).all(axis=-1)
-        rotation = Rotation.from_quat(truth.orientation_wxyz[turned, drone], scalar_first=True)
-        position_m[turned, drone] += rotation.apply(offset_m[name])
-    return replace(truth, position_m=position_m)
-
-
-def tracked_sequences(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-    """The rows of the simulated sequences: a name, and a function that computes the row."""
-    for sequence in SEQUENCES[-1:] if options.quick else SEQUENCES:
-        recording, silhouettes = _runs.open_sequence(sequence, options.data)
-        if options.frames is not None:
-            recording, silhouettes = first_frames(recording, silhouettes, options.frames)
-        assert recording.truth is not None
-        for method in METHODS:
-            sound = tracked(recording, silhouettes, method, Perturbation())
-            truth = without_offsets(recording.truth, offsets(sound, recording.truth))
-            for case, changes in CASES.items():
-                for draw in range(options.draws if changes else 1):
-                    perturbation = Perturbation(draw=draw, **changes)
-                    shown = late(truth, perturbation.clock_frames / 2)
-                    compute = partial(row, recording, silhouettes, method, perturbation, shown)
-                    name = f"{sequence} {method} {case} {draw}"
-                    yield (
-                        name,
-                        lambda named=(sequence, method, case, draw), compute=compute: {
-                            **dict(zip(("sequence", "method", "case", "draw"), named, strict=True)),
-                            **compute(),
-                        },
-                    )
-
-
-def late(truth: Trajectories, frames: float) -> Trajectories:
-    """The reference that is late by a share of a frame."""
-    before_m = np.concatenate([truth.position_m[:1], truth.position_m[:-1]])
-    return replace(truth, position_m=(1 - frames) * truth.position_m + frames * before_m)
-
-
-def first_frames(
-    recording: Recording, silhouettes: Silhouettes, num_frames: int
-) -> tuple[Recording, Silhouettes]:
-    """The first frames of a recording, and their silhouettes in memory."""
-    arrays = tuple(np.asarray(array[:num_frames]) for array in silhouettes.arrays)
-    return recording.usable(None, num_frames), replace(silhouettes, arrays=arrays, num_frames=num_frames)
-
-
-def tracked(
-    recording: Recording, silhouettes: Silhouettes, method: str, perturbation: Perturbation
-) -> Trajectories:
-    """The tracks of one method on a perturbed recording."""
-    changed, its_silhouettes = perturb(recording, silhouettes, perturbation, None)
-    (result,) = track_runs(changed, its_silhouettes, [TrackSettings().changed(METHODS[method])])
-    if isinstance(result, Exception):
-        raise result
-    return result.trajectories
-
-
-def row(
-    recording: Recording,
-    silhouettes: Silhouettes,
-    method: str,
-    perturbation: Perturbation,
-    truth: Trajectories,
-) -> dict[str, Any]:
-    """Figures of one run against the reference at the tracked points."""
-    estimate = tracked(recording, silhouettes, method, perturbation)
-    figures = evaluate(estimate, truth).to_dict()
-    kept = ("mean_error_m", "inside_90_rate", "mean_nees", "offset_removed_inside_90_rate", "missed_rate")
-    assert estimate.covariance_m2 is not None
-    return {key: figures[key] for key in kept} | {"std_m": mean_std_m(estimate.covariance_m2[estimate.seen])}
 
 
 def mean_std_m(covariance_m2: Float[np.ndarray, "*points 3 3"]) -> float:
@@ -199,8 +90,7 @@ def labelled(rig: Rig, case: str, seed: int, num_frames: int) -> dict[str, Any]:
     covariance_m2 = corrected.covariance_m2 + errors.systematic.absolute_m2
     figures = consistency(error_m, error_m, covariance_m2)
     return {
-        "sequence": f"{len(rig)} cameras",
-        "method": "labels, projection lines",
+        "rig": f"{len(rig)} cameras",
         "case": case,
         "draw": seed,
         "mean_error_m": float(np.nanmean(np.linalg.norm(error_m, axis=-1))),
@@ -241,39 +131,23 @@ def turned(rig: Rig, angle_deg: float, rng: np.random.Generator) -> Rig:
     return replace(rig, cameras=replace(rig.cameras, T_cam_world=T_cam_world))
 
 
-def labelled_rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-    """The rows of the synthetic labels: a name, and a function that computes the row."""
+def add_options(options: argparse.ArgumentParser) -> None:
+    """Options of this study."""
+    options.add_argument("--draws", type=int, default=8, help="rigs of each case")
+    options.add_argument("--frames", type=int, default=100, help="number of frames")
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Name and function of each row."""
     rig = build(scenario(LABELLED)).rig
     for cameras, names in RIGS.items():
         chosen = rig if names is None else rig.select(names)
         for case in LABELS:
-            for seed in range(2 if options.quick else options.label_draws):
-                name = f"labels {cameras} {case} {seed}"
-                yield name, partial(labelled, chosen, case, seed, options.frames or 100)
+            for seed in range(options.draws):
+                yield f"{cameras} {case} {seed}", partial(labelled, chosen, case, seed, options.frames)
 
 
-def main() -> None:
-    """Track, evaluate, and print the mean shares."""
-    parser = _runs.parser(__doc__)
-    parser.add_argument("--frames", type=int, help="number of frames  [default: all; of labels 100]")
-    parser.add_argument("--draws", type=int, default=4, help="perturbed rigs of each case")
-    parser.add_argument("--label-draws", type=int, default=8, help="rigs of each case with synthetic labels")
-    parser.add_argument("--videos", action="store_true", help="simulated videos as well")
-    parser.add_argument("--quick", action="store_true", help="one sequence, 100 frames, two draws")
-    options = parser.parse_args()
-    if options.quick:
-        options.frames, options.draws = options.frames or 100, min(options.draws, 2)
-    run = _runs.start("covariances")
-
-    def rows() -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-        yield from labelled_rows(options)
-        if options.videos:
-            yield from tracked_sequences(options)
-
-    table = _runs.save_rows(run, rows(), options.data, options.out)
-    means = table.drop(columns="draw").groupby(["method", "sequence", "case"], sort=False).mean()
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print the mean shares."""
+    means = table.drop(columns="draw").groupby(["rig", "case"], sort=False).mean()
     print(means.to_string(float_format="{:.3f}".format))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How often the truth of real flights lies in the 90 % ellipsoid, and sightings of a camera left out in its ellipse.
 
-    python experiments/accuracy/real_flights.py --data data --real real
+    python experiments/accuracy/accuracy.py real_flights --data data --real real
 
 Flights that other people recorded (OWNER/NAME in --real): wordbomb/PoseFree-GeoLocator (3 cameras, RTK),
 cvlab-epfl/multiview_calib (drone_rolex, 5 cameras, GPS) and christofhapp/batflight3D_publication (2 thermal cameras,
@@ -18,6 +18,7 @@ the sighting itself is taken to be the mean of those that are learned of the oth
 
 from __future__ import annotations
 
+import argparse
 import json
 import pickle
 from collections.abc import Callable, Iterator
@@ -26,7 +27,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import _runs
 import cv2
 import numpy as np
 import pandas as pd
@@ -307,8 +307,13 @@ FLIGHTS = {
 }
 
 
-def rows(folder: Path, real: Path) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+def add_options(options: argparse.ArgumentParser) -> None:
+    """This study has no options of its own."""
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
     """Name and function of each row."""
+    folder, real = options.data / "real_flights", options.real
     for name, (read, num_frames, left_out, num_left_out) in FLIGHTS.items():
         if not (folder / name / "recording.toml").exists():
             make_recording(folder / name, *read(real))
@@ -324,18 +329,6 @@ def rows(folder: Path, real: Path) -> Iterator[tuple[str, Callable[[], dict[str,
         yield short, partial(by_truth, folder, short, BAT_FRAMES, BAT_GATE_M)
 
 
-def main() -> None:
-    """Track, compare, and print the table."""
-    parser = _runs.parser(__doc__)
-    parser.add_argument(
-        "--real", type=Path, required=True, help="folder of the real recordings, as OWNER/NAME"
-    )
-    options = parser.parse_args()
-    run = _runs.start("real_flights")
-    folder = options.data / "real_flights"
-    table = _runs.save_rows(run, rows(folder, options.real), options.data, options.out)
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print the table."""
     print(table.to_string(index=False, float_format="{:.3f}".format, na_rep="-"))
-
-
-if __name__ == "__main__":
-    main()

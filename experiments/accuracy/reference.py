@@ -1,38 +1,40 @@
 """The reference table: today's defaults on the flights against which every change of the tracker is judged.
 
-    python experiments/accuracy/reference.py --data data --real real                   # makes the table
-    python experiments/accuracy/reference.py --data data --real real --out after --against experiments/accuracy/results
-    python experiments/accuracy/reference.py --data data --only S02_D4_A "bats 1:lines"    # some rows only
+    python experiments/accuracy/accuracy.py reference --data data --real real        # makes the table
+    python experiments/accuracy/accuracy.py reference --data data --out after --against experiments/results
+    python experiments/accuracy/accuracy.py reference --data data --only S02_D4_A "bats 1:lines"    # some rows only
 
-Flights: three of each of three simulated sequences, three in restless surroundings, one whose drones come and go, and,
-where --real names a folder of public repositories (OWNER/NAME), recordings that other people made. Methods: the swarm,
-projection lines on blobs and on detections, and both fused, each with its defaults. The same command continues an
-interrupted run. With --against, each row is compared with the row of another table: a mean error more than 3 % larger,
-a switch, a missed drone or a false track more is marked, and the exit code is 1.
+Flights: three of each of three simulated sequences, three in restless surroundings, one whose drones come and go
+(`comings_and_goings.toml`), and, with --real, parts of flights before two cameras. Methods: the swarm, projection lines
+on blobs and on detections, and both fused, each with its defaults. --quick takes one flight of each kind. With
+--against, each row is compared with the row of another table: a mean error more than 3 % larger, a switch, a missed
+drone or a false track more is marked, and the exit code is 1.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import _runs
 import numpy as np
 import pandas as pd
 from bat_flights import read_flight, write_recording
-from comings_and_goings import open_sequence
-from restless import false_tracks, made
 
 from psotrack.evaluation import evaluate
 from psotrack.recordings.datasets import open_recording
+from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, scenarios, simulate
+from psotrack.support import progress_bar
 from psotrack.trajectories import Status, Trajectories, read_trajectories
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from _sequences import simulated
 
 METHODS: dict[str, tuple[str, ...]] = {
     "swarm": (),
@@ -40,15 +42,15 @@ METHODS: dict[str, tuple[str, ...]] = {
     "lines on detections": ("--method", "projection-lines"),
     "fused": ("--method", "fused"),
 }
-WITHOUT_DETECTIONS = ("swarm", "lines on blobs")
-SEEDS = (0, 1, 2)
 SEQUENCES = ("S01_D2_A", "S02_D4_A", "S04_D10")
-#: Parts of the published flights of bats: name, first frame, number of frames; and the errors of GPS, metres.
+COMINGS = Path(__file__).with_name("comings_and_goings.toml")
+#: Parts of the published flights of bats: name, first frame, number of frames.
 BATS = {
     "bats 1": ("Turbine2_Setup5_2022-06-25_21-03", 3000, 450),
     "bats 2": ("Turbine2_Setup6_2022-06-26_20-46", 2000, 450),
     "bats 3": ("Turbine2_Setup4_2022-06-23_21-41", 2000, 450),
 }
+#: Distance from every drone beyond which a track is false, metres; where the reference is GPS.
 GATE_M, GPS_GATE_M = 0.5, 5.0
 #: Figures of `evaluate`, by the column of the table.
 FIGURES = {
@@ -81,64 +83,43 @@ class Flight:
     gate_m: float = GATE_M
 
 
-def flights(data: Path, real: Path | None) -> Iterator[tuple[str, partial[Flight]]]:
+def flights(data: Path, real: Path | None, quick: bool) -> Iterator[tuple[str, Callable[[], Flight]]]:
     """Name of each flight, and the function that makes the flight ready."""
     for name in SEQUENCES:
-        for seed in SEEDS:
+        for seed in range(1 if quick else 3):
             yield f"{name} {seed}", partial(_simulated, name, data, seed)
-    for seed in (1, 2, 3):
+    for seed in range(1, 2 if quick else 4):
         yield f"restless {seed}", partial(_restless, data, seed)
     yield "comings and goings", partial(_comings, data)
-    if real is not None:
-        for name in BATS:
-            yield name, partial(_bats, name, data, real)
-        yield "hand", partial(_hand, data, real)
-        yield "mouse", partial(_mouse, data, real)
+    for name in BATS if real is not None else ():
+        yield name, partial(_bats, name, data, real)
 
 
 def _simulated(name: str, data: Path, seed: int) -> Flight:
-    return Flight(_runs.simulated(name, data, seed), seed=seed)
+    return Flight(simulated(name, data, seed), seed=seed)
 
 
 def _restless(data: Path, seed: int) -> Flight:
-    return Flight(made(data, "restless", seed))
+    """Four drones, 200 frames at half size, with all that `psotrack simulate --restless` changes."""
+    recipe, root = change_scenario(scenario("S02_D4_A"), RESTLESS), data / "restless" / f"restless{seed}"
+    settings = SimulationSettings(num_frames=200, scale=0.5, seed=seed, masks=False, onboard=False)
+    if not (folder := root / "Simulated_Data" / recipe.name).exists():
+        simulate(recipe, root, settings, report=progress_bar)
+    return Flight(folder)
 
 
 def _comings(data: Path) -> Flight:
-    return Flight(open_sequence(data).folder)
+    recipe, root = scenarios.load(COMINGS), data / "comings"
+    if not (folder := root / "Simulated_Data" / recipe.name).exists():
+        settings = SimulationSettings(masks=False, onboard=False)
+        simulate(recipe, root, settings, report=progress_bar)
+    return Flight(folder)
 
 
 def _bats(name: str, data: Path, real: Path) -> Flight:
     flight, folder = read_flight(real, *BATS[name]), data / "reference" / name.replace(" ", "_")
     write_recording(flight, folder)
     return Flight(folder, ("lines on detections",), truth=flight.truth, gate_m=GPS_GATE_M)
-
-
-def _hand(data: Path, real: Path) -> Flight:
-    """Two cameras about a hand, of TemugeB/handpose3d; lengths are in an arbitrary unit, taken for centimetres."""
-    source, folder = real / "TemugeB/handpose3d", data / "reference/hand"
-    videos = {f"cam{number}": source / f"media/cam{number}_test.mp4" for number in range(2)}
-    words = ("--units", "cm", "--size", "720,720")
-    return Flight(_copied(folder, source / "camera_parameters/c0.dat", videos, words), WITHOUT_DETECTIONS)
-
-
-def _mouse(data: Path, real: Path) -> Flight:
-    """Three cameras about a mouse, of talmolab/sleap-anipose; the pose of the fourth is a copy of another one."""
-    source = real / "talmolab/sleap-anipose/tests/data/minimal_session"
-    folder = data / "reference/mouse"
-    videos = {name: source / name / f"minimal_{name}.mp4" for name in ("back", "mid", "top")}
-    return Flight(_copied(folder, source / "calibration.toml", videos, ("--units", "mm")), WITHOUT_DETECTIONS)
-
-
-def _copied(folder: Path, calibration: Path, videos: dict[str, Path], words: tuple[str, ...]) -> Path:
-    """A folder with a recording of these videos and this calibration."""
-    if not (folder / "recording.toml").exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, video in videos.items():
-            shutil.copy(video, folder / f"{name}{video.suffix}")
-        psotrack("calibrate", "convert", str(calibration), str(folder / "rig.toml"), *words, "--force")
-        psotrack("init", str(folder), "--calibration", str(folder / "rig.toml"))
-    return folder
 
 
 def psotrack(*words: str) -> str:
@@ -154,7 +135,7 @@ def row(name: str, method: str, flight: Flight, data: Path) -> dict[str, Any]:
     """Track a flight by a method; its row of the table."""
     tracks = data / "reference" / "tracks" / f"{name}-{method}.csv".replace(" ", "_")
     tracks.parent.mkdir(parents=True, exist_ok=True)
-    where = ("--out", str(tracks), "--cache", str(_runs.cache_folder(data)), "--seed", str(flight.seed))
+    where = ("--out", str(tracks), "--cache", str(data / "silhouettes"), "--seed", str(flight.seed))
     refused = psotrack("track", str(flight.sequence), *METHODS[method], *where, "--force")
     if refused:
         note = refused.replace(str(flight.sequence), name)
@@ -186,6 +167,22 @@ def _figures(found: Trajectories, truth: Trajectories, gate_m: float) -> dict[st
     }
 
 
+def false_tracks(found: Trajectories, truth: Trajectories, gate_m: float) -> dict[str, Any]:
+    """Tracks that are mostly away from all drones, by the gate or more, and the time that tracks are away, seconds."""
+    tracked = found.status == Status.TRACKED
+    index = np.searchsorted(truth.frame, found.frame)
+    seen = np.isin(found.frame, truth.frame)
+    apart_m = found.position_m[seen][:, :, None] - truth.position_m[index[seen]][:, None]
+    distance_m = np.nan_to_num(np.linalg.norm(apart_m, axis=-1), nan=np.inf).min(axis=-1)
+    # The dataset's reference begins at frame 1: no distance is known before.
+    false = (distance_m > gate_m) & np.isfinite(distance_m) & tracked[seen]
+    mostly = false.sum(axis=0) > 0.5 * np.maximum(tracked[seen].sum(axis=0), 1)
+    return {
+        "false_tracks": int(mostly.sum()),
+        "false_s": float(false.sum() * np.median(np.diff(found.time_s))),
+    }
+
+
 def compared(table: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
     """The rows beside those of another table, with the reasons why a row is worse."""
     keys = ["flight", "method"]
@@ -203,38 +200,30 @@ def compared(table: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
     return both[[*keys, *shown, "worse"]]
 
 
-def main() -> None:
-    """Track all flights by all methods, write the table, and compare it."""
-    parser = _runs.parser(__doc__)
-    parser.add_argument("--real", type=Path, help="folder of the real recordings, as OWNER/NAME")
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        metavar="FLIGHT[:METHOD]",
-        default=[""],
-        help="rows whose names begin so [default: all]",
-    )
-    parser.add_argument("--against", type=Path, metavar="FOLDER", help="compare with FOLDER/reference.csv")
-    options = parser.parse_args()
-    run = _runs.start("reference")
-    rows = (
-        (f"{name}:{method}", partial(row, name, method, flight, options.data))
-        for name, prepare in flights(options.data, options.real)
-        if any(name.startswith(word.split(":")[0]) for word in options.only)
-        for flight in [prepare()]
-        for method in flight.methods
-        if any(f"{name}:{method}".startswith(word) for word in options.only)
-    )
-    table = _runs.save_rows(run, rows, options.data, options.out)
-    if table.empty:
-        parser.error(f"--only: expected names of rows, such as 'S01_D2_A 0:swarm', found {options.only}")
+def add_options(options: argparse.ArgumentParser) -> None:
+    """Options of this study."""
+    options.add_argument("--quick", action="store_true", help="one flight of each kind")
+    words = {"nargs": "+", "metavar": "FLIGHT[:METHOD]", "default": [""]}
+    options.add_argument("--only", **words, help="rows whose names begin so [default: all]")
+    options.add_argument("--against", type=Path, metavar="FOLDER", help="compare with FOLDER/reference.csv")
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Name and function of each row."""
+    for name, prepare in flights(options.data, options.real, options.quick):
+        if not any(name.startswith(word.split(":")[0]) for word in options.only):
+            continue
+        flight = prepare()
+        for method in flight.methods:
+            if any(f"{name}:{method}".startswith(word) for word in options.only):
+                yield f"{name}:{method}", partial(row, name, method, flight, options.data)
+
+
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print the table, and compare it with another one."""
     print(table.to_string(index=False, float_format="{:.3f}".format, na_rep="-"))
     if options.against is not None:
         both = compared(table, pd.read_csv(options.against / "reference.csv"))
         print(both.to_string(index=False, float_format="{:.3f}".format, na_rep="-"))
         if (both.worse != "").any():
             sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

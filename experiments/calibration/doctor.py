@@ -35,8 +35,6 @@ import _boxes
 import _results
 from _boxes import FPS, Flight, Scene
 
-HERE = Path(__file__).parent
-
 #: Smallest shift of the boxes by a fault that is counted, pixels.
 LEAST_PX = 3.0
 #: Scenes, in turn, before the number of cameras is set.
@@ -218,7 +216,7 @@ def main() -> None:
     parser.add_argument("--fault", action="append", choices=["nothing", *FAULTS], help="only this one")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--verbose", action="store_true")
-    parser.add_argument("--out", type=Path, default=HERE / "results", help="folder of the table")
+    parser.add_argument("--out", type=Path, default=_results.FOLDER, help="folder of the table")
     options = parser.parse_args()
     record = _results.Run("doctor")
     sound, rigs, three = (6, 2, 1) if options.quick else (options.sound, options.rigs, options.three)
@@ -232,13 +230,8 @@ def main() -> None:
     judged = pd.DataFrame(rows)
     table = summary(judged)
     print(table.to_string(index=False))
-    whole = not (options.quick or options.fault or options.first)
-    if whole:
-        figures = {
-            "table": table.to_dict("records"),
-            "most_seconds": round(float(judged["seconds"].max()), 1),
-        }
-        record.save(options.out, rows=judged.round(2), figures=figures)
+    if not (options.quick or options.fault or options.first):
+        record.save(options.out, rows=judged.round(2), figures={"table": table.to_dict("records")})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ cameras alone; "length" is the error of the distance between two triangulated co
 caliscope and aniposelib run in PYTHON, an interpreter that has them; without --peers they are left out.
 `calibrateMultiview` of OpenCV takes (-1, -1), the pixel of a corner that is not seen, for a pixel; it is run on all
 views ("OpenCV") and on the views with all corners ("OpenCV, whole boards"). "as published" is the calibration that
-comes with the recording. Writes OUT/peers.csv.
+comes with the recording. Writes OUT/rigs.csv.
 """
 
 from __future__ import annotations
@@ -81,9 +81,9 @@ def main() -> None:
         "--folds", type=int, default=5, help="calibrations of each method, each without other instants"
     )
     parser.add_argument("--quick", action="store_true", help="one small recording only")
-    parser.add_argument("--out", type=Path, default=HERE / "results", help="folder of the table")
+    parser.add_argument("--out", type=Path, default=_results.FOLDER, help="folder of the table")
     options = parser.parse_args()
-    run = _results.Run("peers")
+    run = _results.Run("rigs")
     rows = []
     for name in ["stereo chessboard"] if options.quick else options.sets:
         paths, board, published = SETS[name]

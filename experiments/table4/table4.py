@@ -1,10 +1,10 @@
 """The paper's Table 4, triangulation based on projection lines, beside the swarm: mean and median error, and FNR.
 
-    python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated if they are missing
+    python experiments/table4/table4.py            # S01_D2_A, S02_D4_A and S04_D10, simulated into data/ if missing
     python experiments/table4/table4.py --data FOLDER_OF_THE_DATASET    # every sequence in it that has a reference
 
-FNR is the share of frames and drones that were missed. Writes results.csv, table4.md and the files of `psotrack sweep`
-to --out. Finished cells in --out are not run again.
+FNR is the share of frames and drones that were missed. Writes the tables, table4.md, and the files of `psotrack sweep`
+to --out. Finished cells in --out are not run again. With --results, rows and record become the headline figure.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from psotrack.sweeps import grid, pivot, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
+from _sequences import simulated_root
 
 HERE = Path(__file__).parent
 SIMULATED = ("S01_D2_A", "S02_D4_A", "S04_D10")
@@ -35,8 +36,6 @@ TABLES = {
     "MOTA": ("mota", 1.0, 3),
     "Time of the track stage per frame (ms)": ("track_ms_per_frame", 1.0, 1),
 }
-#: Files of the result that are committed.
-FILES = ("results.csv", "table4.md")
 KEPT = [
     "sequence",
     "method",
@@ -57,7 +56,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"
+        "--data", type=Path, help="root folder of the sequences [default: simulated into data/]"
     )
     parser.add_argument(
         "--methods",
@@ -66,31 +65,20 @@ def main() -> None:
         help="[default: methods.toml, beside this file]",
     )
     parser.add_argument("--out", type=Path, default=Path("table4"))
-    parser.add_argument("--results", type=Path, help="copy the result and its record into this folder, too")
+    parser.add_argument("--results", type=Path, help="write rows and record into this folder")
     options = parser.parse_args()
     run = _results.Run("table4")
     try:
-        data = options.data or simulated(options.out / "data")
+        data = options.data or simulated_root(SIMULATED, Path("data"))
         methods = tomllib.loads(options.methods.read_text())
         rows = tracked({**methods, "sequences": at_hand(data)}, options.out, data)
         show(rows, options.out)
         if options.results:
-            run.copy([options.out / name for name in FILES], options.results)
+            run.save(options.results, rows=rows[[name for name in KEPT if name in rows]])
     except PsotrackError as error:
         sys.exit(f"table4: {error}")
     if rows.attrs["errors"]:
         sys.exit("\n".join(f"table4: {error}" for error in rows.attrs["errors"]))
-
-
-def simulated(data: Path) -> Path:
-    """Root folder of the data, after the missing sequences were simulated."""
-    from psotrack.simulation import SimulationSettings, simulate
-
-    for name in SIMULATED:
-        if not (data / "Simulated_Data" / name).is_dir():
-            print(f"simulating {name}", flush=True)
-            simulate(name, data, SimulationSettings(masks=False, onboard=False), progress=True)
-    return data
 
 
 def at_hand(data: Path) -> list[str]:
@@ -110,15 +98,12 @@ def tracked(cells: dict, out: Path, data: Path) -> pd.DataFrame:
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:
-    """Print the tables, and write the tables and the rows."""
+    """Print and write the tables."""
     parts = []
     for title, (value, scale, decimals) in TABLES.items():
         table = pivot(rows, rows_by=["sequence"], columns_by=["method"], value=value, scale=scale)
         parts.append(f"## {title}\n\n{render_table(table, 'markdown', decimals=decimals)}")
         print(f"{title}\n{render_table(table, decimals=decimals)}")
-    rows[[name for name in KEPT if name in rows]].to_csv(
-        out / "results.csv", index=False, float_format="%.6g"
-    )
     (out / "table4.md").write_text("\n".join(parts))
 
 

@@ -1,11 +1,11 @@
 """The paper's Table 5 beside ours: mean errors over ten runs for each number of particles and iterations.
 
     python experiments/table5/table5.py            # 540 runs; the same command continues an interrupted call
-    python experiments/table5/table5.py --quick    # a few settings on short sequences
+    python experiments/table5/table5.py --quick    # the smallest and the largest swarms, two runs each
     python experiments/table5/table5.py --data FOLDER_OF_THE_DATASET
 
-Without --data, missing sequences are simulated. Writes results.csv (one row per run), table5.md and a picture to
---out. Finished cells in --out are not run again.
+Without --data, missing sequences are simulated into data/. Writes table5.md and a picture to --out. Finished cells in
+--out are not run again. With --results, rows (one per run) and record become the headline figure.
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from psotrack.sweeps import Grid, pivot, read_grid, render_table, sweep
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 import _results
+from _sequences import simulated_root
 
 HERE = Path(__file__).parent
-#: Files of the result that are committed.
-FILES = ("results.csv", "table5.md", "error_against_work.png")
 #: Title of a table -> column, its factor, and decimals.
 TABLES = {
     "Mean error": ("mean_error_m", 1e3, 1),
@@ -35,12 +34,11 @@ TABLES = {
     "Missed, of all frames and drones": ("missed_rate", 1.0, 3),
     "Time of the track stage per frame": ("track_ms_per_frame", 1.0, 1),
 }
-#: Columns of results.csv.
+#: Columns of the rows.
 KEPT = ["sequence", "method", "settings.swarm.particles", "settings.swarm.iterations", "seed", "frames"]
 KEPT += ["mean_error_m", "median_error_m", "p95_error_m", "max_error_m", "offset_removed_mean_error_m"]
 KEPT += ["missed_rate", "id_switches", "mota", "idf1", "hota", "offset_removed_inside_90_rate"]
 KEPT += ["track_ms_per_frame", "runs_in_batch", "commit"]
-QUICK_FRAMES, QUICK_SCALE = 50, 0.5
 
 
 def main() -> None:
@@ -48,40 +46,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--quick", action="store_true", help="a few settings on short sequences")
+    parser.add_argument("--quick", action="store_true", help="the smallest and the largest swarms")
     parser.add_argument("--grid", type=Path, help="[default: grid.toml or quick.toml, beside this file]")
     parser.add_argument(
-        "--data", type=Path, help="root folder of the sequences [default: simulated into OUT]"
+        "--data", type=Path, help="root folder of the sequences [default: simulated into data/]"
     )
     parser.add_argument("--out", type=Path, help="[default: table5, or table5/quick]")
-    parser.add_argument("--results", type=Path, help="copy the result and its record into this folder, too")
+    parser.add_argument("--results", type=Path, help="write rows and record into this folder")
     options = parser.parse_args()
     run = _results.Run("table5")
     out = options.out or (Path("table5/quick") if options.quick else Path("table5"))
     try:
         grid = read_grid(options.grid or HERE / ("quick.toml" if options.quick else "grid.toml"))
-        data = options.data or simulated(grid, out / "data", quick=options.quick)
+        data = options.data or simulated_root(grid.sequences, Path("data"))
         rows = tracked(grid, out, data)
         show(rows, out)
         if options.results:
-            run.copy([out / name for name in FILES], options.results)
+            run.save(options.results, rows=rows[[name for name in KEPT if name in rows]])
     except PsotrackError as error:
         sys.exit(f"table5: {error}")
     if rows.attrs["errors"]:
         sys.exit("\n".join(f"table5: {error}" for error in rows.attrs["errors"]))
-
-
-def simulated(grid: Grid, data: Path, *, quick: bool) -> Path:
-    """Root folder of the data, after the missing sequences were simulated."""
-    from psotrack.simulation import SimulationSettings, simulate
-
-    for name in grid.sequences:
-        if not (data / "Simulated_Data" / name).is_dir():
-            print(f"simulating {name}", flush=True)
-            size = {"num_frames": QUICK_FRAMES, "scale": QUICK_SCALE} if quick else {}
-            settings = SimulationSettings(masks=False, onboard=False, **size)
-            simulate(name, data, settings, progress=True)
-    return data
 
 
 def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
@@ -93,7 +78,7 @@ def tracked(grid: Grid, out: Path, data: Path) -> pd.DataFrame:
 
 
 def show(rows: pd.DataFrame, out: Path) -> None:
-    """Print the tables; write tables, rows and the picture."""
+    """Print the tables; write tables and the picture."""
     published = tomllib.loads((HERE / "published.toml").read_text())
     tables = {
         title: pivot(
@@ -113,9 +98,6 @@ def show(rows: pd.DataFrame, out: Path) -> None:
         if name in set(rows["sequence"])
     ]
     print("Published mean errors:", ", ".join(said))
-    rows[[name for name in KEPT if name in rows]].to_csv(
-        out / "results.csv", index=False, float_format="%.6g"
-    )
     figure = error_against_work(rows, published=published)
     figure.savefig(out / "error_against_work.png")
     parts = [

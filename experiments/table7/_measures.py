@@ -6,9 +6,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 
 import numpy as np
-from _methods import MIN_MARKERS
 from _recordings import Recording
-from _visibility import visible_markers
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -29,7 +27,6 @@ class Measures:
             true pose, and here the reference takes its place.
         inside_90: whether the true position lies in the 90 % ellipsoid of the estimate.
         posed: whether the frame has a pose.
-        enough: whether at least `MIN_MARKERS` markers are visible, as the paper requires.
     """
 
     distance_m: Float[np.ndarray, "frames"]
@@ -40,7 +37,6 @@ class Measures:
     error_deg: Float[np.ndarray, "frames"]
     inside_90: Float[np.ndarray, "frames"]
     posed: Bool[np.ndarray, "frames"]
-    enough: Bool[np.ndarray, "frames"]
 
 
 def measure(recording: Recording, path: CameraPath, comparison: PathComparison) -> Measures:
@@ -51,7 +47,6 @@ def measure(recording: Recording, path: CameraPath, comparison: PathComparison) 
     else:
         true_m = comparison.reference_m
         true_wxyz = np.full((path.num_frames, 4), np.nan) if turning is None else turning.reference_wxyz
-    visible = visible_markers(recording.marker_map, recording.lens, true_m, true_wxyz)
     off_m = np.where(path.seen[:, None], path.position_m, np.nan) - true_m
     return Measures(
         distance_m=comparison.distance_m,
@@ -62,7 +57,6 @@ def measure(recording: Recording, path: CameraPath, comparison: PathComparison) 
         error_deg=_angles_deg(np.where(path.seen[:, None], path.orientation_wxyz, np.nan), true_wxyz),
         inside_90=_inside_90(off_m, path.covariance[:, :3, :3]),
         posed=path.seen,
-        enough=visible.sum(axis=1) >= MIN_MARKERS,
     )
 
 
@@ -81,7 +75,7 @@ def row(measures: Measures) -> dict[str, float]:
         "position_p99_m": _statistic(lambda values: np.nanpercentile(values, 99), measures.error_m),
         "position_max_m": _statistic(np.nanmax, measures.error_m),
         "orientation_median_deg": _statistic(np.nanmedian, measures.error_deg),
-        "posed_rate": float(np.mean(measures.posed[measures.enough])) if measures.enough.any() else np.nan,
+        "posed_rate": float(np.mean(measures.posed)),
         "inside_90_rate": _statistic(np.nanmean, measures.inside_90),
     }
     tables = {

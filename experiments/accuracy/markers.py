@@ -1,13 +1,12 @@
 """Photographs and a video of markers that other people recorded: what the commands of a user find in them.
 
-    python experiments/accuracy/real_markers.py REAL
+    python experiments/accuracy/accuracy.py markers --real REAL
 
 REAL is the folder of the public repositories, as OWNER/NAME. Cases: AprilTags with hand-marked corners
 (AprilRobotics/apriltag); a tag that is turned by 10 degrees from photograph to photograph, whose pose is compared with
 these angles (duckietown/lib-dt-apriltags); ten photographs of several tags (the same); markers of known ids
 (UbiquityRobotics/fiducials); a board of markers (abakisita/camera_calibration); a video by a hand-held phone
 (Ashrafhij/TelloAI-V.0.1), from which a map is made and along which the phone is localised.
-Writes OUT/real_markers.csv.
 """
 
 from __future__ import annotations
@@ -18,7 +17,8 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,6 @@ import yaml
 from jaxtyping import Float
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
-
-HERE = Path(__file__).resolve().parent
-sys.path.append(str(HERE.parent))
-import _results
 
 Figures = dict[str, float]
 CORNERS = [f"{axis}{corner}_px" for corner in range(4) for axis in "xy"]
@@ -185,28 +181,23 @@ def _spread(errors: list[Float[np.ndarray, " errors"]], unit: str) -> Figures:
     return {f"median {unit}": float(np.median(each)), f"99 % {unit}": float(np.percentile(each, 99))}
 
 
-def main() -> None:
-    """Run the cases, print and write the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("real", type=Path, help="folder of the real recordings, as OWNER/NAME")
-    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
-    parser.add_argument("--out", type=Path, default=HERE / "results", help="folder of the table")
-    options = parser.parse_args()
-    run = _results.Run("real_markers")
-    rows = []
+def add_options(options: argparse.ArgumentParser) -> None:
+    """Options of this study."""
+    options.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Name and function of each case."""
     for name in options.cases:
-        with tempfile.TemporaryDirectory() as folder:
-            figures = CASES[name](options.real, Path(folder))
-        rows += [
-            {"case": name, "figure": figure, "value": round(float(value), 4)}
-            for figure, value in figures.items()
-        ]
-    table = pd.DataFrame(rows)
-    print(table.to_string(index=False))
-    run.save(options.out, rows=table)
+        yield name, partial(figures_of, name, options.real)
 
 
-if __name__ == "__main__":
-    main()
+def figures_of(name: str, real: Path) -> dict[str, Any]:
+    """The figures of a case."""
+    with tempfile.TemporaryDirectory() as folder:
+        return {"case": name, **CASES[name](real, Path(folder))}
+
+
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print a line per figure."""
+    print(table.melt("case", var_name="figure").dropna().sort_values("case").to_string(index=False))

@@ -1,26 +1,28 @@
-"""The rolling shutter of an on-board camera: poses, covariances, line times and maps of markers.
+"""A camera in a hand, with a global and with a rolling shutter: poses, covariances, line times and maps of markers.
 
-    python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study
-    python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study --seeds 1 --frames 90
-    python experiments/accuracy/rolling_shutter.py --folder /tmp/shutter_study --picture picture.png
+    python experiments/accuracy/accuracy.py localise --data data
+    python experiments/accuracy/accuracy.py localise --data data --seeds 1 --frames 90
+    python experiments/accuracy/accuracy.py localise --data data --picture picture.png
 
 A camera is carried by hand through the laboratory: sinusoids from slow walking to tremor at 7 Hz. The simulator draws
 every row at its own time, with lens distortion, motion blur of 1/200 s, noise, JPEG 60 and an automatic exposure that
 swings between 0.3 and 2. Cases: a global shutter, and a rolling shutter of 20 ms whose line time is given, estimated,
-or left out on purpose (`--readout 0`). Truths: the pose when the middle row is exposed. The videos are kept in the
-folder and drawn once.
+or left out on purpose (`--readout 0`). Truths: the pose when the middle row is exposed. The videos are kept in
+DATA/localise and drawn once.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -160,26 +162,25 @@ def errors(path: CameraPath, clip: Clip) -> dict[str, float]:
     }
 
 
-def poses_of(clip: Clip, shutter: RollingShutter | None) -> list[dict[str, Any]]:
-    """Errors of the filter and of the smoother, and the line time."""
+def poses_of(
+    clip: Clip, shutter: RollingShutter | None, smoothed: bool, about: dict[str, Any]
+) -> dict[str, Any]:
+    """Errors of the filter or of the smoother, and the line time."""
     settings = LocaliseSettings(shutter=shutter)
     began = time.perf_counter()
     found = localise_video(open_source(clip.video), clip.marker_map, clip.camera, settings)
     wall_s = time.perf_counter() - began
-    smoothed = found.smoothed()
-    used = found.shutter
-    about = {
-        "line_time_us": 1e6 * used.line_time_s,
-        "line_time_std_us": 1e6 * used.std_s,
+    return {
+        **about,
+        "estimate": "smoother" if smoothed else "filter",
+        **errors(found.smoothed() if smoothed else found.path, clip),
+        "line_time_us": 1e6 * found.shutter.line_time_s,
+        "line_time_std_us": 1e6 * found.shutter.std_s,
         "frames_per_second": found.raw.num_frames / wall_s,
     }
-    return [
-        {"estimate": name, **errors(path, clip), **about}
-        for name, path in (("filter", found.path), ("smoother", smoothed))
-    ]
 
 
-def map_of(clip: Clip) -> dict[str, Any]:
+def map_of(clip: Clip, about: dict[str, Any]) -> dict[str, Any]:
     """Errors of a map from the video of one hand's motion, given its most seen marker.
 
     Its covariance allows for a camera that encodes light by another power than assumed, which finds the sides of all
@@ -198,6 +199,7 @@ def map_of(clip: Clip) -> dict[str, Any]:
         inside += _off_map(again, clip)[1].tolist()
     off_mm = 1e3 * np.linalg.norm(off_m, axis=-1)
     return {
+        **about,
         "estimate": "map",
         "median_mm": float(np.median(off_mm)),
         "p99_mm": float(np.percentile(off_mm, 99)),
@@ -259,42 +261,29 @@ def picture(path: Path, folder: Path, frames: int) -> None:
     figure.savefig(path, dpi=110)
 
 
-def rows_of(folder: Path, frames: int, seed: int) -> list[dict[str, Any]]:
-    """All figures of one hand's motion."""
-    found: list[dict[str, Any]] = []
-    for case, readout_s, shutter in CASES:
-        clip = draw(folder, seed, frames, readout_s)
-        about = {"case": case, "seed": seed}
-        found += [about | row for row in poses_of(clip, shutter)]
-        if shutter is None:
-            found.append(about | map_of(clip))
-    return found
+def add_options(options: argparse.ArgumentParser) -> None:
+    """Options of this study."""
+    options.add_argument("--seeds", type=int, default=3, help="number of motions")
+    options.add_argument("--frames", type=int, default=150, help="frames of each video")
+    options.add_argument("--picture", type=Path, help="draw this picture too, from the first motion")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--folder", type=Path, required=True, help="folder of the videos and of the figures")
-    parser.add_argument("--seeds", type=int, default=3, help="number of motions")
-    parser.add_argument("--frames", type=int, default=150, help="frames of each video")
-    parser.add_argument("--picture", type=Path, help="draw this picture instead, from the first motion")
-    arguments = parser.parse_args()
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    if arguments.picture is not None:
-        picture(arguments.picture, arguments.folder, arguments.frames)
-        return
-    rows: list[dict[str, Any]] = []
-    for seed in range(arguments.seeds):
-        rows += rows_of(arguments.folder, arguments.frames, seed)
-        for row in rows[-10:]:
-            print(
-                "  ".join(
-                    f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"
-                    for key, value in row.items()
-                ),
-                flush=True,
-            )
-    (arguments.folder / "rolling_shutter.json").write_text(json.dumps(rows, indent=1))
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    """Name and function of each row."""
+    folder = options.data / "localise"
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(options.seeds):
+        for case, readout_s, shutter in CASES:
+            clip = draw(folder, seed, options.frames, readout_s)
+            for smoothed in (False, True):
+                name = f"{case} {seed} {smoothed}"
+                yield name, partial(poses_of, clip, shutter, smoothed, {"case": case, "seed": seed})
+            if shutter is None:
+                yield f"{case} {seed} map", partial(map_of, clip, {"case": case, "seed": seed})
 
 
-if __name__ == "__main__":
-    main()
+def show(table: pd.DataFrame, options: argparse.Namespace) -> None:
+    """Print the table, and draw the picture."""
+    print(table.to_string(index=False, float_format="{:.3f}".format, na_rep="-"))
+    if options.picture is not None:
+        picture(options.picture, options.data / "localise", options.frames)

@@ -1,21 +1,20 @@
 """How fast psotrack is: from videos to tracks, live, and many runs at once.
 
-    python experiments/benchmarks/benchmark.py videos --data data     # `make bench-videos`, ten minutes
-    python experiments/benchmarks/benchmark.py live --data data       # `make bench-live`, two minutes
-    python experiments/benchmarks/benchmark.py batch --data data      # `make bench-batch`, eight minutes
-    python experiments/benchmarks/benchmark.py batch --device gpu
+    python experiments/benchmark.py videos --data data     # `make bench-videos`, three minutes
+    python experiments/benchmark.py live --data data       # `make bench-live`, a minute
+    python experiments/benchmark.py batch --data data      # `make bench-batch`, eight minutes
+    python experiments/benchmark.py batch --device gpu
 
-`videos` tracks with no stored silhouettes, after a run that compiled and stored the programs. `live` replays eight
-videos of 1920 x 1080 pixels at their own rate and measures how long the rows come after the last frame. `batch`
-times 64 runs of a sequence at once beside one run, without silhouettes and compilation. Recordings are simulated unless
-they exist.
+All measure on ten seconds of eight cameras of 1920 x 1080 pixels and four drones, which are simulated if missing,
+or on a recording of your own (--sequence). `videos` tracks with no stored silhouettes, after a run that compiled and
+stored the programs. `live` replays the videos at their own rate and measures how long the rows come after the last
+frame. `batch` times 64 runs at once beside one run, without silhouettes and compilation.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -24,28 +23,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import _results
 import cv2
 import numpy as np
 import pandas as pd
+from _sequences import simulated
 
 from psotrack.recordings import VideoInfo
 from psotrack.recordings.datasets import open_recording
-from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
-from psotrack.support import progress_bar
-
-sys.path.append(str(Path(__file__).resolve().parents[1]))
-import _results
-from _sequences import simulated
-
-FPS = 25
-#: Scenario, seconds of video that are tracked, and the real-time factor that is to be reached.
-CASES = {
-    "4 drones, 10 s": ("S02_D4_A", 10, 1.0),
-    "4 drones, 60 s": ("S02_D4_A", 60, 1.3),
-    "10 drones, 60 s": ("S03_D10_A", 60, 1.0),
-}
-#: Seconds of video that are simulated, and smallest distance of two drones: on longer flights they come nearer.
-_SIMULATED_S, _MIN_DISTANCE_M = 60, 0.3
 
 
 def main() -> None:
@@ -55,16 +40,17 @@ def main() -> None:
     )
     parser.add_argument("what", choices=MEASURES)
     parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the recordings")
-    parser.add_argument("--sequence", type=Path, help="videos: a recording of your own instead of the cases")
+    parser.add_argument("--sequence", type=Path, help="a recording of your own")
     parser.add_argument("--runs", type=int, default=64, help="batch: runs at once")
-    parser.add_argument("--frames", type=int, help="number of first frames [default: all of a case]")
+    parser.add_argument("--frames", type=int, help="number of first frames [default: all]")
     parser.add_argument("--repeats", type=int, default=2, help="timed repeats; medians are printed")
     parser.add_argument("--device", choices=["cpu", "gpu"], help="batch: where it computes")
     parser.add_argument("--results", type=Path, help="write the result and its record into this folder")
     options = parser.parse_args()
     name, measure = MEASURES[options.what]
     run = _results.Run(name)
-    rows, figures = measure(options)
+    folder = options.sequence or simulated("S02_D4_A", options.data, 0)
+    rows, figures = measure(folder, options)
     print(
         pd.DataFrame(rows).to_string(index=False, float_format="%.3g")
         if rows
@@ -74,52 +60,42 @@ def main() -> None:
         run.save(options.results, rows=pd.DataFrame(rows) if rows else None, figures=figures)
 
 
-def videos(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def videos(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Real-time factors and seconds of all stages, from the videos to the tracks."""
-    if options.sequence is not None:
-        cases = {options.sequence.name: (options.sequence, options.frames, None)}
-    else:
-        cases = {
-            case: (_long(name, options.data), options.frames or seconds * FPS, least)
-            for case, (name, seconds, least) in CASES.items()
+    recording = open_recording(folder).usable(num_frames=options.frames)
+    records = []
+    with tempfile.TemporaryDirectory() as cache:
+        for _ in range(options.repeats + 1):
+            for stored in Path(cache).iterdir():
+                if stored.name != "compiled":
+                    shutil.rmtree(stored)
+            words = ("track", folder, "--frames", recording.num_frames)
+            records.append(_record_of(words, Path(cache)))
+    factors = ("real_time_factor", "real_time_factor_running")
+    # The first one compiles.
+    timed = pd.DataFrame(
+        {
+            **{f"{stage}_s": seconds for stage, seconds in record["seconds"].items()},
+            **{key: record[key] for key in factors},
         }
+        for record in records[1:]
+    ).median()
+    row = {
+        "recording": recording.name,
+        "drones": len(records[-1]["drones"]),
+        "video_s": recording.num_frames / recording.fps,
+        "cameras": len(recording.rig),
+        "codec": _codec(next(iter(recording.videos.values()))),
+        **timed,
+    }
+    return [row], {}
+
+
+def live(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Delay from the last camera's frame to the row."""
     rows = []
-    for case, (folder, num_frames, least) in cases.items():
-        recording = open_recording(folder).usable(num_frames=num_frames)
-        records = []
-        with tempfile.TemporaryDirectory() as cache:
-            for _ in range(options.repeats + 1):
-                for stored in Path(cache).iterdir():
-                    if stored.name != "compiled":
-                        shutil.rmtree(stored)
-                words = ("track", folder, "--frames", recording.num_frames)
-                records.append(_record_of(words, Path(cache)))
-        timed = pd.DataFrame(
-            {
-                **record["seconds"],
-                **{key: record[key] for key in ("real_time_factor", "real_time_factor_running")},
-            }
-            for record in records[1:]  # the first one compiles
-        ).median()
-        rows.append(
-            {
-                "case": case,
-                "least_factor": least,
-                "drones": len(records[-1]["drones"]),
-                "video_s": recording.num_frames / recording.fps,
-                "cameras": len(recording.rig),
-                "codec": _codec(next(iter(recording.videos.values()))),
-                **{key if "factor" in key else f"{key}_s": value for key, value in timed.items()},
-                "load_average": os.getloadavg()[0],
-            }
-        )
-    return rows, {"processors": os.cpu_count()}
-
-
-def live(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Delay from the last camera's frame to the row, eight cameras of 1920 x 1080 pixels, four drones."""
-    folder, rows = _long("S02_D4_A", options.data), []
-    seconds = () if options.frames is None else ("--seconds", f"{options.frames / FPS}")
+    fps = open_recording(folder).fps
+    seconds = () if options.frames is None else ("--seconds", f"{options.frames / fps}")
     with tempfile.TemporaryDirectory() as cache:
         _record_of(("live", folder, "--replay", "--seconds", "2"), Path(cache))  # compiles
         for _ in range(options.repeats):
@@ -140,7 +116,7 @@ def live(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, A
     return rows, {}
 
 
-def batch(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def batch(folder: Path, options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Seconds of some runs at once, and of one run."""
     from psotrack.foreground.silhouettes import compute
     from psotrack.pipeline import track_runs
@@ -149,7 +125,7 @@ def batch(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, 
 
     if options.device:
         use_device(options.device)
-    recording = open_recording(simulated("S02_D4_A", options.data, 0)).usable(num_frames=options.frames)
+    recording = open_recording(folder).usable(num_frames=options.frames)
     silhouettes = compute(recording, TrackSettings().silhouettes, cache=options.data / "silhouettes")
     seconds: dict[int, dict[str, float]] = {}
     for runs in (1, options.runs):
@@ -173,7 +149,7 @@ def batch(options: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, 
     return [], figures
 
 
-MEASURES = {"videos": ("end_to_end", videos), "live": ("live_delay", live), "batch": ("batch", batch)}
+MEASURES = {"videos": ("speed", videos), "live": ("live", live), "batch": ("batch", batch)}
 
 
 def _record_of(words: tuple[object, ...], cache: Path) -> dict[str, Any]:
@@ -183,17 +159,6 @@ def _record_of(words: tuple[object, ...], cache: Path) -> dict[str, Any]:
         command = [sys.executable, "-m", "psotrack", *map(str, words), "--out", str(tracks)]
         subprocess.run([*command, "--cache", str(cache), "--quiet"], check=True)
         return json.loads(tracks.with_suffix(".json").read_text(encoding="utf-8"))
-
-
-def _long(name: str, data: Path) -> Path:
-    """The folder of a simulated recording of a minute, which is made if it is missing."""
-    folder = data / "end_to_end" / "Simulated_Data" / name
-    if not folder.exists():
-        print(f"simulating {folder}", flush=True)
-        changes = {"num_frames": _SIMULATED_S * FPS, "limits.min_distance_m": _MIN_DISTANCE_M}
-        settings = SimulationSettings(masks=False, onboard=False)
-        simulate(change_scenario(scenario(name), changes), folder.parents[1], settings, report=progress_bar)
-    return folder
 
 
 def _codec(video: VideoInfo) -> str:
