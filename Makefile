@@ -20,7 +20,7 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow nightly real fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results clean
+.PHONY: help demo test test-slow nightly real fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results reference-flights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -82,7 +82,7 @@ size:  ## lines of code per room, and their budgets
 bench: bench-videos  ## from videos to tracks, stage by stage: as fast as the cameras?
 
 bench-videos bench-live bench-batch: $(VENV)/.installed  ## from videos to tracks; live; many runs at once: some minutes each
-	@$(BIN)/python experiments/benchmarks/benchmark.py $(@:bench-%=%) $(if $(DATA),--data $(DATA))
+	@$(BIN)/python experiments/benchmark.py $(@:bench-%=%) $(if $(DATA),--data $(DATA))
 
 notebooks: $(VENV)/.installed  ## run the notebooks and write them with their output; commit the changed files
 	@cd notebooks && ../$(BIN)/python _refresh.py
@@ -93,22 +93,24 @@ table5: $(VENV)/.installed  ## the paper's Table 5 beside ours, an hour; DATA=FO
 table4: $(VENV)/.installed  ## the paper's Table 4: projection lines, beside the swarm; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table4/table4.py $(if $(DATA),--data $(DATA))
 
-table5-quick: $(VENV)/.installed  ## a small form of Table 5, five minutes
+table5-quick: $(VENV)/.installed  ## a small form of Table 5: the smallest and the largest swarms, ten minutes
 	@$(BIN)/python experiments/table5/table5.py --quick $(if $(DATA),--data $(DATA))
 
 table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' own cameras and markers; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table7/table7.py $(if $(DATA),--data $(DATA))
 
-docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning or a missing figure
+docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning, and on a figure that is missing or of another version of tracking
 	@$(call install,docs)
 	@$(BIN)/python docs/readme.py --check
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
 
-results: $(VENV)/.installed  ## make the results again, hours; ONLY=table4 for one
-	@$(call install,bench)
+results: $(VENV)/.installed  ## make the headline figures again, less than two hours; ONLY=table4 for one
 	@$(BIN)/python experiments/_results.py make $(ONLY)
 	@$(BIN)/python docs/readme.py
+
+reference-flights: $(VENV)/.installed  ## write the numbers of three small flights anew, after a change of the results that is meant
+	@$(BIN)/python experiments/reference_flights.py --write
 
 clean:  ## remove what was built, the environment too
 	rm -rf $(VENV) build dist demo notebooks/data ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .compiled

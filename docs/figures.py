@@ -1,4 +1,4 @@
-"""Figures that the pages and the README show, taken from the result files of the experiments.
+"""Figures that the pages and the README show, taken from experiments/results.
 
 Pages call these functions in Jinja expressions, for instance `{{ mean("ablation", "mean_error_m") | mm }}`.
 A result, a column or a row that is missing raises `MissingFigureError`, which stops the build.
@@ -38,16 +38,10 @@ class MissingFigureError(Exception):
     """A result file does not hold the figure that a page shows."""
 
 
-def folder(name: str) -> Path:
-    """Folder of the files of a result: as declared, or that of the experiments that exist no more."""
-    declared = _results.registry()
-    return declared[name].record.parent if name in declared else ROOT / "experiments" / "history"
-
-
 @cache
 def record(name: str) -> dict[str, Any]:
-    """The record of a result."""
-    path = folder(name) / f"{name}.json"
+    """The record of a figure."""
+    path = _results.FOLDER / f"{name}.json"
     if not path.exists():
         raise MissingFigureError(f"{path}: expected a record, found none; run `make results ONLY={name}`")
     return json.loads(path.read_text(encoding="utf-8"))
@@ -55,18 +49,18 @@ def record(name: str) -> dict[str, Any]:
 
 @cache
 def all_rows(name: str) -> pd.DataFrame:
-    """All rows of a result, from its first CSV file."""
-    tables = [file for file in record(name)["files"] if file.endswith(".csv")]
-    if not tables:
-        raise MissingFigureError(f"{name}: expected a CSV file in the record, found none")
-    return pd.read_csv(folder(name) / tables[0])
+    """All rows of a figure."""
+    path = _results.FOLDER / f"{name}.csv"
+    if not path.exists():
+        raise MissingFigureError(f"{path}: expected rows, found none; run `make results ONLY={name}`")
+    return pd.read_csv(path)
 
 
 def rows(name: str, /, **where: Any) -> pd.DataFrame:
     """Rows of a result whose columns have the given values.
 
     Args:
-        name: name of the result in experiments/results.toml.
+        name: name of the figure in experiments/results.toml.
         where: values that columns must have; a list allows several values.
     """
     table = all_rows(name)
@@ -124,16 +118,9 @@ def _cell(content: Any) -> str:
     return text if text.startswith("`") else text.replace("|", "\\|")
 
 
-def result_table(name: str) -> str:
-    """All rows of a result as a Markdown table."""
-    return markdown(
-        all_rows(name).map(lambda cell: f"{cell:g}" if isinstance(cell, float) else cell).fillna("")
-    )
-
-
-def part(name: str, file: str, title: str) -> str:
-    """The section below a title of a Markdown file of a result."""
-    path = folder(name) / file
+def part(file: str, title: str) -> str:
+    """The section below a title of a Markdown file beside the records."""
+    path = _results.FOLDER / file
     sections = path.read_text(encoding="utf-8").split("## ")
     found = [section.partition("\n")[2].strip() for section in sections if section.startswith(title)]
     if len(found) != 1:
@@ -177,23 +164,29 @@ def published(name: str) -> str:
 
 
 def provenance(name: str) -> str:
-    """One line that says how a result was made."""
+    """One line that says how a figure was made."""
     facts = record(name)
     machine = facts["machine"]
     where = f"{machine['processors']} processors of {machine['processor']}"
-    text = f"`{facts['command']}`, commit {facts['commit'][:7]}, {facts['date'][:10]}, {where}"
+    text = f"`{facts['command']}`, version {facts['tracking']} of tracking, "
+    text += f"commit {facts['commit'][:7]}, {facts['date'][:10]}, {where}"
     if facts["dirty"]:
         text += f", with local changes in {len(facts['dirty'])} files"
-    return text + (f" ({facts['note']})" if facts.get("note") else "")
+    return text
 
 
 def records() -> str:
-    """A table of all results with their records."""
-    lines = []
-    for name, result in _results.registry().items():
-        made = provenance(name) if result.record.exists() else "not made yet"
-        lines.append({"result": f"`{name}`", "shows": result.says, "made by": made})
+    """A table of all headline figures with their records."""
+    lines = [
+        {"figure": f"`{name}`", "shows": one.says, "minutes": f"{one.minutes:g}", "made by": provenance(name)}
+        for name, one in _results.registry().items()
+    ]
     return markdown(pd.DataFrame(lines))
+
+
+def outdated() -> list[str]:
+    """One line for each figure that is of another version of tracking."""
+    return _results.outdated()
 
 
 def cli_reference() -> str:
@@ -310,7 +303,7 @@ ENVIRONMENT.globals.update(
     {
         function.__name__: function
         for function in (
-            figure, pivot, result_table, part, accuracy_table, cli_reference, published, provenance, records,
+            figure, pivot, part, accuracy_table, cli_reference, published, provenance, records,
             struct_tables, rows,
         )
     }

@@ -36,7 +36,7 @@ import figures  # noqa: E402
 #: Parts of the package without a public Python interface.
 HIDDEN = {"__init__", "__main__", "cli"}
 #: Pictures that pages show, by folder below the repository's root.
-PICTURES = ("experiments/pictures", "experiments/table5/results")
+PICTURES = ("experiments/pictures",)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:

@@ -1,7 +1,7 @@
-"""Write the README's figures from the result files.
+"""Write the README's figures from the result files, and check that all figures are of today's version of tracking.
 
     python docs/readme.py            # write the text between the comment markers of README.md anew
-    python docs/readme.py --check    # exit code 1 if README.md differs from the result files
+    python docs/readme.py --check    # exit code 1 if README.md differs, or if a figure is of another version
 
 The marker `<!-- figures: NAME -->` begins a part that the function NAME of `figures.py` writes; `<!-- end -->` ends it.
 """
@@ -26,8 +26,12 @@ def main() -> None:
         sys.exit("README.md: expected a part `<!-- figures: NAME -->` ... `<!-- end -->`, found none")
     if "--check" not in sys.argv:
         README.write_text(new, encoding="utf-8")
-    elif new != text:
-        sys.exit("README.md: its figures differ from the result files; run `python docs/readme.py`")
+        return
+    faults = figures.outdated()
+    if new != text:
+        faults.append("README.md: expected the stored figures, found others; run `python docs/readme.py`")
+    if faults:
+        sys.exit("\n".join(faults))
 
 
 if __name__ == "__main__":

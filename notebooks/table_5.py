@@ -14,7 +14,7 @@
 # The paper's Table 5 tracks three sequences with 20, 50 and 100 particles and 20, 50 and 70 iterations, several times
 # each, because a swarm is random. `make table5` does the same with the paper's method (one swarm for all drones, one
 # hard box as score) and with psotrack's defaults, ten runs each. This notebook reads the results in
-# `experiments/table5/results`; it tracks nothing itself.
+# `experiments/history`, of November 2026; it tracks nothing itself.
 
 # %%
 import tomllib
@@ -29,13 +29,13 @@ from psotrack.sweeps import pivot, render_table
 
 # %%
 TABLE_5 = Path("../experiments/table5")
-RESULTS = TABLE_5 / "results"  # or where your own `table5.py --out` wrote
+RESULTS = Path("../experiments/history")
 DPI = 80
 # %matplotlib inline
 plt.rcParams.update({"figure.dpi": DPI, "font.size": 9})
 
 # %%
-rows = pd.read_csv(RESULTS / "results.csv")  # a row per run
+rows = pd.read_csv(RESULTS / "table5.csv")  # a row per run
 published_m = tomllib.loads((TABLE_5 / "published.toml").read_text())  # lowest and highest mean error, metres
 columns = [
     "sequence",

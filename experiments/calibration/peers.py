@@ -8,8 +8,8 @@ from a board at one pose for all cameras of an instant; "others" is the distance
 cameras alone; "length" is the error of the distance between two triangulated corners next to each other.
 
 caliscope and aniposelib run in PYTHON, an interpreter that has them; without --peers they are left out.
-`calibrateMultiview` of OpenCV takes (-1, -1), the pixel of a corner that is not seen, for a pixel; it is run on all
-views ("OpenCV") and on the views with all corners ("OpenCV, whole boards"). "as published" is the calibration that
+`calibrateMultiview` of OpenCV takes (-1, -1), the pixel of a corner that is not seen, for a pixel; it is run on the
+views with all corners ("OpenCV, whole boards"). "as published" is the calibration that
 comes with the recording. Writes OUT/rigs.csv.
 """
 
@@ -104,7 +104,6 @@ def methods(peers, real, published):
     """Name of each method -> function of board and views that gives a rig, or None where it fails."""
     made = {
         "psotrack": lambda board, views: calibrate_rig(board, views).rig,
-        "OpenCV": lambda board, views: opencv(board, views),
         "OpenCV, whole boards": lambda board, views: opencv(board, whole(views)),
     }
     for peer in ("caliscope", "aniposelib") if peers else ():
