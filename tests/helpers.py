@@ -1,7 +1,8 @@
 """Rigs and silhouettes for tests, made without the code under test (`boxes`, `fitness`)."""
 
+import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -128,6 +129,21 @@ def content_of(folder: Path) -> dict[str, bytes | None]:
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in folder.rglob("*")
     }
+
+
+@contextlib.contextmanager
+def files_up_to(num_bytes: int) -> Iterator[None]:
+    """No file gets longer than a number of bytes, which needs no rights, and stands for a full disk.
+
+    Python ignores the signal that else ends the process.
+    """
+    resource = pytest.importorskip("resource", reason="limits on the size of files are a matter of Unix")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def environment_without_jax_settings() -> dict[str, str]:

@@ -1,6 +1,5 @@
 """Outputs of all commands: kept without --force, whole or as they were on a full disk, and paths that are no files."""
 
-import contextlib
 import json
 import os
 import stat
@@ -8,9 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from helpers import assert_refused, content_of
-
-resource = pytest.importorskip("resource", reason="limits on the size of files are a matter of Unix")
+from helpers import assert_refused, content_of, files_up_to
 
 #: What is there before -> words of the command that would replace it.
 OUTPUTS = {
@@ -103,20 +100,6 @@ FOLDERS = {
 }
 #: Smallest limit, bytes. What pytest captures is a file too, and must take a line.
 LEAST = 500
-
-
-@contextlib.contextmanager
-def files_up_to(num_bytes):
-    """No file gets longer than a number of bytes, which needs no rights, and stands for a full disk.
-
-    Python ignores the signal that else ends the process.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def limits(whole):

@@ -1,22 +1,151 @@
-"""`Recording.usable` accepts what belongs together; its errors name the file that does not, and a remedy."""
+"""Recordings: frames of all cameras meet at the instants of one clock, and `usable` accepts what belongs together."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import cameras_of, with_cameras
+from helpers import assert_refused, cameras_of, with_cameras
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
-from psotrack.errors import InputError, SettingsError
 from psotrack.geometry import make_camera, make_rig
-from psotrack.recordings import FrameTimes, Recording, VideoInfo
+from psotrack.recordings import FrameTimes, Recording, VideoInfo, make_timeline
+
+# --- frames at instants
+
+
+# The strategies draw plain numbers: the runtime type checks draw random numbers of their own, which hypothesis forbids.
+regular = st.tuples(
+    st.integers(1, 40),
+    st.sampled_from([12.5, 24.0, 25.0, 29.97, 30.0, 50.0, 100.0]),
+    st.floats(-0.3, 0.5),
+)
+steps = st.lists(st.floats(0.005, 0.2), min_size=1, max_size=30)
+one_camera = regular | steps
+cameras = st.lists(one_camera, min_size=1, max_size=4)
+
+
+def times_of(drawn) -> FrameTimes:
+    """Frame times of a drawn camera: number of frames, rate and start, or steps from time to time."""
+    if isinstance(drawn, tuple):
+        return FrameTimes(*drawn)
+    return FrameTimes.listed(np.cumsum([0.1, *drawn]))
+
+
+@given(cameras, st.sampled_from([None, 10.0, 25.0, 60.0]))
+def test_each_instant_shows_the_nearest_frame_of_each_camera_or_none(drawn, rate_hz):
+    frame_times = {f"camera{number}": times_of(each) for number, each in enumerate(drawn)}
+    # Some frame is near an instant from time 0 on.
+    assume(any(times.time_s[-1] >= 0 for times in frame_times.values()))
+    timeline = make_timeline(frame_times, rate_hz)
+    assert timeline.is_there.any(axis=1)[-1]
+    for camera, times in enumerate(frame_times.values()):
+        apart_s = np.abs(times.time_s - timeline.time_s[:, None])
+        nearest_s = apart_s.min(axis=1)
+        there = timeline.is_there[:, camera]
+        frame, share = timeline.frame[there, camera], timeline.share[:, camera]
+        # Differences below a millionth of an interval count as rounding.
+        used_s = times.time_s[frame]
+        assert np.allclose(timeline.offset_s[there, camera], used_s - timeline.time_s[there], atol=2e-7)
+        assert np.allclose(np.abs(timeline.offset_s[there, camera]), nearest_s[there], atol=2e-7)
+        assert (nearest_s[there] * times.fps <= 0.6 + 1e-6).all()
+        assert (nearest_s[~there] * times.fps >= 0.5).all()
+        assert not timeline.offset_s[~there, camera].any()
+        # The shares of each frame that is shown sum to 1.
+        sums = np.bincount(frame, share[there])
+        assert np.allclose(sums[np.unique(frame)], 1.0)
+        assert not share[~there].any()
+
+
+@given(one_camera, st.integers(1, 4))
+def test_frame_i_of_equal_cameras_is_instant_i(drawn, num_cameras):
+    times = times_of(drawn)
+    if times.time_s[0] < 0:
+        times = times.corrected(-times.time_s[0])
+    timeline = make_timeline({f"{number}": times for number in range(num_cameras)})
+    assert timeline.is_synchronous
+    assert timeline.time_s.tolist() == times.time_s.tolist()
+    assert (timeline.share == 1).all()
+
+
+@given(one_camera, st.floats(-2, 2), st.floats(-0.01, 0.01))
+def test_corrected_times(drawn, offset_s, drift):
+    times = times_of(drawn)
+    corrected = times.corrected(offset_s, drift)
+    assert np.allclose(corrected.time_s, times.time_s * (1 + drift) + offset_s, atol=1e-9)
+
+
+LATE = FrameTimes(5, 10.0, -0.2)
+DROPPED = FrameTimes.listed(np.array([0.0, 0.1, 0.2, 0.4, 0.5]))
+#: Name of the case -> times of two cameras, rate of the instants, frames of both, offsets of the second in seconds.
+TIMELINES = {
+    "before time 0": ((LATE, LATE), None, [[2, 2], [3, 3], [4, 4]], [0, 0, 0]),
+    "a late start": (
+        (FrameTimes(4, 10.0), FrameTimes(4, 10.0, 0.23)),
+        None,
+        [[0, -1], [1, -1], [2, 0], [3, 1], [-1, 2], [-1, 3]],
+        [0, 0, *[0.03] * 4],
+    ),
+    "an early end": ((FrameTimes(3, 25.0), FrameTimes(1, 25.0)), None, [[0, 0], [1, -1], [2, -1]], [0, 0, 0]),
+    "a slower camera": (
+        (FrameTimes(8, 40.0), FrameTimes(2, 10.0)),
+        None,
+        [[0, 0], [1, 0], [2, 0], [3, 1], [4, 1], [5, 1], [6, 1], [7, -1]],
+        [0, -0.025, -0.05, 0.025, 0, -0.025, -0.05, 0],
+    ),
+    "a dropped frame": (
+        (FrameTimes(6, 10.0), DROPPED),
+        None,
+        [[0, 0], [1, 1], [2, 2], [3, -1], [4, 3], [5, 4]],
+        [0] * 6,
+    ),
+    "another rate": ((FrameTimes(5, 10.0), FrameTimes(5, 10.0)), 5.0, [[0, 0], [2, 2], [4, 4]], [0, 0, 0]),
+}
+
+
+@pytest.mark.parametrize(("times", "rate_hz", "frame", "offset_s"), TIMELINES.values(), ids=TIMELINES)
+def test_timelines_by_hand(times, rate_hz, frame, offset_s):
+    timeline = make_timeline(dict(zip("ab", times, strict=True)), rate_hz)
+    rate_hz = rate_hz or max(each.fps for each in times)
+    assert timeline.rate_hz == rate_hz
+    assert timeline.time_s == pytest.approx(np.arange(len(frame)) / rate_hz)
+    assert timeline.frame.tolist() == frame
+    assert timeline.offset_s[:, 1] == pytest.approx(offset_s)
+    assert not timeline.offset_s[:, 0].any()
+    assert not timeline.is_synchronous
+
+
+def times(*time_s):
+    return lambda: FrameTimes.listed(np.array(time_s), where="left_times.csv")
+
+
+INCREASING = "left_times.csv: expected times that increase from frame to frame, found 0.1 s for frame 2 after"
+#: Name of the case -> what is refused, words of the line.
+BAD_TIMES = {
+    "a rate of 0": (lambda: FrameTimes(10, 0.0), "fps: expected a number above 0"),
+    "a negative rate": (lambda: FrameTimes(10, -25.0), "fps: expected a number above 0"),
+    "a rate of NaN": (lambda: FrameTimes(10, np.nan), "fps: expected a number above 0"),
+    "an infinite rate": (lambda: make_timeline({"a": LATE}, np.inf), "rate: expected a number above 0"),
+    "times that go back": (times(0.0, 0.2, 0.1), INCREASING),
+    "a time of NaN": (times(0.0, np.nan, 0.1), "expected finite times, found nan s for frame 1"),
+    "a single time": (times(0.0), "expected times of at least 2 frames, found 1"),
+    "nothing from time 0 on": (
+        lambda: make_timeline({"a": FrameTimes(10, 25.0, -1.0)}),
+        "expected a camera with a frame at time 0 s or later",
+    ),
+}
+
+
+@pytest.mark.parametrize(("bad", "words"), BAD_TIMES.values(), ids=BAD_TIMES)
+def test_wrong_times_are_refused(bad, words, tmp_path):
+    assert_refused(bad, words, unchanged=tmp_path)
+
+
+# --- what belongs together
+
 
 NAMES = ("a", "b", "c", "d", "e")
-
-
-def make_test_camera(size_wh=(1920, 1080)):
-    K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
-    return make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=size_wh)
 
 
 def make_recording(**changes) -> Recording:
@@ -31,75 +160,37 @@ def make_recording(**changes) -> Recording:
             del videos[name]
         else:
             videos[name] = replace(videos[name], **change)
-    rig = make_rig({name: make_test_camera() for name in NAMES})
+    K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+    rig = make_rig(
+        {name: make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=(1920, 1080)) for name in NAMES}
+    )
     return Recording("S01", Path("S01"), cameras_of(rig, video=videos))
 
 
-def test_consistent_videos_are_kept():
-    recording = make_recording().usable()
-    assert recording.rig.names == tuple(recording.videos) == NAMES
-    assert (recording.num_frames, recording.fps) == (250, 25.0)
-
-
-def test_cameras_are_chosen_in_the_order_given():
-    recording = make_recording().usable(["d", "b"])
-    assert recording.rig.names == tuple(recording.videos) == ("d", "b")
-
-
-def test_an_unknown_camera():
-    with pytest.raises(SettingsError, match="cameras: expected some of a, b, c, d, e, found z"):
-        make_recording().usable(["a", "z"])
+def test_cameras_are_chosen_by_their_names():
+    # Rates that differ by rounding are equal.
+    recording = make_recording(c={"fps": 25.00004})
+    usable = recording.usable()
+    assert usable.rig.names == tuple(usable.videos) == NAMES
+    assert usable.num_frames == 250
+    assert usable.fps == pytest.approx(25.0, abs=1e-4)
+    chosen = recording.usable(["d", "b"])
+    assert chosen.rig.names == tuple(chosen.videos) == ("d", "b")
+    assert recording.usable("c").rig.names == ("c",)
 
 
 def test_a_camera_without_video_is_left_out_with_a_warning(caplog):
-    recording = make_recording(b=None, d=None).usable()
-    assert recording.rig.names == tuple(recording.videos) == ("a", "c", "e")
-    lines = [record.getMessage() for record in caplog.records]
-    assert lines == [f"camera {name} is left out: it has no video" for name in "bd"]
-
-
-def test_a_camera_without_video_that_is_asked_for_is_an_error():
-    with pytest.raises(InputError, match=r"^S01: expected a video for each .* a, b, found none for b$"):
-        make_recording(b=None).usable(["a", "b"])
-    assert make_recording(b=None).usable(["a", "c"]).rig.names == ("a", "c")
-
-
-def test_a_camera_with_times_alone_counts_where_no_videos_are_needed():
-    recording = with_cameras(make_recording(b=None, d=None), times={"b": FrameTimes(30, 25.0)})
-    assert recording.usable(videos=False).rig.names == ("a", "b", "c", "e")
-    assert recording.usable(videos=False).num_frames == 250
-    assert recording.usable(["b"], videos=False).num_frames == 30
-
-
-def test_no_videos():
-    recording = make_recording(**dict.fromkeys(NAMES))
-    assert recording.num_frames == 0
-    with pytest.raises(InputError, match="S01: expected at least one video, found none"):
-        _ = recording.fps
-    with pytest.raises(InputError, match=r"found none for a, b, c, d, e$"):
-        recording.usable()
-
-
-@pytest.mark.parametrize("camera", ["a", "c"], ids=["the first", "a later one"])
-@pytest.mark.parametrize(
-    ("size_wh", "remedy"),
-    [
-        ((1280, 720), "multiply the first two rows of K by 2/3"),
-        ((3840, 2160), "multiply the first two rows of K by 2/1"),
-        ((1920, 1200), "is it the video of another camera?"),
-    ],
-)
-def test_a_size_that_differs_from_the_calibration_is_an_error(camera, size_wh, remedy):
-    recording = make_recording(**{camera: {"image_size_wh": size_wh}})
-    with pytest.raises(InputError) as error:
-        recording.usable()
-    start = (
-        f"{camera}.avi: expected 1920 x 1080 pixels as calibrated, found {size_wh[0]} x {size_wh[1]} pixels"
-    )
-    assert str(error.value).startswith(start)
-    assert str(error.value).endswith(remedy)
-    rest = [name for name in NAMES if name != camera]
-    assert recording.usable(rest).rig.names == tuple(rest)
+    recording = make_recording(b=None, d=None)
+    usable = recording.usable()
+    assert usable.rig.names == tuple(usable.videos) == ("a", "c", "e")
+    assert caplog.messages == [f"camera {name} is left out: it has no video" for name in "bd"]
+    assert recording.usable(["a", "c"]).rig.names == ("a", "c")
+    # A camera with times alone counts where no videos are needed.
+    timed = with_cameras(recording, times={"b": FrameTimes(30, 25.0)})
+    assert timed.usable(videos=False).rig.names == ("a", "b", "c", "e")
+    assert timed.usable(videos=False).num_frames == 250
+    assert timed.usable(["b"], videos=False).num_frames == 30
+    assert make_recording(**dict.fromkeys(NAMES)).num_frames == 0
 
 
 def test_cameras_may_differ_in_size_rate_and_length():
@@ -117,16 +208,6 @@ def test_cameras_may_differ_in_size_rate_and_length():
     assert timeline.frame[200].tolist() == [-1, 200, 100, 100, 100]
 
 
-def test_rates_that_differ_by_rounding_are_equal():
-    assert make_recording(c={"fps": 25.00004}).usable().num_frames == 250
-
-
-def test_leading_frames():
-    recording = make_recording(c={"num_frames": 240}).usable(num_frames=240)
-    assert {video.num_frames for video in recording.videos.values()} == {240}
-    assert recording.num_frames == 240
-
-
 def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
     recording = with_cameras(
         make_recording(b={"fps": 50.0}),
@@ -138,19 +219,46 @@ def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
     assert {each.name: each.times.num_frames for each in recording.cameras} == counts
     assert recording.num_frames == 100
     assert "camera d is left out: it has no frame before instant 100" in caplog.text
+    shorter = make_recording(c={"num_frames": 240}).usable(num_frames=240)
+    assert {video.num_frames for video in shorter.videos.values()} == {240}
 
 
-@pytest.mark.parametrize("num_frames", [0, -1, 251])
-def test_more_frames_than_exist_are_refused(num_frames):
-    with pytest.raises(SettingsError, match=f"frames: expected 1 to 250, .* found {num_frames}"):
-        make_recording(c={"num_frames": 240}).usable(num_frames=num_frames)
+def of_size(camera, *size_wh):
+    return make_recording(**{camera: {"image_size_wh": size_wh}})
 
 
-def test_a_single_name_is_one_camera():
-    assert make_recording().usable("c").rig.names == ("c",)
+SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
+SCALED = "if both show the same field of view, multiply the first two rows of K by "
+NO_VIDEOS = make_recording(**dict.fromkeys(NAMES))
+#: Name of the case -> recording, arguments of `usable`, words of the line.
+BAD = {
+    "an unknown camera": (make_recording(), {"cameras": ["a", "z"]}, "some of a, b, c, d, e, found z"),
+    "no name": (make_recording(), {"cameras": []}, "cameras: expected some of a, b, c, d, e, found "),
+    "an empty name": (
+        make_recording(),
+        {"cameras": [" "]},
+        "cameras: expected some of a, b, c, d, e, found ",
+    ),
+    "no video": (make_recording(b=None), {"cameras": ["a", "b"]}, "S01: expected a video for each"),
+    "no video is named": (make_recording(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
+    "no videos": (NO_VIDEOS, {}, "found none for a, b, c, d, e"),
+    "smaller": (of_size("a", 1280, 720), {}, SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
+    "larger": (of_size("c", 3840, 2160), {}, SIZE.format("c", "3840 x 2160", f"{SCALED}2/1")),
+    "another shape": (
+        of_size("c", 1920, 1200),
+        {},
+        SIZE.format("c", "1920 x 1200", "is it the video of another camera?"),
+    ),
+    "no frames": (make_recording(), {"num_frames": 0}, "frames: expected 1 to 250, "),
+    "more frames": (make_recording(), {"num_frames": 251}, "frames: expected 1 to 250, "),
+}
 
 
-@pytest.mark.parametrize("names", [[], [""], [" "]])
-def test_empty_names_are_refused(names):
-    with pytest.raises(SettingsError, match=r"^cameras: expected some of a, b, c, d, e, found "):
-        make_recording().usable(names)
+@pytest.mark.parametrize(("recording", "arguments", "words"), BAD.values(), ids=BAD)
+def test_what_does_not_belong_together_is_refused(recording, arguments, words, tmp_path):
+    assert_refused(lambda: recording.usable(**arguments), words, unchanged=tmp_path)
+
+
+def test_a_recording_of_nothing_has_no_rate(tmp_path):
+    refused = "S01: expected at least one video, found none"
+    assert_refused(lambda: NO_VIDEOS.fps, refused, unchanged=tmp_path)
