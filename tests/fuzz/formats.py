@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import archives_made
 import cv2
 import numpy as np
 import onnx_models
 import pandas as pd
 import rig_texts as rigs
-import test_archives
 import test_dpjait
 import worlds
 from helpers import ring_rig
@@ -514,7 +514,7 @@ def _stored(file: str, command: str, inside: Change | None = None) -> Format:
 
 
 def _archive(folder: Path) -> None:
-    shutil.copy(test_archives.OLD, folder / "a.psotrack")
+    shutil.copy(archives_made.OLD, folder / "a.psotrack")
 
 
 def _unpack(path: Path) -> None:
@@ -534,7 +534,7 @@ def _detected(path: Path) -> object:
 def _unpacked(file: str) -> Format:
     """Silhouettes of a camera in an archive that was unpacked."""
     return Format(
-        lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
+        lambda folder: archives.unpack(archives_made.OLD, folder / "flight"),
         f"flight/silhouettes/cam1/{file}",
         (_frames_of_silhouettes,),
         "archive {folder}/flight/tracks.csv {folder}/flight --out {out}/a.psotrack",
@@ -592,7 +592,7 @@ _OTHERS = {
         "simulate fly --out {out}/flight.csv --device {file}",
     ),
     "archive-manifest": Format(
-        lambda folder: archives.unpack(test_archives.OLD, folder / "flight"),
+        lambda folder: archives.unpack(archives_made.OLD, folder / "flight"),
         f"flight/{archives.MANIFEST_FILE}",
         (lambda path: archives.read_manifest(path.parent),),
         "init --show {folder}/flight",

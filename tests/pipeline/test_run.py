@@ -16,44 +16,44 @@ from psotrack.show.flights import find_recording
 Run = Callable[..., Output]
 
 
-def write_video(path: Path) -> None:
-    with VideoWriter(path, 25.0, (64, 48)) as video:
-        for _ in range(3):
-            video.write(np.zeros((48, 64, 3), np.uint8))
-
-
 def commands_in(output: Output) -> list[str]:
     """The commands that a run says that it runs."""
     return [line.split()[2] for line in output.out.splitlines() if line.startswith("$ psotrack ")]
 
 
-def test_a_rig_without_a_board_is_said_also_the_second_time(run_psotrack: Run, tmp_path: Path) -> None:
-    """The first run drafts a recording without places; the second one does not take it for calibrated."""
-    assert "expected a video of each camera" in run_psotrack("run", tmp_path).err
+@pytest.fixture
+def two_videos(tmp_path: Path) -> Path:
+    """A folder with two small videos, which show nothing."""
     for name in ("left.avi", "right.avi"):
-        write_video(tmp_path / name)
+        with VideoWriter(tmp_path / name, 25.0, (64, 48)) as video:
+            for _ in range(3):
+                video.write(np.zeros((48, 64, 3), np.uint8))
+    return tmp_path
+
+
+def test_a_rig_without_a_board_is_said_also_the_second_time(run_psotrack: Run, two_videos: Path) -> None:
+    """The first run drafts a recording without places; the second one does not take it for calibrated."""
     for _ in range(2):
-        stopped = run_psotrack("run", tmp_path)
+        stopped = run_psotrack("run", two_videos)
         assert (stopped.code, stopped.err.count("\n")) == (2, 1)
-        assert (
-            f"expected videos of a board in {tmp_path / 'board'}, or a rig file, found neither" in stopped.err
-        )
-    (tmp_path / "board").mkdir()
-    assert "--square: expected the side of a square" in run_psotrack("run", tmp_path).err
+        expected = f"expected videos of a board in {two_videos / 'board'}, or a rig file, found neither"
+        assert expected in stopped.err
+    (two_videos / "board").mkdir()
+    assert "--square: expected the side of a square" in run_psotrack("run", two_videos).err
+    assert "expected a video of each camera" in run_psotrack("run", two_videos / "board").err
 
 
 def test_ctrl_c_in_a_step_ends_the_run(
-    run_psotrack: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run_psotrack: Run, two_videos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As in every command: the program answers, in one line, and no step follows."""
 
     def press(*_: object) -> None:
         raise KeyboardInterrupt
 
-    write_video(tmp_path / "left.avi")
     monkeypatch.setattr("psotrack.api.draft_recording", press)
     with pytest.raises(KeyboardInterrupt):
-        run_psotrack("run", tmp_path)
+        run_psotrack("run", two_videos)
 
 
 @pytest.mark.slow
