@@ -9,47 +9,42 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import socket
-import stat
 import subprocess
 import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers import listening_at
+from helpers import assert_refused, listening_at
 from network_cameras import (
     CAMERAS,
     EFFORT,
     NUM_FRAMES,
-    Cameras,
+    NetworkCamera,
     film,
-    film_on_the_network,
     free_port,
+    jpeg_part,
     laboratory_of,
     live_sequence,
-    psotrack,
-    python,
-    wait_for_server,
+    wait_until,
 )
 
 from psotrack.errors import InputError
 from psotrack.live import CameraStream, LiveSession, ReplayedVideo, UdpLines, live_cameras
-from psotrack.recordings import read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.settings import TrackSettings
 from psotrack.trajectories import Trajectories, read_trajectories
 
-pytestmark = pytest.mark.slow
-
-SIZE_WH = (64, 48)
+AGAIN = "it is tried again every second"
 
 
 @pytest.fixture(scope="module")
@@ -63,137 +58,137 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def cameras() -> Iterator[Cameras]:
-    with film_on_the_network() as processes:
-        yield processes
+def cameras() -> Iterator[list[NetworkCamera]]:
+    """Cameras that are stopped after the test."""
+    made: list[NetworkCamera] = []
+    yield made
+    for camera in made:
+        if not camera.has_ended:
+            camera.stop()
 
 
 @pytest.fixture
-def small_video(tmp_path: Path) -> Path:
-    """A video whose images are smaller than those of the rig."""
-    path = tmp_path / "small.avi"
-    writer = cv2.VideoWriter(f"{path}", cv2.VideoWriter.fourcc(*"XVID"), 10, SIZE_WH)
-    for level in range(30):
-        writer.write(np.full((*SIZE_WH[::-1], 3), level, np.uint8))
-    writer.release()
-    return path
+def meanwhile() -> Iterator[Callable[[Callable[[], object]], None]]:
+    """Does something in a thread while the test runs, and raises its error at the end of the test."""
+    errors: list[BaseException] = []
+    threads: list[threading.Thread] = []
+
+    def start(work: Callable[[], object]) -> None:
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+                # The session in the main thread would wait for ever.
+                os.kill(os.getpid(), signal.SIGINT)
+
+        threads.append(threading.Thread(target=run, daemon=True))
+        threads[-1].start()
+
+    yield start
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
 
 
-def test_a_replay_without_losses_gives_the_tracks_of_the_offline_twin(
-    sequence: Path, cache: Path, tmp_path: Path
+@pytest.mark.slow
+def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
+    sequence: Path, cache: Path, tmp_path: Path, run_psotrack, meanwhile
 ) -> None:
-    # Two of the cameras have rolling shutters: a frame has the time of its middle row, 3.8 ms after its first row.
-    videos = {name: f"{sequence / name}i_s.avi" for name in CAMERAS}
-    recording = laboratory_of(tmp_path, sequence, videos)
-    text = recording.read_text().replace("fps = 10", "line_time_s = 2e-5", 2).replace("fps = 10\n", "")
-    recording.write_text(text)
-    common = ["--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
-    offline = psotrack("track", recording, "--causal", "--out", tmp_path / "offline.csv", *common)
-    assert offline.returncode == 0, offline.stderr
-    # Slow enough for a machine that is busy with other tests.
-    live = psotrack("live", recording, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv", *common)
-    assert live.returncode == 0, live.stderr
-    record = json.loads((tmp_path / "live.json").read_text())
-    assert record["frames"] == NUM_FRAMES
-    assert record["frames_left_out"] == 0
-    assert record["late_searches"] is None
-    assert not any(camera["left_out"] for camera in record["camera_frames"].values())
-    assert (tmp_path / "live.csv").read_bytes() == (tmp_path / "offline.csv").read_bytes()
-    twin = json.loads((tmp_path / "offline.json").read_text())
-    for key in (
-        "sequence",
-        "causal",
-        "cameras",
-        "rate_hz",
-        "settings",
-        "seed",
-        "volume",
-        "drones",
-        "versions",
-    ):
-        assert record[key] == twin[key], key
-    # 3.6 seconds of video at a fifth of their rate: at least 17.8 s, when the last frame comes.
-    assert 0 < record["real_time_factor"] < record["real_time_factor_running"] <= 0.203
-    tracks = read_trajectories(tmp_path / "live.csv")
-    assert tracks.num_drones >= 3
-    # No row depends on a later frame: a shorter recording gives the beginning of the same table.
-    short = psotrack("track", recording, "--causal", "--frames", 70, "--out", tmp_path / "short.csv", *common)
-    assert short.returncode == 0, short.stderr
-    assert (tmp_path / "live.csv").read_text().startswith((tmp_path / "short.csv").read_text())
-
-
-def _take_datagrams(receiver: socket.socket, taken: list[str]) -> None:
-    """Take datagrams, until one says that it is the end."""
-    while (text := receiver.recv(65536).decode()) != "end":
-        taken.append(text)
-
-
-def test_rows_come_as_lines_by_udp_and_by_websocket(sequence: Path, cache: Path, tmp_path: Path) -> None:
     client = pytest.importorskip("websockets.sync.client", reason="needs the extra `live`")
-    port, sent, lines = free_port(), list[str](), tmp_path / "lines.txt"
-    # A pipe that nobody reads takes 64 KiB, and then stops the program.
-    with lines.open("w") as out, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        # Taken as they come: the system keeps only some hundred of them.
-        taking = threading.Thread(target=_take_datagrams, args=(receiver, sent), daemon=True)
-        taking.start()
-        live = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "psotrack", "live", f"{sequence}", "--replay", "--speed", "0.2"),
-                *("--websocket", f"{port}", "--udp", f"127.0.0.1:{receiver.getsockname()[1]}", "--lines"),
-                *("--json", f"{tmp_path / 'live.json'}"),
-                *("--cameras", ",".join(CAMERAS), "--cache", f"{cache}", *EFFORT),
-            ],
-            stdout=out,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        wait_for_server(port, live)
-        assert listening_at(live.pid) == {"127.0.0.1"}
-        # The server listens before anything is compiled, so a client that comes then gets all rows.
+    # Two of the cameras have rolling shutters: a frame has the time of its middle row, 2.7 ms after its first row.
+    videos = {name: f"{sequence / name}i_s.avi" for name in CAMERAS}
+    recording = laboratory_of(tmp_path, sequence, videos, fps="")
+    recording.write_text(recording.read_text().replace("_s.avi", '_s.avi"\nline_time_s = 2e-5 #', 2))
+    common = ["--cache", cache, *EFFORT]
+    port, sent, received = free_port(), list[str](), list[str]()
+
+    def answers() -> bool:
+        with socket.socket() as one:
+            return one.connect_ex(("127.0.0.1", port)) == 0
+
+    def listen() -> None:
+        wait_until(answers, f"nobody answers at port {port}")
+        assert listening_at(os.getpid()) == {"127.0.0.1"}
         with client.connect(f"ws://127.0.0.1:{port}") as connection:
-            received = list(connection)
-        _, err = live.communicate(timeout=60)
+            received.extend(connection)
+
+    def take_datagrams() -> None:
+        # Taken as they come: the system keeps only some hundred of them.
+        while (text := receiver.recv(65536).decode()) != "end":
+            sent.append(text)
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        meanwhile(listen)
+        meanwhile(take_datagrams)
+        # Slow enough for a machine that is busy with other tests.
+        live = run_psotrack(
+            *("live", recording, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv", "--lines"),
+            *("--udp", f"127.0.0.1:{receiver.getsockname()[1]}", "--websocket", port),
+            *("--record", tmp_path / "kept", *common),
+        )
         receiver.sendto(b"end", receiver.getsockname())
-        taking.join()
-    assert live.returncode == 0, err
-    assert f"rows are sent to clients of ws://127.0.0.1:{port}\n" in err
-    assert json.loads((tmp_path / "live.json").read_text())["websocket"] == {"clients": 1}
-    assert received == sent == lines.read_text().splitlines()
-    rows = [json.loads(line) for line in received]
-    assert set(rows[0]) == {
-        *("frame", "time_s", "drone", "position_m", "velocity_m_s", "covariance_m2", "status")
-    }
+        assert live.code == 0, live.err
+        wait_until(lambda: len(sent) == live.out.count("\n"), "the last datagrams do not come")
+    assert f"rows are sent to clients of ws://127.0.0.1:{port}\n" in live.err
+    assert sent == live.out.splitlines()
+    # The client may come after the first rows.
+    assert received == sent[-len(received) :]
+    rows = [json.loads(line) for line in sent]
+    columns = ("frame", "time_s", "drone", "position_m", "velocity_m_s", "covariance_m2", "status")
+    assert set(rows[0]) == set(columns)
     assert np.shape(rows[0]["covariance_m2"]) == (3, 3)
     assert [row["frame"] for row in rows] == sorted(row["frame"] for row in rows)
     assert rows[-1]["status"] == "tracked"
 
+    record = json.loads((tmp_path / "live.json").read_text())
+    assert record["websocket"] == {"clients": 1}
+    assert (record["frames"], record["frames_left_out"], record["late_searches"]) == (NUM_FRAMES, 0, None)
+    assert not any(camera["left_out"] for camera in record["camera_frames"].values())
+    # 2.4 seconds of video at a fifth of their rate: at least 11.8 s, when the last frame comes.
+    assert 0 < record["real_time_factor"] < record["real_time_factor_running"] <= 0.204
+    for frames in ((), ("--frames", 45)):
+        offline = run_psotrack(
+            "track", recording, "--causal", "--out", tmp_path / "off.csv", *frames, *common
+        )
+        assert offline.code == 0, offline.err
+        # No row depends on a later frame: a shorter recording gives the beginning of the same table.
+        assert (tmp_path / "live.csv").read_text().startswith((tmp_path / "off.csv").read_text())
+        if not frames:
+            assert (tmp_path / "live.csv").read_bytes() == (tmp_path / "off.csv").read_bytes()
+            twin = json.loads((tmp_path / "off.json").read_text())
+            same = (
+                "sequence",
+                "causal",
+                "cameras",
+                "rate_hz",
+                "settings",
+                "seed",
+                "volume",
+                "drones",
+                "versions",
+            )
+            assert {key: record[key] for key in same} == {key: twin[key] for key in same}
+        for name in ("off.csv", "off.json"):
+            (tmp_path / name).unlink()
+    tracks = read_trajectories(tmp_path / "live.csv")
+    assert tracks.num_drones >= 3
 
-def test_a_session_that_is_recorded_is_tracked_again(sequence: Path, cache: Path, tmp_path: Path) -> None:
-    common = ["--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
-    live = psotrack(
-        "live", sequence, "--replay", "--speed", "0.2", "--out", tmp_path / "live.csv",
-        "--record", tmp_path / "kept", *common,
-    )  # fmt: skip
-    assert live.returncode == 0, live.stderr
-    recorded = json.loads((tmp_path / "live.json").read_text())["recorded"]
-    kept = open_recording(tmp_path / "kept" / "recording.toml")
-    source = open_recording(sequence)
+    kept, source = open_recording(tmp_path / "kept" / "recording.toml"), open_recording(recording)
     for name in CAMERAS:
-        counts = recorded[name]
+        counts = record["recorded"][name]
         assert counts["frames"] + counts["left_out"] == NUM_FRAMES
         assert kept.videos[name].num_frames == counts["frames"]
         # A busy machine leaves frames out; the others have the times at which they were filmed.
         assert counts["frames"] >= 0.8 * NUM_FRAMES
         assert set(kept.by_name[name].times.time_s) <= set(source.by_name[name].times.time_s)
-    again = psotrack("track", tmp_path / "kept", "--out", tmp_path / "again.csv", "--cache", cache, *EFFORT)
-    assert again.returncode == 0, again.stderr
-    distance_m = _distances_m(
-        read_trajectories(tmp_path / "live.csv"), read_trajectories(tmp_path / "again.csv")
-    )
-    # The codec and the background, which `track` learns from the whole video, move positions by 4 mm in the median, and
-    # by 29 mm at most where nothing was left out: far less than the width of a drone, 0.3 m.
-    assert len(distance_m) > 100
+    again = run_psotrack("track", tmp_path / "kept", "--causal", "--out", tmp_path / "again.csv", *common)
+    assert again.code == 0, again.err
+    distance_m = _distances_m(tracks, read_trajectories(tmp_path / "again.csv"))
+    # The codec moves positions by some millimetres: far less than the width of a drone, 0.3 m.
+    assert len(distance_m) > 60
     assert np.median(distance_m) < 0.02
     assert np.mean(distance_m < 0.1) > 0.95
 
@@ -210,70 +205,104 @@ def _distances_m(tracks: Trajectories, others: Trajectories) -> np.ndarray:
     return np.array(found)
 
 
-def test_cameras_on_the_network_stop_and_come_back(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: Cameras
+@pytest.mark.slow
+def test_cameras_stop_come_back_are_missing_or_send_another_size(
+    sequence: Path, cache: Path, tmp_path: Path, cameras: list[NetworkCamera], run_psotrack, meanwhile, caplog
 ) -> None:
-    ports = {name: free_port() for name in CAMERAS}
-    for name, port in ports.items():
-        film(cameras, sequence / f"{name}i_s.avi", port)
-    laboratory = laboratory_of(
-        tmp_path, sequence, {name: f"http://127.0.0.1:{port}/" for name, port in ports.items()}
-    )
-    options = ["--out", f"{tmp_path / 'live.csv'}", "--cache", f"{cache}", "--most-drones", "4", *EFFORT]
-    live = subprocess.Popen(
-        [sys.executable, "-m", "psotrack", "live", f"{laboratory}", *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    table = tmp_path / "live.csv"
+    """One camera breaks off and comes back, a device is not there, and a camera sends another size."""
+    cameras += [film(sequence / "cam1i_s.avi"), film(sequence / "cam2i_s.avi")]
+    cameras.append(NetworkCamera(lambda: iter([jpeg_part(np.zeros((48, 64, 3), np.uint8))] * 9)))
+    wrong = cameras[2].address.replace("http://", "http://me:secret@")
+    videos = dict(zip(CAMERAS, [cameras[0].address, cameras[1].address, 63, wrong], strict=True))
+    laboratory, table = laboratory_of(tmp_path, sequence, videos), tmp_path / "live.csv"
 
     def wait_for_rows(count: int) -> None:
-        before = table.read_text().count("\n") if table.exists() else 0
-        for _ in range(1200):
-            if table.exists() and table.read_text().count("\n") >= before + count:
-                return
-            assert live.poll() is None, live.communicate()
-            time.sleep(0.1)
-        raise AssertionError("no rows come")
+        def rows() -> int:
+            return table.read_text().count("\n") if table.exists() else 0
 
-    wait_for_rows(60)
-    gone = ports["cam3"]
-    cameras[gone].kill()
-    cameras[gone].wait()
-    wait_for_rows(60)
-    film(cameras, sequence / "cam3i_s.avi", gone)
-    wait_for_rows(60)
-    live.send_signal(signal.SIGINT)
-    out, err = live.communicate(timeout=60)
-    assert live.returncode == 0, err
-    assert "4 drones" in out or "3 drones" in out
+        before = rows()
+        wait_until(lambda: rows() >= before + count, "no rows come")
+
+    def stop_and_film() -> None:
+        wait_for_rows(20)
+        gone = cameras[1]
+        gone.stop()
+        wait_until(lambda: any("has broken off" in line for line in caplog.messages), "nobody says it")
+        wait_for_rows(20)
+        cameras.append(film(sequence / "cam2i_s.avi", gone.server_address[1]))
+        wait_until(lambda: "camera cam2 films again" in caplog.messages, "the camera does not come back")
+        wait_for_rows(20)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    meanwhile(stop_and_film)
+    done = run_psotrack(
+        *("live", laboratory, "--out", table, "--record", tmp_path / "kept", "--cache", cache, *EFFORT)
+    )
+    assert done.code == 0, done.err
     record = json.loads((tmp_path / "live.json").read_text())
-    assert record["camera_frames"]["cam3"]["stops"] >= 1
-    assert record["camera_frames"]["cam3"]["frames"] > 0
-    assert "camera cam3: " in err
-    assert "has broken off" in err
+    assert record["camera_frames"]["cam2"]["stops"] >= 1
+    assert record["camera_frames"]["cam2"]["frames"] > 0
+    missing = "camera cam3: expected frames of device 63, found no /dev/video63; is the camera plugged in?"
     # Said once, not once per frame.
-    assert len(err.splitlines()) < 20
-    # Three times 60 lines, of four drones at most.
-    assert read_trajectories(table).num_frames >= 3 * 60 // 4
+    assert caplog.messages.count(f"{missing}; {AGAIN}") == 1
+    size = (
+        "expected images of 480 x 270 pixels, as the rig says, found 64 x 48; let the camera send this size"
+    )
+    hidden = cameras[2].address.replace("http://", "http://me:***@")
+    assert sum(f"camera cam4: {hidden}: {size}" in line for line in caplog.messages) == 1
+    assert not any("secret" in line for line in (*caplog.messages, done.err))
+    assert len(caplog.messages) < 20
+    assert read_trajectories(table).num_frames >= 60 // 4
+    assert open_recording(tmp_path / "kept").rig.names == CAMERAS[:2]
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--replay"], "--out: expected --out FILE, --lines, --udp, --websocket or --view"),
-        (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
-        (["--replay", "--out", "tracks.txt"], "ends in .csv"),
-        (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
-        (["--replay", "--websocket", "nowhere"], "--websocket: expected PORT or HOST:PORT"),
-    ],
-)
-def test_what_cannot_be_done_is_one_line(sequence: Path, cache: Path, options: list[str], words: str) -> None:
-    done = psotrack("live", sequence, "--cache", cache, *options)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert done.stderr.count("\n") == 1
+@pytest.mark.slow
+def test_without_two_cameras_that_film_the_command_ends(
+    sequence: Path, cache: Path, tmp_path: Path, cameras: list[NetworkCamera], run_psotrack, caplog
+) -> None:
+    cameras.append(film(sequence / "cam1i_s.avi"))
+    silent = f"http://127.0.0.1:{free_port()}/"
+    videos = dict(zip(CAMERAS, [cameras[0].address, silent, 63, 63], strict=True))
+    laboratory = laboratory_of(tmp_path, sequence, videos)
+    done = run_psotrack(
+        *("live", laboratory, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept"),
+        *("--cache", cache, *EFFORT),
+    )
+    assert done.code == 2
+    last = "expected at least two cameras that film, found 1 of 4; the lines above say why"
+    assert done.err == f"psotrack: the cameras: {last}\n"
+    assert sorted(line.split(", found")[0] for line in caplog.messages if "expected" in line) == [
+        f"camera cam2: expected frames of {silent}",
+        "camera cam3: expected frames of device 63",
+        "camera cam4: expected frames of device 63",
+    ]
+    # Nothing is in the way of the next attempt, but what cam1 has filmed is kept.
+    assert not list(tmp_path.glob("live*"))
+
+
+#: Name of the case -> options, and words of the line.
+BAD = {
+    "no output": (["--replay"], "--out: expected --out FILE, --lines, --udp, --websocket or --view"),
+    "files": (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
+    "another kind of file": (["--replay", "--out", "tracks.txt"], "ends in .csv"),
+    "no address": (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
+    "no port": (["--replay", "--websocket", "nowhere"], "--websocket: expected PORT or HOST:PORT"),
+    "no such camera": (
+        ["--lines", "--replay", "--cameras", "cam1,cam9"],
+        "cameras: expected some of cam1, cam2, cam3, cam4, found cam9",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_done_is_one_line(
+    name: str, sequence: Path, cache: Path, tmp_path: Path, monkeypatch, run_psotrack
+) -> None:
+    options, words = BAD[name]
+    monkeypatch.chdir(tmp_path)
+    assert_refused(
+        lambda: run_psotrack("live", sequence, "--cache", cache, *options), words, unchanged=tmp_path
+    )
 
 
 # --- What goes wrong
@@ -281,195 +310,86 @@ def test_what_cannot_be_done_is_one_line(sequence: Path, cache: Path, options: l
 
 def first_line(address: str) -> str:
     """What a source says first."""
-    with_frames = CameraStream(address, SIZE_WH).frames(time.monotonic, lambda: False)
+    with_frames = CameraStream(address, (64, 48)).frames(time.monotonic, lambda: False)
     line = next(with_frames)
     with_frames.close()
     assert isinstance(line, str)
     return line
 
 
-def test_each_reason_why_a_stream_is_silent_is_said(small_video: Path, cameras: Cameras) -> None:
-    again = "it is tried again every second"
+@pytest.mark.slow
+def test_each_reason_why_a_stream_is_silent_is_said(cameras: list[NetworkCamera]) -> None:
     silent = free_port()
-    address = f"http://me:secret@127.0.0.1:{silent}/1"
-    assert first_line(address) == (
+    assert first_line(f"http://me:secret@127.0.0.1:{silent}/1") == (
         f"expected frames of http://me:***@127.0.0.1:{silent}/1, "
-        f"found that it does not answer: connection refused; {again}"
+        f"found that it does not answer: connection refused; {AGAIN}"
     )
     # A host that accepts, and says nothing.
     with socket.create_server(("127.0.0.1", 0)) as dumb:
         address = f"rtsp://127.0.0.1:{dumb.getsockname()[1]}/1"
-        expected = f"expected frames of {address}, found that it does not answer within 5 s; {again}"
+        expected = f"expected frames of {address}, found that it does not answer within 5 s; {AGAIN}"
         assert first_line(address) == expected
-    port = free_port()
-    film(cameras, small_video, port)
-    address = f"http://127.0.0.1:{port}/nothing"
+    cameras.append(NetworkCamera(lambda: []))
+    address = f"{cameras[0].address}nothing"
     expected = f"expected frames of {address}, found no video there; are path, user name and password right?"
-    assert first_line(address) == f"{expected}; {again}"
+    assert first_line(address) == f"{expected}; {AGAIN}"
 
 
-def test_each_reason_why_a_device_is_silent_is_said(tmp_path: Path) -> None:
-    again = "it is tried again every second"
+def test_each_reason_why_a_device_is_silent_is_said(tmp_path: Path, monkeypatch) -> None:
     expected = "expected frames of device 63, found no /dev/video63; is the camera plugged in?"
-    assert first_line("device 63") == f"{expected}; {again}"
+    assert first_line("device 63") == f"{expected}; {AGAIN}"
     file = tmp_path / "video0"
     file.touch()
     expected = f"expected frames of device {file}, found no such camera, or another program that uses it"
-    assert first_line(f"device {file}") == f"{expected}; {again}"
-
-
-def test_a_device_without_permission(tmp_path: Path) -> None:
-    file = tmp_path / "video0"
-    file.touch(mode=0)
-    # The worker's folder, the run's and the user's, which pytest opens to this user alone.
-    for folder in (tmp_path, *tmp_path.parents[:3]):
-        if not folder.stat().st_mode & stat.S_IXOTH:
-            folder.chmod(folder.stat().st_mode | stat.S_IXOTH)
-    # Root may open every file: a process of root becomes another user, when everything is imported.
-    script = """
-        import os, sys, time
-        from psotrack.live import CameraStream
-        frames = CameraStream(sys.argv[1], (64, 48)).frames(time.monotonic, lambda: False)
-        if os.getuid() == 0:
-            os.setgroups([])
-            os.setgid(65534)
-            os.setuid(65534)
-        print(next(frames))
-    """
-    command = [sys.executable, "-B", "-c", textwrap.dedent(script), f"device {file}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == (
-        f"expected frames of device {file}, found no permission for {file}; is this user in the group that owns it, "
-        "mostly `video`?; it is tried again every second"
-    ), done.stderr
-
-
-@pytest.mark.skipif(
-    cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER), reason="this OpenCV has GStreamer, as few builds have"
-)
-def test_a_pipeline_without_gstreamer() -> None:
-    with pytest.raises(InputError, match="expected a build of OpenCV with GStreamer, found OpenCV without"):
-        first_line("gstreamer://videotestsrc ! appsink")
-
-
-def test_the_other_cameras_go_on(
-    sequence: Path, cache: Path, tmp_path: Path, small_video: Path, cameras: Cameras
-) -> None:
-    """A device that is not there, and a camera that sends another size, beside two that film."""
-    ports = [free_port() for _ in range(3)]
-    for port, video in zip(ports, ("cam1i_s.avi", "cam3i_s.avi", small_video), strict=True):
-        film(cameras, sequence / video, port)
-    videos = [f"http://127.0.0.1:{ports[0]}/", f"http://127.0.0.1:{ports[1]}/", 63]
-    laboratory = laboratory_of(
-        tmp_path,
-        sequence,
-        dict(zip(CAMERAS, [*videos, f"http://me:secret@127.0.0.1:{ports[2]}/"], strict=True)),
+    assert first_line(f"device {file}") == f"{expected}; {AGAIN}"
+    if not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
+        with pytest.raises(
+            InputError, match="expected a build of OpenCV with GStreamer, found OpenCV without"
+        ):
+            first_line("gstreamer://videotestsrc ! appsink")
+    # Root may open every file.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    expected = (
+        f"expected frames of device {file}, found no permission for {file}; is this user in the group that"
     )
-    options = ["--cache", cache, "--seconds", "5", "--record", tmp_path / "kept", *EFFORT]
-    done = psotrack("live", laboratory, "--out", tmp_path / "live.csv", *options)
-    assert done.returncode == 0, done.stderr
-    lines = done.stderr.splitlines()
-    missing = "camera cam5: expected frames of device 63, found no /dev/video63; is the camera plugged in?"
-    assert lines.count(f"psotrack: warning: {missing}; it is tried again every second") == 1
-    size = (
-        "expected images of 672 x 378 pixels, as the rig says, found 64 x 48; let the camera send this size"
+    assert first_line(f"device {file}") == f"{expected} owns it, mostly `video`?; {AGAIN}"
+
+
+@pytest.fixture
+def replay(sequence: Path, cache: Path, run_psotrack):
+    """Runs `live` on replayed videos, with some options."""
+    return lambda *options: run_psotrack(
+        "live", sequence, "--replay", "--speed", "0.3", "--cache", cache, *EFFORT, *options
     )
-    assert sum(f"camera cam7: http://me:***@127.0.0.1:{ports[2]}/: {size}" in line for line in lines) == 1
-    assert "secret" not in done.stderr
-    assert "Traceback" not in done.stderr
-    record = json.loads((tmp_path / "live.json").read_text())
-    assert record["frames"] > 10
-    assert open_recording(tmp_path / "kept").rig.names == CAMERAS[:2]
-    unknown = psotrack("live", laboratory, "--lines", "--cameras", "cam1,cam9", "--cache", cache)
-    assert unknown.returncode == 2
-    assert unknown.stderr.startswith("psotrack: cameras: expected some of cam1, cam3, cam5, cam7, found cam9")
 
 
-def test_without_two_cameras_that_film_the_command_ends(
-    sequence: Path, cache: Path, tmp_path: Path, cameras: Cameras
-) -> None:
-    port, silent = free_port(), free_port()
-    film(cameras, sequence / "cam1i_s.avi", port)
-    address = f"http://127.0.0.1:{silent}/"
-    videos = {"cam1": f"http://127.0.0.1:{port}/", "cam3": address, "cam5": 63}
-    laboratory = laboratory_of(tmp_path, sequence, videos)
-    done = psotrack(
-        "live", laboratory, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept", "--cache", cache, *EFFORT
-    )  # fmt: skip
-    assert done.returncode == 2
-    *lines, last = done.stderr.splitlines()
-    assert last == (
-        "psotrack: the cameras: expected at least two cameras that film, found 1 of 3; the lines above say why"
-    )
-    assert sorted(line.split(", found")[0] for line in lines if "expected" in line) == [
-        f"psotrack: warning: camera cam3: expected frames of {address}",
-        "psotrack: warning: camera cam5: expected frames of device 63",
-    ]
-    # Nothing is in the way of the next attempt, but what cam1 has filmed is kept.
-    assert not list(tmp_path.glob("live*"))
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_other_outputs_go_on_where_a_disk_is_full(replay, tmp_path: Path, caplog) -> None:
+    table = tmp_path / "live.csv"
+    table.symlink_to("/dev/full")
+    done = replay("--out", table, "--force", "--lines")
+    assert done.code == 2
+    line = f"{table}: expected to write rows, found no space left on device"
+    assert f"{line}; tracking goes on with the other outputs" in caplog.messages
+    assert done.err == f"psotrack: {line}\n"
+    rows = [json.loads(line) for line in done.out.splitlines()]
+    # To the end of the video: a busy machine leaves out a few of its frames.
+    assert max(row["frame"] for row in rows) >= NUM_FRAMES - 10
 
 
-class TestFullDisk:
-    """A full disk: no space, as /dev/full has none, or a limit on the size of files."""
-
-    @pytest.fixture
-    def command(self, sequence: Path, cache: Path) -> list[object]:
-        return ["live", sequence, "--replay", "--cameras", ",".join(CAMERAS), "--cache", cache, *EFFORT]
-
-    @pytest.fixture
-    def full_table(self, tmp_path: Path) -> Path:
-        if not os.path.exists("/dev/full"):
-            pytest.skip("needs /dev/full")
-        (tmp_path / "live.csv").symlink_to("/dev/full")
-        return tmp_path / "live.csv"
-
-    def test_other_outputs_go_on(self, command: list[object], full_table: Path) -> None:
-        done = psotrack(*command, "--out", full_table, "--force", "--lines", "--speed", "0.3")
-        assert done.returncode == 2
-        line = f"{full_table}: expected to write rows, found no space left on device"
-        assert f"psotrack: warning: {line}; tracking goes on with the other outputs" in done.stderr
-        assert done.stderr.splitlines()[-1] == f"psotrack: {line}"
-        rows = [json.loads(line) for line in done.stdout.splitlines()]
-        # To the end of the video: a busy machine leaves out a few of its frames.
-        assert max(row["frame"] for row in rows) >= NUM_FRAMES - 10
-
-    def test_lines_to_a_full_disk(self, command: list[object], full_table: Path) -> None:
-        with full_table.open("w") as full:
-            done = psotrack(*command, "--lines", "--speed", "0.3", stdout=full)
-        assert done.returncode == 2
-        assert (
-            done.stderr.splitlines()[-1]
-            == "psotrack: --lines: expected to write rows, found no space left on device"
-        )
-        assert "Exception ignored" not in done.stderr
-
-    def test_a_recording_that_does_not_fit_keeps_what_fits(
-        self, command: list[object], tmp_path: Path
-    ) -> None:
-        """Tracking goes on to the end, and the record says how many frames are on the disk."""
-        options = [*command, "--speed", "0.3"]
-        assert psotrack(*options, "--seconds", "2", "--lines").returncode == 0  # compiled programs are stored
-        limited = (
-            "import resource; "
-            "resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)); "
-            "from psotrack.cli import main; main()"
-        )
-        done = python(
-            "-c", limited, *options, "--out", tmp_path / "live.csv", "--record", tmp_path / "kept",
-            env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        assert "Traceback" not in done.stderr
-        record = json.loads((tmp_path / "live.json").read_text())
-        assert record["frames"] >= NUM_FRAMES - 10
-        assert read_trajectories(tmp_path / "live.csv").frame.max() >= NUM_FRAMES - 10
-        kept = open_recording(tmp_path / "kept")
-        for name in CAMERAS:
-            counts = record["recorded"][name]
-            assert counts["frames"] + counts["left_out"] == NUM_FRAMES
-            assert 10 < counts["frames"] < NUM_FRAMES - 10
-            assert len(list(read_frames(kept.videos[name]))) == counts["frames"]
-            assert f"{name}.avi: expected " in done.stderr
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_lines_to_a_full_disk(replay, monkeypatch) -> None:
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        done = replay("--lines")
+        monkeypatch.undo()
+        with contextlib.suppress(OSError):
+            full.close()
+    assert done.code == 2
+    expected = "psotrack: --lines: expected to write rows, found no space left on device"
+    assert done.err.splitlines()[-1] == expected
 
 
 def test_an_unreachable_network_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
@@ -489,6 +409,7 @@ def test_an_unreachable_network_stops_nothing(caplog: pytest.LogCaptureFixture) 
     assert caplog.messages == [f"--udp 255.255.255.255:9: {found}"]
 
 
+@pytest.mark.slow
 def test_a_video_that_is_gone_when_the_session_begins(
     sequence: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -499,15 +420,14 @@ def test_a_video_that_is_gone_when_the_session_begins(
     video = replace(gone.source.video, path=tmp_path / "gone.avi")
     cameras[0] = replace(gone, source=replace(gone.source, video=video))
     settings = TrackSettings().changed({"swarm.particles": 20, "swarm.iterations": 15})
-    session = LiveSession(recording, cameras, settings, most_drones=4)
+    session = LiveSession(recording, cameras, settings, most_drones=16)
     result = session.run([], longest_s=1.0)
     assert result.instants > 0
     assert result.cameras[gone.name].counts.frames == 0
-    assert [
-        line for line in caplog.messages if line.startswith(f"camera {gone.name}: ") and "gone.avi" in line
-    ]
+    assert any(re.match(f"camera {gone.name}: .*gone.avi", line) for line in caplog.messages)
 
 
+@pytest.mark.slow
 def test_a_signal_that_comes_while_another_one_stops_the_session(sequence: Path) -> None:
     """A signal handler that interrupted itself waited for ever."""
     script = """
@@ -533,5 +453,5 @@ def test_a_signal_that_comes_while_another_one_stops_the_session(sequence: Path)
         print("ended")
     """
     command = [sys.executable, "-c", textwrap.dedent(script), f"{sequence}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=40, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.stdout == "ended\n", done.stderr

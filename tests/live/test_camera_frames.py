@@ -1,0 +1,562 @@
+"""Frames of live cameras: streams bring them with their times, they meet at instants, and what is filmed is kept."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers import assert_refused, cameras_of, ring_rig
+from hypothesis import given
+from hypothesis import strategies as st
+from network_cameras import MJPEG, NetworkCamera, jpeg_part, timed
+
+from psotrack.errors import OutputError
+from psotrack.live import (
+    CameraRecorder,
+    CameraStream,
+    Instant,
+    Meeting,
+    SourceFrame,
+    StreamClock,
+    live_cameras,
+    recording_folder,
+)
+from psotrack.recordings import FrameTimes, Recording, VideoEncoder, make_timeline, probe, read_frames
+from psotrack.recordings.datasets import open_recording
+
+FPS = 25.0
+WAIT_S = 0.1
+#: Size of the images of streams, and of those that are recorded.
+SMALL_WH, SIZE_WH = (64, 48), (320, 240)
+RIG = ring_rig(3, image_size_wh=SIZE_WH)
+
+
+# --- streams
+
+
+def clock_times(stream_s: np.ndarray, arrived_s: np.ndarray) -> tuple[np.ndarray, list[bool | None]]:
+    clock, times_s, is_used = StreamClock(), [], []
+    for of_stream_s, of_arrival_s in zip(stream_s.tolist(), arrived_s.tolist(), strict=True):
+        times_s.append(clock.time_s(of_stream_s, of_arrival_s))
+        is_used.append(clock.is_used)
+    return np.array(times_s), is_used
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4])
+def test_jitter_is_removed_from_the_times_of_a_stream(drift: float) -> None:
+    rng = np.random.default_rng(0)
+    filmed_s = 1000 + np.arange(1000) / FPS
+    arrived_s = np.maximum.accumulate(filmed_s + 0.08 + rng.exponential(0.02, len(filmed_s)))
+    times_s, is_used = clock_times((filmed_s - 1000) * (1 + drift), arrived_s)
+    used = np.array([each is True for each in is_used])
+    assert used[-1]
+    assert used.mean() > 0.85
+    error_s = (times_s - filmed_s - 0.08)[used]
+    # The least lateness of 50 frames is 0.4 ms in the mean; and clocks that are 1e-4 apart move by 0.4 ms in 4 s.
+    assert np.abs(error_s).max() < 0.004
+    assert np.abs((arrived_s - filmed_s - 0.08)[used]).max() > 0.05
+
+
+def test_times_that_are_no_times_of_this_clock_are_not_used() -> None:
+    arrived_s = 1000 + np.arange(500) / FPS
+    number = np.arange(500)
+    for stream_s in (
+        number * 0.0,  # none at all
+        number / 30,  # of another rate, as FFmpeg invents them
+        np.where(number % 3 == 2, number - 2, number) / FPS,  # that go back
+    ):
+        times_s, is_used = clock_times(stream_s, arrived_s)
+        assert is_used[-1] is False
+        np.testing.assert_array_equal(times_s, arrived_s)
+
+
+def test_a_frame_that_the_stream_does_not_count_is_noticed() -> None:
+    """Invented times of the right rate fall behind by an interval with each frame that the camera drops."""
+    number = np.delete(np.arange(750), 400)
+    arrived_s = 1000 + number / FPS
+    times_s, is_used = clock_times(np.arange(749) / FPS, arrived_s)
+    assert {True, False} <= set(is_used)
+    assert is_used[-1] is True
+    # Until the block ends, two seconds at most, and the one before is over.
+    wrong = np.abs(times_s - arrived_s) > 1e-6
+    assert wrong.sum() <= 2 * 2 * FPS
+    assert not wrong[-1]
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[str, list[bytes], np.ndarray], str]]:
+    """Starts a camera that sends parts of a stream at given times; its address."""
+    cameras = []
+
+    def start(kind: str, parts: list[bytes], at_s: np.ndarray) -> str:
+        cameras.append(NetworkCamera(timed(parts, at_s), kind))
+        return cameras[-1].address
+
+    yield start
+    for camera in cameras:
+        camera.stop()
+
+
+def taken(address: str, work_s: float = 0.0) -> tuple[list[SourceFrame], list[float], list[str]]:
+    """The frames of a stream until it breaks off, their ages when they are taken, and what is said."""
+    frames, ages_s, lines = [], [], []
+    source = CameraStream(address, SMALL_WH).frames(lambda: 0.0, lambda: False)
+    for frame in source:
+        if isinstance(frame, SourceFrame):
+            frames.append(frame)
+            ages_s.append(time.monotonic() - frame.arrived_s)
+            time.sleep(work_s)
+        else:
+            lines.append(frame)
+            if "broken off" in frame:
+                break
+    source.close()
+    return frames, ages_s, lines
+
+
+def jpeg_parts(count: int) -> list[bytes]:
+    return [jpeg_part(np.full((*SMALL_WH[::-1], 3), 2 * number, np.uint8)) for number in range(count)]
+
+
+def test_frames_that_come_close_together_are_not_lost(serve: Callable[..., str]) -> None:
+    """A frame that could be read at once was taken for one that had waited, and left out."""
+    # Five frames together, five times per second: four of them are there when they are asked for.
+    frames, _, _ = taken(serve(MJPEG, jpeg_parts(30), np.arange(30) // 5 / 5))
+    # The last image is complete only when the next one begins.
+    assert len(frames) >= 29
+    levels = [frame.image.mean() for frame in frames]
+    assert np.abs(np.diff(levels) - 2).max() < 1.5
+
+
+def test_frames_that_wait_for_a_slow_program_tell_their_age(serve: Callable[..., str]) -> None:
+    """So that the session can leave them out: in the buffers of a stream, they looked as new as the last one."""
+    frames, ages_s, _ = taken(serve(MJPEG, jpeg_parts(30), np.arange(30) / FPS), work_s=0.08)
+    assert len(frames) >= 29
+    # The program takes twice as long as the camera.
+    assert ages_s[-1] > 0.5
+
+
+@pytest.mark.slow
+def test_the_times_of_a_stream_are_used_and_said(
+    serve: Callable[..., str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A Matroska stream has times; its packets come late by up to 30 ms."""
+    path, count = tmp_path / "film.mkv", 200
+    writer = cv2.VideoWriter(f"{path}", cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), FPS, SMALL_WH)
+    assert writer.isOpened()
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        writer.write(rng.integers(0, 255, (*SMALL_WH[::-1], 3), dtype=np.uint8))
+    writer.release()
+    # Each part ends with the end of a JPEG image.
+    first, *others, last = path.read_bytes().split(b"\xff\xd9")
+    parts = [first + b"\xff\xd9", *(each + b"\xff\xd9" for each in others), last]
+    assert len(parts) == count + 1
+    at_s = np.arange(count + 1) / FPS + rng.exponential(0.012, count + 1).clip(max=0.03)
+    address = serve("video/x-matroska", parts, at_s)
+    with caplog.at_level("INFO", "psotrack"):
+        frames, _, lines = taken(address)
+    assert f"{address}: frames are timed by the stream" in caplog.messages
+    assert not [line for line in lines if "when they arrive" in line]
+    # Where a frame that is less late than all before comes, the times go back by the difference.
+    times_s, arrived_s = (
+        np.diff([getattr(frame, name) for frame in frames[-60:]]) for name in ("time_s", "arrived_s")
+    )
+    assert np.median(np.abs(times_s - 1 / FPS)) < 0.0006  # the stream's times are whole milliseconds
+    assert np.median(np.abs(arrived_s - 1 / FPS)) > 0.004
+
+
+@pytest.mark.slow
+def test_a_stream_without_times_of_its_own_says_so_once(serve: Callable[..., str]) -> None:
+    """FFmpeg invents 25 frames per second for images over HTTP."""
+    frames, _, lines = taken(serve(MJPEG, jpeg_parts(60), np.arange(60) / 10))
+    assert len([line for line in lines if "frames are timed when they arrive" in line]) == 1
+    assert all(frame.time_s == frame.arrived_s for frame in frames)
+
+
+# --- instants
+
+
+def _image(number: int) -> np.ndarray:
+    """A silhouette that tells the number of its frame."""
+    return np.array([[number % 256, number // 256]], np.uint8)
+
+
+def _number(image: np.ndarray | None) -> int:
+    return -1 if image is None else int(image[0, 0]) + 256 * int(image[0, 1])
+
+
+def _put(meeting: Meeting, camera: int, number: int, time_s: float, now_s: float) -> bool:
+    is_back = meeting.announce(camera, time_s, now_s)
+    meeting.put(camera, time_s, _image(number), now_s)
+    return is_back
+
+
+def _meeting(count: int = 3, fps: float = 25.0) -> Meeting:
+    meeting = Meeting([fps] * count, fps, wait_s=WAIT_S)
+    meeting.began_s = 0.0
+    return meeting
+
+
+def _all(meeting: Meeting, now_s: float) -> list[Instant]:
+    taken = []
+    while (instant := meeting.take(now_s)) is not None:
+        taken.append(instant)
+    return taken
+
+
+@given(
+    rates=st.lists(st.sampled_from([25.0, 30.0, 50.0, 12.5, 24.0]), min_size=2, max_size=4),
+    offsets=st.lists(st.integers(0, 40), min_size=4, max_size=4),
+    data=st.data(),
+)
+def test_frames_meet_as_on_the_timeline_of_a_recording(
+    rates: list[float], offsets: list[int], data: st.DataObject
+) -> None:
+    """Frames that come in the order of their times, those of equal times in any order, and none lost."""
+    times = {
+        f"c{index}": FrameTimes(round(rate), rate, offsets[index] / 1000) for index, rate in enumerate(rates)
+    }
+    timeline = make_timeline(times)
+    meeting = Meeting(rates, timeline.rate_hz, wait_s=WAIT_S, first_s=float(timeline.time_s[0]))
+    coming = [
+        (time_s, camera, number)
+        for camera, each in enumerate(times.values())
+        for number, time_s in enumerate(each.time_s.tolist())
+    ]
+    coming = sorted(data.draw(st.permutations(coming)), key=lambda frame: frame[0])
+    taken: list[Instant] = []
+    for time_s, camera, number in coming:
+        _put(meeting, camera, number, time_s, time_s)
+        taken += _all(meeting, time_s)
+    for camera in range(len(rates)):
+        meeting.end(camera)
+    taken += _all(meeting, np.inf)
+    shown = {instant.number: instant for instant in taken}
+    for instant in range(timeline.num_instants):
+        if not timeline.is_there[instant].any():
+            assert instant not in shown
+            continue
+        found = shown[instant]
+        assert found.time_s == pytest.approx(timeline.time_s[instant])
+        numbers = [_number(image) for image in found.coverage]
+        # Two frames that are equally near may both be meant: the times differ in their last digits only.
+        for camera, number in enumerate(numbers):
+            expected = timeline.frame[instant, camera]
+            if number != expected:
+                apart = abs(abs(found.offset_s[camera]) - abs(timeline.offset_s[instant, camera]))
+                assert apart < 1e-9
+                assert -1 not in (number, expected)
+    assert all(camera.counts.late == camera.counts.doubled == 0 for camera in meeting.cameras)
+
+
+def test_an_instant_waits_for_a_frame_and_not_for_ever() -> None:
+    meeting = _meeting()
+    _put(meeting, 0, 0, 0.0, 10.0)
+    _put(meeting, 1, 0, 0.001, 10.01)
+    assert meeting.take(10.05) is None
+    instant = meeting.take(10.11)
+    assert instant is not None
+    assert [_number(image) for image in instant.coverage] == [0, 0, -1]
+    np.testing.assert_allclose(instant.offset_s, [0, 0.001, 0])
+    assert instant.arrived_s == 10.01
+    # The third camera's frame comes when its instant is over.
+    _put(meeting, 2, 0, 0.0, 10.2)
+    assert meeting.cameras[2].counts.late == 1
+    assert meeting.cameras[2].counts.missing == 1
+
+
+@pytest.mark.parametrize(
+    ("ends", "shown", "left_out"),
+    [
+        (lambda meeting: meeting.put(1, 0.0, _image(0), 0.0), 0, 0),
+        (lambda meeting: meeting.put(1, 0.0, None, 0.0), -1, 1),
+        # A camera whose frame fails in work ends: its instant waited for ever.
+        (lambda meeting: meeting.end(1), -1, 0),
+    ],
+)
+def test_an_instant_waits_for_a_frame_that_is_in_work(ends, shown: int, left_out: int) -> None:
+    meeting = _meeting(2)
+    _put(meeting, 0, 0, 0.0, 0.0)
+    meeting.announce(1, 0.0, 0.0)
+    assert meeting.has_work
+    assert meeting.take(5.0) is None
+    ends(meeting)
+    assert not meeting.has_work
+    instant = meeting.take(0.0)
+    assert instant is not None
+    assert [_number(image) for image in instant.coverage] == [0, shown]
+    assert meeting.cameras[1].counts.left_out == left_out
+
+
+def test_a_doubled_frame_counts_once_and_the_meeting_ends_when_all_cameras_have() -> None:
+    meeting = _meeting(2)
+    for camera in (0, 1, 1):
+        _put(meeting, camera, 0, 0.0, 0.0)
+    assert len(_all(meeting, 0.0)) == 1
+    assert meeting.cameras[1].counts.doubled == 1
+    assert meeting.take(1.0) is None
+    _put(meeting, 0, 1, 0.04, 2.0)
+    meeting.end(1)
+    assert not meeting.has_ended
+    meeting.end(0)
+    assert len(_all(meeting, 2.0)) == 1
+    assert meeting.has_ended
+
+
+def test_a_camera_that_stops_is_not_waited_for_and_comes_back() -> None:
+    meeting = _meeting()
+    for frame in range(100):
+        at_s = frame / 25
+        for camera in (0, 1, 2):
+            if camera == 2 and 25 <= frame < 75:
+                continue
+            assert _put(meeting, camera, frame, at_s, at_s) == (camera == 2 and frame == 75)
+        stopped = meeting.stopped(at_s)
+        # A second after its last frame, and once.
+        assert stopped == ([2] if frame == 50 else [])
+        wait_s = WAIT_S if 25 <= frame < 50 else 0.0
+        (instant,) = _all(meeting, at_s + wait_s)
+        assert instant.number == frame
+        assert [image is not None for image in instant.coverage] == [True, True, not 25 <= frame < 75]
+    counts = meeting.cameras[2].counts
+    assert (counts.stops, counts.frames, counts.late) == (1, 50, 0)
+    assert all(camera.films for camera in meeting.cameras)
+
+
+def test_a_camera_that_begins_late_has_not_stopped() -> None:
+    meeting = _meeting(2)
+    _put(meeting, 0, 0, 1.1, 1.1)
+    assert meeting.stopped(1.2) == [1]
+    assert [camera.films for camera in meeting.cameras] == [True, False]
+    assert _put(meeting, 1, 1, 2.0, 2.0)
+    assert meeting.cameras[1].films
+    assert meeting.cameras[1].counts.stops == 0
+    assert meeting.stopped(3.5) == [0, 1]
+    assert [camera.counts.stops for camera in meeting.cameras] == [1, 1]
+
+
+@pytest.mark.parametrize("drift", [-3e-3, 3e-3])
+def test_a_clock_that_drifts_drops_or_doubles_a_frame_at_times(drift: float) -> None:
+    meeting = _meeting(2)
+    shown = []
+    coming = sorted(
+        [(frame / 25, 0, frame) for frame in range(400)]
+        + [(frame / 25 * (1 + drift), 1, frame) for frame in range(400)]
+    )
+    for time_s, camera, number in coming:
+        _put(meeting, camera, number, time_s, time_s)
+        shown += _all(meeting, time_s)
+    numbers = np.array([_number(instant.coverage[1]) for instant in shown])
+    assert (numbers >= 0).all()
+    offsets_s = np.array([instant.offset_s[1] for instant in shown])
+    # Never farther than half an interval, and after 400 frames a frame apart.
+    assert np.abs(offsets_s).max() <= 0.5 / 25 * (1 + abs(drift)) + 1e-9
+    apart = numbers - np.arange(len(numbers))
+    assert apart[0] == 0
+    assert apart[-1] == (-1 if drift > 0 else 1)
+    assert meeting.cameras[1].counts.stops == 0
+
+
+# --- what is kept
+
+
+@pytest.fixture
+def laboratory(tmp_path: Path) -> Recording:
+    """Three cameras on the network, with bounds, an image of what is ignored, and a rolling shutter."""
+    ignore = tmp_path / "trees.png"
+    cv2.imwrite(f"{ignore}", np.zeros(SIZE_WH[::-1], np.uint8))
+    return Recording(
+        "laboratory",
+        tmp_path / "laboratory",
+        cameras_of(
+            RIG,
+            stream={name: f"rtsp://camera/{name}" for name in RIG.names},
+            ignore={RIG.names[0]: ignore},
+            line_time_s={RIG.names[1]: 1e-5},
+        ),
+        bounds_m=(-1.0, 1.0, -2.0, 2.0, 0.0, 3.0),
+    )
+
+
+def test_cameras_have_the_short_names_of_other_commands(laboratory: Recording) -> None:
+    cameras = live_cameras(laboratory, ["0", "2"], replay=False)
+    assert [camera.name for camera in cameras] == [RIG.names[0], RIG.names[2]]
+    assert cameras[1].source == CameraStream(f"rtsp://camera/{RIG.names[2]}", SIZE_WH)
+
+
+def noise(index: int, size_wh: tuple[int, int] = SIZE_WH) -> np.ndarray:
+    return np.random.default_rng(index).integers(0, 255, (size_wh[1], size_wh[0], 3), dtype=np.uint8)
+
+
+def keep(recorder: CameraRecorder, num_frames: int, first: int = 0) -> None:
+    """Record grey frames at 25 Hz, as fast as they are encoded."""
+    for index in range(first, first + num_frames):
+        recorder.write(np.full((*SIZE_WH[::-1], 3), 2 * index, np.uint8), index / 25)
+        wait_for_row(recorder.times, index + 1 - first)
+
+
+def wait_for_row(times: Path, count: int) -> None:
+    """Wait until a frame is being encoded: its row is written just before."""
+    for _ in range(1000):
+        if times.exists() and times.read_text().count("\n") > count:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"no row {count} in {times}")
+
+
+def test_what_was_filmed_is_a_recording(laboratory: Recording, tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    with recording_folder(folder, laboratory, RIG.names):
+        recorders = [CameraRecorder(folder, name, 25.0) for name in RIG.names]
+        # A camera that starts later; and one that never films.
+        keep(recorders[0], 30)
+        keep(recorders[1], 20, first=5)
+        assert vars(recorders[0].close()) == {"frames": 30, "left_out": 0}
+        assert vars(recorders[1].close()) == {"frames": 20, "left_out": 0}
+        assert vars(recorders[2].close()) == {"frames": 0, "left_out": 0}
+    found = open_recording(folder / "recording.toml")
+    assert found.rig.names == RIG.names[:2]
+    assert np.allclose(found.rig.cameras.T_cam_world, RIG.cameras.T_cam_world[:2], atol=1e-6)
+    assert found.bounds_m == laboratory.bounds_m
+    assert [each.line_time_s for each in found.cameras] == [0.0, 1e-5]
+    assert [each.ignore is not None for each in found.cameras] == [True, False]
+    for name, first, count in ((RIG.names[0], 0, 30), (RIG.names[1], 5, 20)):
+        # Not rounded: what meets live shall meet again.
+        assert found.by_name[name].times.time_s.tolist() == [(first + i) / 25 for i in range(count)]
+        levels = [frame.mean() for frame in read_frames(found.videos[name])]
+        # The codec changes the level of flat frames by up to 3.7 of 255, as tests/test_video.py says.
+        assert levels == pytest.approx([2 * (first + index) for index in range(count)], abs=3.7)
+
+
+def test_a_frame_that_comes_twice_is_kept_once(tmp_path: Path) -> None:
+    recorder = CameraRecorder(tmp_path, "cam1", 25.0)
+    for time_s in (0.0, 0.04, 0.04, 0.02, 0.08):
+        recorder.write(noise(0), time_s)
+    assert vars(recorder.close()) == {"frames": 3, "left_out": 0}
+    # The times are exact.
+    assert recorder.times.read_text() == "frame,time_s\n0,0.0\n1,0.04\n2,0.08\n"
+
+
+def test_nobody_waits_for_the_codec(tmp_path: Path, monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
+    """While the codec is busy, frames are left out and counted, and this is said once."""
+    is_free, encode = threading.Event(), VideoEncoder.write
+
+    def wait(encoder: VideoEncoder, image: np.ndarray) -> None:
+        is_free.wait()
+        encode(encoder, image)
+
+    monkeypatch.setattr(VideoEncoder, "write", wait)
+    recorder = CameraRecorder(tmp_path, "cam1", FPS)
+    for index in range(50):
+        recorder.write(noise(index), index / FPS)
+    is_free.set()
+    counts = recorder.close()
+    assert counts.frames + counts.left_out == 50
+    # Those that wait, and the one that is encoded.
+    assert counts.frames in (8, 9)
+    said = f"{tmp_path}: frames are left out of the recording, because the computer is too slow"
+    assert caplog.messages == [said]
+
+
+def test_a_crash_leaves_what_was_recorded(laboratory: Recording, tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    script = """
+        import os, sys, time
+        from pathlib import Path
+        import numpy as np
+        from psotrack.live import CameraRecorder
+        rng = np.random.default_rng(0)
+        recorders = [CameraRecorder(Path(sys.argv[1]), name, 25.0) for name in sys.argv[2:]]
+        for index in range(60):
+            for recorder in recorders:
+                recorder.write(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8), index / 25)
+                # The row of a frame is written just before it is encoded.
+                while not recorder.times.exists() or recorder.times.read_text().count("\\n") < index + 2:
+                    time.sleep(0.001)
+        os.kill(os.getpid(), 9)
+    """
+    with recording_folder(folder, laboratory, RIG.names):
+        command = [sys.executable, "-c", textwrap.dedent(script), folder, *RIG.names]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == -9, done.stderr
+        found = open_recording(folder)
+    for name in RIG.names:
+        # 32 KiB and the last frame are lost: these frames of noise take 20 KiB and more.
+        assert 55 <= found.videos[name].num_frames < 60
+        assert len(list(read_frames(found.videos[name]))) == found.by_name[name].times.num_frames
+
+
+def test_a_recording_that_does_not_fit_keeps_what_fits(tmp_path: Path, caplog) -> None:
+    """A limit on the size of files stands for a full disk, of which FFmpeg says nothing."""
+    recorder, before = CameraRecorder(tmp_path, "cam1", FPS), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, before[1]))
+    try:
+        for index in range(30):
+            recorder.write(noise(index), index / FPS)
+            wait_for_row(recorder.times, index + 1)
+        counts = recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert counts.frames + counts.left_out == 30
+    # Frames of noise take 25 to 90 kB.
+    assert 3 < counts.frames < 20
+    assert len(list(read_frames(probe(recorder.video)))) == counts.frames
+    expected = f"expected 30 frames, found {counts.frames}; is the disk full, or too slow?"
+    assert caplog.messages == [f"{recorder.video}: {expected}"]
+
+
+def test_a_disk_that_is_nearly_full_ends_the_recording_in_time(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorder = CameraRecorder(tmp_path, "cam1", 25.0, least_free_bytes=10**18)
+    for index in range(20):
+        recorder.write(noise(index), index / 25)
+    assert vars(recorder.close()) == {"frames": 0, "left_out": 20}
+    said = [line for line in caplog.messages if "too slow" not in line]
+    assert len(said) == 1
+    assert "less than 1000000000000 MB of free disk space; what was recorded before stays" in said[0]
+
+
+def test_the_folder_of_a_recording_keeps_other_files(laboratory: Recording, tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    for _ in range(2):  # of cameras that never film nothing stays, so that the second session is not refused
+        with recording_folder(folder, laboratory, RIG.names):
+            assert (folder / "recording.toml").exists()
+    assert not list(folder.iterdir())
+    (folder / "notes.txt").write_text("mine")
+    (folder / f"{RIG.names[0]}.avi").write_bytes(b"an earlier video")
+    refused = "expected a new or an empty folder, found a folder with files"
+    with pytest.raises(OutputError, match=refused), recording_folder(folder, laboratory, RIG.names):
+        pass
+    with recording_folder(folder, laboratory, RIG.names, force=True):
+        assert not (folder / f"{RIG.names[0]}.avi").exists()
+    assert (folder / "notes.txt").read_text() == "mine"
+
+
+#: Folder, size of the images -> words of the line.
+BAD_FOLDERS = {
+    ("laboratory", SIZE_WH): "--record: expected another folder",
+    ("flight", (321, 240)): "even numbers of pixels",
+    ("file/flight", SIZE_WH): "expected a folder that can be written",
+    ("file", SIZE_WH): "expected a folder that can be written, found File exists",
+}
+
+
+@pytest.mark.parametrize(("folder", "size_wh"), BAD_FOLDERS)
+def test_a_folder_that_cannot_hold_a_recording(
+    folder, size_wh, laboratory: Recording, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    recording = laboratory.with_rig(ring_rig(3, image_size_wh=size_wh))
+    block = recording_folder(tmp_path / folder, recording, RIG.names, force=True)
+    assert_refused(block.__enter__, BAD_FOLDERS[folder, size_wh], unchanged=tmp_path)
