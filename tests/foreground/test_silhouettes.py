@@ -1,19 +1,18 @@
-"""The store of silhouettes: its content, the reasons to compute silhouettes again, and interruptions."""
+"""Silhouettes: their settings, the store and the cache, frames that are left out, and blobs."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
+import json
 import logging
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import textwrap
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,28 +20,34 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from helpers import cameras_of, with_cameras
+from helpers import Output, assert_refused, cameras_of, make_once, with_cameras
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.errors import InputError, OutputError, PsotrackError, SettingsError
 from psotrack.foreground.silhouettes import (
+    SEAL_FILE,
     ForegroundSettings,
     Living,
     Mog2,
     Silhouettes,
     SilhouetteSettings,
+    blob_detections,
+    border_cells,
+    computation,
     compute,
     coverage,
+    find_blobs,
+    foreground_is_everywhere,
     is_whole,
     learning_step,
     list_entries,
     look_first,
-    remove_entry,
     stored_silhouettes,
     usual_drone_px,
 )
 from psotrack.foreground.silhouettes import store as silhouette_store
+from psotrack.foreground.silhouettes.usable_frames import LEAST_FRAMES, in_words, intervals_of
 from psotrack.geometry import look_at, make_camera, make_rig
 from psotrack.recordings import (
     FrameTimes,
@@ -53,29 +58,36 @@ from psotrack.recordings import (
     probe_silhouettes,
     read_frames,
 )
-from psotrack.support import Advance, map_in_processes
+from psotrack.support import Advance, atomic_write, map_in_processes
 
 NUM_FRAMES = 30
 SIZE_WH = (162, 118)  # not multiples of 4
 SETTINGS = SilhouetteSettings(
     background="mog2", reduction=4, working_reduction=2, min_blob_px=64, num_learning_frames=10
 )
+#: Frames of a longer video, and those in which its camera shows another picture in each frame.
+NUM_USABLE, SHAKEN = 80, range(40, 55)
+DAY_S = 24 * 3600
+Run = Callable[..., Output]
 
 
-def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES) -> None:
-    """Write a video of a dark disc that moves in front of a smooth texture, with noise."""
+def _write_video(path: Path, seed: int, num_frames: int = NUM_FRAMES, shaken: range = range(0)) -> None:
+    """A video of a dark disc that moves in front of a smooth texture, with noise."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(90, 190, (5, 7, 3)).astype(np.float32)
     background = cv2.resize(coarse, SIZE_WH, interpolation=cv2.INTER_CUBIC)
     with VideoWriter(path, 25.0, SIZE_WH) as writer:
         for index in range(num_frames):
             image = background + rng.normal(0, 2, background.shape)
-            cv2.circle(image, (20 + 4 * index, 30 + 10 * seed), 9, (25, 25, 25), -1, cv2.LINE_AA)
+            if index in shaken:
+                image = cv2.resize(rng.uniform(0, 255, (12, 16, 3)), SIZE_WH)
+            x = 20 + 120 * index // num_frames
+            cv2.circle(image, (x, 30 + 10 * seed), 9, (25, 25, 25), -1, cv2.LINE_AA)
             writer.write(np.clip(image, 0, 255).astype(np.uint8))
 
 
 def _make_recording(folder: Path) -> Recording:
-    """Make a recording of all videos in a folder."""
+    """A recording of all videos in a folder."""
     R, t_m = look_at((0.0, 0.0, 1.0), (5.0, 0.0, 1.0))
     K = np.array([[100.0, 0, 81], [0, 100, 59], [0, 0, 1]])
     videos = {path.stem: probe(path) for path in sorted(folder.glob("*.avi"))}
@@ -83,18 +95,36 @@ def _make_recording(folder: Path) -> Recording:
     return Recording(folder.name, folder, cameras_of(rig, video=videos))
 
 
-@pytest.fixture(scope="session")
-def video_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recorded")
+def _make_videos(folder: Path) -> None:
     for seed in range(3):
         _write_video(folder / f"cam{seed + 1}.avi", seed)
-    return folder
+
+
+@pytest.fixture(scope="session")
+def video_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_once(tmp_path_factory, "three_videos", _make_videos)
 
 
 @pytest.fixture
 def folder(video_folder: Path, tmp_path: Path) -> Path:
     """Folder with three videos that a test may change."""
     return Path(shutil.copytree(video_folder, tmp_path / "videos"))
+
+
+@pytest.fixture
+def recording(folder: Path) -> Recording:
+    return _make_recording(folder)
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def make(cache: Path) -> Callable[..., Silhouettes]:
+    """Computes the silhouettes of a recording in this process, into the cache of the test."""
+    return functools.partial(compute, settings=SETTINGS, cache=cache, jobs=1)
 
 
 @pytest.fixture
@@ -112,7 +142,7 @@ def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def _expected(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
-    """Compute silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
+    """Silhouettes without store, workers or chunks, (frames, cameras, height, width)."""
     scaled = settings.scaled([video.image_size_wh for video in recording.videos.values()])
     step = learning_step(recording.num_frames, scaled)
     factor = scaled.reduction // scaled.working_reduction
@@ -140,105 +170,22 @@ def _keys(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> dict
     return {name: each.key for name, each in stored_silhouettes(recording, settings, Path()).items()}
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_stored_silhouettes_equal_direct_computation(folder: Path, tmp_path: Path, jobs: int) -> None:
-    started: list[tuple[str, int]] = []
-    done: list[int] = []
-
-    @contextlib.contextmanager
-    def report(description: str, total: int) -> Iterator[Advance]:
-        started.append((description, total))
-        yield done.append
-
-    recording = _make_recording(folder)
-    for _ in range(2):
-        silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs, report=report)
-    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
-    assert sum(done) == 3 * (NUM_FRAMES + 10)
-    assert silhouettes.cameras == ("cam1", "cam2", "cam3")
-    assert silhouettes.shape == (30, 41)
-    assert (silhouettes.num_frames, silhouettes.reduction) == (NUM_FRAMES, 4)
-    assert silhouettes.keys == _keys(recording)
-    all_frames = _read_all(silhouettes)
-    assert all_frames.dtype == np.uint8
-    assert all_frames.flags.c_contiguous
-    np.testing.assert_array_equal(all_frames, _expected(recording))
-    assert all_frames.any(axis=(2, 3)).all(), "every frame of every camera shows a disc"
-    assert _unfinished_folders(tmp_path / "cache") == []
-    for start, stop in [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)]:
-        np.testing.assert_array_equal(silhouettes.read(start, stop), all_frames[start:stop])
-    for start, stop in [(-1, 5), (5, 31), (6, 5)]:
-        with pytest.raises(SettingsError, match=f"expected a part of 0 to 30, found {start} to {stop}"):
-            silhouettes.read(start, stop)
+def _damage(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
 
 
-def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kept(
-    folder: Path, tmp_path: Path
-) -> None:
-    """The store decodes each frame over the one before; here all frames are kept."""
-    recording = _make_recording(folder)
-    settings = SilhouetteSettings(background="living", reduction=4, working_reduction=2, min_blob_px=64)
-    silhouettes = compute(recording, settings, cache=tmp_path / "cache", jobs=1)
-    scaled = settings.scaled([SIZE_WH])
-    for camera, video in enumerate(recording.videos.values()):
-        looked_at = look_first(video, iter(list(read_frames(video))), scaled)
-        masks = [coverage(mask, 2) for mask in Living(scaled).masks(*looked_at)]
-        assert np.any(masks)
-        np.testing.assert_array_equal(_read_all(silhouettes)[:, camera], masks)
+def _warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_only_what_is_missing_is_decoded(folder: Path, tmp_path: Path, decoded_videos: list[str]) -> None:
-    shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
-    first = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10), "equal videos are decoded once"
-    assert first.seconds["decode"] > 0
-    assert first.seconds["foreground"] > 0
-    before = _read_all(first)
-    np.testing.assert_array_equal(before[:, 0], before[:, 1])
-    decoded_videos.clear()
-    # Name and folder of a video are not in the key.
-    moved = Path(shutil.copytree(folder, tmp_path / "moved"))
-    (moved / "cam3.avi").rename(moved / "other.avi")
-    second = compute(_make_recording(moved), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert decoded_videos == []
-    assert second.seconds == {"decode": 0.0, "foreground": 0.0}
-    np.testing.assert_array_equal(_read_all(second), before)
-    _write_video(folder / "cam2.avi", seed=5)
-    recording = _make_recording(folder)
-    third = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert set(decoded_videos) == {"cam2"}
-    np.testing.assert_array_equal(_read_all(third), _expected(recording))
-    np.testing.assert_array_equal(_read_all(first), before)
-
-
-def test_every_setting_the_model_and_the_number_of_frames_are_in_the_key(video_folder: Path) -> None:
-    changes: list[dict[str, Any]] = [
-        {"reduction": 2},
-        {"working_reduction": 1},
-        {"num_learning_frames": 11},
-        {"learning_rate": 0.01},
-        {"var_threshold": 17.0},
-        {"shadows": "drop"},
-        {"shadow_weight": 0.4},
-        {"min_blob_px": 33},
-        {"background": "living"},
-        {"background": "living", "first_look": False},
-    ]
-    assert {name for change in changes for name in change} >= set(ForegroundSettings.__struct_fields__)
-    recording = _make_recording(video_folder)
-    keys = [
-        _keys(recording, msgspec.structs.replace(SETTINGS, **change))["cam1"] for change in [{}, *changes]
-    ]
-    keys += [_keys(recording.usable(num_frames=12))["cam1"]]
-    assert len(set(keys)) == len(keys)
-    with pytest.raises(SettingsError, match=r"background: expected .*found liveing"):
-        _keys(recording, SilhouetteSettings(background="liveing"))
+# --- settings
 
 
 @pytest.mark.parametrize(
     ("settings", "sizes_wh", "expected"),
     [
-        ({}, [(1920, 1080)], (2, 4, 9)),
         ({}, [(640, 512), (1920, 1080)], (2, 4, 9)),
         ({}, [(3840, 2160)], (4, 8, 9)),
         ({}, [(1080, 1920)], (2, 4, 9)),
@@ -268,7 +215,6 @@ def test_reduction_and_smallest_blob_follow_from_the_drones_size(
         # A drone of 24 px is six stored values of 4 px wide: the background model needs no finer image.
         ({}, 24.0, (4, 4)),
         ({}, 23.0, (2, 4)),
-        ({}, 500.0, (4, 4)),
         ({"reduction": 8}, 500.0, (8, 8)),
         ({"drone_px": 40.0}, 500.0, (2, 4)),
         ({"working_reduction": 1}, 500.0, (1, 2)),
@@ -283,49 +229,182 @@ def test_the_background_model_sees_no_finer_image_than_the_rig_demands(
 
 def test_the_usual_width_of_a_drone_follows_from_the_rig() -> None:
     K = np.array([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]])
-    poses = {
-        name: look_at(eye, (0.0, 0.0, 1.0)) for name, eye in (("a", (6.0, 0.0, 1.0)), ("b", (0.0, 3.0, 1.0)))
-    }
-    cameras = {
-        name: make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080)) for name, (R, t_m) in poses.items()
-    }
+    cameras = {}
+    for name, eye in (("a", (6.0, 0.0, 1.0)), ("b", (0.0, 3.0, 1.0))):
+        R, t_m = look_at(eye, (0.0, 0.0, 1.0))
+        cameras[name] = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
     # 0.3 m at 6 m, in the farther camera.
     assert usual_drone_px(make_rig(cameras)) == pytest.approx(50.0)
     assert usual_drone_px(make_rig({"a": cameras["a"]})) is None
 
 
+#: Name and value of a setting -> words of the line.
+BAD_SETTINGS = {
+    ("working_reduction", 0): "expected a whole number of at least 1, found 0",
+    ("working_reduction", 1.5): "expected a whole number, found 1.5",
+    ("num_learning_frames", 0): "expected a whole number of at least 1, found 0",
+    ("min_blob_px", -1): "expected a whole number of at least 0, found -1",
+    ("learning_rate", -0.1): "expected a number of at least 0, found -0.1",
+    ("learning_rate", float("nan")): "expected a number of at least 0, found NaN",
+    ("shadow_weight", 1.5): "expected a number of at most 1, found 1.5",
+    ("var_threshold", 0.0): "expected a number above 0, found 0",
+    ("var_threshold", float("inf")): "expected a number above 0, found inf",
+    ("shadows", "maybe"): "expected one of keep, drop, weight, found maybe",
+    ("reduction", 0): "expected a whole number of at least 1, found 0",
+    ("reduction", 3): "expected a multiple of working_reduction, 2, found 3",
+    ("reduction", True): "expected a whole number, found true",
+}
+
+
+@pytest.mark.parametrize(("setting", "value"), BAD_SETTINGS)
+@pytest.mark.parametrize(
+    "kind", [ForegroundSettings, functools.partial(SilhouetteSettings, background="mog2")]
+)
+def test_invalid_settings_are_refused(kind, setting: str, value: object, tmp_path: Path) -> None:
+    bad = functools.partial(kind, **{"working_reduction": 2, setting: value})
+    assert_refused(bad, f"{setting}: {BAD_SETTINGS[setting, value]}", unchanged=tmp_path)
+
+
 @pytest.mark.parametrize(
     ("setting", "value"), [("shadows", "drop"), ("var_threshold", 9.0), ("learning_rate", 0.1)]
 )
-def test_what_the_living_background_does_not_use_is_refused(setting: str, value: object) -> None:
-    with pytest.raises(
-        SettingsError, match=rf"{setting}: expected .*the background model living does not use"
-    ):
-        SilhouetteSettings(**{setting: value})
+def test_what_a_background_does_not_use_is_refused(setting: str, value: object, tmp_path: Path) -> None:
+    words = f"{setting}: expected ", "because the background model living does not use this setting"
+    assert_refused(lambda: SilhouetteSettings(**{setting: value}), *words, unchanged=tmp_path)
     assert getattr(SilhouetteSettings(background="mog2", **{setting: value}), setting) == value
 
 
-def test_fewer_frames_are_made_anew(folder: Path, tmp_path: Path) -> None:
-    shorter = _make_recording(folder).usable(num_frames=12)
-    silhouettes = compute(shorter, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert silhouettes.num_frames == 12
-    np.testing.assert_array_equal(_read_all(silhouettes), _expected(shorter))
+def test_every_setting_the_model_and_the_number_of_frames_are_in_the_key(
+    video_folder: Path, tmp_path: Path
+) -> None:
+    changes: list[dict[str, Any]] = [
+        {"reduction": 2},
+        {"working_reduction": 1},
+        {"num_learning_frames": 11},
+        {"learning_rate": 0.01},
+        {"var_threshold": 17.0},
+        {"shadows": "drop"},
+        {"shadow_weight": 0.4},
+        {"min_blob_px": 33},
+        {"background": "living"},
+        {"background": "living", "first_look": False},
+    ]
+    assert {name for change in changes for name in change} >= set(ForegroundSettings.__struct_fields__)
+    recording = _make_recording(video_folder)
+    keys = [
+        _keys(recording, msgspec.structs.replace(SETTINGS, **change))["cam1"] for change in [{}, *changes]
+    ]
+    keys += [_keys(recording.usable(num_frames=12))["cam1"]]
+    assert len(set(keys)) == len(keys)
+    unknown = functools.partial(_keys, recording, SilhouetteSettings(background="liveing"))
+    assert_refused(unknown, "background: expected ", "found liveing", unchanged=tmp_path)
+
+
+# --- the store
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_stored_silhouettes_equal_direct_computation(
+    recording: Recording, cache: Path, jobs: int, tmp_path: Path
+) -> None:
+    started: list[tuple[str, int]] = []
+    done: list[int] = []
+
+    @contextlib.contextmanager
+    def report(description: str, total: int) -> Iterator[Advance]:
+        started.append((description, total))
+        yield done.append
+
+    for _ in range(2):
+        silhouettes = compute(recording, SETTINGS, cache=cache, jobs=jobs, report=report)
+    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
+    assert sum(done) == 3 * (NUM_FRAMES + 10)
+    assert silhouettes.cameras == ("cam1", "cam2", "cam3")
+    assert silhouettes.shape == (30, 41)
+    assert (silhouettes.num_frames, silhouettes.reduction) == (NUM_FRAMES, 4)
+    assert silhouettes.keys == _keys(recording)
+    all_frames = _read_all(silhouettes)
+    assert all_frames.dtype == np.uint8
+    assert all_frames.flags.c_contiguous
+    np.testing.assert_array_equal(all_frames, _expected(recording))
+    assert all_frames.any(axis=(2, 3)).all(), "every frame of every camera shows a disc"
+    assert _unfinished_folders(cache) == []
+    for start, stop in [(0, 0), (0, 1), (7, 26), (24, 26), (25, 30), (30, 30)]:
+        np.testing.assert_array_equal(silhouettes.read(start, stop), all_frames[start:stop])
+    for start, stop in [(-1, 5), (5, 31), (6, 5)]:
+        words = f"expected a part of 0 to 30, found {start} to {stop}"
+        assert_refused(functools.partial(silhouettes.read, start, stop), words, unchanged=tmp_path)
+
+
+def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kept(
+    recording: Recording, cache: Path
+) -> None:
+    """The store decodes each frame over the one before; here all frames are kept."""
+    settings = SilhouetteSettings(background="living", reduction=4, working_reduction=2, min_blob_px=64)
+    silhouettes = compute(recording, settings, cache=cache, jobs=1)
+    scaled = settings.scaled([SIZE_WH])
+    for camera, video in enumerate(recording.videos.values()):
+        looked_at = look_first(video, iter(list(read_frames(video))), scaled)
+        masks = [coverage(mask, 2) for mask in Living(scaled).masks(*looked_at)]
+        assert np.any(masks)
+        np.testing.assert_array_equal(_read_all(silhouettes)[:, camera], masks)
+
+
+def test_only_what_is_missing_is_decoded(
+    folder: Path, tmp_path: Path, make, decoded_videos: list[str]
+) -> None:
+    shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
+    first = make(_make_recording(folder))
+    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10), "equal videos are decoded once"
+    assert first.seconds["decode"] > 0
+    assert first.seconds["foreground"] > 0
+    before = _read_all(first)
+    np.testing.assert_array_equal(before[:, 0], before[:, 1])
+    decoded_videos.clear()
+    # Name and folder of a video are not in the key.
+    moved = Path(shutil.copytree(folder, tmp_path / "moved"))
+    (moved / "cam3.avi").rename(moved / "other.avi")
+    second = make(_make_recording(moved))
+    assert decoded_videos == []
+    assert second.seconds == {"decode": 0.0, "foreground": 0.0}
+    np.testing.assert_array_equal(_read_all(second), before)
+    _write_video(folder / "cam2.avi", seed=5)
+    recording = _make_recording(folder)
+    third = make(recording)
+    assert set(decoded_videos) == {"cam2"}
+    np.testing.assert_array_equal(_read_all(third), _expected(recording))
+    # Fewer frames are made anew. What happens to the folder has no effect after reading.
+    shorter = recording.usable(num_frames=12)
+    np.testing.assert_array_equal(_read_all(make(shorter)), _expected(shorter))
+    shutil.rmtree(tmp_path / "cache")
+    np.testing.assert_array_equal(_read_all(first), before)
+
+
+def test_silhouettes_that_are_stored_meanwhile_stay(recording: Recording, cache: Path) -> None:
+    """A process that reads a whole folder would find no files while the folder is replaced."""
+    task = computation.tasks_of(recording, SETTINGS, cache)["cam1"]
+    silhouette_store.store(task, lambda steps: None)
+    before = task.stored.path.stat().st_ino
+    silhouette_store.store(task, lambda steps: None)
+    assert task.stored.path.stat().st_ino == before
+    assert is_whole(task.stored.path)
+    assert _unfinished_folders(cache) == []
 
 
 @pytest.fixture(scope="module")
-def whole_cache(video_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    cache = tmp_path_factory.mktemp("whole")
-    compute(_make_recording(video_folder), SETTINGS, cache=cache, jobs=1)
-    return cache
+def whole(video_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of stored silhouettes."""
+    recording = _make_recording(video_folder).usable(["cam1"])
+    silhouettes = compute(recording, SETTINGS, cache=tmp_path_factory.mktemp("whole"), jobs=1)
+    return next(tmp_path_factory.getbasetemp().glob(f"whole*/{silhouettes.keys['cam1']}"))
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(data=st.data())
-def test_no_changed_bit_and_no_truncation_goes_unnoticed(whole_cache: Path, data: st.DataObject) -> None:
+def test_no_changed_bit_and_no_truncation_goes_unnoticed(whole: Path, data: st.DataObject) -> None:
     """Whole folders pass, and a folder with one changed bit or a file cut short does not."""
-    folder = min(path for path in whole_cache.iterdir() if not path.name.startswith("."))
-    assert is_whole(folder)
-    file = data.draw(st.sampled_from(sorted(path for path in folder.rglob("*") if path.is_file())))
+    assert is_whole(whole)
+    file = data.draw(st.sampled_from(sorted(path for path in whole.rglob("*") if path.is_file())))
     content = file.read_bytes()
     damaged = bytearray(content)
     if data.draw(st.booleans()):
@@ -334,137 +413,100 @@ def test_no_changed_bit_and_no_truncation_goes_unnoticed(whole_cache: Path, data
         del damaged[data.draw(st.integers(0, len(content) - 1)) :]
     try:
         file.write_bytes(damaged)
-        assert not is_whole(folder)
+        assert not is_whole(whole)
     finally:
         file.write_bytes(content)
 
 
-@pytest.mark.parametrize("file", ["c/0/0/0", "zarr.json", "seal"])
-@pytest.mark.parametrize("is_missing", [False, True])
+@pytest.mark.parametrize("file", ["c/0/0/0", "zarr.json", SEAL_FILE])
+@pytest.mark.parametrize("how", [_damage, Path.unlink])
 def test_damage_is_named_and_the_silhouettes_are_made_anew(
-    folder: Path, tmp_path: Path, file: str, is_missing: bool, caplog: pytest.LogCaptureFixture
+    recording: Recording, cache: Path, make, file: str, how, caplog: pytest.LogCaptureFixture
 ) -> None:
-    recording = _make_recording(folder)
-    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    damaged = tmp_path / "cache" / first.keys["cam2"]
-    content = bytearray((damaged / file).read_bytes())
-    content[len(content) // 2] ^= 1
-    (damaged / file).write_bytes(content)
-    if is_missing:
-        (damaged / file).unlink()
+    damaged = cache / make(recording).keys["cam2"]
+    how(damaged / file)
     caplog.clear()
-    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert lines == [f"{damaged}: damaged silhouettes; they are made anew"]
+    again = make(recording)
+    assert _warnings(caplog) == [f"{damaged}: damaged silhouettes; they are made anew"]
     assert is_whole(damaged)
     np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
-@pytest.mark.parametrize("is_missing", [False, True])
+@pytest.mark.parametrize("how", [_damage, Path.unlink])
 def test_damaged_silhouettes_beside_a_video_are_named_and_made_from_it(
-    folder: Path, tmp_path: Path, is_missing: bool, caplog: pytest.LogCaptureFixture
+    recording: Recording, cache: Path, make, how, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The recording itself brings these silhouettes, as an archive does."""
-    recording = _make_recording(folder)
-    first = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    brought = tmp_path / "brought"
-    (tmp_path / "cache" / first.keys["cam2"]).rename(brought)
+    stored = cache / make(recording).keys["cam2"]
+    brought = cache.with_name("brought")
+    stored.rename(brought)
     recording = with_cameras(recording, silhouettes={"cam2": probe_silhouettes(brought)})
-    compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    assert not (tmp_path / "cache" / first.keys["cam2"]).exists()
-    if is_missing:
-        (brought / "c/0/0/0").unlink()
-    else:
-        content = bytearray((brought / "c/0/0/0").read_bytes())
-        content[len(content) // 2] ^= 0xFF
-        (brought / "c/0/0/0").write_bytes(content)
+    make(recording)
+    assert not stored.exists()
+    how(brought / "c/0/0/0")
     caplog.clear()
-    again = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
-    lines = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert lines == [f"{brought}: damaged silhouettes; they are made anew"]
+    again = make(recording)
+    assert _warnings(caplog) == [f"{brought}: damaged silhouettes; they are made anew"]
     np.testing.assert_array_equal(_read_all(again), _expected(recording))
 
 
-def test_what_happens_to_the_folder_has_no_effect_after_reading(folder: Path, tmp_path: Path) -> None:
-    silhouettes = compute(_make_recording(folder), SETTINGS, cache=tmp_path / "cache", jobs=1)
-    before = _read_all(silhouettes)
-    (tmp_path / "cache" / silhouettes.keys["cam2"] / "c" / "0" / "0" / "0").write_bytes(b"damaged")
-    for entry in list_entries(tmp_path / "cache"):
-        remove_entry(entry)
-    assert list_entries(tmp_path / "cache") == []
-    np.testing.assert_array_equal(_read_all(silhouettes), before)
+def _cut(video: Path) -> None:
+    os.truncate(video, video.stat().st_size * 2 // 3)
 
 
-# --- errors ---
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
 def test_a_truncated_video_is_named_and_the_other_videos_are_kept(
-    folder: Path, tmp_path: Path, jobs: int
+    recording: Recording, cache: Path, make, decoded_videos: list[str]
 ) -> None:
-    recording = _make_recording(folder)
-    video = folder / "cam3.avi"
+    video = recording.videos["cam3"].path
     content = video.read_bytes()
-    video.write_bytes(content[: len(content) * 2 // 3])
+    _cut(video)
     with pytest.raises(InputError) as error_info:
-        compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=jobs)
+        make(recording)
     assert str(error_info.value).startswith(f"{video}: expected {NUM_FRAMES} frames, found ")
-    assert _unfinished_folders(tmp_path / "cache") == []
+    assert _unfinished_folders(cache) == []
     video.write_bytes(content)
-    np.testing.assert_array_equal(
-        _read_all(compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)), _expected(recording)
-    )
+    decoded_videos.clear()
+    np.testing.assert_array_equal(_read_all(make(recording)), _expected(recording))
+    assert set(decoded_videos) == {"cam3"}
 
 
-def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(folder: Path, tmp_path: Path) -> None:
+def test_a_truncated_video_of_half_the_rate_is_advised_in_instants(
+    recording: Recording, cache: Path, make
+) -> None:
     """`--frames` counts instants at the rate of the fastest camera, not frames of the truncated video."""
-    recording = _make_recording(folder)
     recording = with_cameras(recording, times={"cam3": FrameTimes(NUM_FRAMES, fps=12.5)})
-    video = folder / "cam3.avi"
-    content = video.read_bytes()
-    video.write_bytes(content[: len(content) * 2 // 3])
+    _cut(recording.videos["cam3"].path)
     with pytest.raises(TruncatedVideoError) as error_info:
-        compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=2)
+        compute(recording, SETTINGS, cache=cache, jobs=2)
     # The commands with `--frames` advise this number.
     readable, advised = error_info.value.num_readable, error_info.value.num_instants
     # Frame i of the slow camera is nearest to instants 2i - 1 (or 2i - 1 and 2i) to 2i + 1.
     assert 2 * readable - 1 <= advised <= 2 * readable
-    compute(recording.usable(num_frames=advised), SETTINGS, cache=tmp_path / "cache", jobs=1)
+    make(recording.usable(num_frames=advised))
     with pytest.raises(InputError, match="can be decoded"):
-        compute(recording.usable(num_frames=advised + 1), SETTINGS, cache=tmp_path / "cache", jobs=1)
+        make(recording.usable(num_frames=advised + 1))
 
 
-def test_a_camera_without_video_sees_nothing_where_not_all_need_one(folder: Path, tmp_path: Path) -> None:
-    recording = _make_recording(folder)
-    two = with_cameras(recording, video={"cam2": None})
-    made = compute(two, SETTINGS, cache=tmp_path / "cache", all_videos=False)
+def test_a_camera_without_video_sees_nothing_where_not_all_need_one(recording: Recording, make) -> None:
+    made = make(with_cameras(recording, video={"cam2": None}), all_videos=False)
     assert made.cameras == ("cam1", "cam2", "cam3")
     assert set(made.keys) == {"cam1", "cam3"}
     shown = made.at_instants(recording.timeline())
     assert shown.exposures is not None
     assert shown.exposures.is_there.all(axis=0).tolist() == [True, False, True]
     assert shown.exposures.is_there.any(axis=0).tolist() == [True, False, True]
-    both = compute(recording, SETTINGS, cache=tmp_path / "cache")
-    np.testing.assert_array_equal(_read_all(shown)[:, [0, 2]], _read_all(both)[:, [0, 2]])
-    assert not _read_all(shown)[:, 1].any()
-    with pytest.raises(InputError, match="expected at least one video, found none"):
-        compute(
-            with_cameras(recording, video=dict.fromkeys(recording.videos)),
-            SETTINGS,
-            cache=tmp_path / "cache",
-            all_videos=False,
-        )
+    expected = _read_all(make(recording))
+    expected[:, 1] = 0
+    np.testing.assert_array_equal(_read_all(shown), expected)
 
 
-def test_cameras_of_different_size_and_length_are_filled_up_with_background(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_cameras_of_different_size_and_length_are_filled_up_with_background(folder: Path, make) -> None:
     with VideoWriter(folder / "cam2.avi", 25.0, (202, 98)) as writer:
         for frame in itertools.islice(read_frames(probe(folder / "cam1.avi")), 20):
             writer.write(cv2.copyMakeBorder(frame[20:], 0, 0, 0, 40, cv2.BORDER_REPLICATE))
     recording = _make_recording(folder)
     recording.by_name["cam2"].camera.image_size_wh[:] = (202, 98)
-    silhouettes = compute(recording, SETTINGS, cache=tmp_path / "cache", jobs=1)
+    silhouettes = make(recording)
     assert silhouettes.shape == (30, 51)
     frames = _read_all(silhouettes)
     assert frames.shape == (NUM_FRAMES, 3, 30, 51)
@@ -478,15 +520,13 @@ def test_cameras_of_different_size_and_length_are_filled_up_with_background(
         assert not frames[:, index, :, width:].any()
 
 
-def test_what_is_ignored_is_background_and_belongs_to_the_key(folder: Path, tmp_path: Path) -> None:
-    recording = _make_recording(folder)
+def test_what_is_ignored_is_background_and_belongs_to_the_key(
+    recording: Recording, tmp_path: Path, make
+) -> None:
     white = np.zeros(SIZE_WH[::-1], np.uint8)
     white[:, :81] = 255
     cv2.imwrite(str(tmp_path / "left.png"), white)
-    masked = with_cameras(recording, ignore={"cam1": tmp_path / "left.png"})
-    plain, without = (
-        compute(each, SETTINGS, cache=tmp_path / "cache", jobs=1) for each in (recording, masked)
-    )
+    plain, without = make(recording), make(with_cameras(recording, ignore={"cam1": tmp_path / "left.png"}))
     assert {name for name in plain.keys if plain.keys[name] != without.keys[name]} == {"cam1"}
     before, after = _read_all(plain), _read_all(without)
     # Working pixels are 2 x 2: pixel 40 covers columns 80 and 81, of which one is ignored.
@@ -496,181 +536,69 @@ def test_what_is_ignored_is_background_and_belongs_to_the_key(folder: Path, tmp_
     np.testing.assert_array_equal(after[:, 1:], before[:, 1:])
 
 
-@pytest.mark.parametrize("reduction", [0, -4, 3, True])
-def test_invalid_reductions_are_refused(reduction: int) -> None:
-    with pytest.raises(SettingsError, match="reduction: expected a "):
-        SilhouetteSettings(reduction=reduction, working_reduction=2)
+def _ignoring(recording: Recording) -> Recording:
+    cv2.imwrite(str(recording.folder / "small.png"), np.zeros((10, 10), np.uint8))
+    return with_cameras(recording, ignore={"cam1": recording.folder / "small.png"})
 
 
-def test_what_is_missing_or_wrong_is_named(folder: Path, tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    recording = _make_recording(folder)
-    with pytest.raises(SettingsError, match="jobs: expected a whole number of at least 1, found 0"):
-        compute(recording, SETTINGS, cache=cache, jobs=0)
-    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
-    with pytest.raises(InputError, match=r"small\.png: expected 162 x 118 .* as in cam1\.avi, found 10 x 10"):
-        compute(
-            with_cameras(recording, ignore={"cam1": tmp_path / "small.png"}), SETTINGS, cache=cache, jobs=1
-        )
-    two = with_cameras(recording, video={"cam2": None})
-    with pytest.raises(InputError, match=r"expected a video for each of the cameras .* found none for cam2"):
-        compute(two, SETTINGS, cache=cache)
-    (folder / "cam2.avi").unlink()
-    with pytest.raises(InputError, match=r"cam2\.avi: expected a readable video, found No such file"):
-        compute(recording, SETTINGS, cache=cache)
-    shutil.rmtree(cache, ignore_errors=True)
+def _without_file(recording: Recording) -> Recording:
+    recording.videos["cam2"].path.unlink()
+    return recording
+
+
+#: Name of the case -> how the recording is changed, other arguments, and words of the line.
+BAD = {
+    "no jobs": (
+        lambda recording: recording,
+        {"jobs": 0},
+        ("jobs: expected a whole number of at least 1, found 0",),
+    ),
+    "small mask": (_ignoring, {}, ("small.png: expected 162 x 118 ", " as in cam1.avi, found 10 x 10")),
+    "no video": (
+        lambda recording: with_cameras(recording, video={"cam2": None}),
+        {},
+        ("expected a video for each of the cameras ", " found none for cam2"),
+    ),
+    "no videos": (
+        lambda recording: with_cameras(recording, video=dict.fromkeys(recording.videos)),
+        {"all_videos": False},
+        ("expected at least one video, found none",),
+    ),
+    "no file": (_without_file, {}, ("cam2.avi: expected a readable video, found No such file",)),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_missing_or_wrong_is_named(case: str, recording: Recording, make) -> None:
+    change, options, words = BAD[case]
+    bad = functools.partial(make, change(recording), **options)
+    assert_refused(bad, *words, unchanged=recording.folder)
+
+
+def test_a_cache_that_cannot_be_written(recording: Recording, cache: Path, make, monkeypatch) -> None:
+    """A file in its place, or a disk that becomes full after the first camera."""
     cache.write_text("mine")
-    with pytest.raises(OutputError, match=r"cache/.*: expected a path that can be written, found "):
-        compute(two, SETTINGS, cache=cache, jobs=1, all_videos=False)
-    assert cache.read_text() == "mine"
-
-
-# --- other processes ---
-
-
-def _run_program(
-    folder: Path,
-    cache: Path,
-    *,
-    before: str = "",
-    settings: str = "SETTINGS",
-    action: str = "pass",
-    after_frames: int = 0,
-) -> subprocess.CompletedProcess[str]:
-    """Run a program that computes the silhouettes of a folder in two worker processes.
-
-    The program runs the statement `action` itself after `after_frames` reported frames, because a test that watched the
-    program from outside might react too late. The program and its workers have ended when this function returns.
-    """
-    program = f"""
-        import contextlib, os, signal, sys
-        # A test run in the background ignores SIGINT, and its children inherit this.
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.path.insert(0, {str(Path(__file__).parents[1])!r})
-        from pathlib import Path
-        from test_silhouettes import SETTINGS, SilhouetteSettings, _make_recording, compute
-        {before}
-
-        @contextlib.contextmanager
-        def report(description, total):
-            done = 0
-
-            def advance(steps):
-                nonlocal done
-                done += steps
-                if done >= {after_frames}:
-                    {action}
-
-            advance(0)
-            yield advance
-
-        compute(
-            _make_recording(Path({str(folder)!r})), {settings}, cache=Path({str(cache)!r}), jobs=2, report=report
-        )
-    """
-    running = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(program)],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
+    assert_refused(
+        functools.partial(make, recording),
+        "expected a path that can be written, found ",
+        unchanged=cache.parent,
     )
-    _, stderr = running.communicate()
-    # Workers close stderr shortly before the system removes them: until then, what they write is not left over.
-    until_s = time.monotonic() + 30
-    with contextlib.suppress(ProcessLookupError):
-        while time.monotonic() < until_s:
-            os.killpg(running.pid, 0)
-            time.sleep(0.01)
-    return subprocess.CompletedProcess(running.args, running.returncode, None, stderr)
+    cache.unlink()
+    before = _read_all(make(recording.usable(["cam1"])))
 
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
 
-def _stored_keys(cache: Path) -> list[str]:
-    """Return the keys of the stored silhouettes."""
-    return [path.name for path in cache.glob("[!.]*")]
-
-
-# There are 120 frames in total: each camera has 10 frames to learn the background and 30 frames; a chunk has 25 frames.
-@pytest.mark.parametrize("after_frames", [0, 1, 75, 100])
-@pytest.mark.parametrize("whole_group", [False, True])
-@pytest.mark.slow
-def test_a_killed_computation_is_resumed(
-    folder: Path, tmp_path: Path, decoded_videos: list[str], after_frames: int, whole_group: bool
-) -> None:
-    cache = tmp_path / "cache"
-    target = "0" if whole_group else "os.getpid()"
-    killed = _run_program(
-        folder, cache, action=f"os.kill({target}, signal.SIGKILL)", after_frames=after_frames
-    )
-    assert killed.returncode == -signal.SIGKILL
-    if not whole_group:
-        # The workers notice the end of their parent and remove their unfinished folders.
-        assert not _unfinished_folders(cache)
-    recording = _make_recording(folder)
-    keys = _keys(recording)
-    finished = _stored_keys(cache)
-    resumed = compute(recording, SETTINGS, cache=cache, jobs=1)
-    assert set(decoded_videos) == {name for name, key in keys.items() if key not in finished}
-    assert not _unfinished_folders(cache)
-    np.testing.assert_array_equal(_read_all(resumed), _expected(recording))
-
-
-def test_ctrl_c_leaves_nothing(folder: Path, tmp_path: Path) -> None:
-    interrupted = _run_program(
-        folder,
-        tmp_path / "cache",
-        # A long grace period keeps slow workers from being killed; their duration is not part of this test.
-        before="from psotrack.support import processes; processes.GRACE_S = 3600",
-        action="os.kill(0, signal.SIGINT)",  # like a terminal, also to the workers
-        after_frames=1,
-    )
-    assert interrupted.returncode == -signal.SIGINT
-    assert interrupted.stderr.count("Traceback") == 1, "the workers print no traceback"
-    assert _unfinished_folders(tmp_path / "cache") == []
-
-
-@pytest.mark.slow
-def test_two_computations_at_once_do_not_disturb_each_other(
-    folder: Path, tmp_path: Path, decoded_videos: list[str]
-) -> None:
-    cache = tmp_path / "cache"
-    with ThreadPoolExecutor(2) as threads:
-        both = list(threads.map(lambda _: _run_program(folder, cache), range(2)))
-    assert [(result.returncode, result.stderr) for result in both] == [(0, "")] * 2
+    with monkeypatch.context() as full:
+        full.setattr(silhouette_store, "_move_to_disk", fail)
+        words = "expected a path that can be written, found No space left on device; earlier results"
+        with pytest.raises(OutputError, match=words):
+            make(recording)
     assert _unfinished_folders(cache) == []
-    recording = _make_recording(folder)
-    silhouettes = compute(recording, SETTINGS, cache=cache, jobs=1)
-    assert decoded_videos == []
-    np.testing.assert_array_equal(_read_all(silhouettes), _expected(recording))
+    np.testing.assert_array_equal(_read_all(make(recording))[:, :1], before)
 
 
-def test_full_disk(folder: Path, tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    before = _read_all(compute(_make_recording(folder), SETTINGS, cache=cache, jobs=1))
-    full = _run_program(
-        folder,
-        cache,
-        # Files are limited to 4 kB, so writing noise fails as on a full disk. Bytecode is not written, because the
-        # limit would truncate it too.
-        before="import resource, sys; sys.dont_write_bytecode = True; "
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))",
-        settings="SilhouetteSettings(background='mog2', reduction=2, min_blob_px=0, var_threshold=0.1)",
-    )
-    assert full.returncode == 1
-    assert "OutputError" in full.stderr
-    assert "expected a path that can be written, found File too large; earlier results" in full.stderr
-    assert _unfinished_folders(cache) == []
-    assert len(_stored_keys(cache)) == 3
-    np.testing.assert_array_equal(
-        _read_all(compute(_make_recording(folder), SETTINGS, cache=cache, jobs=1)), before
-    )
-
-
-def test_workers_do_not_import_jax() -> None:
-    program = (
-        "import sys, psotrack.foreground.silhouettes.store, psotrack.support.processes;"
-        "sys.exit('jax' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+# --- other processes
 
 
 def _double(task: int, advance: Advance) -> int:
@@ -682,19 +610,193 @@ def _double(task: int, advance: Advance) -> int:
     return 2 * task
 
 
-def test_results_come_in_the_order_of_tasks() -> None:
+def test_results_come_in_the_order_of_tasks_and_errors_keep_their_type_and_message() -> None:
     done: list[int] = []
     assert map_in_processes(_double, [5, 3, 4, 1], jobs=2, advance=done.append) == [10, 6, 8, 2]
     assert sorted(done) == [1, 3, 4, 5]
-
-
-def test_errors_of_workers_keep_their_type_and_message() -> None:
     with pytest.raises(SettingsError, match=r"^task: expected a number of at least 0, found -2$"):
-        map_in_processes(_double, [1, -2, 3], jobs=2, advance=lambda steps: None)
-
-
-def test_a_worker_that_dies_is_an_error() -> None:
+        map_in_processes(_double, [1, -2, 3], jobs=2, advance=done.append)
     with pytest.raises(
         PsotrackError, match="a worker process: expected a result, found that the process died"
     ):
-        map_in_processes(_double, [1, -1, 3], jobs=2, advance=lambda steps: None)
+        map_in_processes(_double, [1, -1, 3], jobs=2, advance=done.append)
+
+
+def test_workers_do_not_import_jax() -> None:
+    program = (
+        "import sys, psotrack.foreground.silhouettes.store, psotrack.support.processes;"
+        "sys.exit('jax' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
+
+
+# --- the command `cache`
+
+
+def _listed(run: Run, cache: Path) -> list[dict[str, Any]]:
+    entries: list[dict[str, Any]] = json.loads(run("cache", "--cache", cache, "--json", "-").out)["entries"]
+    return entries
+
+
+@pytest.fixture
+def filled(recording: Recording, cache: Path, make) -> Silhouettes:
+    """Silhouettes of two videos in a cache with a program and what is no entry."""
+    made = make(recording.usable(["cam1", "cam2"]))
+    (cache / "compiled").mkdir()
+    (cache / "compiled" / f"jit__scores-{'a' * 64}-cache").write_bytes(b"a program")
+    (cache / "compiled" / "notes-cache").write_text("mine")
+    (cache / ("c" * 40)).mkdir()
+    (cache / ("c" * 40) / "thesis.txt").write_text("mine")
+    cache.with_name("elsewhere").mkdir()
+    (cache / ("d" * 40)).symlink_to(cache.with_name("elsewhere"))
+    # The program was used last.
+    for name, age_s in (("cam1", 40 * DAY_S), ("cam2", 9 * DAY_S)):
+        os.utime(cache / made.keys[name] / SEAL_FILE, (time.time() - age_s,) * 2)
+    return made
+
+
+def test_entries_are_listed_and_pruned_the_oldest_first(
+    run_psotrack: Run, cache: Path, filled: Silhouettes
+) -> None:
+    entries = _listed(run_psotrack, cache)
+    assert [(entry["kind"], entry["video"], round(entry["days_unused"])) for entry in entries] == [
+        ("silhouettes", "cam1.avi", 40),
+        ("silhouettes", "cam2.avi", 9),
+        ("program", "", 0),
+    ]
+    shown = run_psotrack("cache", "--cache", cache).out
+    assert "cam1.avi" in shown
+    assert "silhouettes of 2 videos, 1 programs" in shown
+    removed = run_psotrack("cache", "--cache", cache, "--older-than", 30).out
+    assert "removed: silhouettes of 1 videos" in removed
+    assert [entry["video"] for entry in _listed(run_psotrack, cache)] == ["cam2.avi", ""]
+    run_psotrack("cache", "--cache", cache, "--max-gb", 1e-6)
+    assert [entry["kind"] for entry in _listed(run_psotrack, cache)] == ["program"]
+    missing = functools.partial(run_psotrack, "cache", "--cache", cache / "none")
+    words = f"{cache / 'none'}: expected a cache folder, found no such file or directory"
+    assert_refused(missing, words, unchanged=cache)
+
+
+def test_empty_removes_what_a_killed_run_left_and_leaves_what_is_no_entry(
+    run_psotrack: Run, cache: Path, filled: Silhouettes
+) -> None:
+    """Found: parts of silhouettes stayed for ever unless the same key was made again."""
+    ended = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True)
+    with atomic_write(cache / ("e" * 40)) as running:
+        running.mkdir()
+    parts = [
+        running.with_name(running.name.replace(f"-{os.getpid()}-", f"-{process}-"))
+        for process in (int(ended.stdout), os.getpid())
+    ]
+    for part in parts:
+        (part / "c" / "0").mkdir(parents=True)
+        (part / "zarr.json").write_text("{}")
+    assert f"{parts[0]}" in {entry["path"] for entry in _listed(run_psotrack, cache)}
+    run_psotrack("cache", "--empty", "--cache", cache)
+    assert list_entries(cache) == []
+    stay = {"compiled", "c" * 40, "d" * 40, parts[1].name}
+    assert {path.name for path in cache.iterdir()} == stay
+    assert (cache / "compiled" / "notes-cache").exists()
+    assert (cache / ("c" * 40) / "thesis.txt").exists()
+    assert filled.read(0, 12).any(), "a process that has read the silhouettes goes on"
+
+
+# --- frames that are left out
+
+
+def test_foreground_is_everywhere_where_most_parts_of_the_image_have_some() -> None:
+    speckle = np.zeros((5, 90, 160), np.uint8)
+    speckle[1, 5::10, 5::10] = 255  # a cell in each part
+    speckle[2, :60, :50] = 255  # a large object
+    speckle[3, 15::20, 5::10] = 255  # less than half of the parts
+    # Ten drones, each where four parts of the image meet.
+    for x, y in itertools.product(range(10, 160, 30), (20, 60)):
+        speckle[4, y - 5 : y + 5, x - 5 : x + 5] = 255
+    assert foreground_is_everywhere(speckle).tolist() == [False, True, False, False, False]
+
+
+@given(st.lists(st.booleans(), max_size=60))
+def test_intervals_are_the_chosen_frames(chosen: list[bool]) -> None:
+    again = np.zeros(len(chosen), bool)
+    intervals = intervals_of(np.array(chosen, bool))
+    for start, stop in intervals:
+        assert start < stop
+        assert not again[max(start - 1, 0) : stop].any()
+        again[start:stop] = True
+    assert again.tolist() == chosen
+    # Found: single key frames of a codec were left out in all cameras at once, and tracks were lost there.
+    long = [each for each in intervals if each[1] - each[0] >= LEAST_FRAMES]
+    assert intervals_of(np.array(chosen, bool), LEAST_FRAMES) == long
+
+
+def test_intervals_in_words_leave_out_short_gaps() -> None:
+    assert in_words([(3, 4), (10, 20), (22, 31), (60, 70)], gap_frames=25) == "3 to 30, 60 to 69"
+    assert in_words([(3, 4), (40, 41)], gap_frames=25) == "3, 40"
+
+
+def test_a_camera_is_left_out_for_as_long_and_a_line_says_which_and_when(
+    tmp_path: Path, make, caplog: pytest.LogCaptureFixture
+) -> None:
+    _write_video(tmp_path / "calm.avi", 0, NUM_USABLE)
+    _write_video(tmp_path / "shaken.avi", 1, NUM_USABLE, SHAKEN)
+    recording = _make_recording(tmp_path)
+    for _ in range(2):  # computed, and read from the store
+        caplog.clear()
+        made = make(recording)
+        (line,) = _warnings(caplog)
+        assert line.startswith("camera shaken: 15 of 80 frames are left out")
+        assert "frames 40 to 54" in line
+        assert made.left_out == {"shaken": [(40, 55)]}
+    frames = _read_all(made)
+    assert not frames[40:55, 1].any()
+    assert frames[:, 0].any(axis=(1, 2)).all()
+    # The camera has no frame at these instants, and no blob.
+    timeline = recording.timeline()
+    every, some = (made.at_instants(each) for each in (timeline, timeline.part(np.arange(50, NUM_USABLE))))
+    there = np.ones((NUM_USABLE, 2), bool)
+    there[40:55, 1] = False
+    for shown, start in ((every, 0), (some, 50)):
+        assert shown.exposures is not None
+        np.testing.assert_array_equal(shown.exposures.is_there, there[start:])
+        np.testing.assert_array_equal(_read_all(shown), frames[start:])
+    boxes = blob_detections(made, np.array([SIZE_WH, SIZE_WH], float))
+    assert set(boxes["shaken"].frame.tolist()) == set(range(NUM_USABLE)) - set(SHAKEN)
+
+
+# --- blobs
+
+
+def test_blobs_by_hand() -> None:
+    """Cells of 4 x 4 px: the middle of a box of cells, with pixel centres at whole numbers."""
+    image = np.zeros((20, 30), np.uint8)
+    image[4:8, 10:16] = 255
+    image[12:16, 27:30] = 255
+    image[15, 3] = 255  # a single cell is noise
+    image[0:3, 0:9] = 20  # hardly covered
+    image[10, 3:5] = 255  # two cells are a blob
+    blobs = find_blobs(image, 4)
+    assert blobs.centre_px.tolist() == [[51.5, 23.5], [113.5, 55.5], [15.5, 41.5]]
+    assert blobs.size_px.tolist() == [[24, 16], [12, 16], [8, 4]]
+    assert blobs.whole.tolist() == [True, False, True]
+    # The same image in an array that a larger image of another camera needs.
+    filled_up = np.pad(image, ((0, 10), (0, 10)))
+    assert find_blobs(filled_up, 4).whole.tolist() == [True, True, True]
+    border = border_cells(np.array([118.0, 80.0]), 4)
+    assert find_blobs(filled_up, 4, border).whole.tolist() == [True, False, True]
+
+
+def test_all_blobs_of_a_silhouette_count_from_large_to_small() -> None:
+    """An image has 70 blobs of increasing width. Regression: only the 50 largest counted, without a word."""
+    image = np.zeros((70 * 5 + 4, 90), np.uint8)
+    for row in range(70):
+        image[5 * row + 4 : 5 * row + 6, 4 : 6 + row] = 255
+    assert (find_blobs(image, 3).size_px[:, 0] / 3).tolist() == list(range(71, 1, -1))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+def test_blobs_do_not_depend_on_the_pixels_per_cell(seed: int, times: int) -> None:
+    """Regression: the smallest area was in image pixels, so fine silhouettes had no small blobs."""
+    image = 255 * (np.random.default_rng(seed).random((20, 30)) < 0.1).astype(np.uint8)
+    one, other = find_blobs(image, 1), find_blobs(image, times)
+    assert (times * one.size_px == other.size_px).all()
+    assert (times * (one.centre_px + 0.5) == other.centre_px + 0.5).all()
