@@ -35,6 +35,7 @@ from psotrack.recordings.datasets import (
     write_poses,
 )
 from psotrack.show import flights
+from psotrack.simulation import build, change_scenario, scenario
 from psotrack.simulation.flights.piloting import read_sticks
 from psotrack.simulation.flights.recordings import read_recorded_flight
 from psotrack.sweeps import Store, read_grid
@@ -367,6 +368,21 @@ def _table(file: str, text: str, *reads: Read, command: str = "") -> Format:
     return Format(_text(file, text), file, reads, command)
 
 
+#: A tetrahedron of 0.2 m as a drone, in both formats of meshes.
+_OBJ = "v 0 0 0\nv 0.2 0 0\nv 0 0.2 0\nv 0 0 0.2\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+_PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 4\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n0.2 0 0\n0 0.2 0\n0 0 0.2\n"
+    "3 0 2 1\n3 0 1 3\n3 1 2 3\n3 2 0 3\n"
+)
+
+
+def _drone(path: Path) -> object:
+    """The scene in which a mesh is a drone."""
+    recipe = change_scenario(scenario("S01_D2_A"), {"drones[0].model": {"file": f"{path}"}})
+    return build(recipe, scale=0.1)
+
+
 def _marks() -> str:
     """Points marked in the images of two cameras."""
     rng = np.random.default_rng(0)
@@ -584,6 +600,8 @@ _OTHERS = {
     ),
     "stored-silhouettes": _unpacked("zarr.json"),
     "stored-silhouettes-chunk": _unpacked("c/0/0/0"),
+    "mesh-obj": _table("drone.obj", _OBJ, _drone),
+    "mesh-ply": _table("drone.ply", _PLY, _drone),
     "recorded-flight": Format(_text("flight.csv", _FLIGHT), "flight.csv", (read_recorded_flight,)),
     "sticks": Format(
         _text("sticks.csv", _STICKS),

@@ -2,8 +2,8 @@
 
 The real half differs from the simulated half: four cameras of one type with lens distortion, 1924 x 1082 pixels, named
 by serial number, calibration in millimetres. The reference is one C3D file of marker crosses at 100 Hz. It begins at
-another time than the videos, and has noise, hidden markers and swapped labels. There are no poses and no masks. The
-middle of a cross is not the drone's body origin: evaluation finds the lever arm.
+another time than the videos, and has noise. There are no poses and no masks. The middle of a cross is not the drone's
+body origin: evaluation finds the lever arm.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from helpers import read_mocap_markers
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from psotrack.geometry import Camera, Rig, to_pixels, undistort
@@ -46,8 +46,6 @@ _SIMULATED_WIDTH_PX = 1920
 _LENS = np.array([-0.08, 0.02, 0.0004, -0.0003])
 #: Standard deviation of a marker's position along each axis.
 _NOISE_M = 0.0002
-#: Rate at which a marker gets hidden, mean duration, and duration of the one swap of two labels of each drone.
-_HIDDEN_PER_S, _HIDDEN_S, _SWAPPED_S = 0.1, 0.08, 0.2
 #: Position of an unlabelled reflection on the floor.
 _REFLECTION_M = (1.3, -1.1, 0.02)
 
@@ -147,25 +145,7 @@ def _recording(
     spline = CubicSpline(np.arange(num_frames) / fps, markers_m.reshape(num_frames, -1))
     shown_m = spline(np.maximum(time_s, 0.0)).reshape(len(time_s), -1, 3)
     shown_m += rng.normal(0.0, _NOISE_M, shown_m.shape)
-    shown_m[_hidden(len(time_s), num_drones * per_drone, rate_hz, rng)] = np.nan
-    for drone in range(num_drones):
-        start = int(rng.integers(len(time_s)))
-        swapped = slice(start, start + round(_SWAPPED_S * rate_hz))
-        pair = drone * per_drone + rng.choice(per_drone, 2, replace=False)
-        shown_m[swapped, pair] = shown_m[swapped, pair[::-1]]
     names = [f"Dron{number}" for number in range(1, num_drones + 1)]
     labels = [f"{name}:{name}{marker}" for name in names for marker in range(1, per_drone + 1)]
     strays_m = np.tile(_REFLECTION_M, (len(time_s), 1, 1))
     return Markers((*labels, "*1"), np.concatenate([shown_m, strays_m], axis=1), rate_hz)
-
-
-def _hidden(
-    num_frames: int, num_markers: int, rate_hz: float, rng: np.random.Generator
-) -> Bool[np.ndarray, "frames markers"]:
-    """Whether each marker is hidden in each frame: intervals with random starts and exponential durations."""
-    hidden = np.zeros((num_frames, num_markers), bool)
-    for marker in range(num_markers):
-        starts = np.flatnonzero(rng.random(num_frames) < _HIDDEN_PER_S / rate_hz)
-        for start, length_s in zip(starts, rng.exponential(_HIDDEN_S, len(starts)), strict=True):
-            hidden[start : start + 1 + int(length_s * rate_hz), marker] = True
-    return hidden

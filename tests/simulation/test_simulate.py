@@ -7,10 +7,6 @@ import json
 import os
 import resource
 import shutil
-import signal
-import subprocess
-import sys
-import textwrap
 from dataclasses import replace
 
 import cv2
@@ -311,65 +307,6 @@ def test_an_interruption_after_the_last_frame_renders_no_frame_again(
     folder = simulate(PAIR, tmp_path, TINY, jobs=1)
     assert read_contents(folder) == read_contents(pair_folder)
     assert [path.name for path in folder.parent.iterdir()] == [NAME]
-
-
-#: Script that simulates into a folder with `jobs` processes and kills itself `delay_s` seconds after `frames` frames,
-#: or at the next frame if that comes earlier.
-KILLED_SCRIPT = """
-    import contextlib
-    import os
-    import signal
-    import sys
-    import threading
-    from pathlib import Path
-    import msgspec
-    from psotrack.simulation import Scenario, SimulationSettings, segments, simulate
-
-    def kill():
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    @contextlib.contextmanager
-    def report(description, total):
-        done = 0
-
-        def advance(steps):
-            nonlocal done
-            if done >= frames:
-                kill()
-            done += steps
-            if done >= frames:
-                threading.Timer(delay_s, kill).start()
-
-        yield advance
-
-    if __name__ == "__main__":
-        segments.SEGMENT_FRAMES = 2
-        folder, jobs, frames, delay_s = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
-        recipe = msgspec.json.decode(sys.stdin.buffer.read(), type=Scenario)
-        simulate(recipe, Path(folder), SimulationSettings(num_frames=7, scale=0.04), jobs=jobs, report=report)
-"""
-
-
-@pytest.mark.usefixtures("short_segments")
-@pytest.mark.nightly
-def test_a_simulation_killed_at_random_moments_ends_with_the_same_bytes(pair_folder, tmp_path):
-    (tmp_path / "run.py").write_text(textwrap.dedent(KILLED_SCRIPT))
-    rng = np.random.default_rng(0)
-    parent = tmp_path / "Simulated_Data"
-    num_segments = [0]
-    for jobs in (2, 1):
-        # The process is killed a few frames after the frames that existed at its start, plus a random delay.
-        moment = 2 * num_segments[-1] + rng.integers(4, 9), rng.uniform(0, 0.04)
-        command = [sys.executable, tmp_path / "run.py", tmp_path, *map(str, (jobs, *moment))]
-        # `run` waits until stderr is closed, that is until the process and all of its workers have ended.
-        killed = subprocess.run(command, input=msgspec.json.encode(PAIR), capture_output=True, check=False)
-        assert killed.returncode == -signal.SIGKILL, killed
-        # The lock file remains, but the lock ended with the process.
-        assert sorted(path.name for path in parent.iterdir()) == [f".{NAME}.lock", f".{NAME}.unfinished"]
-        num_segments.append(len(list(parent.rglob("[0-9]*/video.avi"))))
-    assert num_segments[-1] > 1, "complete segments are kept"
-    assert read_contents(simulate(PAIR, tmp_path, TINY, jobs=1)) == read_contents(pair_folder)
-    assert [path.name for path in parent.iterdir()] == [NAME]
 
 
 @pytest.mark.usefixtures("short_segments")
