@@ -29,7 +29,7 @@ from bat_flights import read_flight, write_recording
 
 from psotrack.evaluation import evaluate
 from psotrack.recordings.datasets import open_recording
-from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, scenario, scenarios, simulate
+from psotrack.simulation import RESTLESS, SimulationSettings, change_scenario, load, scenario, simulate
 from psotrack.support import progress_bar
 from psotrack.trajectories import Status, Trajectories, read_trajectories
 
@@ -109,7 +109,7 @@ def _restless(data: Path, seed: int) -> Flight:
 
 
 def _comings(data: Path) -> Flight:
-    recipe, root = scenarios.load(COMINGS), data / "comings"
+    recipe, root = load(COMINGS), data / "comings"
     if not (folder := root / "Simulated_Data" / recipe.name).exists():
         settings = SimulationSettings(masks=False, onboard=False)
         simulate(recipe, root, settings, report=progress_bar)
