@@ -11,11 +11,11 @@ from pathlib import Path
 
 import archives_made
 import cv2
+import dpjait_folders
 import numpy as np
 import onnx_models
 import pandas as pd
 import rig_texts as rigs
-import test_dpjait
 import worlds
 from helpers import ring_rig
 
@@ -28,11 +28,9 @@ from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
 from psotrack.pipeline import archives
 from psotrack.recordings import datasets, exchange, mocap
 from psotrack.recordings.datasets import (
-    pose_file,
     read_marker_centres,
     read_masks,
     write_marker_corners,
-    write_poses,
 )
 from psotrack.show import flights
 from psotrack.simulation import build, change_scenario, scenario
@@ -112,7 +110,7 @@ _CALIBRATIONS = {
     "dpjait-cameras": _calibration(
         _text(
             "cameras.csv",
-            f"{test_dpjait.REAL_HEADER}\n55260362;-100;250.5;6000;1.9;0.1;0;1158.7;640;360;-0.1;0.02;0.001;-0.002\n"
+            f"{dpjait_folders.REAL_HEADER}\n55260362;-100;250.5;6000;1.9;0.1;0;1158.7;640;360;-0.1;0.02;0.001;-0.002\n"
             "56339527;100;250.5;6000;1.9;-0.1;0;1158.7;640;360;-0.1;0.02;0.001;-0.002\n",
         ),
         "cameras.csv",
@@ -236,27 +234,7 @@ def _part(file: str, *reads: Read) -> Format:
 
 def _dpjait(folder: Path) -> None:
     """A small sequence of the dataset with all kinds of files."""
-    cameras = [f"cam{i}i;{i};0.5;8;1.9;{i / 10};0;{1156.3 + i};32;24" for i in (1, 2)]
-    (folder / "cameras_calibration.csv").write_text(
-        "\n".join([test_dpjait.SIMULATED_HEADER, *cameras]) + "\n"
-    )
-    (folder / "dl_data").mkdir()
-    for i in (1, 2):
-        with recordings.VideoWriter(folder / f"cam{i}i_s.avi", 25.0, (64, 48)) as writer:
-            for _ in range(5):
-                writer.write(np.zeros((48, 64, 3), np.uint8))
-        boxes = recordings.Detections(np.arange(5), np.tile([3.0, 4, 9, 8], (5, 1)), np.full(5, 0.5))
-        recordings.write_detections(folder / "dl_data" / f"cam{i}i_s.csv", boxes)
-    orientation = np.tile([1.0, 0, 0, 0], (5, 1))
-    for drone in (1, 2):
-        position_m = np.column_stack([drone + 0.1 * np.arange(5), np.full(5, 2.0), np.full(5, 1.5)])
-        write_poses(folder / pose_file(drone), position_m, orientation)
-        shutil.copy(folder / pose_file(drone), folder / f"dron{drone}_cam_25.csv")
-        shutil.copy(folder / "cam1i_s.avi", folder / f"dron{drone}_cam_s.avi")
-    (folder / "drone_cameras_calibration.csv").write_text(
-        "cam_name;focal_length_x;focal_length_y;cx;cy;width;height\n"
-        "dron1;60;60;31.5;23.5;64;48\ndron2;61;61;31.5;23.5;64;48\n"
-    )
+    dpjait_folders.make_simulated(folder)
     write_marker_corners(folder / "aruco_corners.csv", _corners())
     mask = cv2.imencode(".png", np.eye(8, dtype=np.uint8) * 255)[1].tobytes()
     with zipfile.ZipFile(folder / "drone_masks.zip", "w") as archive:
@@ -290,7 +268,7 @@ _RECORDINGS = {
     "recording-reference": Format(_csv_recording, "dron1.csv", (_open,), _INFO, is_slow=True),
     "dpjait-calibration": _published("cameras_calibration.csv"),
     "dpjait-poses": _published("dron1_pos_25.csv"),
-    "dpjait-boxes": _published("dl_data/cam1i_s.csv", recordings.read_detections),
+    "dpjait-boxes": _published("dl_data/cam2i_s.csv", recordings.read_detections),
     "dpjait-onboard-poses": _published("dron1_cam_25.csv"),
     "dpjait-onboard-lenses": _published("drone_cameras_calibration.csv"),
     "dpjait-corners": _published("aruco_corners.csv", inside_out.read_marker_map),

@@ -1,6 +1,7 @@
-"""C3D files of any maker: byte orders, integers and reals, numbers of frames, units, damage; ezc3d is the oracle.
+"""C3D files of any maker: byte orders, integers and reals, numbers of frames, units; ezc3d is the oracle.
 
 The files are written byte by byte here, after the format's user guide, so that neither ezc3d nor psotrack makes them.
+Damaged files are a matter of the fuzzer (`recording-c3d`, `tracks-c3d`).
 """
 
 import math
@@ -10,10 +11,10 @@ from pathlib import Path
 import ezc3d
 import numpy as np
 import pytest
+from helpers import assert_refused
 from real_data import published
 
-from psotrack.errors import InputError
-from psotrack.recordings.mocap import read_c3d
+from psotrack.recordings.mocap import Markers, read_c3d, write_c3d
 
 INTEL, DEC, SGI = 84, 85, 86
 LABELS = ("LASI", "RASI", "SACR")
@@ -119,9 +120,8 @@ def test_byte_orders_integers_and_reals(tmp_path, processor, scale, analog, capl
     seen = points[..., 3] >= 0
     np.testing.assert_allclose(markers.position_m[seen], points[seen][:, :3] / 1e3, rtol=1e-12)
     assert not caplog.records
-    if (
-        processor != SGI and not analog
-    ):  # ezc3d does not read SGI, and asks for parameters of analogue channels
+    # ezc3d does not read SGI, and asks for parameters of analogue channels.
+    if processor != SGI and not analog:
         independent = ezc3d.c3d(str(path))["data"]["points"][:3].transpose(2, 1, 0)
         np.testing.assert_allclose(markers.position_m[seen], independent[seen] / 1e3, rtol=1e-12)
 
@@ -156,64 +156,24 @@ def test_more_frames_than_16_bits_hold(tmp_path, caplog):
          "TRIAL__ACTUAL_END_FIELD": (70_000 - 65536, 1)},
         {"FRAMES": 65535},
     ):  # fmt: skip
-        path = make_c3d(tmp_path / "a.c3d", points[:, :1], header_frames=65535, **changed)
+        path = make_c3d(tmp_path / "a.c3d", points, header_frames=65535, **changed)
         assert len(read_c3d(path).position_m) == 70_000
     assert not caplog.records
 
 
-@pytest.mark.parametrize("words", ["mete", "METERS", "metres", "m"])
-def test_units_that_are_words(tmp_path, words):
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        *[("m", 1), ("M", 1), ("mete", 1), ("METERS", 1), ("metres", 1), ("dm", 0.1), ("cm", 0.01)],
+        *[("um", 1e-6), ("in", 0.0254), ("feet", 0.3048), (None, 1e-3)],
+    ],
+)
+def test_units(tmp_path, caplog, unit, metres):
     points = make_points()
-    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=(words,)))
-    np.testing.assert_allclose(markers.position_m[0], points[0, :, :3], rtol=1e-6)
-
-
-def test_a_missing_unit_is_the_millimetre_with_a_warning(tmp_path, caplog):
-    points = make_points()
-    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=None))
-    np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
-    assert caplog.messages == [
-        f"{tmp_path / 'a.c3d'}: it has no POINT:UNITS; its coordinates are read as millimetres"
-    ]
-
-
-@pytest.mark.parametrize("length", [0, 1, 511, 700, 1100, 1030])
-def test_files_cut_short_anywhere_are_one_line(tmp_path, length):
-    path = make_c3d(tmp_path / "a.c3d", make_points())
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(InputError, match=r"a\.c3d: expected .*, found ") as caught:
-        read_c3d(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_random_damage_is_never_a_traceback(tmp_path):
-    """Bytes of header and parameters replaced at random: a file is read, or refused in one line."""
-    path = make_c3d(tmp_path / "a.c3d", make_points())
-    whole, rng = path.read_bytes(), np.random.default_rng(0)
-    refused = 0
-    for _ in range(300):
-        damaged = bytearray(whole)
-        for position in rng.integers(0, 1024, 3):
-            damaged[position] = rng.integers(256)
-        path.write_bytes(damaged)
-        try:
-            read_c3d(path)
-        except InputError:
-            refused += 1
-    assert 0 < refused < 300
-
-
-def test_two_scales_are_refused(tmp_path):
-    """Integers times one scale or the other: positions would be wrong by an unknown factor."""
-    path = make_c3d(tmp_path / "a.c3d", make_points(), scale=0.25, SCALE=0.5)
-    with pytest.raises(InputError, match=r"found 0\.25 in its header and 0\.5 in POINT:SCALE"):
-        read_c3d(path)
-
-
-def test_a_file_without_points(tmp_path):
-    path = make_c3d(tmp_path / "a.c3d", np.zeros((20, 0, 4)), analog=8)
-    with pytest.raises(InputError, match="expected markers over time, found none, only 8 analogue samples"):
-        read_c3d(path)
+    markers = read_c3d(make_c3d(tmp_path / "a.c3d", points, UNITS=unit and (unit,)))
+    np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] * metres, rtol=1e-6)
+    warning = f"{tmp_path / 'a.c3d'}: it has no POINT:UNITS; its coordinates are read as millimetres"
+    assert caplog.messages == ([] if unit else [warning])
 
 
 def test_a_file_without_parameters_is_read_by_its_header(tmp_path, caplog):
@@ -229,11 +189,11 @@ def test_a_file_without_parameters_is_read_by_its_header(tmp_path, caplog):
     assert markers.labels == ("*1", "*2", "*3")
     assert markers.rate_hz == 50
     np.testing.assert_allclose(markers.position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
-    assert "it has no POINT:UNITS; its coordinates are read as millimetres" in caplog.text
     content[530] = 1
     path.write_bytes(content)
-    with pytest.raises(InputError, match="parameters that are damaged: none can be read"):
-        read_c3d(path)
+    assert_refused(
+        lambda: read_c3d(path), "parameters that are damaged: none can be read", unchanged=tmp_path
+    )
 
 
 def test_analogue_samples_counted_as_channels(tmp_path):
@@ -244,6 +204,63 @@ def test_analogue_samples_counted_as_channels(tmp_path):
     content[4:6], content[18:20] = struct.pack("<H", 2), struct.pack("<H", 3)
     path.write_bytes(bytes(content).replace(b"USED\x05\x00\x02\x00\x06", b"USED\x05\x00\x02\x00\x02"))
     np.testing.assert_allclose(read_c3d(path).position_m[0], points[0, :, :3] / 1e3, rtol=1e-6)
+
+
+#: Name of the case -> points, keywords of `make_c3d`, share of the file that is there, words of the line.
+BAD = {
+    # Integers times one scale or the other: positions would be wrong by an unknown factor.
+    "two scales": (make_points(), {"scale": 0.25, "SCALE": 0.5}, 1, "0.25 in its header and 0.5 in POINT:SCALE"),
+    "no points": (np.zeros((20, 0, 4)), {"analog": 8}, 1, "found none, only 8 analogue samples"),
+    "an unknown unit": (make_points(), {"UNITS": ("furlong",)}, 1, "a unit of um, mm, cm, dm, m, in, ft, found"),
+    "far away": (1e9 * np.ones((2, 1, 4)), {}, 1, "positions of at most 100000 m, found 1e+06 m for marker 1"),
+    "a rate of none": (make_points(), {"RATE": 1e-9}, 1, "frames per second"),
+    "no scale": (make_points(), {"scale": 0.25, "SCALE": math.nan}, 1, "a scale of the coordinates, found nan"),
+    # ezc3d reads a file that is cut short without an error.
+    "cut short": (np.ones((400, 3, 4)), {}, 0.9, "400 frames as its parameters say"),
+    "cut short in its parameters": (make_points(), {}, 0.4, "cut short in its parameters: copy it again"),
+    "empty": (make_points(), {}, 0, "expected a C3D file, found an empty file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("points", "changed", "share", "words"), BAD.values(), ids=BAD)
+def test_bad_files_are_refused(tmp_path, points, changed, share, words):
+    path = make_c3d(tmp_path / "a.c3d", points, **changed)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    assert_refused(lambda: read_c3d(path), "a.c3d: expected", words, unchanged=tmp_path)
+
+
+# --- writing
+
+
+def test_written_markers_are_read_back_and_by_ezc3d(tmp_path):
+    """LABELS holds 255 labels, and LABELS2 holds the rest: recordings have many unlabelled reflections."""
+    position_m = np.random.default_rng(0).uniform(1, 2, (5, 310, 3))
+    position_m[3, 1] = np.nan
+    markers = Markers(tuple(f"*{number}" for number in range(310)), position_m, 100.0)
+    write_c3d(tmp_path / "a.c3d", markers)
+    again = read_c3d(tmp_path / "a.c3d")
+    assert (again.labels, again.rate_hz) == (markers.labels, 100.0)
+    # The file stores float32 millimetres: half of 2^-23 times 2 m is 0.12 micrometres.
+    np.testing.assert_allclose(again.position_m, position_m, rtol=0, atol=2e-7)
+    independent = ezc3d.c3d(str(tmp_path / "a.c3d"))
+    assert independent["parameters"]["POINT"]["UNITS"]["value"] == ["mm"]
+    # ezc3d gives NaN for a point whose residual is -1: the format's mark of an unseen point.
+    assert np.isnan(independent["data"]["points"][:3, 1, 3]).all()
+    assert np.argwhere(independent["data"]["meta_points"]["residuals"][0] < 0).tolist() == [[1, 3]]
+    np.testing.assert_allclose(independent["data"]["points"][:3, 2, 4], 1e3 * position_m[4, 2], rtol=1e-6)
+
+
+def test_the_largest_number_of_frames_that_is_written(tmp_path):
+    """The header counts frames in 16 bits: at most 65,535 (11 minutes at 100 Hz). ezc3d silently drops the rest."""
+    path = tmp_path / "a.c3d"
+    write_c3d(path, Markers(("Dron1:1",), np.ones((65_535, 1, 3)), 100.0))
+    assert len(read_c3d(path).position_m) == 65_535
+    too_long = Markers(("Dron1:1",), np.ones((65_536, 1, 3)), 100.0)
+    words = "expected at most 65535 frames in a C3D file, found 65536"
+    assert_refused(lambda: write_c3d(path, too_long), words, unchanged=tmp_path)
+    shape = "expected positions of shape (frames, 1, 3), found (3, 2, 3)"
+    assert_refused(lambda: Markers(("a",), np.zeros((3, 2, 3)), 100.0), shape, unchanged=tmp_path)
 
 
 @pytest.mark.real

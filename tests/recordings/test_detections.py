@@ -1,18 +1,25 @@
-"""Detection files: reading, writing and reading again, and errors that name the line."""
+"""Detections: their files, and recordings of cameras that differ in size, rate and start and have nothing else."""
+
+import json
 
 import numpy as np
 import pytest
+from helpers import assert_refused, make_once, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psotrack.errors import InputError
+import psotrack as pt
+from psotrack.geometry import project
+from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import Detections, read_detections, write_detections
+from psotrack.recordings.datasets import open_recording
+from psotrack.trajectories import read_trajectories
 
 LINE = "4,10,20,30,40,25,40,0.9"
 
 
-def write_file(tmp_path, text, name="cam1i_s.csv"):
-    path = tmp_path / name
+def write_file(tmp_path, text):
+    path = tmp_path / "cam1i_s.csv"
     path.write_bytes(text.encode())
     return path
 
@@ -24,24 +31,21 @@ def test_a_file_is_read(tmp_path):
     assert detections.confidence.tolist() == [0.9, 0.9, 0.25]
     assert detections.in_frame(9).confidence.tolist() == [0.9, 0.25]
     assert len(detections.in_frame(7)) == 0
-
-
-def test_x_and_y_may_be_the_middle(tmp_path):
-    """Some exports of YOLO have the middle of the box as x and y; the box that is read is the same."""
-    detections = read_detections(write_file(tmp_path, "0,25,40,30,40,25,40,0.9"))
-    assert detections.xyxy.tolist() == [[10, 20, 40, 60]]
+    assert len(read_detections(write_file(tmp_path, ""))) == 0
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "frames"),
     [
-        f"\ufeff{LINE}\n",
-        f"{LINE}\r\n\r\n",
-        f"\n\n{LINE},\n\n",
-        LINE.replace(",", " , "),
-        f"{LINE}\n2,{LINE[2:]}".replace("\n2", "\n2.0"),
-        f"{LINE},,,,\n2,{LINE[2:]}{7 * ','}\n3,,,,\n,,,,",
-        f"{LINE},,,,,,,,{LINE[2:]}",
+        (f"\ufeff{LINE}\n", [4]),
+        (f"{LINE}\r\n\r\n", [4]),
+        (f"\n\n{LINE},\n\n", [4]),
+        (LINE.replace(",", " , "), [4]),
+        (f"{LINE}\n2.0,{LINE[2:]}", [2, 4]),
+        (f"{LINE},,,,\n2,{LINE[2:]}{7 * ','}\n3,,,,\n,,,,", [2, 4]),
+        (f"{LINE},,,,,,,,{LINE[2:]}", [4, 4]),
+        # Some exports of YOLO have the middle of the box as x and y.
+        ("0,25,40,30,40,25,40,0.9", [0]),
     ],
     ids=[
         "byte order mark",
@@ -51,44 +55,34 @@ def test_x_and_y_may_be_the_middle(tmp_path):
         "out of order, frame as 2.0",
         "padded with empty fields",
         "an empty detection between two",
+        "middles",
     ],
 )
-def test_variants_of_the_format_are_read(tmp_path, text):
+def test_variants_of_the_format_are_read(tmp_path, text, frames):
     detections = read_detections(write_file(tmp_path, text))
-    assert set(detections.frame.tolist()) <= {2, 4}
-    assert np.all(np.diff(detections.frame) >= 0)
-    np.testing.assert_array_equal(detections.xyxy, [[10, 20, 40, 60]] * len(detections))
+    assert detections.frame.tolist() == frames
+    assert detections.xyxy.tolist() == [[10, 20, 40, 60]] * len(frames)
 
 
-def test_no_detections_at_all(tmp_path):
-    assert len(read_detections(write_file(tmp_path, ""))) == 0
+#: Second line of a file -> words of the message.
+BAD = {
+    "5,1,2,3,4,5,6": ("line 2: expected a frame number and 7 values per detection ", ", found 6 values"),
+    "5,1,2,3,4,5,6,x": ("line 2, column 8: expected a number, found 'x'",),
+    "5,1,2,,4,5,6,0.5": ("line 2, column 4: expected a value, found nothing",),
+    "5,1,2,nan,4,5,6,0.5": ("line 2, column 4: expected a finite number, found 'nan'",),
+    "5,1,2,-3,4,5,6,0.5": ("line 2, column 4: expected a size w of 0 or more pixels, found -3",),
+    "5,1,2,3,4,5,6,1.5": ("line 2, column 8: expected a confidence from 0 to 1, found 1.5",),
+    "5.5,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '5.5'",),
+    "-1,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '-1'",),
+    LINE: ("line 2, column 1: expected each frame once, found frame 4 again",),
+    LINE.replace(",", ";"): ("line 2, column 1: expected a number",),
+}
 
 
-@pytest.mark.parametrize(
-    ("broken", "expected"),
-    [
-        ("5,1,2,3,4,5,6", "line 2: expected a frame number and 7 values per detection .*, found 6 values"),
-        ("5,1,2,3,4,5,6,x", "line 2, column 8: expected a number, found 'x'"),
-        ("5,1,2,,4,5,6,0.5", "line 2, column 4: expected a value, found nothing"),
-        ("5,1,2,nan,4,5,6,0.5", "line 2, column 4: expected a finite number, found 'nan'"),
-        ("5,1,2,-3,4,5,6,0.5", "line 2, column 4: expected a size w of 0 or more pixels, found -3"),
-        ("5,1,2,3,4,5,6,1.5", "line 2, column 8: expected a confidence from 0 to 1, found 1.5"),
-        ("5.5,1,2,3,4,5,6,0.5", "line 2, column 1: expected a whole number, 0 or more, found '5.5'"),
-        ("-1,1,2,3,4,5,6,0.5", "line 2, column 1: expected a whole number, 0 or more, found '-1'"),
-        (LINE, "line 2, column 1: expected each frame once, found frame 4 again"),
-        (LINE.replace(",", ";"), "line 2, column 1: expected a number"),
-    ],
-)
-def test_a_broken_line_is_named(tmp_path, broken, expected):
-    with pytest.raises(InputError, match=rf"cam1i_s\.csv, {expected}"):
-        read_detections(write_file(tmp_path, f"{LINE}\n{broken}\n"))
-
-
-def test_a_file_that_is_not_text_is_refused(tmp_path):
-    path = tmp_path / "cam1i_s.csv"
-    path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(InputError, match=r"cam1i_s\.csv: expected UTF-8 text, found an invalid byte"):
-        read_detections(path)
+@pytest.mark.parametrize(("line", "words"), BAD.items(), ids=BAD)
+def test_a_wrong_line_is_named(tmp_path, line, words):
+    path = write_file(tmp_path, f"{LINE}\n{line}\n")
+    assert_refused(lambda: read_detections(path), "cam1i_s.csv", *words, unchanged=tmp_path)
 
 
 pixels = st.floats(-1e4, 1e4)
@@ -110,6 +104,93 @@ def test_detections_are_read_as_they_were_written(tmp_path_factory, found):
     np.testing.assert_array_equal(again.confidence, detections.confidence)
 
 
-def test_frames_must_be_in_order():
-    with pytest.raises(InputError, match="expected increasing frame numbers, found steps back"):
-        Detections(np.array([3, 2]), np.zeros((2, 4)), np.zeros(2))
+def test_frames_must_be_in_order(tmp_path):
+    words = "expected increasing frame numbers, found steps back"
+    assert_refused(
+        lambda: Detections(np.array([3, 2]), np.zeros((2, 4)), np.zeros(2)), words, unchanged=tmp_path
+    )
+
+
+# --- recordings without videos
+
+LASTS_S = 1.0
+#: Rate and time of frame 0 of each camera.
+CLOCKS = {"c0": (25.0, 0.0), "c1": (50.0, 0.0), "c2": (25.0, 0.013), "c3": (30.0, 0.2), "c4": (25.0, 0.0)}
+
+
+def path_m(time_s):
+    """A drone that flies a curve at about 1.5 m/s."""
+    return np.stack([np.cos(1.5 * time_s), np.sin(1.5 * time_s), 1.2 + 0.2 * time_s], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording with detections of five cameras, a rig file and a reference."""
+
+    def make(folder):
+        rig = ring_rig(5, image_size_wh=(640, 480))
+        # The last camera has twice the resolution.
+        rig.cameras.K[4, :2] *= 2
+        rig.cameras.image_size_wh[4] *= 2
+        write_rig(folder / "rig.toml", rig)
+        text = 'version = 1\ncalibration = "rig.toml"\n[reference]\nfiles = ["drone.tum"]\n'
+        for index, (name, (fps, begins_s)) in enumerate(CLOCKS.items()):
+            time_s = begins_s + np.arange(int((LASTS_S - begins_s) * fps)) / fps
+            centre_px = project(rig.cameras[index], path_m(time_s))[0] + 0.5
+            side_px = 24.0 if index == 4 else 12.0
+            xyxy = np.hstack([centre_px - side_px, centre_px + side_px])
+            found = Detections(np.arange(len(time_s)), xyxy, np.ones(len(time_s)))
+            write_detections(folder / f"{name}.csv", found)
+            text += f'[cameras.{name}]\ndetections = "{name}.csv"\nfps = {fps}\ntime_offset_s = {begins_s}\n'
+        (folder / "recording.toml").write_text(text)
+        time_s = np.arange(0, LASTS_S, 0.01)
+        rows = (f"{t} {x} {y} {z} 0 0 0 1\n" for t, (x, y, z) in zip(time_s, path_m(time_s), strict=True))
+        (folder / "drone.tum").write_text("".join(rows))
+
+    return make_once(tmp_path_factory, "detections_alone", make)
+
+
+@pytest.mark.slow
+def test_detections_without_videos_are_tracked(run_psotrack, folder, tmp_path):
+    out = tmp_path / "tracks.csv"
+    tracked = run_psotrack("track", folder, "--method", "projection-lines", "--out", out)
+    assert tracked.code == 0, tracked.err
+    tracks, recording = read_trajectories(out), open_recording(folder)
+    assert (recording.fps, recording.num_frames) == (50.0, tracks.num_frames)
+    assert tracks.num_drones == 1
+    np.testing.assert_allclose(tracks.time_s, recording.timeline().time_s, rtol=0, atol=1e-9)
+    seen = tracks.seen[:, 0]
+    assert seen.mean() > 0.9
+    error_m = np.linalg.norm(tracks.position_m[seen, 0] - path_m(tracks.time_s[seen]), axis=-1)
+    # At 1.5 m/s half an interval of the slow cameras is 30 mm.
+    assert np.median(error_m) < 0.01
+    assert json.loads(run_psotrack("evaluate", out, folder, "--json", "-").out)["mean_error_m"] < 0.01
+
+
+class Own:
+    """A method of the caller."""
+
+    reads_detections = True
+
+    def __call__(self, inputs, report=None):
+        raise AssertionError("never called: there are no videos")
+
+
+def test_recordings_without_videos(run_psotrack, folder, tmp_path):
+    recording = pt.read_recording(folder, cameras="C-2", num_frames=20)
+    assert (recording.rig.names, recording.num_frames) == (("c2",), 20)
+    shown = run_psotrack("init", "--show", folder).out
+    for word in ("no video", "1280 x 960", "50 Hz"):
+        assert word in shown
+    for bad, words in (
+        (lambda: pt.read_recording(folder, cameras="camera9"), ("cameras: expected some of",)),
+        (
+            lambda: run_psotrack("track", folder, "--out", tmp_path / "tracks.csv", "--quiet"),
+            ("expected a video for each of the cameras ", "found none"),
+        ),
+        (
+            lambda: pt.track(folder, {"method": "projection-lines"}, method=Own(), cache=tmp_path),
+            ("expected at least one video",),
+        ),
+    ):
+        assert_refused(bad, *words, unchanged=tmp_path)

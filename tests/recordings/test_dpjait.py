@@ -1,177 +1,191 @@
-"""The reader of the dataset: hand-made folders of both halves are read, and damaged in many ways."""
+"""The dataset's folders: both halves are read, written files are read back, and what is wrong is said in one line."""
 
+import csv
 import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
-
-from psotrack.cli import cli
-from psotrack.errors import InputError, SettingsError
-from psotrack.geometry import project
-from psotrack.recordings import VideoWriter, read_detections
-from psotrack.recordings.datasets import read_sequence
-from psotrack.recordings.mocap import Markers, write_c3d
-
-WIDTH, HEIGHT, FPS = 64, 48, 25.0
-SIMULATED_HEADER = (
-    "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
+from dpjait_folders import (
+    POSE_HEADER,
+    SERIALS,
+    SIMULATED_HEADER,
+    make_real,
+    make_simulated,
+    pose_lines,
+    write_cameras,
+    write_video,
 )
-REAL_HEADER = SIMULATED_HEADER.replace("[m]", "[mm]") + ";coeff_1;coeff_2;coeff_3;coeff_4"
-POSE_HEADER = "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z"
-SERIALS = ("55260362", "56339527", "60881257", "61920488")
+from helpers import assert_refused, make_once
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from psotrack.geometry import make_camera, make_rig, project
+from psotrack.geometry.rig_files import read_rig, write_calibration
+from psotrack.recordings import inventory_table, read_detections
+from psotrack.recordings.datasets import (
+    CALIBRATION,
+    MARKER_CORNERS,
+    ONBOARD_CALIBRATION,
+    pose_file,
+    read_marker_corners,
+    read_onboard,
+    read_onboard_calibration,
+    read_poses,
+    read_sequence,
+    write_marker_corners,
+    write_onboard_calibration,
+    write_poses,
+)
+from psotrack.recordings.mocap import Markers, write_c3d
 
 
 @pytest.fixture(scope="session")
-def make_video(tmp_path_factory):
-    """Return a function that writes a small black video once and returns its path."""
-    folder = tmp_path_factory.mktemp("videos")
+def halves(tmp_path_factory):
+    """Folder with a sequence of each half; the names of the folders state other numbers of drones."""
 
-    def make(num_frames: int, size_wh: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
-        path = folder / f"{num_frames}_{size_wh[0]}.avi"
-        if not path.exists():
-            with VideoWriter(path, FPS, size_wh) as writer:
-                for _ in range(num_frames):
-                    writer.write(np.zeros((size_wh[1], size_wh[0], 3), np.uint8))
-        return path
+    def make(folder):
+        make_simulated(folder / "S99_D9")
+        make_real(folder / "R99_D9")
 
-    return make
-
-
-def pose_lines(num_rows: int, x0: float) -> str:
-    rows = ["0;0;0;-0;0;0;0;1;0;0;0"]
-    rows += [f"{i};{x0 + 0.1 * i};2;1.5;0;0;0;0;0;0;1" for i in range(1, num_rows)]
-    return "\n".join([POSE_HEADER, *rows]) + "\n"
+    return make_once(tmp_path_factory, "dpjait", make)
 
 
 @pytest.fixture
-def simulated_folder(tmp_path, make_video):
-    """A simulated sequence of three cameras, two drones and five frames; its folder name states nine drones."""
-    folder = tmp_path / "Simulated_Data" / "S99_D9"
-    folder.mkdir(parents=True)
-    cameras = [f"cam{i}i;{i};0.5;8;1.9;{i / 10};0;{1156.3 + i};32;24" for i in (1, 2, 3)]
-    (folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
-    for i in (1, 2, 3):
-        shutil.copy(make_video(5), folder / f"cam{i}i_s.avi")
-    (folder / "dron1_pos_25.csv").write_text(pose_lines(5, 0.0))
-    (folder / "dron2_pos_25.csv").write_text(pose_lines(5, 1.0))
-    return folder
+def simulated(halves, tmp_path):
+    """A copy of the simulated sequence, which a test may change."""
+    return shutil.copytree(halves / "S99_D9", tmp_path / "S99_D9")
 
 
 @pytest.fixture
-def real_folder(tmp_path, make_video):
-    """A real sequence of four cameras named by serial number, two drones at 100 Hz, and five frames."""
-    folder = tmp_path / "Real_Data" / "R99_D2"
-    folder.mkdir(parents=True)
-    cameras = [f"{name};-100;250.5;6000;1.9;0.1;0;1158.7;32;24;-0.1;0.02;0.001;-0.002" for name in SERIALS]
-    (folder / "cameras_calibration.csv").write_text("\n".join([REAL_HEADER, *cameras]) + "\n")
-    for name in SERIALS:
-        shutil.copy(make_video(5), folder / f"{name}.avi")
-    t = np.arange(20)[:, None, None]
-    position_m = np.tile([1.0, 2.0, 1.5], (20, 6, 1)) + 0.01 * t + 0.1 * np.arange(6)[None, :, None]
-    labels = tuple(f"Dron{drone}:Dron{drone}{i}" for drone in (4, 7) for i in (1, 2, 3))
-    write_c3d(folder / "R99.c3d", Markers(labels, position_m, 100.0))
-    return folder
+def real(halves, tmp_path):
+    """A copy of the real sequence, which a test may change."""
+    return shutil.copytree(halves / "R99_D9", tmp_path / "R99_D9")
 
 
-def replace_in_file(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
+def edit(file, old, new, count=1):
+    """Function that replaces a text in a file of a folder."""
+
+    def change(folder):
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new, count))
+
+    return change
 
 
-def test_the_simulated_half(simulated_folder):
-    recording = read_sequence(simulated_folder)
+def write(file, text):
+    """Function that writes a file of a folder."""
+    return lambda folder: (folder / file).write_text(text)
+
+
+# --- both halves
+
+
+def test_the_simulated_half(simulated):
+    recording = read_sequence(simulated)
     assert recording.name == "S99_D9"
     assert recording.rig.names == ("cam1i", "cam2i", "cam3i")
-    assert [recording.videos[name].path.name for name in recording.rig.names] == [
-        "cam1i_s.avi",
-        "cam2i_s.avi",
-        "cam3i_s.avi",
-    ]
+    assert {name: video.path.name for name, video in recording.videos.items()} == {
+        name: f"{name}_s.avi" for name in recording.rig.names
+    }
     assert (recording.fps, recording.num_frames) == (25.0, 5)
     cameras = recording.rig.cameras
     assert cameras.image_size_wh.tolist() == [[64, 48]] * 3
-    assert cameras.K[:, 0, 0].tolist() == [1157.3, 1158.3, 1159.3]  # each camera has its own focal length
+    # Each camera has its own focal length.
+    assert cameras.K[:, 0, 0].tolist() == [1157.3, 1158.3, 1159.3]
     assert cameras.dist.shape == (3, 0)
     truth = recording.truth
-    assert truth.drones == ("dron1", "dron2")  # the files count, not the name of the folder
-    assert np.isnan(truth.position_m[0]).all()  # the placeholder
+    # The files count, not the name of the folder; the first row is a placeholder.
+    assert truth.drones == ("dron1", "dron2")
+    assert np.isnan(truth.position_m[0]).all()
     assert np.isnan(truth.orientation_wxyz[0]).all()
     np.testing.assert_allclose(truth.position_m[1:, 1, 0], [1.1, 1.2, 1.3, 1.4], rtol=0, atol=1e-12)
     assert truth.orientation_wxyz[4, 0].tolist() == [0, 0, 0, 1]
     assert truth.time_s.tolist() == [0, 0.04, 0.08, 0.12, 0.16]
-    assert not recording.detections
+    assert list(recording.detections) == ["cam2i"]
+    assert read_detections(recording.detections["cam2i"]).xyxy.tolist() == [[10, 20, 14, 26]]
     assert recording.usable().num_frames == 5
 
 
-@pytest.fixture
-def published_folder(simulated_folder, make_video):
-    """The simulated half as published: ten cameras, named `cam1` in the calibration and `cam1i_s` in file names."""
+def test_the_cameras_on_drones(simulated):
+    recording = read_sequence(simulated)
+    first, second = recording.onboard.values()
+    assert list(recording.onboard) == ["dron1", "dron2"]
+    assert recording.usable(num_frames=3).onboard == recording.onboard
+    assert (first.video.path.name, first.video.num_frames) == ("dron1_cam_s.avi", 5)
+    assert first.K.tolist() == [[60.5, 0, 31.5], [0, 60.25, 23.5], [0, 0, 1]]
+    assert second.K[:2, :2].tolist() == [[61, 0], [0, 61]]
+    assert np.isnan(first.position_m[0]).all(), "the first row is a placeholder"
+    np.testing.assert_allclose(second.position_m[1:, 0], [1.2, 1.3, 1.4, 1.5], rtol=0, atol=1e-12)
+    assert second.orientation_wxyz[4].tolist() == [0, 0, 0, 1]
+    content = recording.to_dict()
+    assert content["onboard"]["dron1"] == {
+        "video": str(simulated / "dron1_cam_s.avi"),
+        "frames": 5,
+        "fps": 25.0,
+        "image_size_wh": [64, 48],
+        "focal_length_px": 60.5,
+        "frames_with_pose": 4,
+    }
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(inventory_table(content))
+    row = next(line for line in capture.get().splitlines() if "on dron1" in line)
+    assert row.split() == ["on", "dron1", "dron1_cam_s.avi", "5", "25", "64", "x", "48", "60.5", "4", "poses"]
+    # Intrinsics and poses without videos are ignored.
+    for path in simulated.glob("dron?_cam_s.avi"):
+        path.unlink()
+    assert read_onboard(simulated) == {}
+    assert read_sequence(simulated).to_dict()["onboard"] is None
+
+
+def test_the_simulated_half_as_published(simulated):
+    """Cameras are `cam1` in the calibration and `cam1i_s` in the names of files; `cam10i_s` is another camera."""
     names = [f"cam{i}" for i in range(1, 11)]
-    cameras = [f"{name};{i};0.5;8;1.9;0;0;{1156.3 + i};32;24" for i, name in enumerate(names, start=1)]
-    (simulated_folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
-    (simulated_folder / "dl_data").mkdir()
+    write_cameras(simulated, names)
     for i, name in enumerate(names, start=1):
-        shutil.copy(make_video(5), simulated_folder / f"{name}i_s.avi")
-        (simulated_folder / "dl_data" / f"{name}i_s.csv").write_text(f"{i},10,20,30,40,25,40,0.66,,,,,,,\n")
-    return simulated_folder
-
-
-def test_the_simulated_half_as_published(published_folder):
-    """The file `cam1i_s` belongs to the camera `cam1` of the calibration; the file `cam10i_s` does not."""
-    recording = read_sequence(published_folder)
-    names = tuple(f"cam{i}" for i in range(1, 11))
-    assert recording.rig.names == names
+        write_video(simulated / f"{name}i_s.avi")
+        (simulated / "dl_data" / f"{name}i_s.csv").write_text(f"{i},10,20,30,40,25,40,0.66,,,,,,,\n")
+    recording = read_sequence(simulated)
+    assert recording.rig.names == tuple(names)
     assert {name: video.path.name for name, video in recording.videos.items()} == {
         name: f"{name}i_s.avi" for name in names
     }
     for i, name in enumerate(names, start=1):
         assert read_detections(recording.detections[name]).frame.tolist() == [i]
-
-
-@pytest.mark.parametrize("typed", ["cam1", "cam1i", "cam1i_s", "CAM1"])
-@pytest.mark.parametrize("half", ["simulated_folder", "published_folder"])
-def test_a_camera_is_selected_by_any_of_its_names(half, typed, request):
-    recording = read_sequence(request.getfixturevalue(half))
-    kept = recording.usable([typed, "cam3"])
-    assert kept.rig.names == (recording.rig.names[0], recording.rig.names[2])
-    assert list(kept.videos) == list(kept.rig.names)
-    assert kept.rig.cameras.K[:, 0, 0].tolist() == [1157.3, 1159.3]
-
-
-@pytest.mark.parametrize(
-    ("typed", "found"),
-    [
+    # A camera is selected by any of its names.
+    for typed in ("cam1", "cam1i", "cam1i_s", "CAM1"):
+        kept = recording.usable([typed, "cam3"])
+        assert kept.rig.names == tuple(kept.videos) == ("cam1", "cam3")
+        assert kept.rig.cameras.K[:, 0, 0].tolist() == [1157.3, 1159.3]
+    for typed, found in (
         (["cam"], "found cam"),
         (["cam11"], "found cam11"),
         (["cam1", "cam1i_s"], "each once, found cam1, cam1i_s"),
-    ],
-)
-def test_unknown_and_repeated_camera_names(published_folder, typed, found):
-    with pytest.raises(SettingsError, match=f"cameras: expected some of cam1, cam2, .*{found}"):
-        read_sequence(published_folder).usable(typed)
+    ):
+        words = ("cameras: expected some of cam1, cam2, ", found)
+        assert_refused(lambda typed=typed: recording.usable(typed), *words, unchanged=simulated)
 
 
-def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated_folder, make_video):
+def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated):
     """`left_back_s` belongs to `left_back`, not to `left`; `left.avi` comes before `left_debug.avi`."""
-    names = ("left", "left_back")
-    cameras = [f"{name};1;0.5;8;1.9;0;0;1156.3;32;24" for name in names]
-    (simulated_folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *cameras]) + "\n")
+    write_cameras(simulated, ["left", "left_back"])
     for name in ("left_back_s", "left", "left_debug"):
-        shutil.copy(make_video(5), simulated_folder / f"{name}.avi")
-    videos = read_sequence(simulated_folder).videos
+        write_video(simulated / f"{name}.avi")
+    videos = read_sequence(simulated).videos
     assert {name: video.path.name for name, video in videos.items()} == {
         "left": "left.avi",
         "left_back": "left_back_s.avi",
     }
 
 
-def test_the_real_half(real_folder):
-    recording = read_sequence(real_folder)
-    assert recording.rig.names == SERIALS
+def test_the_real_half(real):
+    (real / f"{SERIALS[0]}.avi").rename(real / f"cam_{SERIALS[0]}.avi")
+    recording = read_sequence(real)
+    assert recording.rig.names == tuple(recording.videos) == SERIALS
     cameras = recording.rig.cameras
     np.testing.assert_allclose(cameras.T_cam_world[0, :3, 3], [-0.1, 0.2505, 6.0], rtol=0, atol=1e-12)
     assert cameras.dist[2].tolist() == [-0.1, 0.02, 0.001, -0.002]
@@ -184,184 +198,81 @@ def test_the_real_half(real_folder):
     assert truth.seen.all()
 
 
-@pytest.mark.parametrize("half", ["simulated_folder", "real_folder"])
-def test_projection_agrees_with_opencv(half, request):
+@pytest.mark.parametrize(("half", "metres"), [("S99_D9", 1), ("R99_D9", 1e-3)])
+def test_projection_agrees_with_opencv(halves, half, metres):
     """Projection agrees with `cv2.projectPoints` and the values of the file: t is not the camera's centre."""
-    folder = request.getfixturevalue(half)
-    rig = read_sequence(folder).rig
-    line = (folder / "cameras_calibration.csv").read_text().splitlines()[2].split(";")
+    rig = read_sequence(halves / half).rig
+    line = (halves / half / CALIBRATION).read_text().splitlines()[2].split(";")
     t, rvec = np.array(line[1:4], float), np.array(line[4:7], float)
     f, cx, cy = (float(value) for value in line[7:10])
     points_m = np.random.default_rng(0).uniform(-2, 2, (7, 3))
-    in_file_units = points_m * (1000 if half == "real_folder" else 1)
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
-    expected, _ = cv2.projectPoints(in_file_units, rvec, t, K, np.array(line[10:], float))
+    expected, _ = cv2.projectPoints(points_m / metres, rvec, t, K, np.array(line[10:], float))
     pixels, depth_m = project(rig.cameras[1], points_m)
     assert depth_m.min() > 0
     # Both compute in double precision with pixels up to a few thousand.
     np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-8)
 
 
-def test_forms_of_the_path_of_a_sequence(simulated_folder, monkeypatch):
-    monkeypatch.chdir(simulated_folder.parent)
-    for typed in ("S99_D9", "S99_D9/", "./S99_D9//", simulated_folder):
+def test_forms_of_the_path_of_a_sequence(halves, monkeypatch):
+    monkeypatch.chdir(halves)
+    for typed in ("S99_D9", "S99_D9/", "./S99_D9//"):
         assert read_sequence(typed).name == "S99_D9"
-    monkeypatch.chdir(simulated_folder)
+    monkeypatch.chdir(halves / "S99_D9")
     assert read_sequence(".").name == "S99_D9"
 
 
-def test_cameras_may_be_without_video(simulated_folder, caplog):
-    (simulated_folder / "cam2i_s.avi").unlink()
-    with caplog.at_level("INFO"):
-        recording = read_sequence(simulated_folder)
+# --- folders that differ
+
+
+def test_cameras_without_video_and_videos_without_camera(simulated, caplog):
+    caplog.set_level("INFO")
+    (simulated / "cam2i_s.avi").unlink()
+    write_video(simulated / "dron1_fpv.avi", 7)
+    recording = read_sequence(simulated)
     assert list(recording.videos) == ["cam1i", "cam3i"]
+    assert recording.truth.num_frames == 5
     assert recording.rig.cameras.image_size_wh.tolist() == [[64, 48]] * 3
     assert "camera cam2i has no video: assuming 64 x 48 pixels like most cameras" in caplog.text
+    assert "dron1_fpv.avi: not used" in caplog.text
     assert recording.usable().rig.names == ("cam1i", "cam3i")
     assert "camera cam2i is left out: it has no video" in caplog.text
     assert recording.usable(["cam3i", "cam1i"]).num_frames == 5
 
 
-def test_videos_may_differ_in_length(simulated_folder, make_video):
-    shutil.copy(make_video(7), simulated_folder / "cam2i_s.avi")
-    recording = read_sequence(simulated_folder)
+def test_videos_may_differ_in_length(simulated):
+    write_video(simulated / "cam2i_s.avi", 7)
+    recording = read_sequence(simulated)
     assert recording.num_frames == recording.truth.num_frames == 7
     assert recording.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
     assert recording.usable().timeline().frame[4:6].tolist() == [[4, 4, 4], [-1, 5, -1]]
 
 
-def test_a_video_of_another_size(simulated_folder, make_video):
-    shutil.copy(make_video(5, (96, 64)), simulated_folder / "cam1i_s.avi")
-    with pytest.raises(
-        InputError, match=r"cam1i_s\.avi: .* principal point \(32, 24\), found 96 x 64 pixels"
-    ):
-        read_sequence(simulated_folder)
-    replace_in_file(simulated_folder / "cameras_calibration.csv", "1157.3;32;24", "1157.3;47;31")
-    recording = read_sequence(simulated_folder).usable()
+def test_a_video_of_another_size(simulated):
+    write_video(simulated / "cam1i_s.avi", size_wh=(96, 64))
+    words = ("cam1i_s.avi: expected images", "principal point (32, 24), found 96 x 64 pixels")
+    assert_refused(lambda: read_sequence(simulated), *words, unchanged=simulated)
+    edit(CALIBRATION, "1157.3;32;24", "1157.3;47;31")(simulated)
+    recording = read_sequence(simulated).usable()
     assert recording.rig.cameras.image_size_wh.tolist() == [[96, 64], [64, 48], [64, 48]]
 
 
-def test_poses_after_the_end_of_the_videos_are_dropped(simulated_folder):
-    (simulated_folder / "dron1_pos_25.csv").write_text(pose_lines(9, 0.0))
-    assert read_sequence(simulated_folder).truth.num_frames == 5
-
-
-def test_missing_poses_are_nan(simulated_folder):
-    (simulated_folder / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0))
-    replace_in_file(simulated_folder / "dron2_pos_25.csv", "\n3;", "\n12;")
-    truth = read_sequence(simulated_folder).truth
+def test_poses_that_are_missing_more_than_frames_or_at_another_rate(simulated):
+    (simulated / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0))
+    edit("dron2_pos_25.csv", "\n3;", "\n12;")(simulated)
+    # The other spelling, `drone`, beside numbers that sort otherwise as text.
+    (simulated / "drone10_pos_100.csv").write_text(pose_lines(20, 9.0))
+    truth = read_sequence(simulated).truth
+    assert truth.drones == ("dron1", "dron2", "dron10")
+    assert truth.num_frames == 5
     assert truth.seen[:, 0].tolist() == [False, True, True, False, False]
     # One missing row is interpolated.
     assert truth.seen[:, 1].tolist() == [False, True, True, True, True]
     assert truth.position_m[3, 1, 0] == pytest.approx(1.3, abs=0.02)
-
-
-def test_ten_drones_are_in_the_order_of_their_numbers(simulated_folder):
-    for number in range(3, 11):
-        (simulated_folder / f"drone{number}_pos_25.csv").write_text(
-            pose_lines(5, number)
-        )  # the other spelling, `drone`
-    truth = read_sequence(simulated_folder).truth
-    assert truth.drones == tuple(f"dron{number}" for number in range(1, 11))
-    assert truth.position_m[1, 9, 0] == pytest.approx(10.1)
-
-
-def test_no_reference(simulated_folder):
-    for path in simulated_folder.glob("dron*.csv"):
+    np.testing.assert_allclose(truth.position_m[1:, 2, 0], [9.4, 9.8, 10.2, 10.6], rtol=0, atol=1e-12)
+    for path in simulated.glob("dron*_pos_*.csv"):
         path.unlink()
-    assert read_sequence(simulated_folder).truth is None
-
-
-def test_detections_are_assigned_to_cameras(simulated_folder):
-    (simulated_folder / "dl_data").mkdir()
-    (simulated_folder / "dl_data" / "cam2i_s.csv").write_text("1,10,20,4,6,12,23,0.5\n")
-    detections = read_sequence(simulated_folder).detections
-    assert list(detections) == ["cam2i"]
-    assert read_detections(detections["cam2i"]).xyxy.tolist() == [[10, 20, 14, 26]]
-
-
-def test_other_videos_are_ignored(simulated_folder, make_video, caplog):
-    shutil.copy(make_video(7), simulated_folder / "dron1_fpv.mp4")
-    with caplog.at_level("INFO"):
-        assert read_sequence(simulated_folder).truth.num_frames == 5
-    assert "dron1_fpv.mp4: not used" in caplog.text
-
-
-def test_serial_numbers_with_a_prefix(real_folder):
-    (real_folder / f"{SERIALS[0]}.avi").rename(real_folder / f"cam_{SERIALS[0]}.avi")
-    assert list(read_sequence(real_folder).videos) == list(SERIALS)
-
-
-def assert_reading_fails(folder, message):
-    with pytest.raises(InputError, match=message):
-        read_sequence(folder)
-
-
-def test_no_such_folder(tmp_path):
-    assert_reading_fails(tmp_path / "nix", r"nix/cameras_calibration\.csv: expected .*, found no such file")
-
-
-def test_no_videos_at_all(simulated_folder):
-    for path in simulated_folder.glob("*.avi"):
-        path.unlink()
-    assert_reading_fails(
-        simulated_folder, r"S99_D9: expected videos named like the cameras, cam1i\.avi \.\.\., found no \.avi"
-    )
-
-
-def test_two_videos_of_one_camera(simulated_folder, make_video):
-    shutil.copy(make_video(5), simulated_folder / "cam1i.avi")
-    assert_reading_fails(
-        simulated_folder, r"cam1i_s\.avi: expected one such file per camera, found cam1i\.avi as well"
-    )
-
-
-def test_a_broken_video(simulated_folder):
-    (simulated_folder / "cam1i_s.avi").write_bytes(b"")
-    assert_reading_fails(simulated_folder, r"cam1i_s\.avi: expected a video, found an empty file")
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (";", ",", ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
-        ("focal_length", "focus", r": expected a column focal_length, found only cam_name, cam_x\[m\]"),
-        (
-            "cam_x[m]",
-            "cam_x[ft]",
-            r": expected a column cam_x\[m\] or cam_x\[cm\] or cam_x\[mm\], found cam_x\[ft\]",
-        ),
-        ("cam_x[m]", "cam_x", r": expected a column cam_x\[m\] or cam_x\[cm\] or cam_x\[mm\], found cam_x"),
-        ("cam_y[m]", "cam_x[m]", ", line 1: expected each column once, found cam_x again"),
-        (";cy", ";coeff_1", ": expected a column coeff_2"),
-        ("cam2i;2;0.5", "cam2i;2;x", r", line 3, column cam_y\[m\]: expected a number, found 'x'"),
-        ("cam2i;2;0.5", "cam2i;2;nan", r", line 3, column cam_y\[m\]: expected a finite number, found 'nan'"),
-        ("cam2i;2;0.5", "cam2i;2;0,5", ", line 3.*found '0,5'; write decimals with a point"),
-        ("cam2i;2;0.5", "cam2i;2;", r", line 3, column cam_y\[m\]: expected a value, found nothing"),
-        ("cam2i;2;0.5", "cam2i;0.5", ", line 3: expected 10 values as in the header, found 9"),
-        ("cam2i;2", "cam1i_s;2", ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
-        ("1158.3", "0", ", line 3, column focal_length: expected a focal length above 0 pixels, found 0"),
-        ("1158.3", "-1158.3", ", line 3, column focal_length: expected a focal length above 0"),
-    ],
-)
-def test_an_unreadable_calibration(simulated_folder, old, new, message):
-    path = simulated_folder / "cameras_calibration.csv"
-    text = path.read_text()
-    path.write_text(text.replace(old, new) if len(old) == 1 else text.replace(old, new, 1))
-    assert_reading_fails(simulated_folder, rf"cameras_calibration\.csv{message}")
-
-
-@pytest.mark.parametrize(("text", "found"), [("", "an empty file"), (f"{SIMULATED_HEADER}\n", "none")])
-def test_an_empty_calibration(simulated_folder, text, found):
-    (simulated_folder / "cameras_calibration.csv").write_text(text)
-    assert_reading_fails(simulated_folder, f"cameras_calibration.csv.*expected .*, found {found}")
-
-
-def test_too_many_coefficients(real_folder):
-    replace_in_file(real_folder / "cameras_calibration.csv", "coeff_4", "coeff_4;coeff_5")
-    text = (real_folder / "cameras_calibration.csv").read_text()
-    (real_folder / "cameras_calibration.csv").write_text(text.replace("-0.002", "-0.002;0"))
-    assert_reading_fails(real_folder, "expected 4 distortion coefficients, found 5")
+    assert read_sequence(simulated).truth is None
 
 
 @pytest.mark.parametrize(
@@ -376,120 +287,392 @@ def test_too_many_coefficients(real_folder):
     ],
     ids=["byte order mark", "Windows", "last separator", "blank lines", "spaces", "upper case"],
 )
-def test_harmless_differences_are_accepted(simulated_folder, change_text):
-    original = read_sequence(simulated_folder)
-    for name in ("cameras_calibration.csv", "dron1_pos_25.csv"):
-        path = simulated_folder / name
+def test_harmless_differences_are_accepted(simulated, change_text):
+    original = read_sequence(simulated)
+    for name in (CALIBRATION, "dron1_pos_25.csv"):
+        path = simulated / name
         path.write_bytes(change_text(path.read_text()).encode())
-    changed = read_sequence(simulated_folder)
+    changed = read_sequence(simulated)
     assert changed.rig.names == original.rig.names
     np.testing.assert_array_equal(changed.rig.cameras.T_cam_world, original.rig.cameras.T_cam_world)
     np.testing.assert_array_equal(changed.truth.position_m, original.truth.position_m)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("names", "expected"),
     [
-        ("\n2;0.2", "\n2;nan", r"line 4, column pos_x\[m\]: expected a finite number, found 'nan'"),
-        ("\n2;0.2", "\n2;inf", r"line 4, column pos_x\[m\]: expected a finite number, found 'inf'"),
-        ("\n2;0.2", "\n2;", r"line 4, column pos_x\[m\]: expected a value, found nothing"),
-        ("\n2;0.2", "\n1;0.2", "line 4, column id: expected each frame once, found 1 again, after line 3"),
-        ("\n2;0.2", "\n2.5;0.2", "line 4, column id: expected a whole number, 0 or more, found '2.5'"),
-        ("\n2;0.2;2;1.5", "\n2;0.2;2", "line 4: expected 11 values as in the header, found 10"),
-        ("0;0;0;1\n2", "0;0;0;7\n2", "line 3, column q_w: expected a quaternion of length 1, found length 7"),
-        ("pos_x", "x", r"csv: expected a column pos_x, found only id, x\[m\]"),
+        ("qw;qx;qy;qz", [0, 0, 0, 1]),
+        ("quat_w;quat_x;quat_y;quat_z", [0, 0, 0, 1]),
+        ("quaternion.w;quaternion.x;quaternion.y;quaternion.z", [0, 0, 0, 1]),
+        ("or_q_w[-];or_q_x[-];or_q_y[-];or_q_z[-]", [0, 0, 0, 1]),
+        ("Q_W;Q_X;Q_Y;Q_Z", [0, 0, 0, 1]),
+        ("q_x;q_y;q_z;q_w", [1, 0, 0, 0]),
+        ("q1;q2;q3;q4", None),
     ],
 )
-def test_a_broken_reference(simulated_folder, old, new, message):
-    replace_in_file(simulated_folder / "dron1_pos_25.csv", old, new)
-    assert_reading_fails(simulated_folder, f"dron1_pos_25.*{message}")
+def test_column_names_of_the_quaternion(tmp_path, names, expected):
+    """The names of the columns decide, not their order."""
+    (tmp_path / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0).replace("q_w;q_x;q_y;q_z", names))
+    _, orientation_wxyz = read_poses(tmp_path / "dron1_pos_25.csv")
+    assert (None if orientation_wxyz is None else orientation_wxyz[1].tolist()) == expected
 
 
-def test_a_reference_at_another_rate(simulated_folder):
-    (simulated_folder / "dron2_pos_25.csv").write_text(pose_lines(20, 1.0))
-    (simulated_folder / "dron2_pos_25.csv").rename(simulated_folder / "dron2_pos_100.csv")
-    truth = read_sequence(simulated_folder).truth
-    np.testing.assert_allclose(truth.position_m[1:, 1, 0], [1.4, 1.8, 2.2, 2.6], rtol=0, atol=1e-12)
-
-
-def test_two_files_of_one_drone(simulated_folder):
-    shutil.copy(simulated_folder / "dron1_pos_25.csv", simulated_folder / "drone1_pos_25.csv")
-    assert_reading_fails(
-        simulated_folder,
-        r"drone1_pos_25\.csv: expected one file per drone, found dron1 in .*dron1_pos_25\.csv as well",
-    )
-
-
-def test_two_recordings(real_folder):
-    shutil.copy(real_folder / "R99.c3d", real_folder / "R98.c3d")
-    assert_reading_fails(
-        real_folder, r"R99\.c3d: expected one file per drone, found dron4 in .*R98\.c3d as well"
-    )
-
-
-def test_a_reference_that_is_not_c3d(real_folder):
-    (real_folder / "R99.c3d").write_text("hello " * 400)
-    assert_reading_fails(real_folder, r"R99\.c3d: expected a C3D file, found no valid c3d file")
-
-
-def write_person(path: Path) -> None:
-    """A person and a rigid box, as in a C3D of a gait laboratory."""
+def test_a_person_in_the_folder_is_no_reference(run_psotrack, real, tmp_path, caplog):
+    """Found: `evaluate` scored tracks against a walking person without a word."""
     rng = np.random.default_rng(0)
     t = np.arange(100)[:, None, None] / 100
     person_m = rng.uniform(-0.5, 0.5, (10, 3)) + 0.2 * np.sin(6 * t + rng.uniform(0, 6, (10, 1))) + t
     box_m = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]]) + t
     labels = (*(f"Daphnee:M{i}" for i in range(10)), *(f"boite:b{i}" for i in range(4)))
-    write_c3d(path, Markers(labels, np.concatenate([person_m, box_m], axis=1), 100.0))
-
-
-def test_a_person_in_the_folder_is_no_reference(real_folder, tmp_path, caplog):
-    """Found: `evaluate` scored tracks against a walking person without a word."""
-    write_person(real_folder / "R99.c3d")
+    write_c3d(real / "R99.c3d", Markers(labels, np.concatenate([person_m, box_m], axis=1), 100.0))
     (tmp_path / "tracks.csv").write_text("frame,drone,x_m,y_m,z_m\n0,dron1,0,0,1\n1,dron1,0,0,1\n")
-    result = CliRunner().invoke(cli, ["evaluate", str(tmp_path / "tracks.csv"), str(real_folder)])
-    assert isinstance(result.exception, InputError)
-    assert "expected a reference to compare with, found none" in str(result.exception)
+    command = ("evaluate", tmp_path / "tracks.csv", real)
+    result = run_psotrack(*command)
+    assert result.code == 2
+    assert "expected a reference to compare with, found none" in result.err
     assert "boite, rigid (boite:b0, " in caplog.text
     assert "daphnee, not rigid" in caplog.text
-    arguments = ["evaluate", str(tmp_path / "tracks.csv"), str(real_folder), "--body", "cf1=b0,b1,b2,b3"]
-    result = CliRunner().invoke(cli, [*arguments, "--json", "-"])
-    assert result.exit_code == 0, result.output
-    assert read_sequence(real_folder, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
+    assert run_psotrack(*command, "--body", "cf1=b0,b1,b2,b3", "--json", "-").code == 0
+    assert read_sequence(real, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
 
 
-def test_bodies_need_a_c3d(real_folder):
-    (real_folder / "R99.c3d").unlink()
-    with pytest.raises(
-        InputError, match=r"bodies cf1: expected one C3D file that holds their markers, found none"
-    ):
-        read_sequence(real_folder, bodies={"cf1": ["a"]})
+@pytest.mark.parametrize("missing", ["dron1_cam_25.csv", ONBOARD_CALIBRATION])
+def test_the_video_of_a_drone_alone_is_enough(simulated, missing):
+    (simulated / missing).unlink()
+    onboard = read_onboard(simulated)["dron1"]
+    assert (onboard.K is None) == (missing == ONBOARD_CALIBRATION)
+    assert np.isnan(onboard.orientation_wxyz).all() == (missing == "dron1_cam_25.csv")
+    assert onboard.position_m.shape == (5, 3)
+
+
+@pytest.mark.parametrize(("rows", "num_known"), [(3, 2), (9, 4)])
+def test_onboard_poses_may_be_fewer_or_more_than_frames(simulated, rows, num_known):
+    (simulated / "dron1_cam_25.csv").write_text(pose_lines(rows, 0.0))
+    onboard = read_onboard(simulated)["dron1"]
+    assert onboard.position_m.shape == (5, 3)
+    assert np.isfinite(onboard.position_m).all(axis=1).sum() == num_known
+
+
+@pytest.mark.parametrize("file_name", ["drone1_cam.avi", "Dron_1_cam_s.AVI", "dron1_cam.mp4"])
+def test_other_names_of_the_video_of_a_drone(simulated, file_name):
+    (simulated / "dron1_cam_s.avi").rename(simulated / file_name)
+    assert read_onboard(simulated)["dron1"].video.path.name == file_name
+    assert list(read_sequence(simulated).videos) == ["cam1i", "cam2i", "cam3i"]
+
+
+def test_a_sequence_is_read_without_broken_onboard_files(simulated, caplog):
+    """Tracking needs only the wall cameras."""
+    edit("dron1_cam_25.csv", "1.5", "?")(simulated)
+    recording = read_sequence(simulated)
+    assert not recording.onboard
+    assert "dron1_cam_25.csv, line 3" in caplog.text
+    assert recording.truth is not None
+
+
+# --- what is refused
+
+
+def _remove(pattern):
+    def change(folder):
+        for path in folder.glob(pattern):
+            path.unlink()
+
+    return change
+
+
+def _copy(source, target):
+    return lambda folder: shutil.copy(folder / source, folder / target)
+
+
+def _cameras(old, new, count=1):
+    return edit(CALIBRATION, old, new, count)
+
+
+def _poses(old, new):
+    return edit("dron1_pos_25.csv", old, new)
+
+
+#: Name of the case -> what happens to the simulated folder, words of the line; the first ones say where.
+BAD = {
+    "no such folder": (shutil.rmtree, f"S99_D9/{CALIBRATION}: expected", "found no such file"),
+    "no videos": (_remove("*.avi"), "S99_D9: expected videos named like the cameras, cam1i.avi ..., found no .avi"),
+    "two videos": (_copy("cam1i_s.avi", "cam1i.avi"),
+                   "cam1i_s.avi: expected one such file per camera, found cam1i.avi as well"),
+    "a broken video": (write("cam1i_s.avi", ""), "cam1i_s.avi: expected a video, found an empty file"),
+    "detections that are no folder": (lambda folder: _no_folder(folder),
+                                      "dl_data: expected a folder of detections, or none, found a file"),
+    "an empty calibration": (write(CALIBRATION, ""), f"{CALIBRATION}, line 1: expected columns", "found an empty file"),
+    "no cameras": (write(CALIBRATION, f"{SIMULATED_HEADER}\n"), CALIBRATION, "found none"),
+    "commas": (_cameras(";", ",", -1), ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
+    "no focal length": (_cameras("focal_length", "focus"), ": expected a column focal_length, found only cam_name, "),
+    "feet": (_cameras("cam_x[m]", "cam_x[ft]"),
+             ": expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x[ft]"),
+    "no unit": (_cameras("cam_x[m]", "cam_x"), "expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x"),
+    "a column twice": (_cameras("cam_y[m]", "cam_x[m]"), ", line 1: expected each column once, found cam_x again"),
+    "a coefficient alone": (_cameras(";cy", ";coeff_1"), ": expected a column coeff_2"),
+    "five coefficients": (lambda folder: _five_coefficients(folder), "4 distortion coefficients, found 5"),
+    "no number": (_cameras("cam2i;2;0.5", "cam2i;2;x"), ", line 3, column cam_y[m]: expected a number, found 'x'"),
+    "NaN": (_cameras("cam2i;2;0.5", "cam2i;2;nan"), "line 3, column cam_y[m]: expected a finite number, found 'nan'"),
+    "a comma": (_cameras("cam2i;2;0.5", "cam2i;2;0,5"), ", line 3", "found '0,5'; write decimals with a point"),
+    "no value": (_cameras("cam2i;2;0.5", "cam2i;2;"), "line 3, column cam_y[m]: expected a value, found nothing"),
+    "few values": (_cameras("cam2i;2;0.5", "cam2i;0.5"), ", line 3: expected 10 values as in the header, found 9"),
+    "a camera twice": (_cameras("cam2i;2", "cam1i_s;2"),
+                       ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
+    "focal length 0": (_cameras("1158.3", "0"), "line 3, column focal_length: expected a focal length above 0 pixels"),
+    "focal length below 0": (_cameras("1158.3", "-1158.3"), "column focal_length: expected a focal length above 0"),
+    "a pose of NaN": (_poses("\n2;0.20", "\n2;nan"), "dron1_pos_25.csv, line 4, column pos_x[m]: expected a finite"),
+    "no position": (_poses("\n2;0.20;", "\n2;;"), "line 4, column pos_x[m]: expected a value, found nothing"),
+    "a frame twice": (_poses("\n2;0.2", "\n1;0.2"),
+                      "line 4, column id: expected each frame once, found 1 again, after line 3"),
+    "half a frame": (_poses("\n2;0.2", "\n2.5;0.2"),
+                     "line 4, column id: expected a whole number, 0 or more, found '2.5'"),
+    "few values of a pose": (_poses("\n2;0.20;2;1.5", "\n2;0.20;2"), "line 4: expected 11 values as in the header"),
+    "a long quaternion": (_poses("0;0;0;1\n2", "0;0;0;7\n2"),
+                          "line 3, column q_w: expected a quaternion of length 1, found length 7"),
+    "no column of x": (_poses("pos_x", "x"), "csv: expected a column pos_x, found only id, x[m]"),
+    "a drone twice": (_copy("dron1_pos_25.csv", "drone1_pos_25.csv"),
+                      "drone1_pos_25.csv: expected one file per drone, found dron1 in ", "dron1_pos_25.csv as well"),
+}  # fmt: skip
+
+
+def _no_folder(folder):
+    shutil.rmtree(folder / "dl_data")
+    (folder / "dl_data").touch()
+
+
+def _five_coefficients(folder):
+    """Five coefficients in the calibration of the first camera, where the layout has four."""
+    header, row, *_ = (folder / CALIBRATION).read_text().splitlines()
+    coefficients = ";".join(f"coeff_{number}" for number in range(1, 6))
+    (folder / CALIBRATION).write_text(f"{header};{coefficients}\n{row};0.1;0;0;0;0\n")
+
+
+@pytest.mark.parametrize(("change", "words"), [(each[0], each[1:]) for each in BAD.values()], ids=BAD)
+def test_a_wrong_sequence_is_refused(simulated, tmp_path, change, words):
+    change(simulated)
+    assert_refused(lambda: read_sequence(simulated), *words, unchanged=tmp_path)
+
+
+BAD_REAL = {
+    "two recordings": (_copy("R99.c3d", "R98.c3d"), None, "R99.c3d: expected one file per drone, found dron4 in "),
+    "no C3D": (write("R99.c3d", "hello " * 400), None, "R99.c3d: expected a C3D file, found no valid c3d file"),
+    "bodies of none": (_remove("*.c3d"), {"cf1": ["a"]},
+                       "bodies cf1: expected one C3D file that holds their markers, found none"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "bodies", "words"), BAD_REAL.values(), ids=BAD_REAL)
+def test_wrong_motion_capture_is_refused(real, change, bodies, words):
+    change(real)
+    assert_refused(lambda: read_sequence(real, bodies=bodies), words, unchanged=real)
+
+
+def _intrinsics(old, new):
+    return edit(ONBOARD_CALIBRATION, old, new)
+
+
+BAD_ONBOARD = {
+    "two videos": (_copy("dron1_cam_s.avi", "drone1_cam.avi"),
+                   "drone1_cam.avi: expected one file per drone, found dron1_cam_s.avi"),
+    "another size": (lambda folder: write_video(folder / "dron2_cam_s.avi", size_wh=(32, 32)),
+                     "dron2_cam_s.avi: expected 64 x 48 pixels as dron2 has in", "found 32 x 32"),
+    "another rate": (lambda folder: (folder / "dron2_cam_25.csv").rename(folder / "dron2_cam_30.csv"),
+                     "dron2_cam_30.csv: expected poses at the 25 Hz of the video, found 30 Hz"),
+    "no number": (edit("dron1_cam_25.csv", "1.5", "one and a half"),
+                  "dron1_cam_25.csv, line 3, column pos_z[m]: expected a number"),
+    "a drone twice": (_intrinsics("dron2", "dron1"),
+                      "line 3, column cam_name: expected each camera once, found dron1 again"),
+    "below 0": (_intrinsics("60.5", "-60.5"),
+                "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
+    "zero": (_intrinsics("60.25", "0"), "line 2, column focal_length_y: expected a number of pixels above 0"),
+    "no height": (_intrinsics(";48", ";0"), "line 2, column height: expected a number of pixels above 0"),
+    "half a pixel": (_intrinsics(";64", ";64.5"), "line 2, column width: expected a whole number"),
+    "no cx": (_intrinsics("cx", "c_x"), f"{ONBOARD_CALIBRATION}: expected a column cx, found only"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("names", "recognised"),
+    ("change", "words"), [(each[0], each[1:]) for each in BAD_ONBOARD.values()], ids=BAD_ONBOARD
+)
+def test_wrong_files_of_cameras_on_drones_are_refused(simulated, change, words):
+    change(simulated)
+    assert_refused(lambda: read_onboard(simulated), *words, unchanged=simulated)
+
+
+# --- files that are written
+
+
+finite = st.floats(-50, 50)
+triples = st.tuples(finite, finite, finite)
+#: All rotations, and rotations near half a turn, where the Rodrigues vector is nearly ambiguous.
+rotations = st.one_of(
+    st.tuples(*[st.floats(-4, 4)] * 3).map(Rotation.from_rotvec),
+    st.tuples(*[st.floats(-1e-9, 1e-9)] * 3).map(
+        lambda small: Rotation.from_rotvec(np.array([np.pi, 0, 0]) + small)
+    ),
+)
+FULL_HD = (1920, 1080)
+PLAIN_K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+
+
+def camera_at(rotation, t_m, K=PLAIN_K, dist=(), fisheye=False):
+    R, t_m = rotation.as_matrix(), np.array(t_m)
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=FULL_HD, dist=dist, fisheye=fisheye)
+
+
+@given(
+    poses=st.lists(st.tuples(rotations, triples), min_size=1, max_size=5),
+    dist=st.one_of(st.just(()), st.tuples(*[st.floats(-0.5, 0.5)] * 4)),
+    unit=st.sampled_from(["m", "mm"]),
+)
+def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
+    path = tmp_path_factory.getbasetemp() / CALIBRATION
+    cameras = {
+        f"cam{i}i": camera_at(
+            *pose, np.array([[1156.3 + i, 0, 960.25], [0, 1156.3 + i, 540 + i], [0, 0, 1]]), dist
+        )
+        for i, pose in enumerate(poses)
+    }
+    rig = make_rig(cameras)
+    write_calibration(path, rig, unit)
+    again = read_rig(path, FULL_HD)
+    assert again.names == rig.names
+    # Rotations are converted to vectors and back, lengths to millimetres and back, which rounds doubles up to 50.
+    np.testing.assert_allclose(again.cameras.T_cam_world, rig.cameras.T_cam_world, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(again.cameras.K, rig.cameras.K)
+    coefficients = again.cameras.dist.shape[-1]
+    assert coefficients == (4 if any(dist) else 0)
+    np.testing.assert_array_equal(again.cameras.dist, rig.cameras.dist[:, :coefficients])
+
+
+def test_written_files_look_like_the_published_ones(tmp_path):
+    for unit, dist, header, row in (
+        ("m", (), SIMULATED_HEADER, "1.0;2.0;3.0;0.0;0.0;0.0;1000.0;960.0;540.0"),
+        (
+            "mm",
+            (0.1, 0.0, 0.0, 0.0),
+            f"{SIMULATED_HEADER.replace('[m]', '[mm]')};coeff_1;coeff_2;coeff_3;coeff_4",
+            "1000.0;2000.0;3000.0;0.0;0.0;0.0;1000.0;960.0;540.0;0.1;0.0;0.0;0.0",
+        ),
+    ):
+        rig = make_rig({"cam1i": camera_at(Rotation.identity(), (1.0, 2.0, 3.0), dist=dist)})
+        write_calibration(tmp_path / CALIBRATION, rig, unit)
+        assert (tmp_path / CALIBRATION).read_text().splitlines() == [header, f"cam1i;{row}"]
+    write_poses(tmp_path / pose_file(1), np.ones((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    assert (tmp_path / "dron1_pos_25.csv").read_text().splitlines() == [
+        POSE_HEADER,
+        "0;0.0;0.0;-0.0;0.0;0.0;0.0;1.0;0.0;0.0;0.0",
+        "1;1.0;1.0;1.0;0.0;0.0;0.0;1.0;0.0;0.0;0.0",
+    ]
+
+
+def test_what_the_layout_cannot_hold_is_refused(tmp_path):
+    """The message names the camera, not the first one but the one that the file cannot hold."""
+    path, upright = tmp_path / CALIBRATION, (Rotation.identity(), np.zeros(3))
+    # A fifth coefficient of zero can be left out.
+    sound = camera_at(*upright, dist=(0.1, 0.0, 0.0, 0.0, 0.0))
+    write_calibration(path, make_rig({"a": sound}))
+    cameras = {
+        "distortion by k1, k2, p1, p2 alone, found 5 coefficients": {"dist": (0.1, 0.0, 0.0, 0.0, 0.01)},
+        "one focal length, found fx 1000 and fy 1001": {"K": PLAIN_K + np.diag([0, 1.0, 0])},
+        "no skew, found 2.5": {"K": PLAIN_K + np.eye(3, k=1) * [0, 2.5, 0]},
+        "OpenCV's pinhole model, found a fisheye": {"fisheye": True},
+    }
+    for words, fields in cameras.items():
+        rig = make_rig(
+            {"a": sound, "GoPro 3": camera_at(*upright, **fields), "z": camera_at(*upright, **fields)}
+        )
+        line = f"camera GoPro 3: expected {words}; "
+        assert_refused(lambda rig=rig: write_calibration(path, rig), line, "rig.toml", unchanged=tmp_path)
+    turns, position_m = np.tile([1.0, 0, 0, 0], (3, 1)), np.ones((3, 3))
+    position_m[2, 1] = np.nan
+    words = "poses: expected finite numbers, found NaN or infinity at frame 2"
+    assert_refused(lambda: write_poses(tmp_path / "a", position_m, turns), words, unchanged=tmp_path)
+    words = "expected equal numbers of positions and orientations"
+    assert_refused(lambda: write_poses(tmp_path / "a", turns[:0, :3], turns[:0]), words, unchanged=tmp_path)
+    for intrinsics in ({}, {"dron1": (PLAIN_K + np.eye(3, k=1), FULL_HD)}):
+        assert_refused(
+            lambda intrinsics=intrinsics: write_onboard_calibration(tmp_path / "a", intrinsics),
+            "expected at least one camera, all without skew",
+            unchanged=tmp_path,
+        )
+
+
+@given(poses=st.lists(st.tuples(triples, rotations), min_size=2, max_size=9))
+def test_written_poses_are_read_back(tmp_path_factory, poses):
+    path = tmp_path_factory.getbasetemp() / pose_file(1)
+    position_m = np.array([position for position, _ in poses])
+    rotation = Rotation.concatenate([rotation for _, rotation in poses])
+    write_poses(path, position_m, rotation.as_quat(scalar_first=True))
+    position_again_m, orientation_again_wxyz = read_poses(path)
+    assert np.isnan(position_again_m[0]).all()
+    assert np.isnan(orientation_again_wxyz[0]).all()
+    np.testing.assert_array_equal(position_again_m[1:], position_m[1:])
+    again = Rotation.from_quat(orientation_again_wxyz[1:], scalar_first=True)
+    # The reader normalises the quaternion, which rounds it.
+    assert (again * rotation[1:].inv()).magnitude().max() < 1e-12
+    # The Euler angles in the file are the same rotation: R = Rz Ry Rx.
+    with path.open() as file:
+        rows = list(csv.DictReader(file, delimiter=";"))[1:]
+    angles_rad = np.array([[float(row[f"rot_{axis}[rad]"]) for axis in "xyz"] for row in rows])
+    Rx, Ry, Rz = (Rotation.from_rotvec(np.eye(3)[axis] * angles_rad[:, axis : axis + 1]) for axis in range(3))
+    # Near gimbal lock, Euler angles lose half of their digits: the error is up to 1e-7 rad.
+    assert ((Rz * Ry * Rx) * rotation[1:].inv()).magnitude().max() < 1e-6
+
+
+def test_a_first_row_with_a_pose_is_a_pose(tmp_path):
+    path = tmp_path / "dron1_pos_25.csv"
+    path.write_text("id;pos_x[m];pos_y[m];pos_z[m]\n0;1;2;3\n1;1;2;3\n")
+    position_m, orientation_wxyz = read_poses(path)
+    assert position_m.tolist() == [[1, 2, 3]] * 2
+    assert orientation_wxyz is None
+
+
+@given(
+    cameras=st.lists(
+        st.tuples(*[st.floats(1e-3, 1e5)] * 2, *[st.floats(-1e4, 1e4)] * 2, *[st.integers(1, 8000)] * 2),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_written_intrinsics_are_read_back(tmp_path_factory, cameras):
+    path = tmp_path_factory.getbasetemp() / ONBOARD_CALIBRATION
+    intrinsics = {
+        f"dron{number}": (np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (width, height))
+        for number, (fx, fy, cx, cy, width, height) in enumerate(cameras, start=1)
+    }
+    write_onboard_calibration(path, intrinsics)
+    again = read_onboard_calibration(path)
+    assert list(again) == list(intrinsics)
+    for name, (expected, size_wh) in intrinsics.items():
+        np.testing.assert_array_equal(again[name][0], expected)
+        assert again[name][1] == size_wh
+
+
+@given(
+    corners=st.dictionaries(
+        st.integers(0, 999), st.lists(triples, min_size=4, max_size=4).map(np.array), min_size=1, max_size=5
+    )
+)
+def test_written_marker_corners_are_read_back(tmp_path_factory, corners):
+    path = tmp_path_factory.getbasetemp() / MARKER_CORNERS
+    write_marker_corners(path, corners)
+    again = read_marker_corners(path)
+    assert set(again) == set(corners)
+    for marker, corners_m in corners.items():
+        np.testing.assert_array_equal(again[marker], corners_m)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
     [
-        ("q_w;q_x;q_y;q_z", True),
-        ("qw;qx;qy;qz", True),
-        ("quat_w;quat_x;quat_y;quat_z", True),
-        ("quaternion.w;quaternion.x;quaternion.y;quaternion.z", True),
-        ("or_q_w[-];or_q_x[-];or_q_y[-];or_q_z[-]", True),
-        ("Q_W;Q_X;Q_Y;Q_Z", True),
-        ("q1;q2;q3;q4", False),
-        ("a;b;c;d", False),
+        ("7;", "5;", "line 3, column id: expected each marker once, found 5 again"),
+        ("z4[m]", "z5[m]", "expected a column z4"),
+        ("7;0.5", "7;nan", "line 3, column x1[m]: expected a finite number"),
     ],
 )
-def test_column_names_of_the_quaternion(simulated_folder, names, recognised):
-    for path in simulated_folder.glob("dron*.csv"):
-        replace_in_file(path, "q_w;q_x;q_y;q_z", names)
-    orientation_wxyz = read_sequence(simulated_folder).truth.orientation_wxyz
-    if recognised:
-        assert orientation_wxyz[1, 0].tolist() == [0, 0, 0, 1]
-    else:
-        assert orientation_wxyz is None
-
-
-def test_quaternion_with_the_scalar_last(simulated_folder):
-    """The names of the columns decide, not their order."""
-    for path in simulated_folder.glob("dron*.csv"):
-        replace_in_file(path, "q_w;q_x;q_y;q_z", "q_x;q_y;q_z;q_w")
-    assert read_sequence(simulated_folder).truth.orientation_wxyz[1, 0].tolist() == [1, 0, 0, 0]
+def test_wrong_marker_corners_are_refused(tmp_path, old, new, words):
+    path = tmp_path / MARKER_CORNERS
+    write_marker_corners(path, {5: np.zeros((4, 3)), 7: np.full((4, 3), 0.5)})
+    edit(MARKER_CORNERS, old, new)(tmp_path)
+    assert_refused(lambda: read_marker_corners(path), words, unchanged=tmp_path)

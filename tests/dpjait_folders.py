@@ -1,0 +1,70 @@
+"""Small folders in the layout of the DPJAIT dataset, which are written line by line, without the package's writers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from psotrack.recordings import VideoWriter
+from psotrack.recordings.mocap import Markers, write_c3d
+
+SIZE_WH, FPS, NUM_FRAMES = (64, 48), 25.0, 5
+SIMULATED_HEADER = (
+    "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy"
+)
+REAL_HEADER = SIMULATED_HEADER.replace("[m]", "[mm]") + ";coeff_1;coeff_2;coeff_3;coeff_4"
+POSE_HEADER = "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_w;q_x;q_y;q_z"
+#: Names of the cameras of the real half: serial numbers.
+SERIALS = ("55260362", "56339527", "60881257", "61920488")
+
+
+def write_video(path: Path, num_frames: int = NUM_FRAMES, size_wh: tuple[int, int] = SIZE_WH) -> None:
+    """A black video."""
+    with VideoWriter(path, FPS, size_wh) as writer:
+        for _ in range(num_frames):
+            writer.write(np.zeros((size_wh[1], size_wh[0], 3), np.uint8))
+
+
+def write_cameras(folder: Path, names: list[str]) -> None:
+    """The calibration of the simulated half; each camera has its own place, turn and focal length."""
+    rows = [f"{name};{i};0.5;8;1.9;{i / 10};0;{1156.3 + i};32;24" for i, name in enumerate(names, start=1)]
+    (folder / "cameras_calibration.csv").write_text("\n".join([SIMULATED_HEADER, *rows]) + "\n")
+
+
+def pose_lines(num_rows: int, x0: float) -> str:
+    """Poses of a drone that flies along x, turned by half a turn about z; row 0 is the placeholder."""
+    rows = ["0;0;0;-0;0;0;0;1;0;0;0"]
+    rows += [f"{i};{x0 + 0.1 * i:.2f};2;1.5;0;0;0;0;0;0;1" for i in range(1, num_rows)]
+    return "\n".join([POSE_HEADER, *rows]) + "\n"
+
+
+def make_simulated(folder: Path) -> None:
+    """Three cameras, the second with detections, and two drones, each with a camera on board 0.1 m in front."""
+    (folder / "dl_data").mkdir(parents=True)
+    write_cameras(folder, ["cam1i", "cam2i", "cam3i"])
+    for i in (1, 2, 3):
+        write_video(folder / f"cam{i}i_s.avi")
+    (folder / "dl_data" / "cam2i_s.csv").write_text("1,10,20,4,6,12,23,0.5\n")
+    for i in (1, 2):
+        write_video(folder / f"dron{i}_cam_s.avi")
+        (folder / f"dron{i}_pos_25.csv").write_text(pose_lines(NUM_FRAMES, i - 1.0))
+        (folder / f"dron{i}_cam_25.csv").write_text(pose_lines(NUM_FRAMES, i - 0.9))
+    (folder / "drone_cameras_calibration.csv").write_text(
+        "cam_name;focal_length_x;focal_length_y;cx;cy;width;height\n"
+        "dron1;60.5;60.25;31.5;23.5;64;48\ndron2;61;61;31.5;23.5;64;48\n"
+    )
+
+
+def make_real(folder: Path) -> None:
+    """Four cameras that are named by serial number, and two drones in motion capture at 100 Hz."""
+    folder.mkdir(parents=True)
+    cameras = [f"{name};-100;250.5;6000;1.9;0.1;0;1158.7;32;24;-0.1;0.02;0.001;-0.002" for name in SERIALS]
+    (folder / "cameras_calibration.csv").write_text("\n".join([REAL_HEADER, *cameras]) + "\n")
+    for name in SERIALS:
+        write_video(folder / f"{name}.avi")
+    # Three markers of each drone, on a line.
+    t = np.arange(20)[:, None, None]
+    position_m = np.tile([1.0, 2.0, 1.5], (20, 6, 1)) + 0.01 * t + 0.1 * np.arange(6)[None, :, None]
+    labels = tuple(f"Dron{drone}:Dron{drone}{i}" for drone in (4, 7) for i in (1, 2, 3))
+    write_c3d(folder / "R99.c3d", Markers(labels, position_m, 100.0))
