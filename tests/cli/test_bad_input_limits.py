@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import test_archives
-import test_dpjait
 import worlds
 from helpers import make_once
 
@@ -32,9 +31,6 @@ from psotrack.recordings.exchange import read_tracks
 from psotrack.settings import DroneSettings, SwarmSettings, TrackSettings
 from psotrack.sweeps import Store
 from psotrack.trajectories import read_trajectories
-
-simulated_folder = test_dpjait.simulated_folder
-make_video = test_dpjait.make_video
 
 HUGE = "9" * 5000
 
@@ -244,15 +240,6 @@ def test_options_of_thousands_of_digits(words, flight, run_psotrack, monkeypatch
 def test_a_nul_in_a_text(name, text, read, tmp_path):
     with pytest.raises(InputError, match=rf"{name}.*: expected UTF-8 text, found a NUL"):
         read(write(tmp_path / name, text))
-
-
-def test_detections_that_are_no_folder(simulated_folder, run_psotrack):
-    for path in sorted((simulated_folder / "dl_data").glob("*")):
-        path.unlink()
-    if (simulated_folder / "dl_data").is_dir():
-        (simulated_folder / "dl_data").rmdir()
-    write(simulated_folder / "dl_data", "no folder")
-    check_line(run_psotrack("init", "--show", simulated_folder), simulated_folder / "dl_data")
 
 
 # Files that unpack or decode to far more than they are

@@ -263,8 +263,6 @@ NOT_YET_MENDED = {
     "cli/test_small_disks.py",
     "fuzz/formats.py",
     "recordings/test_exchange.py",
-    "recordings/test_own_recordings.py",
-    "recordings/test_recording_file.py",
     "show/test_results_in_notebooks.py",
 }
 

@@ -317,23 +317,37 @@ def test_column_names_of_the_quaternion(tmp_path, names, expected):
     assert (None if orientation_wxyz is None else orientation_wxyz[1].tolist()) == expected
 
 
+def write_bodies(path, **bodies):
+    """A recording of bodies that fly along a diagonal, (frames, markers, 3) or (markers, 3) each."""
+    t = np.arange(100)[:, None, None] / 100
+    position_m = [np.broadcast_to(body_m, (100, *np.shape(body_m)[-2:])) + t for body_m in bodies.values()]
+    labels = [f"{name}:{name[0]}{i}" for name, body_m in bodies.items() for i in range(np.shape(body_m)[-2])]
+    write_c3d(path, Markers(tuple(labels), np.concatenate(position_m, axis=1), 100.0))
+
+
+BOX_M = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]])
+
+
 def test_a_person_in_the_folder_is_no_reference(run_psotrack, real, tmp_path, caplog):
     """Found: `evaluate` scored tracks against a walking person without a word."""
     rng = np.random.default_rng(0)
     t = np.arange(100)[:, None, None] / 100
-    person_m = rng.uniform(-0.5, 0.5, (10, 3)) + 0.2 * np.sin(6 * t + rng.uniform(0, 6, (10, 1))) + t
-    box_m = np.array([[0.2, 0, 0], [-0.1, 0, 0], [0, 0.15, 0], [0, -0.12, 0.1]]) + t
-    labels = (*(f"Daphnee:M{i}" for i in range(10)), *(f"boite:b{i}" for i in range(4)))
-    write_c3d(real / "R99.c3d", Markers(labels, np.concatenate([person_m, box_m], axis=1), 100.0))
+    person_m = rng.uniform(-0.5, 0.5, (10, 3)) + 0.2 * np.sin(6 * t + rng.uniform(0, 6, (10, 1)))
+    write_bodies(real / "R99.c3d", daphnee=person_m, boite=BOX_M)
     (tmp_path / "tracks.csv").write_text("frame,drone,x_m,y_m,z_m\n0,dron1,0,0,1\n1,dron1,0,0,1\n")
-    command = ("evaluate", tmp_path / "tracks.csv", real)
+    command = ("evaluate", tmp_path / "tracks.csv", real, "--quiet")
     result = run_psotrack(*command)
     assert result.code == 2
     assert "expected a reference to compare with, found none" in result.err
     assert "boite, rigid (boite:b0, " in caplog.text
     assert "daphnee, not rigid" in caplog.text
-    assert run_psotrack(*command, "--body", "cf1=b0,b1,b2,b3", "--json", "-").code == 0
+    assert run_psotrack(*command, "--body", "cf1=b0,b1,b2,b3").code == 0
     assert read_sequence(real, bodies={"boite": ["boite:"]}).truth.drones == ("boite",)
+    # Found: with `--offset`, the reference was read twice, and said its warnings twice.
+    write_bodies(real / "R99.c3d", cf1=BOX_M, cf2=BOX_M + 1.0)
+    result = run_psotrack(*command, "--offset", 0)
+    assert result.code == 0, result.err
+    assert caplog.text.count("taken for drones, because their markers are rigid") == 1
 
 
 @pytest.mark.parametrize("missing", ["dron1_cam_25.csv", ONBOARD_CALIBRATION])
