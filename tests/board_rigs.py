@@ -1,4 +1,4 @@
-"""Views of a board by a rig, from the formula of the projection, with errors that corners have in common."""
+"""Boards, marked points and flying points that a rig sees, by the formula of the projection, or drawn."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import Board, BoardViews
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
+from psotrack.recordings import VideoWriter
 
 BOARD = Board((8, 6), 0.1, 0.075)
 SIZE_WH = (1280, 720)
@@ -85,15 +86,76 @@ def relative_to_first(rig):
     return T @ np.linalg.inv(T[0])
 
 
-def draw_board(board, K, T_cam_board, size_wh):
-    """Grey image of a ChArUco board that OpenCV draws, three times as large and then reduced."""
-    per_m = 2500.0
-    columns, rows = board.squares_wh
-    size_px = (round(columns * board.square_m * per_m), round(rows * board.square_m * per_m))
-    sheet = board.opencv().generateImage(size_px)
-    # Pixel (u, v) of the sheet lies at ((u + 0.5) / per_m, (v + 0.5) / per_m) on the board.
-    to_board = np.array([[1 / per_m, 0, 0.5 / per_m], [0, 1 / per_m, 0.5 / per_m], [0, 0, 1]])
+def draw_sheet(sheet, corner_px, per_m, K, T_cam_board, size_wh):
+    """Grey image of a printed sheet, three times as large and then reduced.
+
+    The board's origin lies at the outer corner of the sheet's pixel `corner_px`, and `per_m` pixels are a metre.
+    """
+    shift = (0.5 - corner_px) / per_m
+    to_board = np.array([[1 / per_m, 0, shift], [0, 1 / per_m, shift], [0, 0, 1]])
+    # If an image is enlarged three times, the centre of pixel p moves to 3 p + 1.
     to_large = np.array([[3.0, 0, 1], [0, 3, 1], [0, 0, 1]])
     H = to_large @ K @ T_cam_board[:3, [0, 1, 3]] @ to_board
     large = cv2.warpPerspective(sheet, H, (3 * size_wh[0], 3 * size_wh[1]), borderValue=200)
     return cv2.resize(large, size_wh, interpolation=cv2.INTER_AREA)
+
+
+def draw_board(board, K, T_cam_board, size_wh):
+    """Grey image of a ChArUco board that OpenCV draws."""
+    per_m = 2500.0
+    size_px = tuple(round(count * board.square_m * per_m) for count in board.squares_wh)
+    return draw_sheet(board.opencv().generateImage(size_px), 0, per_m, K, T_cam_board, size_wh)
+
+
+#: A board in the hand before one camera, and the camera's lens.
+HELD, HELD_K = Board((7, 5), 0.04, 0.03), np.array([[620.0, 0, 322.0], [0, 625.0, 236.0], [0, 0, 1]])
+
+
+def random_poses(count=14):
+    """Poses of a board that is turned and moved before a camera."""
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-35, 35, 3), degrees=True).as_matrix()
+        middle_m = rng.uniform((-0.1, -0.08, 0.32), (0.1, 0.08, 0.55))
+        T[:3, 3] = middle_m - T[:3, :3] @ [0.14, 0.1, 0]
+        yield T
+
+
+def film_board(path, poses=None):
+    """Write a video of the board in the hand."""
+    with VideoWriter(path, 25.0, (640, 480)) as writer:
+        for T in random_poses() if poses is None else poses:
+            image = draw_board(HELD, HELD_K, T, (640, 480))
+            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    return path
+
+
+#: Points of known place in a room.
+WORLD_M = np.random.default_rng(0).uniform((-1.5, -1.5, 0.2), (1.5, 1.5, 2.4), (14, 3))
+
+
+def write_pairs(path, rig, *, noise_px=0.5, wrong=None):
+    """Write marks of all points in all cameras; only the rows of the first camera have positions."""
+    rng = np.random.default_rng(1)
+    lines = ["camera,point,x_px,y_px,x_m,y_m,z_m"]
+    for index, name in enumerate(rig.names):
+        pixels = project(rig.cameras[index], WORLD_M)[0] + rng.normal(0, noise_px, (len(WORLD_M), 2))
+        for number, (x, y) in enumerate(pixels):
+            x += 80 if (name, number) == wrong else 0
+            place = ",".join(map(repr, WORLD_M[number].tolist())) if index == 0 else ",,"
+            lines.append(f"{name},p{number},{x},{y},{place}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def fly_point(instants=60):
+    """Positions of a point that flies through the room."""
+    t = np.linspace(0, 30, instants)
+    return np.stack([0.8 * np.sin(t), 0.8 * np.cos(0.7 * t), 1.1 + 0.5 * np.sin(0.31 * t)], axis=-1)
+
+
+def gaps_of(rig):
+    """Distances between all cameras."""
+    centres_m = np.asarray(rig.cameras.centre_world)
+    return np.linalg.norm(centres_m[:, None] - centres_m, axis=-1)

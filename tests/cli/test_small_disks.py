@@ -14,12 +14,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from board_rigs import film_board, write_pairs
 from camera_paths import make_paths_and_tracks
 from helpers import make_once, ring_rig
 from marker_worlds import make_drawn_flight
 from small_sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
-from test_cli_calibrate import film_board, pairs_of
-from test_synchronisation import make_recording
 from worlds import make_sequence, make_tracks_file
 
 from psotrack.geometry.rig_files import write_rig
@@ -98,12 +97,11 @@ def inputs(tmp_path_factory, root):
         make_tracks_file(folder / "flight_tracks.csv")
         rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
         write_rig(folder / "lenses.yml", rig)
-        pairs_of(folder / "pairs.csv", rig)
+        write_pairs(folder / "pairs.csv", rig)
         film_board(folder / "board.avi")
         for name, make_inputs in (
             ("walk", make_drawn_flight),
             ("fuse", make_paths_and_tracks),
-            ("clocks", make_recording),
         ):
             (folder / name).mkdir()
             make_inputs(folder / name)

@@ -251,11 +251,6 @@ def test_the_architecture_page_lists_the_rooms_in_this_order():
 #: Folder of the tests, and the files that still import more than the rule allows. The list only shrinks.
 TESTS = Path(__file__).parents[1]
 NOT_YET_MENDED = {
-    "calibration/test_calibration_boards.py",
-    "calibration/test_cli_calibrate.py",
-    "calibration/test_cli_calibrate_rig.py",
-    "calibration/test_doctor.py",
-    "calibration/test_synchronisation.py",
     "cli/test_bad_input_limits.py",
     "cli/test_image_limits.py",
     "cli/test_messages_name_files.py",

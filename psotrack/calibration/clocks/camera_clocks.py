@@ -180,7 +180,8 @@ def _linearise(
     squares, total = float((weights * (e**2).sum(axis=-1)).sum()), float(weights.sum())
     # Each triangulated point uses up three degrees of freedom.
     freedom = 2 * total - 3 * float((weights.max(axis=-1) * known).sum())
-    variance_px2 = squares / max(freedom, 1.0) + 1e-12
+    # Detections without any error, as of a simulation, would leave the prior no weight: at least (0.001 px)².
+    variance_px2 = squares / max(freedom, 1.0) + 1e-6
 
     inverse = np.linalg.inv(point_normal)
     spread_m2 = np.where(known, variance_px2 * np.trace(inverse, axis1=-2, axis2=-1), np.inf)

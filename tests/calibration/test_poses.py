@@ -1,4 +1,4 @@
-"""Poses of cameras from known points: compared with OpenCV and exact cases, covariances, and invalid input."""
+"""Poses of cameras from known points: compared with OpenCV and exact cases, covariances, outliers."""
 
 import cv2
 import numpy as np
@@ -9,28 +9,41 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
-from psotrack.calibration import inflation, locate_camera, spread_px
-from psotrack.errors import InputError, SettingsError
+from psotrack.calibration import (
+    inflation,
+    locate_camera,
+    ray_distances,
+    solve_pnp,
+    solve_pnp_ransac,
+    spread_px,
+)
 from psotrack.geometry import look_at, make_camera, project
 
 K = np.array([[1157.0, 0, 959.5], [0, 1157.0, 539.5], [0, 0, 1]])
 LENS = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=(1920, 1080))
 
 
-def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=(), K=K):
+def camera_at(centre_m, target_m, K=K, **lens):
+    R, t_m = look_at(centre_m, target_m)
+    return make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), **lens)
+
+
+def view(rng, *, count=12, nearest_m=3.5, farthest_m=6.5, dist=()):
     """A camera 5 m from its target, and points at random depths, one in each cell of a grid of its image."""
     angle = rng.uniform(0, 2 * np.pi)
-    R, t_m = look_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0))
-    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080), dist=dist)
+    camera = camera_at((5 * np.cos(angle), 5 * np.sin(angle), 2.0), (0.0, 0.0, 1.0), dist=dist)
     cells = np.array([(i, j) for i in range(4) for j in range(3)] * (count // 12 + 1))[:count]
     pixels = (cells + rng.uniform(0.1, 0.9, (count, 2))) * (480, 360)
     rays = np.concatenate([pixels, np.ones((count, 1))], axis=1) @ np.linalg.inv(K).T
+    T = camera.T_cam_world
     # Distortion moves the pixels of the points a little; they only need to be near the middles of the cells.
-    return camera, (rays * rng.uniform(nearest_m, farthest_m, (count, 1)) - t_m) @ R
+    return camera, (rays * rng.uniform(nearest_m, farthest_m, (count, 1)) - T[:3, 3]) @ T[:3, :3]
 
 
-def centre(T):
-    return -T[:3, :3].T @ T[:3, 3]
+def off_centre(located, camera):
+    """Error of the camera's centre, metres."""
+    T = located.T_cam_world
+    return -T[:3, :3].T @ T[:3, 3] - camera.centre_world
 
 
 @pytest.mark.parametrize(
@@ -40,11 +53,11 @@ def centre(T):
 def test_exact_points_give_the_pose_through_a_wide_lens(dist, fisheye):
     """Points up to 70 degrees from the axis; one pixel lies where the lens shows nothing."""
     wide_K = np.array([[480.0, 0, 959.5], [0, 480.0, 539.5], [0, 0, 1]])
-    R, t_m = look_at((4.0, -3.0, 2.0), (0.0, 0.0, 1.0))
-    camera = make_camera(R=R, t_m=t_m, K=wide_K, image_size_wh=(1920, 1080), dist=dist, fisheye=fisheye)
+    camera = camera_at((4.0, -3.0, 2.0), (0.0, 0.0, 1.0), wide_K, dist=dist, fisheye=fisheye)
     angle, around = np.radians(np.tile([10.0, 40.0, 55.0, 70.0], 3)), np.arange(12) * 2.4
     rays = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=-1)
-    points = (rays * np.linspace(2, 6, 12)[:, None] - t_m) @ R
+    T = camera.T_cam_world
+    points = (rays * np.linspace(2, 6, 12)[:, None] - T[:3, 3]) @ T[:3, :3]
     pixels = project(camera, points)[0]
     pixels[3] = (1e5, 1e5)
     located = locate_camera(points, pixels, camera)
@@ -53,7 +66,7 @@ def test_exact_points_give_the_pose_through_a_wide_lens(dist, fisheye):
 
 
 @pytest.mark.parametrize("coefficients", sorted(LENSES))
-@pytest.mark.parametrize("count", [6, 12, 29])
+@pytest.mark.parametrize("count", [6, 29])
 def test_exact_points_give_the_camera(count, coefficients):
     camera, points = view(np.random.default_rng(count), count=count, dist=LENSES[coefficients])
     located = locate_camera(points, project(camera, points)[0], camera)
@@ -74,9 +87,7 @@ def test_the_pose_equals_opencvs_least_squares_pose():
     np.testing.assert_allclose(located.T_cam_world[:3, 3], t_m.ravel(), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("nearest_m", "farthest_m"), [(2.5, 7.5), pytest.param(4.5, 5.5, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("nearest_m", "farthest_m"), [(2.5, 7.5), (4.5, 5.5)])
 def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
     """If the points are spread in depth, the centre's error is below 1 cm at 5 m; 90 % ellipsoids contain 90 %."""
     rng, runs = np.random.default_rng(1), 50
@@ -84,7 +95,7 @@ def test_twelve_points_and_a_pixel_of_noise(nearest_m, farthest_m):
     for _ in range(runs):
         camera, points = view(rng, nearest_m=nearest_m, farthest_m=farthest_m)
         located = locate_camera(points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), LENS, 1.0)
-        off = centre(located.T_cam_world) - camera.centre_world
+        off = off_centre(located, camera)
         errors_m.append(np.linalg.norm(off))
         distances.append(off @ np.linalg.solve(located.centre_covariance_m2, off))
     # The limits are exceeded by chance once in a thousand tests.
@@ -115,22 +126,18 @@ def test_outliers_are_found_and_not_used():
 def test_noise_larger_than_stated_widens_the_covariance():
     rng = np.random.default_rng(6)
     camera, points = view(rng, count=36)
-    off = rng.normal(0, 1, (36, 2))
-    small = locate_camera(points, project(camera, points)[0] + off, LENS, noise_px=1.0)
-    large = locate_camera(points, project(camera, points)[0] + 4 * off, LENS, noise_px=1.0)
+    off, pixels = rng.normal(0, 1, (36, 2)), project(camera, points)[0]
+    small, large = (locate_camera(points, pixels + factor * off, LENS, noise_px=1.0) for factor in (1, 4))
     assert large.used.all()
-    ratio = np.sqrt(large.centre_covariance_m2.trace() / small.centre_covariance_m2.trace())
     # 36 points determine the standard deviation to 10 %.
-    assert 3 < ratio < 5
+    assert 3 < np.sqrt(large.centre_covariance_m2.trace() / small.centre_covariance_m2.trace()) < 5
 
 
 def test_points_in_a_plane_determine_the_pose():
-    rng = np.random.default_rng(7)
-    R, t_m = look_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
-    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
+    rng, camera = np.random.default_rng(7), camera_at((4.0, 1.0, 2.5), (0.0, 0.0, 0.0))
     points = np.concatenate([rng.uniform(-1.5, 1.5, (12, 2)), np.zeros((12, 1))], axis=1)
     located = locate_camera(points, project(camera, points)[0] + rng.normal(0, 1, (12, 2)), LENS)
-    off = centre(located.T_cam_world) - camera.centre_world
+    off = off_centre(located, camera)
     # The 99.9 % ellipsoid contains the true centre.
     assert off @ np.linalg.solve(located.centre_covariance_m2, off) < chi2.ppf(0.999, 3)
 
@@ -142,51 +149,14 @@ def test_moving_the_world_moves_the_camera_with_it(turn, shift_m):
     camera, points = view(rng)
     pixels = project(camera, points)[0] + rng.normal(0, 1, (12, 2))
     R = Rotation.from_rotvec(turn).as_matrix()
-    here = locate_camera(points, pixels, LENS)
-    there = locate_camera(points @ R.T + shift_m, pixels, LENS)
-    np.testing.assert_allclose(
-        centre(there.T_cam_world), R @ centre(here.T_cam_world) + shift_m, rtol=0, atol=1e-5
-    )
+    here, there = locate_camera(points, pixels, LENS), locate_camera(points @ R.T + shift_m, pixels, LENS)
+    T = here.T_cam_world.copy()
+    T[:3, :3] = T[:3, :3] @ R.T
+    T[:3, 3] -= T[:3, :3] @ shift_m
+    np.testing.assert_allclose(there.T_cam_world, T, rtol=0, atol=1e-5)
     # Relative to variances of 1e-5 m².
-    np.testing.assert_allclose(
-        there.centre_covariance_m2, R @ here.centre_covariance_m2 @ R.T, rtol=0, atol=1e-8
-    )
-
-
-def error_message(points, pixels, *, noise_px=1.0):
-    """Message of the error for these points, which must be one line with the name of the camera."""
-    with pytest.raises(InputError) as error:
-        locate_camera(points, pixels, LENS, noise_px, name="camera c7")
-    assert str(error.value).startswith("camera c7: ")
-    assert "\n" not in str(error.value)
-    return str(error.value)
-
-
-def test_points_that_determine_no_pose_are_refused():
-    rng = np.random.default_rng(9)
-    camera, points = view(rng)
-    pixels = project(camera, points)[0]
-    assert "at least 4 points of known position, found 3" in error_message(points[:3], pixels[:3])
-    line = np.array([0, 0, 1.0]) + np.arange(5)[:, None] * np.array([0.2, 0.1, 0.05])
-    assert "not all on one line" in error_message(line, project(camera, line)[0])
-    broken = points.copy()
-    broken[2, 1] = np.nan
-    assert "NaN" in error_message(broken, pixels)
-    mirrored = error_message(points * np.array([1, -1, 1]), pixels)
-    assert "right-handed axes" in mirrored
-    assert "mirrored" in mirrored
-    assert "mixed up" in error_message(points, pixels[rng.permutation(12)])
-    with pytest.raises(SettingsError, match="noise_px"):
-        locate_camera(points, pixels, LENS, 0.0)
-
-
-def test_a_small_plane_far_away_has_two_poses():
-    """A sheet of 20 cm at a distance of 8 m, tilted a little, looks the same if it is tilted to the other side."""
-    R, t_m = look_at((0.9, 0.0, 8.0), (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080))
-    sheet = np.array([(x, y, 0) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.1)])
-    rng = np.random.default_rng(0)
-    assert "two poses" in error_message(sheet, project(camera, sheet)[0] + rng.normal(0, 0.5, (6, 2)))
+    turned_m2 = R @ here.centre_covariance_m2 @ R.T
+    np.testing.assert_allclose(there.centre_covariance_m2, turned_m2, rtol=0, atol=1e-8)
 
 
 def test_spread_and_inflation():
@@ -199,3 +169,82 @@ def test_spread_and_inflation():
     assert inflation(24.0, 18) == 1.0
     assert inflation(180.0, 18) == 10.0
     assert inflation(5.0, 0) == 1.0
+
+
+# OpenCV's solvers.
+
+
+def world(rng, count, *, flat=False):
+    """A camera 4 m from points, flat or not, in an oblique plane, and where it sees them."""
+    T = camera_at((3.0, -2.0, 2.0), (0.0, 0.0, 0.5)).T_cam_world
+    points_m = rng.uniform(-1, 1, (count, 3))
+    if flat:
+        points_m[:, 2] = 0.3 * points_m[:, 0] + 0.2
+    return T, points_m, rays_of(T, points_m)
+
+
+def rays_of(T, points_m):
+    in_camera = points_m @ T[:3, :3].T + T[:3, 3]
+    return in_camera[:, :2] / in_camera[:, 2:]
+
+
+@pytest.mark.parametrize(
+    ("solver", "count", "flat"),
+    [("sqpnp", 9, False), ("sqpnp", 9, True), ("ippe", 9, True), ("ap3p", 4, False)],
+)
+def test_exact_points_give_the_pose_first(solver, count, flat):
+    T, points_m, rays = world(np.random.default_rng(0), count, flat=flat)
+    poses = solve_pnp(points_m, rays, solver)
+    # The solvers take the roots of polynomials, which loses half of the digits of a float64.
+    np.testing.assert_allclose(poses[0], T, atol=1e-6)
+    errors = ray_distances(points_m, rays, poses)
+    assert np.isfinite(errors).all(), "a point is behind the camera"
+    assert np.all(np.diff(np.sum(errors**2, axis=1)) >= 0)
+
+
+def test_a_plane_has_a_second_pose_also_where_it_is_not_quite_flat():
+    """The second pose is tilted to the other side, and fits worse."""
+    T, points_m, rays = world(np.random.default_rng(1), 6, flat=True)
+    poses = solve_pnp(points_m, rays, "ippe")
+    assert len(poses) == 2
+    assert np.sum(poses[1, :3, :3] * T[:3, :3]) < 1 + 2 * np.cos(np.deg2rad(20))
+    assert ray_distances(points_m, rays, poses[1]).max() > 1e-3
+    bent = points_m + np.random.default_rng(2).normal(0, 1e-4, points_m.shape)
+    # Errors of 0.1 mm of points 1 m apart turn the camera by about 1e-4.
+    np.testing.assert_allclose(solve_pnp(bent, rays, "ippe")[0], T, atol=2e-3)
+
+
+def test_most_points_give_the_pose_whatever_the_random_numbers_of_opencv_are():
+    rng = np.random.default_rng(3)
+    T, points_m, rays = world(rng, 40)
+    rays[::3] += rng.choice([-1, 1], (14, 2)) * rng.uniform(0.1, 0.5, (14, 2))
+    rays[7] = np.nan
+    found = []
+    for seed in (0, 1):
+        cv2.setRNGSeed(seed)
+        expected = cv2.randu(np.zeros(1), 0, 1)
+        cv2.setRNGSeed(seed)
+        pose, used = solve_pnp_ransac(points_m, rays, 1e-3)
+        found.append(pose)
+        assert cv2.randu(np.zeros(1), 0, 1) == expected
+        assert np.flatnonzero(used).tolist() == [n for n in range(40) if n % 3 and n != 7]
+    np.testing.assert_array_equal(*found)
+    np.testing.assert_allclose(found[0], T, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["sqpnp", "ippe"])
+def test_points_that_determine_no_pose_give_none(solver):
+    T, points_m, rays = world(np.random.default_rng(5), 6)
+    line_m = np.arange(6)[:, None] * np.array([0.1, 0.0, 0.0]) + points_m[0]
+    assert not len(solve_pnp(points_m[:3], rays[:3], solver))
+    assert not len(solve_pnp(line_m, rays_of(T, line_m), solver))
+    assert solve_pnp_ransac(points_m[:3], rays[:3], 1e-3) is None
+    assert solve_pnp_ransac(np.ones((6, 3)), rays, 1e-3) is None
+    assert solve_pnp_ransac(line_m, rays_of(T, line_m), 1e-3) is None
+
+
+def test_a_point_that_is_not_seen_does_not_count_wherever_it_is():
+    """Found: an unseen corner behind a fisheye camera refused the right pose of a board, by 4.7 px."""
+    points_m = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 0.0, -1.0]])
+    rays = np.array([[0.0, 0.0], [1.0, 0.5], [np.nan, np.nan], [0.0, 0.0]])
+    np.testing.assert_array_equal(ray_distances(points_m, rays, np.eye(4)), [0.0, 0.5, np.nan, np.inf])

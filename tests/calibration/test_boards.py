@@ -1,0 +1,316 @@
+"""Boards in drawn images: printed inverted, seen mirrored, not the stated one; and the lens that images of one show."""
+
+import cv2
+import numpy as np
+import pytest
+from board_rigs import HELD, draw_board, draw_sheet, film_board, random_poses
+from real_data import published
+from scipy.spatial.transform import Rotation
+
+from psotrack.calibration import (
+    Board,
+    BoardFinder,
+    LensChoice,
+    LensModel,
+    calibrate_rig,
+    choose_lens_model,
+    detect_board,
+    find_views,
+    instants_of_numbers,
+    lens_of_view,
+    open_images,
+    open_recorded,
+    parse_lens_model,
+    save_board,
+    say_print,
+)
+from psotrack.calibration.board_recognition import measure_markers, missing_board, recognise_board
+from psotrack.calibration.rig.lenses import find_lens, fit_boards
+from psotrack.geometry import make_camera, make_rig, project
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings.datasets import open_recording
+
+SIZE_WH = (640, 480)
+K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
+BOARD = Board((4, 6), 0.04, 0.03)
+CHESS = Board((6, 5), 0.03, kind="chessboard")
+
+
+def pose(seed=0):
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
+    T[:3, 3] = np.array([-0.08, -0.12, 0.45]) + rng.uniform(-0.02, 0.02, 3)
+    return T
+
+
+def projected(board, T):
+    points = board.corners_m @ T[:3, :3].T + T[:3, 3]
+    return points[:, :2] / points[:, 2:] * np.diag(K)[:2] + K[:2, 2]
+
+
+def draw_grid(board, T):
+    """Grey image of a grid of markers."""
+    per_m = 2000.0  # pitch and side are whole numbers of pixels
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    pitch, side = round(board.square_m * per_m), round(board.marker_m * per_m)
+    columns, rows = board.squares_wh
+    sheet = np.full((rows * pitch, columns * pitch), 255, np.uint8)
+    for place in range(columns * rows):
+        top, left = place // columns * pitch, place % columns * pitch
+        marker = cv2.aruco.generateImageMarker(dictionary, board.first_marker + place, side)
+        sheet[top : top + side, left : left + side] = marker
+    return draw_sheet(np.pad(sheet, 30, constant_values=255), 30, per_m, K, T, SIZE_WH)
+
+
+def draw_chess(T):
+    """Grey image of the chessboard, with a white border."""
+    sheet = np.kron(np.add.outer(np.arange(5), np.arange(6)) % 2, np.ones((75, 75))) * 255
+    return draw_sheet(np.pad(sheet.astype(np.uint8), 60, constant_values=255), 60, 2500.0, K, T, SIZE_WH)
+
+
+def drawn(count, board=BOARD):
+    return [draw_board(board, K, pose(seed), SIZE_WH) for seed in range(count)]
+
+
+def test_corners_of_a_board_seen_from_both_sides():
+    (image,) = drawn(1)
+    assert np.abs(BoardFinder(BOARD).find(image) - projected(BOARD, pose())).max() < 0.5
+    # From behind, or in a mirror: the same corners at the pixels where they are.
+    mirrored = BoardFinder(BOARD).find_mirrored(np.ascontiguousarray(image[:, ::-1]))
+    expected = projected(BOARD, pose()) * [-1, 1] + [SIZE_WH[0] - 1, 0]
+    assert np.abs(mirrored - expected).max() < 0.5
+
+
+def test_corners_of_a_grid_and_of_a_chessboard():
+    grid = Board((3, 4), 0.045, 0.036, "apriltag_36h11", "grid", first_marker=5)
+    assert np.abs(BoardFinder(grid).find(draw_grid(grid, pose())) - projected(grid, pose())).max() < 0.6
+    # Turned by half a turn, the corners keep their numbers: the square between the first four is dark.
+    middle_m = pose(1)[:3, 3] + 0.05 + pose(1)[:3, :3] @ [0.09, 0.075, 0]
+    for turn in (0.0, 180.0):
+        T = pose(1)
+        T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        T[:3, 3] = middle_m - T[:3, :3] @ [0.09, 0.075, 0]
+        assert np.abs(BoardFinder(CHESS).find(draw_chess(T)) - projected(CHESS, T)).max() < 0.6
+
+
+def test_a_board_is_drawn_in_its_true_size(tmp_path):
+    """The squares of a page of 300 dots per inch, which a finder of the same board finds."""
+    board = Board((7, 5), 0.035, 0.026)
+    page = cv2.imread(str(save_board(tmp_path / "board.png", board)), cv2.IMREAD_GRAYSCALE)
+    corners = BoardFinder(board).find(page)
+    dots = np.diff(corners.reshape(4, 6, 2)[:, :, 0], axis=1)
+    np.testing.assert_allclose(dots, 0.035 / 0.0254 * 300, rtol=2e-3)
+
+
+# What a board is, by images.
+
+
+@pytest.mark.parametrize(
+    ("printed", "inverted"),
+    [(BOARD, False), (BOARD, True), (Board((5, 4), 0.05, 0.027, "5x5_100"), False), (CHESS, False)],
+    ids=["charuco", "white on black", "small markers", "chessboard"],
+)
+def test_what_a_board_is_follows_from_images_and_the_side_of_a_square(printed, inverted):
+    images = [draw_chess(pose(seed)) for seed in range(3)] if printed is CHESS else drawn(3, printed)
+    found = detect_board(printed.square_m, [255 - image if inverted else image for image in images])
+    assert (found.squares_wh, found.kind) == (printed.squares_wh, printed.kind)
+    if printed.marker_m is not None:
+        assert found.marker_m == pytest.approx(printed.marker_m, rel=0.04)
+        assert found.dictionary == ("5x5_50" if "5x5" in printed.dictionary else "4x4_50")
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("legacy", [False, True])
+def test_the_pattern_is_found_out_in_both_prints(inverted, legacy):
+    printed = Board((4, 6), 0.04, 0.03, legacy=legacy)
+    images = [255 - image if inverted else image for image in drawn(2, printed)]
+    assert recognise_board(BOARD, images) == (printed, 2)
+
+
+SHOWN = "found a ChArUco board of 4 x 6 squares of 40 mm with markers of"
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        (Board((6, 4), 0.04, 0.03, "5x5_50"), (SHOWN, "pass --squares 4x6 --dictionary 4x4_50")),
+        pytest.param(
+            Board((4, 6), 0.04, kind="chessboard"),
+            (SHOWN, "pass --squares 4x6 --marker 0.0"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(Board((4, 3), 0.04, 0.03, kind="grid"), (SHOWN,), marks=pytest.mark.slow),
+        (Board((4, 6), 0.04, 0.03, "4x4_100"), ("found too few of its corners",)),
+    ],
+)
+def test_another_board_is_named(stated, words):
+    message = str(missing_board(stated, drawn(3)))
+    assert message.startswith(f"board: expected a {stated}, ")
+    assert all(each in message for each in words), message
+
+
+def test_another_grid_is_named():
+    shown = Board((2, 2), 0.05, 0.04, "apriltag_36h11", "grid", first_marker=20)
+    stated = Board((2, 2), 0.05, 0.04, "apriltag_36h11", "grid")
+    message = str(missing_board(stated, [draw_grid(shown, pose())]))
+    assert "found markers 20 to 23 of the dictionary apriltag_36h11" in message
+    assert "--first-marker" in message
+
+
+@pytest.mark.slow
+def test_markers_that_stand_still_are_not_those_of_the_board():
+    """As many markers as on the board are on the walls, which each of five cameras sees at other pixels."""
+    walls = Board((4, 6), 0.04, 0.03, "6x6_250")
+    on_walls = [draw_board(walls, K, pose(10 + camera), SIZE_WH) for camera in range(5)]
+    images = [np.hstack([board, wall]) for board in drawn(2) for wall in on_walls]
+    assert detect_board(0.04, images).dictionary == "4x4_50"
+    # What stands still counts where nothing else is found.
+    assert detect_board(0.04, [image[:, 640:] for image in images]).dictionary == "6x6_50"
+
+
+def test_the_size_of_the_markers_is_measured():
+    images, stated = drawn(3), Board((4, 6), 0.04, 0.016)
+    for shown in (images, [255 - image for image in images]):
+        assert measure_markers(stated, shown) == pytest.approx(0.75, rel=0.05)
+    assert measure_markers(stated, images[:2]) is None
+
+
+# Cameras that see a board.
+
+
+def test_cameras_from_paths(tmp_path):
+    for name in ("left", "right"):
+        folder = tmp_path / name / "board"
+        folder.mkdir(parents=True)
+        for number in (2, 10):
+            cv2.imwrite(str(folder / f"{name}7_{number}.png"), np.zeros((4, 6), np.uint8))
+            cv2.imwrite(str(tmp_path / f"{name}{number:02d}.png"), np.zeros((4, 6), np.uint8))
+    cameras = open_images([tmp_path / "left" / "board", tmp_path / "right" / "board"])
+    assert [camera.name for camera in cameras] == ["left", "right"]
+    np.testing.assert_array_equal(cameras[0].frames, [2, 10])
+    assert [number for number, _ in cameras[0].read(np.array([10]))] == [10]
+    by_pattern = open_images([tmp_path / "left??.png", tmp_path / "right??.png"])
+    assert [camera.name for camera in by_pattern] == ["left", "right"]
+
+
+def test_cameras_of_a_recording_need_no_place(tmp_path):
+    """A camera that is new in the rig is calibrated with those that have a place already."""
+    for name in ("old", "new"):
+        film_board(tmp_path / f"{name}.avi", random_poses(3))
+    placed = make_camera(R=np.eye(3), t_m=np.zeros(3), K=K, image_size_wh=SIZE_WH)
+    write_rig(tmp_path / "rig.toml", make_rig({"old": placed}))
+    cameras = "".join(f'[cameras.{name}]\nvideo = "{name}.avi"\n' for name in ("old", "new"))
+    (tmp_path / "recording.toml").write_text(f'version = 1\ncalibration = "rig.toml"\n{cameras}')
+    cameras, (number, frames) = open_recorded(open_recording(tmp_path))
+    assert [camera.name for camera in cameras] == ["old", "new"]
+    np.testing.assert_array_equal(number, [0, 1, 2])
+    np.testing.assert_array_equal(frames, [[0, 0], [1, 1], [2, 2]])
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_four_webcams():
+    """A board printed white on black, which one camera sees from behind; the author's focal lengths are near."""
+    folder = published("mprib/caliscope") / "tests/sessions/4_cam_recording/calibration/extrinsic"
+    cameras = open_images([folder / f"cam_{n}.mp4" for n in range(4)])
+    found = find_views(Board((4, 5), 0.054, 0.0405, "4x4_1000"), cameras, instants_of_numbers(cameras))
+    assert (found.mirrored > 0).tolist() == [False, True, False, False]
+    assert say_print(found) == [
+        f"cam_1 sees the board mirrored, in {found.mirrored[1]} of {found.views.seen[1].sum()} views"
+    ]
+    calibrated = calibrate_rig(found.board, found.views)
+    np.testing.assert_allclose(calibrated.rig.cameras.K[:, 0, 0], [894.5, 704.0, 637.2, 640.4], rtol=0.03)
+    assert np.nanmedian(calibrated.residual_px) < 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_a_stereo_pair_and_a_chessboard():
+    """OpenCV's sample reports 0.22 px."""
+    folder = published("kyamagu/mexopencv") / "test"
+    cameras = open_images([folder / f"{side}??.jpg" for side in ("left", "right")])
+    found = find_views(Board((10, 7), 0.025, kind="chessboard"), cameras, instants_of_numbers(cameras))
+    calibrated = calibrate_rig(found.board, found.views)
+    assert np.sqrt(np.mean(calibrated.residual_px[calibrated.used] ** 2)) < 0.24
+
+
+# The lens of a camera.
+
+
+def test_lenses_of_a_data_sheet():
+    """The dataset's action camera, 92.45 x 60.83 degrees."""
+    lens = lens_of_view(92.45, 60.83, (3840, 2160))
+    edges = np.array([[np.tan(np.deg2rad(92.45 / 2)), 0, 1], [0, -np.tan(np.deg2rad(60.83 / 2)), 1]])
+    # Pixel centres are at whole numbers: the image ends half a pixel after the last pixel's centre.
+    np.testing.assert_allclose(project(lens, edges)[0], [[3839.5, 1079.5], [1919.5, -0.5]], atol=1e-9)
+
+
+def test_a_lens_from_a_board(tmp_path):
+    cameras = open_images([film_board(tmp_path / "board.avi", random_poses(16))])
+    found = find_views(HELD, cameras, instants_of_numbers(cameras))
+    lens = calibrate_rig(found.board, found.views, LensChoice(LensModel(4)))
+    camera, std = lens.rig.cameras[0], lens.lens_std[0]
+    shown = np.array([*np.diag(camera.K)[:2], *camera.K[:2, 2]])
+    # Corners have errors of a tenth of a pixel; an error of 5 standard deviations has a chance of one in a million.
+    assert (np.abs(shown - [620, 625, 322, 236]) < 5 * std[:4] + 0.5).all()
+    assert (np.abs(shown - [620, 625, 322, 236]) < [6, 6, 4, 4]).all()
+    assert np.abs(camera.dist).max() < 0.1
+    assert lens.residual_px[lens.used].max() < 1.0
+    assert lens.used[0].any(axis=1).sum() > 11
+    # All coefficients are 0 within their deviations. A fisheye lens shows straight lines as the pinhole does only where
+    # k1 = 1/3, k2 = -1/5 or so and on.
+    for model in (LensModel(5), LensModel(8), LensModel(14), LensModel(4, fisheye=True)):
+        lens = calibrate_rig(found.board, found.views, LensChoice(model))
+        assert lens.lens_std[0].shape == (model.size,)
+        assert np.sqrt(np.mean(lens.residual_px[lens.used] ** 2)) < 0.2
+        if model == LensModel(5):
+            assert (np.abs(lens.rig.cameras[0].dist) < 6 * lens.lens_std[0][4:] + 0.05).all()
+
+
+#: Name of the model -> focal length in pixels, and OpenCV's coefficients, of lenses with strong distortion.
+STRONG_LENSES = {
+    "5": (700.0, (-0.2, 0.05, 0.001, 0.0005, 0.0)),
+    "8": (520.0, (0.9, -0.12, 0.0008, -0.0006, 0.02, 1.25, -0.05, 0.03)),
+    "12": (650.0, (-0.25, 0.09, 5e-4, -7e-4, -0.01, 0.05, 0.02, 0.01, 0.012, -0.006, 0.009, 0.004)),
+    "14": (650.0, (-0.25, 0.09, 5e-4, -7e-4, -0.01, 0.05, 0.02, 0.01, 4e-3, -2e-3, 3e-3, 1e-3, 0.06, -0.04)),
+    "fisheye": (330.0, (0.06, -0.03, 0.012, -0.003)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(STRONG_LENSES))
+def test_the_chosen_model_shows_other_views_as_well_as_the_true_model(name):
+    """Boards through OpenCV's own formulas, with errors of 0.1 px; rms on other views at most 1.05 times as large."""
+    focal_px, dist = STRONG_LENSES[name]
+    board, rng, size_wh = Board((8, 6), 0.05, 0.0375), np.random.default_rng(3), (1280, 720)
+    K = np.array([[focal_px, 0, 645], [0, 1.002 * focal_px, 352], [0, 0, 1]])
+    views = []
+    while len(views) < 40:
+        # The board faces the camera, more or less, in any direction that the image shows.
+        aim = np.array([*rng.uniform((-1.1, -0.62), (1.1, 0.62)) * 600 / focal_px, 1.0])
+        aim /= np.linalg.norm(aim)
+        x = np.cross([0.0, 1.0, 0.0], aim)
+        x /= np.linalg.norm(x)
+        R = np.column_stack([x, np.cross(aim, x), aim])
+        R = R @ Rotation.from_euler("xyz", rng.uniform(-40, 40, 3), degrees=True).as_matrix()
+        distance_m = 0.4 * focal_px / rng.uniform(300, 560)
+        places = (board.corners_m - board.corners_m.mean(axis=0)) @ R.T + distance_m * aim
+        show = cv2.fisheye.projectPoints if name == "fisheye" else cv2.projectPoints
+        pixels = np.reshape(show(places[:, None], np.zeros(3), np.zeros(3), K, np.array(dist))[0], (-1, 2))
+        # Beyond 50 degrees the formulas with 12 and 14 coefficients fold back.
+        near = np.hypot(*places[:, :2].T) < (5.0 if name == "fisheye" else 1.15) * places[:, 2]
+        inside = ((pixels > 0) & (pixels < np.array(size_wh) - 1)).all(axis=1) & near & (places[:, 2] > 0.05)
+        if inside.sum() >= 12:
+            views.append(np.where(inside[:, None], pixels + rng.normal(0, 0.1, pixels.shape), np.nan))
+    known, other = np.array(views[:20]), np.array(views[20:])
+
+    def rms_px(model):
+        lens = find_lens(board, model, known, size_wh)
+        return np.sqrt(np.nanmean(fit_boards(board, model, lens, other, size_wh) ** 2))
+
+    chosen, true_px = choose_lens_model(board, known, size_wh), rms_px(parse_lens_model(name))
+    assert true_px < 0.16
+    assert rms_px(chosen) < 1.05 * true_px
+    if name in ("5", "fisheye"):
+        assert str(chosen) == name
