@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,6 +72,33 @@ def any_room():
     corners |= {30: marker_at((1.5, 2.5, 0), (0, 0, 1), 20), 31: marker_at((-1.5, 2, 0), (0, 0, 1), 200)}
     corners |= {40: marker_at((1, 2.5, 3), (0, 0, -1), 70), 41: marker_at((-1, 3, 3), (0, 0, -1))}
     return corners
+
+
+def column_names(pattern, corners="1234"):
+    """Header of a table with a row for each marker."""
+    return ["id", *(pattern.format(axis=axis, corner=corner) for corner in corners for axis in "xyz")]
+
+
+OUR_COLUMNS = column_names("{axis}{corner}[m]")
+
+
+def wide_table(corners_m, header=OUR_COLUMNS, *, scale=1.0, separator=";"):
+    """Text of a table with a row for each marker; without a header if it is None."""
+    lines = [separator.join(header)] if header else []
+    for marker, corners in corners_m.items():
+        values = (repr(float(scale * value)) for value in corners.ravel())
+        lines.append(separator.join([str(marker), *values]))
+    return "\n".join(lines) + "\n"
+
+
+def long_table(corners_m, header, corner_names="1234", *, scale=1.0, separator=","):
+    """Text of a table with a row for each corner."""
+    lines = [separator.join(header)] if header else []
+    for marker, corners in corners_m.items():
+        for name, corner in zip(corner_names, corners, strict=True):
+            values = (repr(float(scale * value)) for value in corner)
+            lines.append(separator.join([str(marker), name, *values]))
+    return "\n".join(lines) + "\n"
 
 
 def found_markers(ids, corners_px, std_px=np.nan):
@@ -168,4 +196,23 @@ def make_drawn_flight(folder: Path) -> Path:
             # File names without leading zeros: 10 must come after 9.
             cv2.imwrite(str(folder / "images" / f"frame{number}.png"), image)
             writer.write(image)
+    return folder
+
+
+def write_onboard_sequence(drawn: Path, folder: Path) -> Path:
+    """Write a sequence in the dataset's layout: two drones and a static camera, all with the drawn flight's video."""
+    folder.mkdir()
+    for name in ("dron1_cam_s.avi", "dron2_cam_s.avi", "cam1i_s.avi"):
+        shutil.copy(drawn / "flight.avi", folder / name)
+    shutil.copy(drawn / "corners.csv", folder / "aruco_corners.csv")
+    K = DRAWN_LENS.K
+    rows = [f"dron{number};{K[0, 0]};{K[1, 1]};319.5;239.5;640;480\n" for number in (1, 2)]
+    header = "cam_name;focal_length_x;focal_length_y;cx;cy;width;height\n"
+    (folder / "drone_cameras_calibration.csv").write_text("".join([header, *rows]))
+    (folder / "cameras_calibration.csv").write_text(
+        "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy\n"
+        "cam1i;0;0;5;0;0;0;600;480;360\n"
+    )
+    # A picture in the folder does not make it a folder of images.
+    cv2.imwrite(str(folder / "plot.png"), np.zeros((20, 30), np.uint8))
     return folder

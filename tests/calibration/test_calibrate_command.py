@@ -36,7 +36,8 @@ def calibrate(run_psotrack):
 
 @pytest.fixture
 def lenses(tmp_path):
-    return write_rig(tmp_path / "lenses.toml", RIG) or tmp_path / "lenses.toml"
+    write_rig(tmp_path / "lenses.toml", RIG)
+    return tmp_path / "lenses.toml"
 
 
 def write_lines(path, lines):

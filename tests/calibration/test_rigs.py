@@ -38,9 +38,7 @@ from psotrack.calibration import (
     find_point_shifts,
     fit_world,
     known_lenses,
-    read_point_views,
     read_world,
-    stick_length,
     views_of_detections,
     world_of_camera,
 )
@@ -357,21 +355,6 @@ def test_cameras_with_a_small_field_of_view(seed):
     assert found.used.all(axis=1).mean() > 0.95
     turns = [relative_to_first(each)[1, :3, :3] for each in (found.rig, rig)]
     assert np.rad2deg(Rotation.from_matrix(turns[0] @ turns[1].T).magnitude()) < 0.5
-
-
-def test_a_stick(tmp_path):
-    path, rows = tmp_path / "stick.csv", ["camera,frame,point,x_px,y_px"]
-    ends = np.array([[0.0, 0, 1], [0.3, 0, 1]])
-    for frame in range(20):
-        place = ends + np.array([0.02 * frame - 0.3, 0.3 * np.sin(frame), 0.2 * np.cos(0.7 * frame)])
-        for end, xyz in zip(("tip", "foot"), place, strict=True):
-            pixels, _ = project(FOUR.cameras, xyz)
-            rows += [f"{name},{frame},{end},{x},{y}" for name, (x, y) in zip(FOUR.names, pixels, strict=True)]
-    path.write_text("\n".join(rows) + "\n")
-    views = read_point_views(path)
-    assert views.names == FOUR.names
-    found = calibrate_by_point(FOUR, views)
-    np.testing.assert_allclose(0.3 / stick_length(found) * gaps_of(found.rig), gaps_of(FOUR), atol=1e-3)
 
 
 def test_one_box_of_a_frame_counts():

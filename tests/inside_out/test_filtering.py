@@ -460,15 +460,6 @@ def test_paths_without_poses_at_the_beginning_and_raw_paths_that_stay_as_they_ar
         assert (find(nothing).status == Status.LOST).all()
 
 
-def test_times_may_be_irregular() -> None:
-    """A live stream with randomly dropped frames is followed as accurately as its frames allow."""
-    raw, position_m, truth = flight(150, acceleration=0.5, shake=0.3, seed=20)
-    kept = np.flatnonzero(np.random.default_rng(21).random(150) < 0.4)
-    some = some_frames(raw, kept)
-    found, own = (errors(one, position_m[kept], truth[kept])[0] for one in (filter_path(some), some))
-    assert lengths(found) < 1.03 * lengths(own)
-
-
 # Errors that are the same in all frames.
 
 

@@ -25,6 +25,7 @@ from marker_worlds import (
     make_drawn_flight,
     simple_lens,
     wall_markers,
+    write_onboard_sequence,
 )
 from scipy.spatial.transform import Rotation
 
@@ -191,16 +192,7 @@ def test_a_table_may_have_centres_alone(localise, tmp_path):
 
 
 def test_a_sequence_provides_markers_and_intrinsics(run_psotrack, localise, drawn, tmp_path):
-    folder = tmp_path / "S01_D2_A"
-    folder.mkdir()
-    for drone in ("dron1", "dron2"):
-        (folder / f"{drone}_cam_s.avi").write_bytes((drawn / "flight.avi").read_bytes())
-    (folder / "aruco_corners.csv").write_bytes((drawn / "corners.csv").read_bytes())
-    header = "cam_name;focal_length_x;focal_length_y;cx;cy;width;height"
-    rows = [f"dron{number};{LENS.K[0, 0]};{LENS.K[1, 1]};319.5;239.5;640;480" for number in (1, 2)]
-    (folder / "drone_cameras_calibration.csv").write_text("\n".join([header, *rows]) + "\n")
-    # A picture in the folder does not make it a folder of images.
-    cv2.imwrite(str(folder / "plot.png"), np.zeros((20, 30), np.uint8))
+    folder = write_onboard_sequence(drawn, tmp_path / "S01_D2_A")
     out = tmp_path / "own.csv"
     done = run_psotrack("onboard", "localise", folder, "--drone", "dron2", "--frames", 6, "--out", out)
     assert done.code == 0, done.err

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from dataclasses import replace
 from itertools import combinations
 
@@ -17,6 +16,7 @@ from marker_worlds import (
     PASSING_CAMERA,
     SQUARE,
     any_room,
+    column_names,
     fly_past,
     found_markers,
     four_walls,
@@ -26,6 +26,8 @@ from marker_worlds import (
     seen_markers,
     simple_lens,
     wall_markers,
+    wide_table,
+    write_onboard_sequence,
 )
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -87,49 +89,29 @@ def errors_m(built, truth=ROOM):
 NAMES = ("tl", "tr", "br", "bl")
 
 
-def wide_table(header, *, scale=1.0, separator=";"):
-    lines = [separator.join(header)] if header else []
-    for marker, corners in ROOM.items():
-        values = (repr(float(scale * value)) for value in corners.ravel())
-        lines.append(separator.join([str(marker), *values]))
-    return "\n".join(lines) + "\n"
-
-
-def column_names(pattern, corners="1234"):
-    return ["id", *(pattern.format(axis=axis, corner=corner) for corner in corners for axis in "xyz")]
-
-
-def long_table(header, corner_names, *, scale=1.0, separator=","):
-    lines = [separator.join(header)] if header else []
-    for marker, corners in ROOM.items():
-        for name, corner in zip(corner_names, corners, strict=True):
-            values = (repr(float(scale * value)) for value in corner)
-            lines.append(separator.join([str(marker), name, *values]))
-    return "\n".join(lines) + "\n"
-
-
-OURS = wide_table(column_names("{axis}{corner}[m]"))
-LONG = long_table(["id", "corner", "x_m", "y_m", "z_m"], "1234")
+OURS = wide_table(ROOM)
 LAYOUTS = {
     "ours": OURS,
-    "millimetres": wide_table(column_names("{axis}{corner}[mm]"), scale=1e3),
-    "centimetres": wide_table(column_names("{axis}{corner} (cm)"), scale=1e2),
-    "commas": wide_table(column_names("{axis}_{corner}"), separator=","),
-    "tabs": wide_table(column_names("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
-    "from 0": wide_table(column_names("p{corner}.{axis} [m]", "0123")),
-    "corner names": wide_table(["Marker ID", *column_names("{corner}_{axis}", NAMES)[1:]], separator=","),
-    "numbers alone": wide_table(None, separator=","),
-    "long": LONG,
-    "long from 0": long_table(
-        ["marker", "corner_id", *(f"{a} [mm]" for a in "XYZ")], "0123", scale=1e3, separator=";"
+    "millimetres": wide_table(ROOM, column_names("{axis}{corner}[mm]"), scale=1e3),
+    "centimetres": wide_table(ROOM, column_names("{axis}{corner} (cm)"), scale=1e2),
+    "commas": wide_table(ROOM, column_names("{axis}_{corner}"), separator=","),
+    "tabs": wide_table(ROOM, column_names("corner{corner}_{axis}_mm"), scale=1e3, separator="\t"),
+    "from 0": wide_table(ROOM, column_names("p{corner}.{axis} [m]", "0123")),
+    "corner names": wide_table(
+        ROOM, ["Marker ID", *column_names("{corner}_{axis}", NAMES)[1:]], separator=","
     ),
-    "long with names": long_table(["aruco_id", "corner", *"xyz"], ["Top-left", "TR", "bottom right", "bl"]),
-    "long numbers": long_table(None, "1234", separator=";"),
+    "numbers alone": wide_table(ROOM, None, separator=","),
+    "long": long_table(ROOM, ["id", "corner", "x_m", "y_m", "z_m"]),
+    "long from 0": long_table(
+        ROOM, ["marker", "corner_id", *(f"{a} [mm]" for a in "XYZ")], "0123", scale=1e3, separator=";"
+    ),
+    "long with names": long_table(
+        ROOM, ["aruco_id", "corner", *"xyz"], ["Top-left", "TR", "bottom right", "bl"]
+    ),
+    "long numbers": long_table(ROOM, None, separator=";"),
     "a spreadsheet's": "\ufeff" + OURS.replace("\n", ";\r\n"),
     "words in ids": OURS.replace("\n", "\nMarker_")[: -len("Marker_")],
-    "other columns": OURS.replace("\n", ";0.3\n")
-    .replace("[m];0.3", "[m];size", 12)
-    .replace("z4[m];0.3", "z4[m];size"),
+    "other columns": OURS.replace("\n", ";0.3\n").replace("z4[m];0.3", "z4[m];size"),
 }
 
 
@@ -535,20 +517,7 @@ def test_a_map_from_a_video(run_map, drawn, tmp_path):
 
 def test_a_sequence_provides_videos_intrinsics_and_map(run_map, drawn, tmp_path):
     """The layout of the dataset: video, intrinsics and table of corners are found by their names."""
-    folder = tmp_path / "S01_D2_A"
-    folder.mkdir()
-    for name in ("dron1_cam_s.avi", "cam1i_s.avi"):
-        shutil.copy(drawn / "flight.avi", folder / name)
-    shutil.copy(drawn / "corners.csv", folder / "aruco_corners.csv")
-    K = DRAWN_LENS.K
-    (folder / "drone_cameras_calibration.csv").write_text(
-        "cam_name;focal_length_x;focal_length_y;cx;cy;width;height\n"
-        f"dron1;{K[0, 0]};{K[1, 1]};319.5;239.5;640;480\n"
-    )
-    (folder / "cameras_calibration.csv").write_text(
-        "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy\n"
-        "cam1i;0;0;5;0;0;0;600;480;360\n"
-    )
+    folder = write_onboard_sequence(drawn, tmp_path / "S01_D2_A")
     out = tmp_path / "corners.csv"
     run_map(folder, "--drone", "dron1", "--known", "17", "--out", out)
     assert max(centres_off_m(out).values()) < 0.02

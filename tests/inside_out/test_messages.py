@@ -18,9 +18,11 @@ from marker_worlds import (
     fly_past,
     found_markers,
     four_walls,
+    long_table,
     make_drawn_flight,
     simple_lens,
     wall_markers,
+    wide_table,
 )
 
 from psotrack.foreground.markers import MarkerDetector
@@ -146,30 +148,20 @@ def read_squares(path):
     return fit_squares(read_measured_corners(path))
 
 
-def wide(corners_m):
-    header = ["id", *(f"{axis}{corner}[m]" for corner in "1234" for axis in "xyz")]
-    rows = [";".join(map(str, (marker, *at.ravel().tolist()))) for marker, at in corners_m.items()]
-    return "\n".join([";".join(header), *rows]) + "\n"
-
-
 def third(corners):
     """The table of the room with other corners of marker 3, in line 4."""
-    return wide({**ROOM, 3: corners})
+    return wide_table({**ROOM, 3: corners})
 
 
 def bent(distance_m, axis):
     return ROOM[3] + distance_m * np.outer(np.arange(4) == 2, np.arange(3) == axis)
 
 
-WIDE = wide(ROOM)
-LONG = "id,corner,x_m,y_m,z_m\n" + "".join(
-    f"{marker},{corner + 1},{x},{y},{z}\n"
-    for marker, at in ROOM.items()
-    for corner, (x, y, z) in enumerate(at.tolist())
-)
+WIDE = wide_table(ROOM)
+LONG = long_table(ROOM, ["id", "corner", "x_m", "y_m", "z_m"])
 CELLS = WIDE.splitlines()[3].split(";")
-MIRRORED = wide({marker: corners * [1.0, -1.0, 1.0] for marker, corners in ROOM.items()})
-IN_MILLIMETRES = wide({marker: 1e3 * corners for marker, corners in ROOM.items()})
+MIRRORED = wide_table({marker: corners * [1.0, -1.0, 1.0] for marker, corners in ROOM.items()})
+IN_MILLIMETRES = wide_table({marker: 1e3 * corners for marker, corners in ROOM.items()})
 CORNERS_OF_3 = tuple(f"Marker3:{corner}" for corner in range(1, 5))
 UNSEEN_M = np.where(np.arange(4)[:, None] == 1, np.nan, np.ones((5, 4, 3)))
 TEN_COLUMNS = "\n".join(";".join(line.split(";")[:10]) for line in WIDE.splitlines())

@@ -122,7 +122,10 @@ def own_whitener(std_px):
 
 
 def test_pose_and_covariance_equal_scipys_least_squares_over_all_unknowns():
-    """Unknowns: pose, inset, focal length, markers' offsets; the noise of each marker is another."""
+    """Unknowns: pose, inset, focal length, markers' offsets; the noise of each marker is another.
+
+    Found: `std_px`, which detection writes, had no effect on the pose.
+    """
     rng = np.random.default_rng(0)
     view, corners_m = camera_at(dist=LENSES[4]), two_walls(6)
     count, focal_error, std_px = 6, 0.005, np.array([0.1, 0.2, 0.3, 0.2, 0.1, 0.4])
@@ -176,20 +179,6 @@ def random_views(rng, number):
     for _ in range(number):
         centre_m = rng.uniform((-1.5, -3, 0.8), (0.0, -1, 2))
         yield camera_at(centre_m, rng.uniform((2.5, 3, 1.2), (3.5, 3.5, 2.2)))
-
-
-def test_markers_with_smaller_deviations_count_more():
-    """Found: `std_px`, which detection writes, had no effect on the pose."""
-    rng = np.random.default_rng(15)
-    off_m = {"stated": [], "equal": []}
-    for view in random_views(np.random.default_rng(16), 40):
-        corners_m, std_px = two_walls(8), np.array([0.05] * 4 + [1.0] * 4)
-        pixels = image_corners(view, corners_m)
-        corners_px = pixels + std_px[:, None, None] * rng.normal(size=pixels.shape)
-        for name, stated in (("stated", std_px), ("equal", np.full(8, 0.7))):
-            found = estimated(view, corners_px, corners_m, std_px=stated)
-            off_m[name].append(np.linalg.norm(found.position_m - view.centre_world))
-    assert np.median(off_m["stated"]) < 0.5 * np.median(off_m["equal"])
 
 
 @pytest.mark.parametrize(
