@@ -20,6 +20,7 @@ from marker_worlds import (
     fly_past,
     found_markers,
     four_walls,
+    long_table,
     make_drawn_flight,
     marker_at,
     posed,
