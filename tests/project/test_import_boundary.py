@@ -257,7 +257,6 @@ NOT_YET_MENDED = {
     "cli/test_names_as_paths.py",
     "cli/test_small_disks.py",
     "fuzz/formats.py",
-    "recordings/test_exchange.py",
     "show/test_results_in_notebooks.py",
 }
 
