@@ -1,5 +1,5 @@
-from .flights.piloting import flight_space
-from .flights.recordings import write_recorded_flight
+from .flights.piloting import flight_space, read_sticks
+from .flights.recordings import read_recorded_flight, write_recorded_flight
 from .generate import simulate
 from .imaging.renderer import CameraRenderer
 from .listing import catalogue
@@ -30,6 +30,8 @@ __all__ = [
     "load",
     "preset_names",
     "preset_text",
+    "read_recorded_flight",
+    "read_sticks",
     "scenario",
     "simulate",
     "simulate_own_cameras",

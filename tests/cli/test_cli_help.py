@@ -1,57 +1,37 @@
-"""`psotrack --help`: speed and agreement with the commands; completion of commands and options in shells."""
+"""`psotrack --help`: what it imports, agreement with the commands; completion of commands and options in shells."""
 
 from __future__ import annotations
 
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
 import pytest
+from helpers import Output, assert_refused
 
 from psotrack import cli
-from psotrack.cli.calibrate import calibrate
 from psotrack.cli.lazy import LazyGroup
 
-#: Largest user time of `psotrack --help`, seconds.
-MAX_HELP_S = 0.3
+Run = Callable[..., Output]
+
 #: Packages that only commands need.
 HEAVY = ("cv2", "jax", "matplotlib", "msgspec", "numpy", "pandas", "rich", "scipy", "trimesh", "zarr")
 
-#: Runs `psotrack` with the arguments of the process, then prints the heavy packages that were imported.
+#: Runs `psotrack` with the words of each argument, and prints the heavy packages that are imported after each.
 REPORT_IMPORTS = f"""
-import sys
+import contextlib, io, sys
 from psotrack.cli import main
-try:
-    main()
-finally:
-    print("imported:", *sorted(set({HEAVY!r}) & set(sys.modules)))
+for words in sys.argv[1:]:
+    sys.argv = ["psotrack", *words.split()]
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        main()
+    print(*sorted(set({HEAVY!r}) & set(sys.modules)), sep=" ")
 """
-
-
-def psotrack(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run `psotrack` in a new process."""
-    return subprocess.run(
-        [sys.executable, "-m", "psotrack", *arguments],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-@pytest.mark.parametrize("group", [cli.cli, calibrate], ids=["psotrack", "calibrate"])
-def test_summaries_are_the_first_sentences_of_the_commands(group: LazyGroup) -> None:
-    assert len(group.places) >= 2
-    for name in group.places:
-        command = group.commands[name]
-        assert command.name == name
-        assert group.summary(name) == command.get_short_help_str(limit=1000), name
 
 
 def every_command(group: click.Group = cli.cli, words: str = "") -> Iterator[tuple[str, click.Command]]:
@@ -67,11 +47,33 @@ def every_command(group: click.Group = cli.cli, words: str = "") -> Iterator[tup
 EVERY_COMMAND = dict(every_command())
 
 
+def test_summaries_are_the_first_sentences_of_the_commands(run_psotrack: Run) -> None:
+    """They are written a second time, because help must not import the commands."""
+    groups = [command for command in EVERY_COMMAND.values() if isinstance(command, LazyGroup)]
+    assert cli.cli in groups
+    for group in groups:
+        assert len(group.places) >= 2
+        for name in group.places:
+            command = group.commands[name]
+            assert command.name == name
+            assert group.summary(name) == command.get_short_help_str(limit=1000), name
+    result = run_psotrack("--help")
+    assert result.code == 0
+    words = " ".join(result.out.split())
+    for name in cli.cli.places:
+        assert f" {name} {cli.cli.summary(name)}" in words
+    for shell in ("bash", "zsh", "fish"):
+        assert f"_PSOTRACK_COMPLETE={shell}_source psotrack" in result.out
+
+
 @pytest.mark.parametrize("words", EVERY_COMMAND)
-def test_help_fits_two_screens(words: str) -> None:
+def test_help_fits_two_screens_and_has_an_example(words: str) -> None:
     command = EVERY_COMMAND[words]
     context = click.Context(command, info_name=f"psotrack {words}", terminal_width=100, max_content_width=100)
-    assert len(command.get_help(context).splitlines()) <= 80
+    text = command.get_help(context)
+    assert len(text.splitlines()) <= 80
+    if not isinstance(command, click.Group):
+        assert re.search(rf"Examples?:\n +psotrack {words.removesuffix(' sequence')}\b", text)
 
 
 @pytest.mark.parametrize("words", EVERY_COMMAND)
@@ -103,105 +105,72 @@ def test_init_alone_asks() -> None:
     assert asking == {"init.py"}
 
 
-def test_help_lists_every_command_with_its_whole_summary() -> None:
-    result = psotrack("--help")
-    assert result.returncode == 0
-    words = " ".join(result.stdout.split())
-    for name in cli.cli.places:
-        assert f" {name} {cli.cli.summary(name)}" in words
-
-
 def test_help_and_names_of_commands_import_no_heavy_package() -> None:
-    for arguments, environment in (
-        (["--help"], {}),
-        (["--version"], {}),
-        (["calibrate", "--help"], {}),
-        ([], {"_PSOTRACK_COMPLETE": "bash_complete", "COMP_WORDS": "psotrack s", "COMP_CWORD": "1"}),
-    ):
-        result = subprocess.run(
-            [sys.executable, "-c", REPORT_IMPORTS, *arguments],
-            env=os.environ | environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert result.stdout.splitlines()[-1] == "imported:", arguments
-
-
-@pytest.mark.parametrize("command", ["onboard localise", "detect", "simulate sequence", "sweep", "track"])
-def test_help_of_a_command_imports_the_defaults_of_settings_alone(command: str) -> None:
+    """Help of a command imports the defaults of settings alone. Each process imports what came before."""
+    light, settings = ["--help", "--version", "calibrate --help"], ["onboard localise", "simulate sequence"]
+    words = [*light, *(f"{command} --help" for command in (*settings, "detect", "sweep", "track"))]
     result = subprocess.run(
-        [sys.executable, "-c", REPORT_IMPORTS, *command.split(), "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", REPORT_IMPORTS, *words], capture_output=True, text=True, check=True
     )
-    assert result.stdout.splitlines()[-1] == "imported: msgspec"
+    assert result.stdout.splitlines() == [""] * len(light) + ["msgspec"] * (len(words) - len(light))
 
 
-def test_help_is_quick() -> None:
-    seconds = []
-    for _ in range(3):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        assert psotrack("--help").returncode == 0
-        seconds.append(resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before)
-    # The shortest of three times counts, because other work on the machine makes a process slower.
-    assert min(seconds) <= MAX_HELP_S
+# --- completion
+
+SHELLS = ("bash", "zsh", "fish")
 
 
-def test_the_error_for_a_mistyped_command_suggests_a_command() -> None:
-    result = psotrack("evalute")
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1
-    assert "'evaluate'" in result.stderr
+@pytest.fixture
+def complete(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+    """Runs `psotrack` as a shell does that wants completions."""
+
+    def call(shell: str, **environment: str) -> Output:
+        monkeypatch.setenv("_PSOTRACK_COMPLETE", shell)
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        return run_psotrack()
+
+    return call
 
 
-def test_help_says_how_to_switch_completion_on() -> None:
-    text = psotrack("--help").stdout
-    for shell in ("bash", "zsh", "fish"):
-        assert f"_PSOTRACK_COMPLETE={shell}_source psotrack" in text
-
-
-@pytest.mark.parametrize(
-    ("shell", "switch"), [("bash", "complete "), ("zsh", "compdef "), ("fish", "complete ")]
-)
-def test_the_script_that_switches_completion_on(shell: str, switch: str) -> None:
+@pytest.mark.parametrize("shell", SHELLS)
+def test_the_script_that_switches_completion_on(complete: Run, shell: str) -> None:
     if shell == "bash" and shutil.which("bash") is None:
         pytest.skip("click runs bash to find its version")
-    result = psotrack(_PSOTRACK_COMPLETE=f"{shell}_source")
-    assert result.returncode == 0, result.stderr
-    assert f"_PSOTRACK_COMPLETE={shell}_complete" in result.stdout
-    assert any(line.strip().startswith(switch) and "psotrack" in line for line in result.stdout.splitlines())
+    result = complete(f"{shell}_source")
+    assert result.code == 0, result
+    assert f"_PSOTRACK_COMPLETE={shell}_complete" in result.out
+    switch = "compdef " if shell == "zsh" else "complete "
+    assert any(line.strip().startswith(switch) and "psotrack" in line for line in result.out.splitlines())
 
 
-def completions(shell: str, words: list[str], incomplete: str) -> set[str]:
-    """Completions of `psotrack` in a shell after `words` and the first characters `incomplete` of the next word."""
-    if shell == "fish":
-        typed = {"COMP_WORDS": " ".join(words), "COMP_CWORD": incomplete}
-    else:
-        typed = {"COMP_WORDS": " ".join([*words, incomplete]), "COMP_CWORD": str(len(words))}
-    result = psotrack(_PSOTRACK_COMPLETE=f"{shell}_complete", **typed)
-    assert result.returncode == 0, result.stderr
-    lines = result.stdout.splitlines()
-    if shell == "zsh":
-        # Each completion has three lines: type, value, help.
-        return set(lines[1::3])
-    # bash: `type,value`; fish: `type,value<tab>help`.
-    return {line.split(",", 1)[1].split("\t")[0] for line in lines}
+def test_an_unknown_shell_is_one_line(complete: Run, tmp_path: Path) -> None:
+    shells = "bash_source, zsh_source or fish_source"
+    assert_refused(lambda: complete("tcsh_source"), shells, unchanged=tmp_path)
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_commands_and_options(shell: str) -> None:
-    assert completions(shell, ["psotrack"], "s") == {"simulate", "sweep"}
-    assert completions(shell, ["psotrack", "calibrate"], "c") == {"convert"}
-    assert completions(shell, ["psotrack", "simulate", "sequence"], "--s") == {
-        "--scenario",
-        "--set",
-        "--show",
-        "--scale",
-        "--seed",
-    }
-    assert completions(shell, ["psotrack", "onboard", "fuse", "--at"], "") == {"camera", "middle"}
+@pytest.mark.parametrize("shell", SHELLS)
+def test_shells_complete_commands_and_options(complete: Run, shell: str) -> None:
+    def completions(words: list[str], incomplete: str) -> set[str]:
+        """Completions after `words` and the first characters of the next word."""
+        if shell == "fish":
+            typed = {"COMP_WORDS": " ".join(words), "COMP_CWORD": incomplete}
+        else:
+            typed = {"COMP_WORDS": " ".join([*words, incomplete]), "COMP_CWORD": str(len(words))}
+        result = complete(f"{shell}_complete", **typed)
+        assert result.code == 0, result
+        lines = result.out.splitlines()
+        if shell == "zsh":
+            # Each completion has three lines: type, value, help.
+            return set(lines[1::3])
+        # bash: `type,value`; fish: `type,value<tab>help`.
+        return {line.split(",", 1)[1].split("\t")[0] for line in lines}
+
+    assert completions(["psotrack"], "s") == {"simulate", "sweep"}
+    assert completions(["psotrack", "calibrate"], "c") == {"convert"}
+    options = {"--scenario", "--set", "--show", "--scale", "--seed"}
+    assert completions(["psotrack", "simulate", "sequence"], "--s") == options
+    assert completions(["psotrack", "onboard", "fuse", "--at"], "") == {"camera", "middle"}
 
 
 #: Switches completion on in a shell, presses Tab after `psotrack sim`, and prints the completions.
@@ -216,7 +185,7 @@ TAB = {
 }
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("shell", SHELLS)
 def test_the_tab_key_in_a_shell(tmp_path: Path, shell: str) -> None:
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed")
@@ -231,13 +200,6 @@ def test_the_tab_key_in_a_shell(tmp_path: Path, shell: str) -> None:
         check=True,
     )
     assert re.match(r"simulate\b", result.stdout), result
-
-
-def test_an_unknown_shell_is_one_line() -> None:
-    result = psotrack(_PSOTRACK_COMPLETE="tcsh_source")
-    assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr.count("\n") == 1
-    assert "bash_source, zsh_source or fish_source" in result.stderr
 
 
 def test_hints_about_pip_are_those_of_a_checkout() -> None:

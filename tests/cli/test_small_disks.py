@@ -1,4 +1,4 @@
-"""A disk that is really full, one that cannot be written, and a slow one; `test_disks.py` needs no rights to mount.
+"""A disk that is really full, one that cannot be written, and a slow one; `test_outputs.py` needs no rights to mount.
 
 A small file system in memory stands for the disk. Its free pages and its number of files are counted over all files
 together, so that a limit meets each write of a command in turn, those of other libraries included.
@@ -14,15 +14,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from board_rigs import film_board, write_pairs
-from camera_paths import make_paths_and_tracks
-from helpers import make_once, ring_rig
-from marker_worlds import make_drawn_flight
+from helpers import assert_refused, content_of, make_once
 from small_sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
-from worlds import make_sequence, make_tracks_file
 
-from psotrack.geometry.rig_files import write_rig
 from psotrack.show.flights import find_recording
+
+pytestmark = pytest.mark.nightly
 
 #: Content of the files that a command is to replace.
 OLDER = b"older"
@@ -93,41 +90,32 @@ def inputs(tmp_path_factory, root):
     """Inputs of the commands, which no test changes."""
 
     def make(folder):
-        make_sequence(folder / "flight")
-        make_tracks_file(folder / "flight_tracks.csv")
-        rig = ring_rig(3, coefficients=5, image_size_wh=(1920, 1080))
-        write_rig(folder / "lenses.yml", rig)
-        write_pairs(folder / "pairs.csv", rig)
-        film_board(folder / "board.avi")
-        for name, make_inputs in (
-            ("walk", make_drawn_flight),
-            ("fuse", make_paths_and_tracks),
-        ):
-            (folder / name).mkdir()
-            make_inputs(folder / name)
-        tracked = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
-        assert tracked.returncode == 0, tracked.stderr
         sequence = root / "Simulated_Data" / "S01_D2_A"
-        packed = psotrack(
-            root, "archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack"
-        )
-        assert packed.returncode == 0, packed.stderr
+        for words in (
+            [*TRACK.format(root=root).split(), "--out", folder / "tracks.csv"],
+            ["archive", folder / "tracks.csv", sequence, "--out", folder / "packed.psotrack"],
+        ):
+            done = psotrack(root, *words)
+            assert done.returncode == 0, done.stderr
         grid_file(folder, [2, 3]).rename(folder / "grid.toml")
 
     return make_once(tmp_path_factory, "inputs_of_small_disks", make)
 
 
-def content_of(folder: Path) -> dict[str, bytes | None]:
+def contents(folder: Path) -> dict[str, bytes | None]:
     """Path of every file, hidden ones included, -> bytes without times; of a folder -> None."""
-    return {
-        str(path.relative_to(folder)): TIMES.sub(rb"\1\2", path.read_bytes()) if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
+    return {name: content and TIMES.sub(rb"\1\2", content) for name, content in content_of(folder).items()}
 
 
 def limits(number: int, tries: int) -> list[int]:
     """Numbers from 0 to `number` - 1: all, or some of them, with the smallest and the largest."""
     return sorted({round(i * (number - 1) / (tries - 1)) for i in range(tries)}) if number > 0 else []
+
+
+def assert_says(result, *names: str) -> None:
+    """One line with one of the names."""
+    assert (result.code, result.err.count("\n")) == (2, 1), result
+    assert any(name in result.err for name in names), result
 
 
 #: The small sequence with little effort; the program is the one that `small_sequence` compiles.
@@ -137,43 +125,20 @@ TRACK = (
 )
 #: Outputs, which belong together -> words of the command that writes them.
 COMMANDS = {
-    ("tracks.csv", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.csv",
-    ("tracks.parquet", "tracks.ambiguity.csv", "tracks.json"): f"{TRACK} --out tracks.parquet",
-    (
-        "flight.psotrack",
-    ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --out flight.psotrack --force",
-    (
-        "videos.psotrack",
-    ): "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos --out videos.psotrack --force",
-    ("folder",): "archive {inputs}/packed.psotrack --out folder",
-    ("rig.toml",): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.toml "
-    "--force",
-    (
-        "rig.yml",
-    ): "calibrate rig --pairs {inputs}/pairs.csv --lenses {inputs}/lenses.yml --out rig.yml --force",
-    ("lens.toml",): "calibrate rig {inputs}/board.avi --squares 7x5 --square 0.04 --marker 0.03 --lens 4 "
-    "--out lens.toml --force --quiet",
-    (
-        "camera.csv",
-    ): "onboard localise {walk} --markers {inputs}/walk/corners.csv --camera {inputs}/walk/lens.toml "
-    "--out camera.csv --force --frames 8 --quiet",
-    (
-        "corners.csv",
-    ): "onboard map {walk} --markers {inputs}/walk/corners.csv --camera {inputs}/walk/lens.toml "
-    "--known 17 --out corners.csv --force --quiet",
-    (
-        "markers.csv",
-    ): "onboard detect {walk} --dictionary 4x4_1000 --frames 4 --out markers.csv --force --quiet",
-    ("fused.csv",): "onboard fuse {inputs}/fuse/dron2.csv {inputs}/fuse/tracks.csv --out fused.csv --force",
-    ("doctor.json",): "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
+    "tracks.csv tracks.ambiguity.csv tracks.json": f"{TRACK} --out tracks.csv",
+    "tracks.parquet tracks.ambiguity.csv tracks.json": f"{TRACK} --out tracks.parquet",
+    "videos.psotrack": "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos "
+    "--out videos.psotrack --force",
+    "folder": "archive {inputs}/packed.psotrack --out folder",
+    "markers.csv": "onboard detect {flight}/c0.avi --frames 4 --out markers.csv --force --quiet",
+    "doctor.json": "doctor {root}/Simulated_Data/S01_D2_A --json doctor.json --quiet",
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("names", COMMANDS, ids=" ".join)
-def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, monkeypatch, names):
+@pytest.mark.parametrize("outputs", COMMANDS)
+def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, flight, monkeypatch, outputs):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
-    words = COMMANDS[names].format(root=root, inputs=inputs, walk=inputs / "walk" / "flight.avi").split()
+    words, names = COMMANDS[outputs].format(root=root, inputs=inputs, flight=flight).split(), outputs.split()
 
     def reset():
         for path in disk.place.iterdir():
@@ -182,44 +147,37 @@ def test_outputs_are_whole_or_as_they_were(run_psotrack, disk, root, inputs, mon
             for name in names:
                 Path(name).write_bytes(OLDER)
 
-    parents = {str(parent) for name in names for parent in Path(name).parents}
     empty = disk.used()
-    undisturbed = run_psotrack(*words)
-    assert undisturbed.code == 0, undisturbed.err
-    whole = content_of(disk.place)
+    assert run_psotrack(*words).code == 0
+    whole = contents(disk.place)
     pages, files = (most - least for most, least in zip(disk.used(), empty, strict=True))
     for room in [{"pages": n} for n in limits(pages, 3)] + [{"files": n} for n in limits(files, 3)]:
         reset()
-        older = content_of(disk.place)
+        older = contents(disk.place)
         with disk.room_for(**room):
             result = run_psotrack(*words)
-        assert result.code == 2, (room, result)
-        assert result.err.count("\n") == 1, (room, result.err)
-        assert any(name in result.err for name in names), (room, result.err)
-        # Folders in which the outputs are to be may have been made.
-        left = {path: content for path, content in content_of(disk.place).items() if path not in parents}
-        assert left == older, room
+        assert_says(result, *names)
+        assert contents(disk.place) == older, room
     assert run_psotrack(*words).code == 0
-    assert content_of(disk.place) == whole
+    assert contents(disk.place) == whole
 
 
 #: Output folders of commands that go on where the last call has ended -> words of the command.
 GO_ON = {
     "data": "simulate S01_D2_A --out data --frames 3 --scale 0.1 --jobs 1 --no-onboard --quiet",
-    "cache": "detect --silhouettes {inputs}/flight --cache cache --jobs 1 --quiet",
-    "videos": "overlay {inputs}/flight_tracks.csv {inputs}/flight --out videos --jobs 1 --quiet",
+    "cache": "detect --silhouettes {world}/flight --cache cache --jobs 1 --quiet",
+    "videos": "overlay {world}/tracks.csv {world}/flight --out videos --jobs 1 --quiet",
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", GO_ON)
-def test_the_next_run_goes_on(run_psotrack, disk, inputs, monkeypatch, tmp_path, name):
+def test_the_next_run_goes_on(run_psotrack, disk, world, monkeypatch, tmp_path, name):
     """The disk grows from call to call, and is never emptied."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
-    words = GO_ON[name].format(inputs=inputs).split()
+    words = GO_ON[name].format(world=world).split()
     empty = disk.used()
     assert run_psotrack(*words).code == 0
-    whole = content_of(disk.place)
+    whole = contents(disk.place)
     pages, files = (most - least for most, least in zip(disk.used(), empty, strict=True))
     shutil.rmtree(disk.place / name)
     for kind, index, number in (("files", 1, files), ("pages", 0, pages)):
@@ -229,18 +187,15 @@ def test_the_next_run_goes_on(run_psotrack, disk, inputs, monkeypatch, tmp_path,
                 continue
             with disk.room_for(**{kind: room - used}):
                 result = run_psotrack(*words)
-            assert result.code == 2, (kind, room, result)
-            assert result.err.count("\n") == 1, (kind, room, result.err)
-            assert name in result.err, (kind, room, result.err)
-            left = content_of(disk.place)
+            assert_says(result, name)
+            left = contents(disk.place)
             assert not [path for path in left if ".partial" in path], (kind, room)
             finished = {path: content for path, content in left.items() if "/." not in path and content}
             assert finished.items() <= whole.items(), (kind, room)
     assert run_psotrack(*words).code == 0
-    assert content_of(disk.place) == whole
+    assert contents(disk.place) == whole
 
 
-@pytest.mark.slow
 def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
     monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
     words = ["sweep", inputs / "grid.toml", "--data", root, "--quiet", "--out"]
@@ -251,10 +206,8 @@ def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
         room = rooms.pop(0)
         with disk.room_for(**room):
             result = run_psotrack(*words, "results")
-        assert result.code == 2, (room, result)
-        assert result.err.count("\n") == 1, (room, result.err)
-        assert "results" in result.err, (room, result.err)
-        assert not [path for path in content_of(disk.place) if ".partial" in path], room
+        assert_says(result, "results")
+        assert not [path for path in contents(disk.place) if ".partial" in path], room
         # No cell has failed: the disk has.
         assert not list(disk.place.glob("results/cells/*.error.json")), room
     finished = stamps(Path("results"))
@@ -269,19 +222,8 @@ def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
     pd.testing.assert_frame_equal(found, expected)
 
 
-@pytest.mark.slow
 def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
-    words = [
-        "sweep",
-        inputs / "grid.toml",
-        "--data",
-        root,
-        "--quiet",
-        "--cluster",
-        "local",
-        "--out",
-        "results",
-    ]
+    words = f"sweep {inputs}/grid.toml --data {root} --quiet --cluster local --out results".split()
     # Until a worker meets the full disk, and not the command, whose manifest takes more than two pages.
     pages, said = 2, ""
     while "results/cells" not in said and "results/_errors" not in said:
@@ -297,7 +239,6 @@ def test_a_sweep_on_a_cluster_goes_on(disk, root, inputs):
     assert len(stamps(Path("results"))) == 2
 
 
-@pytest.mark.slow
 def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
     """Found: after a full disk, the next call refused the sequence that the first one had simulated."""
     monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
@@ -309,7 +250,7 @@ def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
     def simulated():
         return {path: path.stat().st_mtime_ns for path in Path("demo/Simulated_Data").rglob("*")}
 
-    whole, made = content_of(disk.place), simulated()
+    whole, made = contents(disk.place), simulated()
     results = [
         Path("demo", name) for name in ("tracks.csv", "tracks.json", "tracks.ambiguity.csv", "demo.png")
     ]
@@ -322,9 +263,9 @@ def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
             result = run_psotrack(*words)
         assert (result.code, result.err.count("\n")) == (2, 1), (pages, result)
         assert not any(path.exists() for path in results), pages
-        assert ".partial" not in "".join(content_of(disk.place)), pages
+        assert ".partial" not in "".join(contents(disk.place)), pages
     assert run_psotrack(*words).code == 0
-    assert content_of(disk.place) == whole
+    assert contents(disk.place) == whole
     assert simulated() == made
     for path in results:
         path.unlink()
@@ -334,7 +275,7 @@ def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch, tmp_path):
 
 
 #: Commands with an output on a disk that cannot be written, at `out`.
-REFUSED = [
+READ_ONLY = [
     "track {flight} --out out/tracks.csv",
     "track {flight} --out out/tracks.csv --causal",
     "track {flight} --out tracks.csv --json out/record.json",
@@ -342,52 +283,35 @@ REFUSED = [
     "track {flight} --out tracks.csv --save-config out/run.toml",
     "track {flight} --out tracks.csv --cache out/cache",
     "live {flight} --replay --out out/tracks.csv",
-    "sweep {flight}/grid.toml --data {flight}/.. --out out/results",
+    "sweep {inputs}/grid.toml --data {root} --out out/results",
     "simulate S01_D2_A --out out/data",
     "detect --silhouettes {flight} --cache out/cache",
     "detect {flight} --masks out/masks",
     "detect {flight} --blobs --out out/boxes",
-    "simulate labels {flight} {flight}/../second --drone-size 0.3,0.3,0.15 --out out/yolo",
-    "overlay {flight}/tracks.csv {flight} --out out/videos",
-    "report {flight}/tracks.csv {flight} --out out/page.html",
-    "evaluate {flight}/tracks.csv {flight} --plot out/errors.png",
-    "export {flight}/tracks.csv --to tum --out out/tum",
-    "archive {flight}/tracks.csv {flight} --out out/flight.psotrack",
+    "simulate labels {flight} {world}/second --drone-size 0.3,0.3,0.15 --out out/yolo",
+    "overlay {world}/tracks.csv {flight} --out out/videos",
+    "report {world}/tracks.csv {flight} --out out/page.html",
+    "evaluate {world}/tracks.csv {flight} --plot out/errors.png",
+    "export {world}/tracks.csv --to tum --out out/tum",
+    "archive {world}/tracks.csv {flight} --out out/flight.psotrack",
     "doctor {flight} --detections blobs --json out/doctor.json",
 ]
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """A small recording with tracks and a grid, and another one, which no test changes."""
-
-    def make(folder):
-        make_sequence(folder / "second")
-        make_tracks_file(make_sequence(folder / "flight") / "tracks.csv")
-        text = grid_file(folder, [2]).read_text(encoding="utf-8")
-        (folder / "flight" / "grid.toml").write_text(text.replace("S01_D2_A", "flight"), encoding="utf-8")
-
-    return make_once(tmp_path_factory, "flight_of_small_disks", make) / "flight"
-
-
 def test_a_disk_that_cannot_be_written_is_named_before_the_work(
-    run_psotrack, disk, flight, tmp_path, monkeypatch
+    run_psotrack, disk, root, inputs, world, tmp_path, monkeypatch
 ):
+    """Neither silhouettes nor tracks are computed."""
     (tmp_path / "here").mkdir()
     monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path / "here")
     Path("out").symlink_to(disk.place)
     disk.remount("ro")
-    for command in REFUSED:
-        result = run_psotrack(*command.format(flight=flight).split())
-        assert result.code == 2, (command, result)
-        assert result.err.count("\n") == 1, (command, result.err)
-        assert "psotrack: out/" in result.err, (command, result.err)
-        # Neither silhouettes nor tracks were computed.
-        assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["filler"], command
+    for command in READ_ONLY:
+        words = command.format(flight=world / "flight", world=world, root=root, inputs=inputs).split()
+        assert_refused(lambda words=words: run_psotrack(*words), "psotrack: out/", unchanged=tmp_path)
 
 
-@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_read(run_psotrack, disk, root, tmp_path, monkeypatch):
     shutil.copytree(root / "cache", "cache")
     monkeypatch.setenv("PSOTRACK_CACHE", str(disk.place / "cache"))
@@ -414,7 +338,6 @@ main()
 """
 
 
-@pytest.mark.slow
 def test_two_processes_make_silhouettes_on_a_slow_disk(run_psotrack, flight, tmp_path):
     words = ["detect", "--silhouettes", str(flight), "--jobs", "1", "--quiet", "--cache"]
     both = [
@@ -431,4 +354,4 @@ def test_two_processes_make_silhouettes_on_a_slow_disk(run_psotrack, flight, tmp
         (0, "", "")
     ] * 2
     assert run_psotrack(*words, tmp_path / "quick").code == 0
-    assert content_of(tmp_path / "slow") == content_of(tmp_path / "quick")
+    assert contents(tmp_path / "slow") == contents(tmp_path / "quick")

@@ -33,9 +33,7 @@ from psotrack.recordings.datasets import (
     write_marker_corners,
 )
 from psotrack.show import flights
-from psotrack.simulation import build, change_scenario, scenario
-from psotrack.simulation.flights.piloting import read_sticks
-from psotrack.simulation.flights.recordings import read_recorded_flight
+from psotrack.simulation import build, change_scenario, read_recorded_flight, read_sticks, scenario
 from psotrack.sweeps import Store, read_grid
 from psotrack.trajectories import read_trajectories
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,11 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import make_once
-from small_sweeps import COMPILER
+from helpers import assert_refused, make_once
 
 import psotrack as pt
-from psotrack.errors import SettingsError
 from psotrack.foreground.silhouettes import ForegroundSettings, find_background
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
@@ -225,47 +224,30 @@ def mean_error_m(trajectories, recording):
     return pt.evaluate(trajectories, recording.truth).mean_error_m
 
 
-@pytest.fixture(scope="module")
-def with_three_parts(track):
-    return track(search=RandomSearch(), score=HighDice(), background=MedianBackground())
-
-
-def test_search_score_and_background_together_find_the_drones(with_three_parts, recording):
-    assert with_three_parts.trajectories.seen.all()
-    assert mean_error_m(with_three_parts.trajectories, recording) < NEAR_M
-    parts = with_three_parts.record["parts"]
-    assert {kind: part["class"].rpartition(".")[2] for kind, part in parts.items()} == {
-        "search": "RandomSearch",
-        "score": "HighDice",
-        "background": "MedianBackground",
-    }
-    assert parts["background"]["key"] == {"threshold": 25, "reduction": 1}
-
-
-def test_the_search_decides_the_positions(with_three_parts, track):
-    # Without steps the best of the first positions remains.
-    without_steps = track(
-        search=RandomSearch(step_m=0.0), score=HighDice(), background=MedianBackground()
-    ).trajectories
-    with_steps = with_three_parts.trajectories
-    # The median may take a slow drone as background; this drone coasts, and no search moves it.
-    found = (with_steps.status == Status.TRACKED).all(axis=0)
-    assert found.any()
-    assert (with_steps.position_m != without_steps.position_m)[:, found].any(axis=2).all()
+def test_search_score_and_background_together_find_the_drones(track, recording):
+    parts = {"score": HighDice(), "background": MedianBackground()}
+    tracked = track(search=RandomSearch(), **parts)
+    found = tracked.trajectories
+    assert found.seen.all()
+    assert mean_error_m(found, recording) < NEAR_M
+    names = {kind: part["class"].rpartition(".")[2] for kind, part in tracked.record["parts"].items()}
+    assert names == {"search": "RandomSearch", "score": "HighDice", "background": "MedianBackground"}
+    assert tracked.record["parts"]["background"]["key"] == {"threshold": 25, "reduction": 1}
+    # The score decides the fitness.
+    assert (found.fitness >= 0.9).all()
+    assert (found.fitness < 1.0).all()
+    # The search decides the positions: without steps the best of the first positions remains. The median may take a
+    # slow drone as background; this drone coasts, and no search moves it.
+    without_steps = track(search=RandomSearch(step_m=0.0), **parts).trajectories
+    moved = (found.status == Status.TRACKED).all(axis=0)
+    assert moved.any()
+    assert (found.position_m != without_steps.position_m)[:, moved].any(axis=2).all()
     # The first positions are so near that the vertices, which the fitness is of, are nearly the same.
-    assert with_steps.fitness.mean() > without_steps.fitness.mean() - 1e-4
-
-
-def test_the_score_decides_the_fitness(with_three_parts):
-    assert (with_three_parts.trajectories.fitness >= 0.9).all()
-    assert (with_three_parts.trajectories.fitness < 1.0).all()
-
-
-def test_the_background_model_decides_the_silhouettes(with_three_parts, track):
-    """A model that sees no foreground loses the drones; its silhouettes are stored under another key."""
+    assert found.fitness.mean() > without_steps.fitness.mean() - 1e-4
+    # A model that sees no foreground loses the drones; its silhouettes are stored under another key.
     blind = track(search=RandomSearch(), score=HighDice(), background=MedianBackground(threshold=255))
     assert not (blind.trajectories.status == Status.TRACKED).any()
-    keys = [set(tracked.record["input_keys"].values()) for tracked in (with_three_parts, blind)]
+    keys = [set(each.record["input_keys"].values()) for each in (tracked, blind)]
     assert not keys[0] & keys[1]
 
 
@@ -277,18 +259,11 @@ def test_the_tracks_of_a_method_are_the_result(track):
 
 
 def test_the_detector_decides_the_detections(track, recording, empty_hall):
+    """A method of one's own that reads detections is given those of the detector, and no others."""
     tracked = track({"method": "projection-lines"}, detector=EmptyHallDetector(empty_hall))
     assert tracked.trajectories.seen.all()
     assert mean_error_m(tracked.trajectories, recording) < NEAR_M
     assert tracked.record["parts"]["detector"]["key"]["threshold"] == 25
-    with pytest.raises(
-        SettingsError, match=r"detector: expected a method that reads detections.*method swarm"
-    ):
-        track(detector=EmptyHallDetector(empty_hall))
-
-
-def test_detections_reach_a_method_of_ones_own(track, recording):
-    """A method that reads detections is given those of the detector, and no others."""
     given = []
 
     class Reads(Hover):
@@ -310,16 +285,14 @@ class CoarseBackground(MedianBackground):
         return (mask[::2] for mask in super().foreground(learning, frames))
 
 
-def test_masks_of_another_size_are_one_line(track):
-    with pytest.raises(
-        SettingsError,
-        match=r"CoarseBackground: expected 8 masks of type uint8 and shape \(270, 480\).*found uint8 \(135, 480\)",
-    ):
-        track(background=CoarseBackground())
-
-
-def test_models_with_equal_keys_and_different_classes_have_silhouettes_of_their_own():
-    """What silhouettes are made of, and so their key, has this identity."""
+def test_parts_that_do_not_fit_are_one_line(track, empty_hall, tmp_path):
+    size = "CoarseBackground: expected 8 masks of type uint8 and shape (270, 480)"
+    assert_refused(
+        lambda: track(background=CoarseBackground()), size, "found uint8 (135, 480)", unchanged=tmp_path
+    )
+    reads = "detector: expected a method that reads detections"
+    assert_refused(lambda: track(detector=EmptyHallDetector(empty_hall)), reads, unchanged=tmp_path)
+    # What silhouettes are made of, and so their key, is the class too.
     assert MedianBackground().key == CoarseBackground().key
     assert identify(MedianBackground()) != identify(CoarseBackground())
 
@@ -371,50 +344,34 @@ def test_a_registered_plugin_is_found_by_name(tmp_path):
     ]
 
 
-#: Wrong parts, each of which gets one line; in a process of its own, where no types are checked at every call.
-WRONG_PARTS = """
-import psotrack as pt
-from psotrack.errors import SettingsError
-
-def track_with(**parts):
-    # Behind the check of the other arguments, which here are none.
-    return lambda: pt.track_runs.__wrapped__(None, None, [], **parts)
-
-for wrong in (
-    track_with(search=1),
-    track_with(score=print),
-    track_with(method=print),
-    track_with(background=print),
-    track_with(detector=print),
-    lambda: pt.register_plugin("searches", "own", print),
-    lambda: pt.register_plugin("search", "own", 1),
-):
-    try:
-        wrong()
-    except SettingsError as error:
-        print(error)
-"""
+@pytest.mark.parametrize(
+    ("part", "value", "face"),
+    [
+        ("search", 1, "Search, found an object of int"),
+        ("score", print, "Score, found an object of builtin_function_or_method"),
+        ("method", print, "Method, found an object of builtin_function_or_method"),
+        ("background", print, "BackgroundModel, found an object of builtin_function_or_method"),
+        ("detector", print, "Detector, found an object of builtin_function_or_method"),
+    ],
+)
+def test_parts_without_the_interface_are_one_line(recording, part, value, face, tmp_path):
+    line = f"psotrack: {part}: expected an object with the attributes of psotrack.{face}\n"
+    call = partial(pt.track, recording, SETTINGS, cache=tmp_path / "cache", **{part: value})
+    assert_refused(call, line, unchanged=tmp_path)
 
 
-def test_parts_without_the_interface_are_one_line():
-    ran = run_python(WRONG_PARTS)
-    expected = "expected an object with the attributes of psotrack"
-    function = "found an object of builtin_function_or_method"
-    assert ran.stdout.splitlines() == [
-        f"search: {expected}.Search, found an object of int",
-        f"score: {expected}.Score, {function}",
-        f"method: {expected}.Method, {function}",
-        f"background: {expected}.BackgroundModel, {function}",
-        f"detector: {expected}.Detector, {function}",
-        "register_plugin(), kind: expected one of search, score, method, background, detector, found 'searches'",
-        "register_plugin(), make: expected a function, found 1",
-    ]
+def test_what_cannot_be_registered_is_one_line(tmp_path):
+    kinds = "kind: expected one of search, score, method, background, detector, found 'searches'"
+    assert_refused(lambda: pt.register_plugin("searches", "own", print), kinds, unchanged=tmp_path)
+    makes = "register_plugin(), make: expected a function, found 1"
+    assert_refused(lambda: pt.register_plugin("search", "own", 1), makes, unchanged=tmp_path)
 
 
 #: A package that adds plugins of all kinds; the classes of `OWN_PARTS` follow. Its search returns the tracker's
 #: prediction, and its detector reads pictures of the empty hall from a file beside the module.
 PACKAGE = """
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -485,34 +442,24 @@ def site(tmp_path_factory):
     return site
 
 
-def run_psotrack(site, *words):
-    """Run `psotrack WORDS` where the package of the folder is installed."""
-    environment = os.environ | COMPILER | {"PYTHONPATH": f"{site}{os.pathsep}{ROOT}"}
-    command = [sys.executable, "-m", "psotrack", *map(str, words)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-
-
-#: Options of a small swarm.
-SMALL = ("--particles", 16)
-
-
 @pytest.fixture
-def run_track(site, root, tmp_path):
-    """Runs `psotrack track` with the options, and returns the tracks and the record that the command wrote."""
+def run_track(site, root, run_psotrack, monkeypatch, tmp_path):
+    """Runs `psotrack track` with the options where the package of `site` is installed: the tracks and the record."""
+    monkeypatch.syspath_prepend(site)
 
     def run_track(*options):
         out = tmp_path / "tracks.csv"
         words = ["track", root / "Simulated_Data" / "S01_D2_A", "--out", out, "--cache", tmp_path / "cache"]
         words += ["--init", "truth", "--drone-size", "0.5,0.5,0.2", "--cameras", ",".join(CAMERAS)]
-        ran = run_psotrack(site, *words, "--jobs", 1, *options)
-        assert ran.returncode == 0, ran.stderr
+        ran = run_psotrack(*words, "--particles", 16, "--jobs", 1, "--force", *options)
+        assert ran.code == 0, ran
         return pt.read_trajectories(out, fps=25.0), json.loads(out.with_suffix(".json").read_text())
 
     return run_track
 
 
-def test_search_and_background_by_entry_points(run_track):
-    tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard", *SMALL)
+def test_search_background_and_score_by_entry_points(run_track):
+    tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard")
     assert record["settings"]["swarm"]["search"] == "prediction"
     assert record["parts"] == {
         "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 1}}
@@ -521,25 +468,19 @@ def test_search_and_background_by_entry_points(run_track):
     steps_m = np.diff(tracks.position_m, axis=0)
     assert np.abs(steps_m).max() > 0.01
     np.testing.assert_allclose(steps_m, np.broadcast_to(steps_m[0], steps_m.shape), atol=1e-3)
-
-
-def test_a_score_by_an_entry_point(run_track):
-    """Its fitness is that of HighDice, as in Python: 0.9, rounded to float32, or more."""
-    tracks, record = run_track("--score", "high-dice", "--search", "prediction", *SMALL)
+    tracks, record = run_track("--search", "prediction", "--score", "high-dice")
     assert record["settings"]["score"]["kind"] == "high-dice"
+    # The fitness is that of HighDice, as in Python: 0.9, rounded to float32, or more.
     assert (tracks.fitness >= np.float32(0.9) - 1e-6).all()
     assert (tracks.fitness < 1.0).all()
 
 
-def test_a_method_by_an_entry_point(run_track):
-    """The drones stay where they are at frame 0; no method of the package writes such tracks of flying drones."""
+def test_a_method_and_a_detector_by_entry_points(run_track, site, recording, empty_hall):
+    """No method of the package writes such tracks of flying drones: they stay where they are at frame 0."""
     tracks, record = run_track("--method", "hover")
     assert record["settings"]["method"] == "hover"
     start_m = np.asarray(record["start"]["position_m"])
     np.testing.assert_allclose(tracks.position_m, np.broadcast_to(start_m, (NUM_FRAMES, 2, 3)), atol=1e-4)
-
-
-def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
     np.save(site / "empty_hall.npy", np.stack(empty_hall))
     tracks, record = run_track("--method", "projection-lines", "--detector", "empty-hall")
     detector = record["parts"]["detector"]
@@ -550,43 +491,39 @@ def test_a_detector_by_an_entry_point(run_track, site, recording, empty_hall):
     assert mean_error_m(tracks, recording) < NEAR_M
 
 
-@pytest.mark.parametrize(
-    ("find", "message"),
-    [
-        (
-            lambda: find_search(pt.SwarmSettings(search="predict")),
-            "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
-        ),
-        (
-            lambda: find_score(pt.ScoreSettings(kind="iou")),
-            "score.kind: expected one of soft, hard, high-dice, found iou",
-        ),
-        (
-            lambda: find_background("mean", ForegroundSettings()),
-            "background: expected one of mog2, living, absent, median, found mean",
-        ),
-        (
-            lambda: find_background("absent", ForegroundSettings()),
-            "background absent: expected own_parts:no_such_function to be importable, found module 'own_parts' "
-            "has no attribute 'no_such_function'",
-        ),
-    ],
-)
-def test_the_message_names_what_is_installed(site, monkeypatch, find, message):
+#: What asks for a plugin, or the name of a detector for a command, and how the line goes on.
+NOT_THERE = [
+    (
+        lambda: find_search(pt.SwarmSettings(search="predict")),
+        "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
+    ),
+    (
+        lambda: find_score(pt.ScoreSettings(kind="iou")),
+        "score.kind: expected one of soft, hard, high-dice, found iou",
+    ),
+    (
+        lambda: find_background("mean", ForegroundSettings()),
+        "background: expected one of mog2, living, absent, median, found mean",
+    ),
+    (
+        lambda: find_background("absent", ForegroundSettings()),
+        "background absent: expected own_parts:no_such_function to be importable, found module 'own_parts' has no "
+        "attribute 'no_such_function'",
+    ),
+    ("yolo", "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo"),
+    (
+        "broken",
+        "detector broken: expected an object with the attributes of psotrack.Detector, found an object of str",
+    ),
+]
+
+
+@pytest.mark.parametrize(("find", "message"), NOT_THERE)
+def test_the_message_names_what_is_installed(site, root, run_psotrack, monkeypatch, tmp_path, find, message):
     monkeypatch.syspath_prepend(site)
-    with pytest.raises(SettingsError) as raised:
-        find()
-    assert str(raised.value) == message
-
-
-def test_a_detector_that_no_package_adds_is_one_line(site, root, tmp_path):
     sequence = root / "Simulated_Data" / "S01_D2_A"
-    for name, message in [
-        ("yolo", "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo"),
-        (
-            "broken",
-            "detector broken: expected an object with the attributes of psotrack.Detector, found an object of str",
-        ),
-    ]:
-        ran = run_psotrack(site, "detect", sequence, "--detector", name, "--out", tmp_path / "boxes")
-        assert (ran.returncode, ran.stderr) == (2, f"psotrack: {message}\n")
+
+    def detect():
+        return run_psotrack("detect", sequence, "--detector", find, "--out", tmp_path / "boxes")
+
+    assert_refused(detect if isinstance(find, str) else find, f"psotrack: {message}\n", unchanged=tmp_path)

@@ -1,13 +1,17 @@
 """Damaged files of every format: a few tries of the fuzzer with a fixed seed, and all that it ever found."""
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fuzz.formats import FORMATS
 from fuzz.trial import Judge
 
-#: Number of tries per format; `make fuzz` makes many thousands.
-TRIES, SLOW_TRIES = 5, 1
+from psotrack.errors import InputError
+
+#: Number of tries per format.
+TRIES = 5
 #: Files that a reader once treated wrongly, in folders with the names of their formats.
 FINDS = sorted(path for path in (Path(__file__).parents[1] / "data" / "fuzz").rglob("*") if path.is_file())
 #: Finds that are long and regular.
@@ -36,11 +40,12 @@ def judges(tmp_path_factory):
     return of
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", FORMATS)
 def test_damaged_files_are_read_or_refused_in_one_line(name, judges):
+    """`make fuzz` makes many thousands of tries."""
     judge = judges(name)
-    trials = [judge.attempt(number) for number in range(SLOW_TRIES if FORMATS[name].is_slow else TRIES)]
+    trials = [judge.attempt(number) for number in range(1 if FORMATS[name].is_slow else TRIES)]
     assert [trial for trial in trials if trial.fault] == []
     assert FORMATS[name].is_slow or len({trial.content for trial in trials}) > TRIES // 2
 
@@ -66,16 +71,11 @@ def test_brackets_in_brackets_are_refused_quickly(name, judges):
 
 def test_the_judge_sees_faults(judges, monkeypatch):
     """What no reader does any more: a traceback, text on stderr, a message without the file, a file that is written."""
-    from dataclasses import replace
-
-    from psotrack.errors import InputError
 
     def trace(path):
         raise ValueError("no")
 
     def speak(path):
-        import os
-
         os.write(2, b"libfoo: bad\n")
 
     def forget(path):

@@ -9,9 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers import assert_refused
 
 import psotrack
-from psotrack.errors import InputError, PsotrackError
+from psotrack.errors import InputError
 from psotrack.geometry.rig_files import read_rig
 from psotrack.recordings.datasets import open_recording
 from psotrack.recordings.exchange import read_tracks
@@ -22,16 +23,7 @@ from psotrack.trajectories import read_trajectories
 PACKAGE = Path(psotrack.__file__).parent
 #: Modules whose readers run code, and calls that do. Written as parts of dotted names.
 MODULES = {
-    "pickle",
-    "cPickle",
-    "dill",
-    "cloudpickle",
-    "joblib",
-    "marshal",
-    "shelve",
-    "torch",
-    "runpy",
-    "code",
+    *("pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "torch", "runpy", "code"),
 }
 CALLS = {"eval", "exec", "compile", "__import__", "execfile"}
 ARGUMENTS = {"allow_pickle", "shell"}
@@ -113,20 +105,16 @@ def test_the_bomb_works(mark):
     assert mark.exists()
 
 
-def pickled(mark: Path) -> bytes:
-    return pickle.dumps(Bomb(mark))
+def read_any_rig(path):
+    return read_rig(path, (320, 240))
 
 
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("t.csv", read_trajectories),
-        ("t.parquet", read_trajectories),
+        *((f"t.{ending}", read_trajectories) for ending in ("csv", "parquet")),
         *((f"t.{ending}", read_tracks) for ending in ("json", "tum", "txt", "c3d", "mcap")),
-        *(
-            (f"r.{ending}", lambda path: read_rig(path, (320, 240)))
-            for ending in ("toml", "yml", "csv", "json", "npz")
-        ),
+        *((f"r.{ending}", read_any_rig) for ending in ("toml", "yml", "csv", "json", "npz")),
         ("recording.toml", open_recording),
         ("grid.toml", read_grid),
         ("scenario.toml", load),
@@ -134,10 +122,8 @@ def pickled(mark: Path) -> bytes:
 )
 def test_a_pickle_in_the_place_of_a_file(name, read, tmp_path, mark):
     path = tmp_path / name
-    path.write_bytes(pickled(mark))
-    with pytest.raises(PsotrackError):
-        read(path)
-    assert not mark.exists()
+    path.write_bytes(pickle.dumps(Bomb(mark)))
+    assert_refused(lambda: read(path), unchanged=tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
@@ -145,20 +131,15 @@ def test_arrays_of_objects(suffix, tmp_path, mark):
     path = tmp_path / f"rig{suffix}"
     objects = np.array([Bomb(mark)], object)
     np.save(path, objects) if suffix == ".npy" else np.savez(path, K=objects)
-    with pytest.raises(InputError):
-        read_rig(path, (320, 240))
-    assert not mark.exists()
+    assert_refused(lambda: read_any_rig(path), unchanged=tmp_path)
 
 
 @pytest.mark.parametrize("tag", ["python/object/apply:os.mkdir", "python/object/new:os.mkdir"])
-@pytest.mark.parametrize("place", ["whole", "value"])
-def test_tags_of_yaml(tag, place, tmp_path, mark):
+@pytest.mark.parametrize("text", ["{call}", "cam0:\n  intrinsics: {call}\n  resolution: [320, 240]\n"])
+def test_tags_of_yaml(tag, text, tmp_path, mark):
     path = tmp_path / "camchain.yaml"
-    call = f"!!{tag} ['{mark}']"
-    path.write_text(call if place == "whole" else f"cam0:\n  intrinsics: {call}\n  resolution: [320, 240]\n")
-    with pytest.raises(InputError, match=r"camchain\.yaml"):
-        read_rig(path, (320, 240))
-    assert not mark.exists()
+    path.write_text(text.format(call=f"!!{tag} ['{mark}']"))
+    assert_refused(lambda: read_rig(path, (320, 240)), path, unchanged=tmp_path)
 
 
 @pytest.mark.parametrize("key", [b"pandas", b"ARROW:schema", b"psotrack.units", b"PANDAS_ATTRS"])
@@ -167,7 +148,7 @@ def test_metadata_of_parquet(key, tmp_path, mark):
     columns = {"frame": [0], "time_s": [0.0], "drone": ["a"], "x_m": [0.0], "y_m": [0.0], "z_m": [1.0]}
     table = pa.table(columns)
     path = tmp_path / "t.parquet"
-    pq.write_table(table.replace_schema_metadata({key: pickled(mark)}), path, store_schema=False)
+    pq.write_table(table.replace_schema_metadata({key: pickle.dumps(Bomb(mark))}), path, store_schema=False)
     # Refused is right, too: Arrow cannot decode such a schema.
     with contextlib.suppress(InputError):
         assert read_trajectories(path).drones == ("a",)
@@ -178,20 +159,11 @@ def test_an_extension_type_of_parquet(tmp_path, mark):
     """Arrow had a type that was stored as a pickle, and loaded with its file."""
     storage = pa.field("x_m", pa.float64(), metadata={
         b"ARROW:extension:name": b"arrow.py_extension_type",
-        b"ARROW:extension:metadata": pickled(mark),
+        b"ARROW:extension:metadata": pickle.dumps(Bomb(mark)),
     })  # fmt: skip
     names = [pa.field("frame", pa.int64()), pa.field("time_s", pa.float64()), pa.field("drone", pa.string())]
     schema = pa.schema([*names, storage, pa.field("y_m", pa.float64()), pa.field("z_m", pa.float64())])
     values = [[0], [0.0], ["a"], [0.0], [0.0], [1.0]]
     pq.write_table(pa.table(values, schema=schema), tmp_path / "t.parquet")
     assert read_trajectories(tmp_path / "t.parquet").drones == ("a",)
-    assert not mark.exists()
-
-
-def test_toml_is_text(tmp_path, mark):
-    """A value that looks like code is a text, and no number."""
-    path = tmp_path / "recording.toml"
-    path.write_text(f"version = \"__import__('pathlib').Path('{mark}').touch()\"\n")
-    with pytest.raises(InputError, match=r"recording\.toml"):
-        open_recording(path)
     assert not mark.exists()

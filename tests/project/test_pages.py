@@ -166,7 +166,7 @@ class Shell:
         return ran.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_newcomers_pages_run_as_they_stand(tmp_path: Path) -> None:
     """From the simulated laboratory with its board to tracks, pictures, errors and Python."""
     shell = Shell(tmp_path)
@@ -189,7 +189,7 @@ def is_shown(line: str) -> bool:
     return line.startswith("psotrack view") and "--save" not in line
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_python_of_the_readme_uses_the_silhouettes_that_track_has_stored(tmp_path: Path) -> None:
     shell = Shell(tmp_path)
     section = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Python")[2]

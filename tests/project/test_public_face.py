@@ -1,23 +1,31 @@
-"""`import psotrack as pt`: its names and their documentation, lazy loading, and short output of `repr`."""
+"""`import psotrack as pt`: its names and documentation, wrong calls, and results that are those of the commands."""
 
 import inspect
+import json
 import re
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from helpers import cameras_of, ring_rig
+from board_rigs import row_of_cameras
+from helpers import assert_refused, cameras_of, project_points, ring_rig
 
 import psotrack as pt
-from psotrack.errors import PsotrackError, SettingsError
-from psotrack.foreground.silhouettes import ForegroundSettings
-from psotrack.geometry import project_boxes
+from psotrack.calibration.clocks import ReferenceOffset
+from psotrack.errors import SettingsError
+from psotrack.evaluation import Offset
+from psotrack.recordings import VideoWriter
 from psotrack.support import short_repr
-from psotrack.tracking.swarm import SoftIoU, camera_weights, foreground_and_area, tracker_settings
+from psotrack.tracking.swarm import tracker_settings
+
+RIG = row_of_cameras(3)
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
 
 
 def test_every_name_is_there_and_documented():
@@ -28,6 +36,23 @@ def test_every_name_is_there_and_documented():
             assert len(value.__doc__) > 30, name
         assert name in pt.__doc__, name
 
+
+def test_importing_loads_nothing_heavy_and_help_fits_ten_screens():
+    """Found: 2,453 lines, the help of every name. A room that is loaded must not hide the function of its name."""
+    heavy = "{'jax', 'cv2', 'pandas', 'zarr', 'scipy', 'numpy'}"
+    sweep = "try: pt.sweep(3, 'out')\nexcept Exception as error: print(error)\n"
+    program = f"import sys, psotrack as pt\nprint(sorted({heavy} & set(sys.modules)))\n{sweep}"
+    first, *said, last = (
+        python(f"{program}import psotrack.sweeps.store\n{sweep}help(pt)").rstrip().splitlines()
+    )
+    assert first == "[]"
+    assert all(line.startswith("sweep(), grid: expected a Grid") for line in said[:2])
+    # Ten screens of 50 lines; prose of 120 characters, indented by pydoc.
+    assert 50 < len(said) < 500
+    assert max(map(len, (*said[2:], last))) <= 124
+
+
+# --- wrong calls
 
 #: Arguments that are right nowhere, but for a text that is the path of no file.
 WRONG = (object(), None, 3, 2.5, "nothing", b"nothing", ())
@@ -43,13 +68,11 @@ def test_a_wrong_call_is_answered_like_a_wrong_option(name, tmp_path, monkeypatc
     """Found: TypeError and AttributeError from the middle of the package."""
     monkeypatch.chdir(tmp_path)
     function = getattr(pt, name)
-    for args, values, words in (
-        ([], {"unknown": 1}, r"\(\): expected .*, found unknown"),
-        ([1] * 40, {}, r"\(\): expected .*, found too many positional arguments"),
-    ):
-        if name != "track" or args:
-            with pytest.raises(SettingsError, match=rf"^{name}{words}"):
-                function(*args, **values)
+    many = "(): expected "
+    assert_refused(lambda: function(*[1] * 40), name, many, "too many positional", unchanged=tmp_path)
+    # Single settings of `track` are named arguments.
+    if name != "track":
+        assert_refused(lambda: function(unknown=1), name, many, "found unknown", unchanged=tmp_path)
     needed = [each for each in inspect.signature(function).parameters.values() if each.default is each.empty]
     # The name of a camera is any text.
     checks_fields = not inspect.isclass(function) or (
@@ -59,30 +82,74 @@ def test_a_wrong_call_is_answered_like_a_wrong_option(name, tmp_path, monkeypatc
         args = [wrong for each in needed if each.kind is each.POSITIONAL_OR_KEYWORD]
         values = {each.name: wrong for each in needed if each.kind is each.KEYWORD_ONLY}
         if args or values:
-            with pytest.raises(PsotrackError, match=r"expected .*, found ") as error:
-                function(*args, **values)
-            assert "\n" not in str(error.value)
+            call = lambda args=args, values=values: function(*args, **values)  # noqa: E731
+            assert_refused(call, "expected ", ", found ", unchanged=tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: pt.evaluate(1, 2), "evaluate(), traj_est: expected a Trajectories, found 1"),
-        (lambda: pt.read_trajectories(None), "path: expected a path or text, found None"),
-        (lambda: pt.track("missing"), "missing: expected a recording.toml"),
-        (
-            lambda: pt.track("missing", particles="many"),
-            'swarm.particles: expected a whole number, found "many"',
-        ),
-        (lambda: pt.track("missing", particels=3), "found particels; did you mean swarm.particles?"),
-        (lambda: pt.track("missing", kind="hard"), "expected one of swarm.kind, score.kind, found kind"),
-        (lambda: pt.SwarmSettings(particels=3), "found particels; did you mean particles?"),
-        (lambda: pt.read_rig("rig.toml", metres=1), "found metres; did you mean metres_per_unit?"),
-    ],
-)
-def test_messages_of_wrong_calls(call, message):
-    with pytest.raises(PsotrackError, match=re.escape(message)):
-        call()
+#: Calls, in a folder with videos without frames, and words of the line.
+BAD = [
+    (lambda: pt.evaluate(1, 2), "evaluate(), traj_est: expected a Trajectories, found 1"),
+    (lambda: pt.read_trajectories(None), "path: expected a path or text, found None"),
+    (lambda: pt.track("missing"), "missing: expected a recording.toml"),
+    (lambda: pt.track("a", particles="many"), 'swarm.particles: expected a whole number, found "many"'),
+    (lambda: pt.track("a", particels=3), "found particels; did you mean swarm.particles?"),
+    (lambda: pt.track("a", kind="hard"), "expected one of swarm.kind, score.kind, found kind"),
+    (lambda: pt.SwarmSettings(particels=3), "found particels; did you mean particles?"),
+    (lambda: pt.SwarmSettings(particles="a"), 'swarm.particles: expected a whole number, found "a"'),
+    (lambda: pt.read_rig("rig.toml", metres=1), "found metres; did you mean metres_per_unit?"),
+    (lambda: pt.calibrate_rig(), "expected one of --square, --squares, --points"),
+    (lambda: pt.calibrate_rig(square_m=0.04), "expected a video, a folder or a pattern"),
+    (lambda: pt.calibrate_rig("board", square=0.04), "did you mean squares?"),
+    (lambda: pt.calibrate_rig("board", square_m="4 cm"), "square_m: expected a number or None"),
+    (lambda: pt.calibrate_rig("board", squares="7x5"), "squares: expected a tuple or None"),
+    # Found: a line about a folder of images.
+    (lambda: pt.calibrate_rig("board", square_m=0.04), "expected a folder with videos or images, found nei"),
+    (lambda: pt.calibrate_rig("videos", square_m=0.04), "right.mp4: expected a video, found an empty file"),
+    (lambda: pt.run("my_lab", squares=3), "run(): expected "),
+    (lambda: pt.run("nothing"), "nothing: expected a video of each camera"),
+    (lambda: pt.doctor("nothing"), "nothing: expected a recording.toml"),
+    (lambda: pt.doctor("nothing", bounds_m=3), "doctor(), bounds_m: expected"),
+    (lambda: pt.report("nothing.csv"), "nothing.csv: expected"),
+    (lambda: pt.report(()), "files: expected one or more paths"),
+    (lambda: pt.overlay("nothing.csv", mosaik=True), "did you mean mosaic?"),
+    (lambda: pt.overlay("nothing.csv", cameras="left"), "cameras: expected a sequence or None"),
+    (lambda: pt.sweep("nothing.toml", "out"), "nothing.toml: expected"),
+    (lambda: tracker_settings(pt.TrackSettings().changed({"swarm.search": "x"})), "expected one of "),
+    (lambda: tracker_settings(pt.TrackSettings().changed({"score.kind": "x"})), "expected one of "),
+]
+
+
+def write_video(path, fps=25.0):
+    with VideoWriter(path, fps, (64, 48)) as video:
+        for _ in range(3):
+            video.write(np.zeros((48, 64, 3), np.uint8))
+
+
+@pytest.mark.parametrize(("call", "words"), BAD)
+def test_wrong_calls_are_one_line(call, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("board", "videos"):
+        (tmp_path / name).mkdir()
+    write_video(tmp_path / "videos" / "left.avi")
+    (tmp_path / "videos" / "right.mp4").touch()
+    assert_refused(call, words, unchanged=tmp_path)
+
+
+def test_a_folder_with_a_recording_has_the_times_of_the_recording(tmp_path):
+    """Videos of different rates cannot be paired by the numbers of their frames, but by a recording's times."""
+    for name, fps in (("left", 25.0), ("right", 50.0)):
+        write_video(tmp_path / f"{name}.avi", fps)
+
+    def calibrate():
+        pt.calibrate_rig(tmp_path, square_m=0.04)
+
+    assert_refused(calibrate, "expected 25 frames per second", unchanged=tmp_path)
+    cameras = "".join(f'[cameras.{name}]\nvideo = "{name}.avi"\n' for name in ("left", "right"))
+    (tmp_path / "recording.toml").write_text(f"version = 1\n{cameras}")
+    assert_refused(calibrate, "expected a ChArUco board or a chessboard", unchanged=tmp_path)
+
+
+# --- settings
 
 
 def test_single_settings_by_the_last_part_of_their_names(monkeypatch):
@@ -93,7 +160,7 @@ def test_single_settings_by_the_last_part_of_their_names(monkeypatch):
         raise SettingsError("the test", expected="to stop here", found="an end")
 
     monkeypatch.setattr("psotrack.api.track_recording", track_recording)
-    recording, score = pt.Recording("flight", Path(), cameras_of(ring_rig(2))), Dice()
+    recording, score = pt.Recording("flight", Path(), cameras_of(ring_rig(2))), object()
     with pytest.raises(SettingsError, match="to stop here"):
         pt.track(recording, {"swarm.kind": "joint"}, particles=50, smooth=True, method="fused", score=score)
     settings = taken["settings"]
@@ -102,31 +169,14 @@ def test_single_settings_by_the_last_part_of_their_names(monkeypatch):
     assert "method" not in taken
 
 
-def test_importing_loads_nothing_heavy():
-    code = "import sys, psotrack; print(sorted({'jax', 'cv2', 'pandas', 'zarr', 'scipy', 'numpy'} & set(sys.modules)))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+def test_settings_may_be_numbers_and_arrays_of_numpy_and_paths():
+    values = {"swarm.particles": np.int64(50), "bounds_m": np.arange(6.0), "init": Path("tracks.csv")}
+    changed = pt.TrackSettings().changed(values)
+    assert (changed.swarm.particles, changed.init) == (50, "tracks.csv")
+    assert list(changed.bounds_m) == [0, 1, 2, 3, 4, 5]
 
 
-def test_markers_in_an_image_in_grey_or_colour():
-    image = np.full((400, 400), 255, np.uint8)
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    image[100:300, 100:300] = cv2.aruco.generateImageMarker(dictionary, 7, 200)
-    for one in (image, cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)):
-        seen = pt.detect_markers(one, "4x4_50")
-        assert seen.ids.tolist() == [7]
-
-
-def test_the_background_model_finds_a_new_object():
-    rng = np.random.default_rng(0)
-    empty = [rng.normal(100, 1, (48, 64, 3)).clip(0, 255).astype(np.uint8) for _ in range(20)]
-    drone = empty[0].copy()
-    drone[10:30, 20:40] = 10
-    model = pt.background_model(ForegroundSettings(working_reduction=1, min_blob_px=0))
-    assert isinstance(model, pt.BackgroundModel)
-    (mask,) = model.foreground(empty, [drone])
-    assert (mask[12:28, 22:38] > 0).all()
-    assert (mask[35:, :] == 0).all()
+# --- results
 
 
 def test_a_repr_fits_a_terminal():
@@ -145,37 +195,33 @@ def test_a_repr_fits_a_terminal():
     assert len(repr(Long(1000 * "x"))) < 100
 
 
-@dataclass(frozen=True)
-class Dice:
-    """A score from outside the package: the Dice coefficient of box and foreground within the ring around the box."""
-
-    ring: float = 1.5
-    whole_pixels: bool = False
-    min_cameras: int = 2
-
-    def camera_scores(self, inputs, position_m):
-        boxes = project_boxes(inputs.extents, position_m)
-        foreground, area = foreground_and_area(inputs, boxes, (1.0, self.ring))
-        score = 2 * foreground[0] / (area[0] + foreground[1] + 1e-6)
-        return score.clip(0, 1), camera_weights(inputs, boxes)
-
-
-def test_scores_are_interchangeable():
-    for score in (Dice(), SoftIoU()):
-        assert isinstance(score, pt.Score)
-        assert hash(score) == hash(type(score)())
-
-
-@pytest.mark.parametrize("settings", [{"swarm.search": "annealing"}, {"score.kind": "dice"}])
-def test_an_unknown_plugin_is_one_line(settings):
-    with pytest.raises(SettingsError, match=r"expected one of .*, found (annealing|dice)"):
-        tracker_settings(pt.TrackSettings().changed(settings))
+def test_a_rig_in_python_is_that_of_the_command(tmp_path, run_psotrack):
+    points_m = np.random.default_rng(0).uniform((-1, -1, 0.5), (1, 1, 2), (14, 3))
+    pixels = project_points(RIG, points_m)
+    rows = [
+        f"{name},p{k},{pixels[k, index, 0]},{pixels[k, index, 1]},{x},{y},{z}"
+        for index, name in enumerate(RIG.names)
+        for k, (x, y, z) in enumerate(points_m)
+    ]
+    pairs, lenses, out = tmp_path / "pairs.csv", tmp_path / "lenses.toml", tmp_path / "rig.toml"
+    pairs.write_text("\n".join(["camera,point,x_px,y_px,x_m,y_m,z_m", *rows]))
+    pt.write_rig(lenses, RIG)
+    words = ("calibrate", "rig", "--pairs", pairs, "--lenses", lenses, "--out", out)
+    printed = run_psotrack(*words)
+    shown = json.loads(run_psotrack(*words, "--force", "--json", "-").out)
+    found = pt.calibrate_rig(pairs=f"{pairs}", lenses=lenses, out=out, force=True)
+    assert json.loads(json.dumps(found.to_dict())) == shown
+    assert f"{found}\n" == printed.out
+    # The pixels are exact: what is left is where the fit stops.
+    np.testing.assert_allclose(found.rig.cameras.centre_world, RIG.cameras.centre_world, atol=1e-4)
+    assert "<table" in found._repr_html_()
 
 
-def test_settings_may_be_numbers_and_arrays_of_numpy_and_paths():
-    values = {"swarm.particles": np.int64(50), "bounds_m": np.arange(6.0), "init": Path("tracks.csv")}
-    changed = pt.TrackSettings().changed(values)
-    assert (changed.swarm.particles, changed.init) == (50, "tracks.csv")
-    assert list(changed.bounds_m) == [0, 1, 2, 3, 4, 5]
-    with pytest.raises(SettingsError, match=re.escape('swarm.particles: expected a whole number, found "a"')):
-        pt.SwarmSettings(particles="a")
+def test_an_offset_says_what_the_command_prints():
+    none = np.zeros(0)
+    offset = Offset(0.4, 0.01, 0.02, None, np.zeros((1, 3)), np.zeros(1, int), 1.0, none, none)
+    found = ReferenceOffset("R12", offset, {"dron1": "0"}, 25.0, "world")
+    assert re.match(
+        r"R12: the reference's clock is 0\.4000 s \(± 0\.0100 s\) ahead of the videos'", str(found)
+    )
+    assert found.to_dict()["drones"] == [{"drone": "dron1", "estimate": "0", "lever_arm_m": [0, 0, 0]}]

@@ -2,18 +2,18 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers import cameras_of, ring_rig
+from helpers import assert_refused, cameras_of, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 from worlds import make_sequence, make_tracks_file
 
-from psotrack.errors import InputError, SettingsError
 from psotrack.recordings import FrameTimes, Recording, view_in_images
 from psotrack.recordings.exchange import export_tracks
 from psotrack.show.flights import (
@@ -146,9 +146,8 @@ class TestImages:
         # The linear approximation is exact to the ellipsoid's size over its distance, 8 cm of 4 m.
         assert 0.97 < radius2.max() < 1.06
 
-    def test_tracks_without_covariances_have_no_ellipses(self):
-        tracks = replace(straight_tracks(), covariance_m2=None)
-        assert np.isnan(view_in_images(recording_of(ring_rig(2)), tracks, SIZE_M).shape_px2).all()
+        bare = replace(tracks, covariance_m2=None)
+        assert np.isnan(view_in_images(recording_of(rig), bare, SIZE_M).shape_px2).all()
 
 
 class TestEllipsoids:
@@ -226,33 +225,79 @@ class TestQuality:
         assert (rows["in_view"] <= 1).all()
 
 
-class TestReading:
-    def test_neither_tracks_nor_a_recording(self):
-        with pytest.raises(InputError, match="expected files of tracks, or a recording, found neither"):
-            read_flight()
+def file_and_recording(folder):
+    """A file of tracks beside the folder of a recording."""
+    path = write_flight(folder, straight_tracks())
+    (folder / "lab").mkdir()
+    (folder / "lab" / "recording.toml").write_text("version = 1", encoding="utf-8")
+    return [path, folder / "lab"]
 
-    def test_cameras_need_a_recording(self, tmp_path):
-        path = write_flight(tmp_path, straight_tracks())
-        with pytest.raises(SettingsError, match="cameras: expected a recording"):
-            read_flight([path], cameras=["c1"])
+
+def with_record(folder, text):
+    path = write_flight(folder, straight_tracks())
+    path.with_suffix(".json").write_text(text, encoding="utf-8")
+    return [path]
+
+
+def of_another_recording(folder, tracks, name):
+    """Tracks with the name of their recording, and a recording of 14 frames at 25 Hz with the name `flight`."""
+    return [write_flight(folder, tracks, {"sequence": name})], make_sequence(folder / "flight")
+
+
+#: Name of the case -> what a folder is filled with, which gives the arguments of `read_flight`; words of the line.
+BAD = {
+    "nothing": (lambda folder: ((),), ("expected files of tracks, or a recording, found neither",)),
+    "cameras without a recording": (
+        lambda folder: ([write_flight(folder, straight_tracks())], None, ["c1"]),
+        ("cameras: expected a recording",),
+    ),
+    "a file twice": (
+        lambda folder: ([write_flight(folder, straight_tracks())] * 2,),
+        ("found one file twice",),
+    ),
+    "a recording among the tracks": (
+        lambda folder: (file_and_recording(folder),),
+        ("lab: expected a file of tracks, found a recording; name the recording last",),
+    ),
+    "a record that is no JSON": (
+        lambda folder: (with_record(folder, "{"),),
+        ("tracks.json: expected the record of a run, ", "found an error"),
+    ),
+    "a record of a list": (
+        lambda folder: (with_record(folder, "[1]"),),
+        ("tracks.json: expected the record of a run, ", "found JSON with a list"),
+    ),
+    "a record of other types": (
+        lambda folder: (with_record(folder, '{"encounters": 3}'),),
+        ("tracks.json, encounters: expected a list",),
+    ),
+    "tracks of another recording": (
+        lambda folder: of_another_recording(folder, straight_tracks(), "barn"),
+        ("expected tracks of flight, found tracks of barn",),
+    ),
+    "tracks of a longer recording": (
+        lambda folder: of_another_recording(folder, straight_tracks(num_frames=30), "flight"),
+        ("expected times from 0.00 to 0.52 s, as in flight, found 0.00 to 2.90 s",),
+    ),
+}
+
+
+class TestReading:
+    @pytest.mark.parametrize("name", BAD)
+    def test_what_cannot_be_read_is_one_line(self, tmp_path, name):
+        fill, words = BAD[name]
+        files, recording, cameras = (*fill(tmp_path), None, None)[:3]
+        call = partial(read_flight, files, recording, cameras=cameras)
+        assert_refused(call, *words, unchanged=tmp_path)
 
     def test_files_of_one_name_are_told_apart_by_their_folders(self, tmp_path):
         paths = [write_flight(folder, straight_tracks()) for folder in (tmp_path / "a", tmp_path / "b")]
         flight = read_flight(paths)
         assert [each.label for each in flight.tracks] == ["a/tracks", "b/tracks"]
         assert len({*flight.tracks[0].colours, *flight.tracks[1].colours}) == 2
-        with pytest.raises(InputError, match="found one file twice"):
-            read_flight([paths[0], paths[0]])
 
-    def test_a_recording_among_the_tracks_is_refused(self, tmp_path):
-        path = write_flight(tmp_path, straight_tracks())
-        lab = tmp_path / "lab"
-        lab.mkdir()
-        (lab / "recording.toml").write_text("version = 1", encoding="utf-8")
-        with pytest.raises(
-            InputError, match=r"lab: expected a file of tracks, found a recording; name the recording last"
-        ):
-            read_flight([path, lab])
+    def test_the_recording_is_named_last(self, tmp_path):
+        path, lab = file_and_recording(tmp_path)
         assert split_sequence([path, lab]) == ((path,), lab)
         assert split_sequence([path]) == ((path,), None)
 
@@ -281,38 +326,6 @@ class TestReading:
         find_recording(tracks).rename(tmp_path / "gone")
         assert read_flight([tracks]).recording is None
         assert "flight is not there; name the recording" in caplog.text
-
-    @pytest.mark.parametrize(
-        ("content", "message"),
-        [
-            ("{", r"tracks.json: expected the record of a run, .*, found an error"),
-            ("[1]", r"tracks.json: expected the record of a run, .*, found JSON with a list"),
-            ('{"encounters": 3}', r"tracks.json, encounters: expected a list"),
-        ],
-    )
-    def test_a_damaged_record(self, tmp_path, content, message):
-        path = write_flight(tmp_path, straight_tracks())
-        path.with_suffix(".json").write_text(content, encoding="utf-8")
-        with pytest.raises(InputError, match=message):
-            read_flight([path])
-
-    def test_tracks_of_another_recording(self, tmp_path, monkeypatch):
-        path = write_flight(tmp_path, straight_tracks(), {"sequence": "barn"})
-        monkeypatch.setattr(
-            "psotrack.show.flights.flight.open_recording", lambda _: recording_of(ring_rig(2))
-        )
-        with pytest.raises(InputError, match="expected tracks of lab, found tracks of barn"):
-            read_flight([path], "lab")
-
-    def test_tracks_of_a_longer_recording_of_the_same_name(self, tmp_path, monkeypatch):
-        path = write_flight(tmp_path, straight_tracks(num_frames=30), {"sequence": "lab"})
-        monkeypatch.setattr(
-            "psotrack.show.flights.flight.open_recording", lambda _: recording_of(ring_rig(2))
-        )
-        with pytest.raises(
-            InputError, match=r"expected times from 0.00 to 1.90 s, as in lab, found 0.00 to 2.90 s"
-        ):
-            read_flight([path], "lab")
 
     def test_exported_tracks_beside_a_file_are_no_record(self, tmp_path):
         path = write_flight(tmp_path, straight_tracks())

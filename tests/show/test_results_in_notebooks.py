@@ -7,8 +7,8 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from evaluation_flights import circling_flights
 from helpers import cameras_of, ring_rig
-from test_evaluation_shown import flights
 
 from psotrack.evaluation import evaluate
 from psotrack.pipeline import TrackedRecording
@@ -133,7 +133,7 @@ def test_a_tracked_recording_shows_sizes_seconds_and_changed_settings() -> None:
 
 
 def test_an_evaluation_shows_the_numbers_of_the_terminal() -> None:
-    evaluation = evaluate(*flights(names=("<i>a</i>", "b", "c")))
+    evaluation = evaluate(*circling_flights(names=("<i>a</i>", "b", "c")))
     page = Page(evaluation._repr_html_())
     assert page.rows[1][:3] == ["<i>a</i> (track 0)", "20.0", "20.0"]
     assert [row[0] for row in page.rows[:5]] == [

@@ -1,0 +1,439 @@
+"""Wrong options and files: one line that names what is wrong, before hours are spent; nothing is written."""
+
+import io
+import json
+import math
+import resource
+import shutil
+import struct
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx_models
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from helpers import assert_refused
+
+from psotrack.errors import SettingsError
+from psotrack.foreground.detection import DetectorSettings, OnnxDetector
+from psotrack.pipeline import archives
+from psotrack.recordings.datasets import open_recording, read_marker_corners, read_masks, read_poses
+from psotrack.recordings.exchange import read_tracks
+from psotrack.settings import DroneSettings, SwarmSettings, TrackSettings
+from psotrack.sweeps import Store
+from psotrack.trajectories import read_trajectories
+
+HUGE = "9" * 5000
+HEAD = "frame,time_s,drone,x_m,y_m,z_m\n"
+CORNERS = f"id;{';'.join(f'{axis}{corner}' for corner in '1234' for axis in 'xyz')}\n"
+ZEROS = f"{';0' * 12}\n"
+
+
+@pytest.fixture
+def little_memory():
+    """A wrong allocation is an error, not a machine that swaps; the limit is far above what the tests need."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+# --- commands
+
+BOARD = "--squares 10x7 --square 0.025 --out out.toml"
+BY_POINT = "--points --lenses {flight}/rig.toml --out out.toml"
+#: Options of `track`, or of `track --causal` -> words of the line.
+TRACK = {
+    "--body-offset inf,0,0": ["drones.body_offset_m"],
+    "--body-offset 1,2": ["--body-offset", "1,2"],
+    "--bounds 0,1,0,1,0,nan": ["bounds_m"],
+    "--particles 1000000000": ["swarm.particles"],
+    f"--particles {HUGE[:400]}": ["swarm.particles"],
+    "--particles -6": ["psotrack: swarm.particles: expected", "found -6"],
+    "--iterations 1000000000": ["swarm.iterations"],
+    "--iterations -1": ["swarm.iterations"],
+    "--drones 1000000000": ["drones.count"],
+    "--drones 0": ["drones.count", "at least 1", "found 0"],
+    f"--seed {HUGE[:30]}": ["seed"],
+    "--causal --most-drones 1000000000": ["--most-drones"],
+    "--cameras ,": ["--cameras", "names with commas"],
+    "--cameras c0,,c1": ["--cameras"],
+    "--cameras c0,c9": ["c9"],
+    "--cameras c1": ["at least two cameras", "found c1"],
+    "--cameras c1 --causal": ["at least two cameras", "found c1"],
+    "--min-cameras 1": ["min_cameras_to_begin"],
+    "--frames 0": ["frames"],
+    "--search psoo": ["swarm.search", "did you mean pso?"],
+    "--score sofd": ["score.kind", "did you mean soft?"],
+    "--init none.csv": ["none.csv"],
+    "--method projection-lines --detections nowhere": ["nowhere", "c0.csv", "no such folder"],
+    "--method projection-lines --detections empty": ["drones", "none in any frame"],
+    "--config run.toml": ["run.toml, swarm.particles: expected", "found -5"],
+    "--save-config run": ["expected a file that ends in .toml"],
+    # The name of an option of which a part was typed.
+    "--speed 4": ["'--max-speed'"],
+    "--ouut y": ["Did you mean one of: '--out'"],
+}
+#: Other commands -> words of the line. Where a fault is in the content of a file, the line names the file.
+COMMANDS = {
+    "trakc": ["trakc", "track", "psotrack --help"],
+    "track": ["SEQ", "psotrack track --help"],
+    "track {flight} --out t.xlsx": [".csv or .parquet", "t.xlsx"],
+    "track nowhere --out out.csv": ["nowhere", "found nothing"],
+    "track far --out out.csv": ["far, frame times"],
+    # Found: options without a default were not asked for, and the command failed later.
+    "simulate fly": ["--device", "psotrack simulate fly --help"],
+    "simulate S99 --out out": ["S99", "S02_D4_A"],
+    "simulate S02_D4_A --out out --scale 0": ["scale"],
+    "simulate S02_D4_A --out out --frames 0": ["frames"],
+    "simulate S02_D4_A --out out --frames 100000": ["frames"],
+    "detect {flight} --masks out --cameras ,": ["--cameras"],
+    "detect {flight} --blobs --out out --cameras ,": ["--cameras"],
+    "evaluate late.csv {flight}": ["late.csv", "{flight}"],
+    "evaluate unseen.csv {flight} --offset auto": ["unseen.csv", "{flight}"],
+    "evaluate no_places.csv {flight}": ["no_places.csv", "x_m"],
+    "evaluate one.csv {flight} --plot my.jpg": ["--plot", "ends in .png", "my.jpg"],
+    "doctor {flight} --tracks unseen.csv": ["unseen.csv", "{flight}"],
+    "doctor {flight} --tracks one.csv": ["one.csv", "{flight}"],
+    f"calibrate rig left right {BOARD}": ["left and 1 more"],
+    f"calibrate rig apart.csv {BY_POINT} --distance c0,c1=1": ["apart.csv"],
+    f"calibrate rig alone.csv {BY_POINT} --distance c0,c1=1": ["alone.csv"],
+    f"calibrate rig ends.csv {BY_POINT} --stick 0.5": ["ends.csv"],
+    f"calibrate convert {{flight}}/rig.toml out.toml --size {HUGE},720": ["--size"],
+    "track one_video --out out.csv --method fused": [
+        "videos of at least two cameras",
+        "found c0",
+        "projection-lines",
+    ],
+    "init --show early": ["early, frame times"],
+    "init --show long": ["long", "c0.csv"],
+    "init --show longer": ["longer", "cameras.c0.frames"],
+    f"onboard map {{flight}}/c0.avi --known {HUGE} --side 0.2 --out m.csv": ["--known"],
+    "onboard localise {flight}/c0.avi --markers digits.csv --out out.csv": ["digits.csv"],
+    "onboard localise {flight}/c0.avi --markers more_digits.csv --out out.csv": ["more_digits.csv"],
+    f"live {{flight}} --replay --out out.csv --udp 127.0.0.1:{HUGE}": ["--udp"],
+    # A recording in which drones are not named: no columns are more than were asked for.
+    "report results --table": ["results"],
+}
+
+
+@pytest.fixture
+def files(flight, tmp_path, monkeypatch):
+    """The current folder: files that can be read, and that fit nothing."""
+    monkeypatch.chdir(tmp_path)
+    points = "camera,frame,x_px,y_px"
+    texts = {
+        "unseen.csv": f"{HEAD}0,0,a,,,\n1,0.04,a,,,\n",
+        "late.csv": f"{HEAD}5000,5000,a,0,0,1\n5001,5001,a,0,0,1\n",
+        "one.csv": f"{HEAD}0,0,a,0,0,1\n",
+        "no_places.csv": "frame,drone\n0,1\n",
+        "apart.csv": f"{points}\nc0,0,1,1\nc1,5,2,2\n",
+        "alone.csv": f"{points}\nc0,0,1,1\n",
+        "ends.csv": f"{points},point\nc0,0,1,1,1\nc1,5,2,2,1\n",
+        "digits.csv": f"{CORNERS}{HUGE[:900]}{ZEROS}",
+        "more_digits.csv": f"{CORNERS}{HUGE}{ZEROS}",
+        "run.toml": "swarm.particles = -5\n",
+        "empty/c0.csv": "",
+        "one_video/c1.csv": "0,1,1,5,5,3,3,0.9\n",
+        "long/c0.csv": "2000000000,1,1,5,5,3,3,0.9\n",
+        "longer/c0.csv": "0,1,1,5,5,3,3,0.9\n",
+        "results/cells/x.parquet": "junk",
+    }
+    rig = f'version = 1\ncalibration = "{flight / "rig.toml"}"\n'
+    for name, offset_s in (("early", -1000.0), ("far", 1e9)):
+        texts[f"{name}/recording.toml"] = rig + "".join(
+            f'[cameras.{camera}]\nvideo = "{flight / camera}.avi"\ntime_offset_s = {offset_s + number}\n'
+            for number, camera in enumerate(("c0", "c1"))
+        )
+    texts["one_video/recording.toml"] = (
+        f'{rig}[cameras.c0]\nvideo = "{flight / "c0.avi"}"\n'
+        '[cameras.c1]\ndetections = "c1.csv"\nfps = 25.0\nsize = [320, 240]\n'
+    )
+    # A camera without a video lasts until its last detection.
+    for name, frames in (("long", ""), ("longer", "frames = 2000000000\n")):
+        camera = f'[cameras.c0]\ndetections = "c0.csv"\n{frames}fps = 25.0\nsize = [320, 240]\n'
+        texts[f"{name}/recording.toml"] = rig + camera
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+        for number in range(3):
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), np.full((48, 64), 128, np.uint8))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        *(
+            (f"track {{flight}} --out out.csv --cache cache {options}", said)
+            for options, said in TRACK.items()
+        ),
+        *COMMANDS.items(),
+    ],
+    ids=lambda each: each[:60] if isinstance(each, str) else "",
+)
+def test_a_command_refuses(words, said, files, flight, run_psotrack, little_memory):
+    words = [word.format(flight=flight) for word in words.split()]
+    said = [each.format(flight=flight) for each in said]
+    assert_refused(lambda: run_psotrack(*words), *said, unchanged=files)
+
+
+def cut_in_half(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+#: File of a recording, what is done to it, words of the line of `track`.
+SPOILT = {
+    "a missing video": ("c2.avi", Path.unlink, ["c2.avi"]),
+    "a video that is cut short": ("c1.avi", cut_in_half, ["c1.avi"]),
+    "an empty video": ("c1.avi", lambda path: path.write_bytes(b""), ["c1.avi"]),
+    "a calibration of another size": (
+        "rig.toml",
+        lambda path: path.write_text(path.read_text().replace("[320, 240]", "[640, 480]", 1)),
+        ["c0.avi", "320 x 240"],
+    ),
+    "no calibration": ("rig.toml", Path.unlink, ["rig.toml"]),
+    "a calibration of words": ("rig.toml", lambda path: path.write_text("words"), ["rig.toml"]),
+    "nan in the reference": (
+        "dron2.csv",
+        lambda path: path.write_text(path.read_text().replace("0.6", "inf", 1)),
+        ["dron2.csv", "line 2", "inf"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_an_earlier_result_stays_where_a_recording_is_spoilt(name, flight, run_psotrack, tmp_path):
+    file, spoil, said = SPOILT[name]
+    lab = tmp_path / "lab"
+    shutil.copytree(flight, lab)
+    (lab / "tracks.csv").write_text("earlier")
+    spoil(lab / file)
+    # Silhouettes of the sound videos may be stored.
+    words = ("track", lab, "--out", lab / "tracks.csv", "--force", "--cache", tmp_path / "cache")
+    assert_refused(lambda: run_psotrack(*words), *said, unchanged=lab)
+
+
+# --- settings
+
+#: Name of a setting, a value, and how the line goes on.
+SETTINGS = [
+    ("swarm.particles", 1, "expected a whole number of at least 2, found 1"),
+    ("swarm.particles", "50", 'expected a whole number, found "50"'),
+    ("bounds_m", (0, 1), "expected a list of length 6, found [0, 1]"),
+    ("bounds_m", (0, 1, 0, 1, 2, 1), "expected x0 < x1, y0 < y1, z0 < z1, found (0, 1, 0, 1, 2, 1)"),
+    ("smooth", "yes", 'expected true or false, found "yes"'),
+    ("swarm.partikles", 20, "found swarm.partikles; did you mean swarm.particles?"),
+    ("particles", 20, "expected the name of a setting, found particles; did you mean swarm.particles?"),
+    ("swarm.kind", "both", "expected one of joint, per-drone, found both"),
+    ("swarm.kind", 3, "expected text, found 3"),
+    ("swarm.inertia", math.inf, "expected finite numbers, found inf"),
+    ("drones.body_offset_m", (0.0, math.nan, 0.0), "expected finite numbers, found (0.0, nan, 0.0)"),
+    ("drones.size_m", (0.4, 0.4, 0.0), "expected a number above 0, found [0.4, 0.4, 0.0]"),
+    ("score.windows", (), "expected a list of length at least 1, found []"),
+    ("motion.max_speed_m_s", math.nan, "expected a number above 0, found NaN"),
+    ("status.min_fitness", 1.5, "expected a number of at most 1, found 1.5"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "said"), SETTINGS)
+def test_a_wrong_setting_is_named(name, value, said, tmp_path):
+    line = f"psotrack: {name}: "
+    assert_refused(lambda: TrackSettings().changed({name: value}), line, said, unchanged=tmp_path)
+
+
+def test_records_made_in_python_have_the_limits():
+    for make, name in (
+        (lambda: SwarmSettings(spread_m=0), "swarm.spread_m: expected a number above 0, found 0"),
+        (lambda: TrackSettings(swarm="joint"), 'swarm: expected a table, found "joint"'),
+        (lambda: SwarmSettings(particles=10**9), "swarm.particles"),
+        (lambda: SwarmSettings(iterations=10**9), "swarm.iterations"),
+        (lambda: DroneSettings(count=10**9), "drones.count"),
+        (lambda: TrackSettings(seed=2**63), "seed"),
+    ):
+        with pytest.raises(SettingsError) as error:
+            make()
+        assert str(error.value).startswith(name)
+    assert TrackSettings(seed=2**63 - 1).seed == 2**63 - 1
+
+
+# --- files
+
+NUL = "expected UTF-8 text, found a NUL"
+FRAME = "line 2: expected a whole number from 0 in frame"
+
+
+def rows_of(count, row):
+    return "".join(row.format(number, number + 1) for number in range(count))
+
+
+def json_of_empty_drones():
+    frames = list(range(20_000))
+    content = {"format": "psotrack tracks", "version": 1, "frame": frames, "time_s": frames}
+    return json.dumps(content | {"drones": [{"name": "a", "position_m": []}] * len(frames)})
+
+
+#: Name of the case -> name of the file, its text, the function that reads it, words of the line.
+TEXTS = {
+    "a huge frame of poses": (
+        "dron1_pos_25.csv",
+        "id;pos_x[m];pos_y[m];pos_z[m]\n0;0;0;0\n300000000;1;2;3\n",
+        read_poses,
+        ["line 3, column id: expected a frame number", "found 300000000"],
+    ),
+    "a frame of 300 digits": ("t.csv", f"{HEAD}1e300,0,a,0,0,1\n", read_trajectories, [FRAME]),
+    "a frame of 64 bits": ("t.csv", f"{HEAD}{2**63},0,a,0,0,1\n", read_trajectories, [FRAME]),
+    # Arrays over frames and drones would have a cell for each pair: 10^10 for 3 MB of text.
+    "a drone of its own in each row": (
+        "t.csv",
+        HEAD + rows_of(100_000, "{0},{0},d{0},0,0,1\n"),
+        read_trajectories,
+        ["found 100000 frames and 100000 drones in 100000 rows"],
+    ),
+    "an identity of its own in each row": (
+        "tracks.txt",
+        rows_of(20_000, "{1},{1},-1,-1,-1,-1,1,0,0,1\n"),
+        lambda path: (path.with_name("seqinfo.ini").exists(), read_tracks(path)),
+        ["tracks.txt: expected drones that are there in most frames"],
+    ),
+    "thousands of empty drones": ("t.json", json_of_empty_drones(), read_tracks, ["t.json"]),
+    "a NUL in a heading": ("t.csv", f"{HEAD[:-1]},\0\n0,0,a,0,0,1,\n", read_trajectories, ["t.csv", NUL]),
+    "a NUL in a row": ("t.csv", f"{HEAD}0,0,a\0,0,0,1\n", read_trajectories, ["t.csv", NUL]),
+    "a NUL in poses": ("dron1_pos_25.csv", "id;pos_x[m];\0\n0;0;0\n", read_poses, [NUL]),
+    "a NUL in corners": ("m.csv", "id;x1\0;y1\n1;0;0\n", read_marker_corners, ["m.csv", NUL]),
+    "a NUL in TOML": ("recording.toml", "version = 1\n#\0\n", open_recording, ["recording.toml", NUL]),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_text_is_refused(name, tmp_path, little_memory):
+    file, text, read, said = TEXTS[name]
+    (tmp_path / "seqinfo.ini").write_text("[Sequence]\nframeRate=25\n")
+    (tmp_path / file).write_text(text, encoding="utf-8")
+    assert_refused(lambda: read(tmp_path / file), *said, unchanged=tmp_path)
+
+
+def test_tracks_of_huge_frames_are_sparse(tmp_path, little_memory):
+    (tmp_path / "t.csv").write_text(f"{HEAD}0,0,a,0,0,1\n2000000000,8e7,a,0,0,1\n")
+    assert read_trajectories(tmp_path / "t.csv").num_frames == 2
+
+
+def test_a_parquet_file_of_one_repeated_row(tmp_path, little_memory):
+    """Three million rows in a few kilobytes; more would take gigabytes."""
+    path, rows = tmp_path / "t.parquet", 3_000_000
+    columns = {"frame": np.zeros(rows, np.int64), "drone": pa.array(["a"] * rows)}
+    pq.write_table(pa.table(columns | {name: np.zeros(rows) for name in ("x_m", "y_m", "z_m")}), path)
+    assert path.stat().st_size < 100_000
+    limit = "t.parquet: expected at most 1000000 rows in a file of"
+    assert_refused(lambda: read_trajectories(path), limit, unchanged=tmp_path)
+
+
+def first_mask(path):
+    with read_masks(path) as masks:
+        return masks.mask("cam1i", 1, 0)
+
+
+@pytest.mark.parametrize("stated", [80 << 20, 100])
+def test_masks_that_unpack_to_gigabytes(stated, tmp_path, little_memory):
+    """Zeros of 80 MiB are 80 kB in a zip file; of what is stated, `zipfile` unpacks as many bytes as are stated."""
+    path = tmp_path / "drone_masks.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("cam1i/dron1/000000.png", bytes(80 << 20))
+    assert path.stat().st_size < 100_000
+    path.write_bytes(path.read_bytes().replace(struct.pack("<I", 80 << 20), struct.pack("<I", stated)))
+    assert_refused(lambda: first_mask(path), "000000.png: expected an image", unchanged=tmp_path)
+
+
+def test_numbers_of_thousands_of_digits_in_names_of_masks(tmp_path):
+    path = tmp_path / "drone_masks.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"cam1i/dron1/{HUGE}.png", b"")
+    assert_refused(lambda: first_mask(path), "drone_masks.zip: expected images such as", unchanged=tmp_path)
+
+
+def test_an_archive_that_unpacks_to_far_more_than_it_is(tmp_path, monkeypatch):
+    """The limit is lowered, so that the test needs no 256 MiB."""
+    sound, path = Path(__file__).parents[1] / "data" / "version_1.psotrack", tmp_path / "a.psotrack"
+    zipped = io.BytesIO()
+    with zipfile.ZipFile(sound) as before, zipfile.ZipFile(zipped, "w", zipfile.ZIP_DEFLATED) as after:
+        manifest = json.loads(before.read("psotrack.json"))
+        manifest["files"] = [*manifest["files"], "zeros.csv"]
+        after.writestr("psotrack.json", json.dumps(manifest))
+        for name in manifest["files"]:
+            after.writestr(name, bytes(8 << 20) if name == "zeros.csv" else before.read(name))
+    path.write_bytes(zipped.getvalue())
+    archives.unpack(path, tmp_path / "usual")
+    monkeypatch.setattr("psotrack.pipeline.archives.zip_file._SMALL", 1 << 20)
+    limit = "a.psotrack: expected files of at most"
+    assert_refused(lambda: archives.unpack(path, tmp_path / "folder"), limit, unchanged=tmp_path)
+
+
+def test_detections_that_are_no_folder(tmp_path, run_psotrack):
+    (tmp_path / "cameras_calibration.csv").write_text("cam_name;cam_x[m]\n")
+    (tmp_path / "dl_data").write_text("no folder")
+    assert_refused(lambda: run_psotrack("init", "--show", tmp_path), tmp_path, unchanged=tmp_path)
+
+
+@pytest.mark.parametrize("junk", [b"", b"junk", b"PAR1" + bytes(40) + b"PAR1", b"[1, 2]", b"\xff\xfe\x00"])
+def test_junk_in_a_cell_of_a_sweep(junk, run_psotrack, tmp_path):
+    store = Store(tmp_path / "results")
+    store.add("a" * 40, pd.DataFrame({"seed": [0], "mean_error_m": [0.01]}))
+    path = store.folder / "cells" / f"{'a' * 40}.parquet"
+    path.write_bytes(junk)
+    assert_refused(lambda: run_psotrack("report", store.folder, "--table"), path, unchanged=tmp_path)
+
+
+# --- networks
+
+
+@pytest.mark.parametrize("place", ["../secret.bin", "secret.bin", "{folder}/secret.bin"])
+@pytest.mark.parametrize("inside", ["initializer", "attribute", "attribute, a superfluous zero"])
+def test_a_network_that_reads_another_file(place, inside, tmp_path, monkeypatch):
+    """OpenCV reads every file that a tensor names; here it is not asked to."""
+    values = np.full((1, 3, 64, 64), 7, np.float32)
+    (tmp_path / "in").mkdir()
+    for folder in (tmp_path, tmp_path / "in"):
+        (folder / "secret.bin").write_bytes(values.tobytes())
+    message, path = onnx_models._message, tmp_path / "in" / "net.onnx"
+    location = message((1, "location"), (2, place.format(folder=tmp_path)))
+    if "zero" in inside:
+        # The length of the word in two bytes, where one is enough.
+        location = location.replace(b"\x08location", b"\x88\x00location")
+    shape = [(1, side) for side in values.shape]
+    tensor = message(*shape, (2, 1), (8, "secret"), (13, location), (14, 1))
+    nodes, tensors = [onnx_models._node("Add", ["images", "secret"], "output")], {"secret": values}
+    if inside == "initializer":
+        monkeypatch.setattr(onnx_models, "_tensor", lambda name, values: tensor)
+    else:
+        constant = message((2, "secret"), (4, "Constant"), (5, message((1, "value"), (5, tensor), (20, 4))))
+        nodes, tensors = [constant, *nodes], {}
+    path.write_bytes(onnx_models.model(nodes, tensors, (1, 3, 64, 64), (1, 3, 64, 64)))
+    found = "found tensors in other files"
+    assert_refused(lambda: OnnxDetector(path, DetectorSettings(size=64)), path, found, unchanged=tmp_path)
+
+
+def terabytes():
+    """A constant of 10^12 numbers in a few bytes."""
+    shape = np.array([1000, 1000, 1000, 1000], np.int64)
+    node = onnx_models._node("ConstantOfShape", ["shape"], "output")
+    return onnx_models.model([node], {"shape": shape}, (1, 3, 64, 64), (1, 1, 1, 1))
+
+
+@pytest.mark.parametrize(
+    "content", [terabytes(), b"", bytes(100), b'{"a": 1}'], ids=["terabytes", "empty", "zeros", "text"]
+)
+def test_what_is_no_network_that_can_be_used(content, tmp_path):
+    path = tmp_path / "net.onnx"
+    path.write_bytes(content)
+
+    def detect():
+        OnnxDetector(path, DetectorSettings(size=64)).boxes(np.zeros((64, 64, 3), np.uint8))
+
+    assert_refused(detect, "net.onnx: expected", unchanged=tmp_path)

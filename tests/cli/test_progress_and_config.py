@@ -1,0 +1,207 @@
+"""`--progress`, `--log`, `--config` and `--save-config`, and the table of `track`."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers import Output as Printed
+from helpers import assert_refused
+from hypothesis import given
+from hypothesis import strategies as st
+
+from psotrack.cli.output import Output
+from psotrack.cli.settings import config_text, read_config
+from psotrack.settings import TrackSettings
+from psotrack.trajectories import Status, Trajectories
+
+#: A line of a log: local time with its offset, level, and what was said.
+LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4} (info|warning|error) (.*)")
+
+Run = Callable[..., Printed]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
+    """Runs `psotrack` with some arguments, with the progress that users see."""
+    monkeypatch.delenv("PSOTRACK_PROGRESS", raising=False)
+    return run_psotrack
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> list[object]:
+    """Arguments of a command that takes a moment: `onboard detect` in a photograph of a marker."""
+    path = tmp_path / "photograph.png"
+    marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 100)
+    cv2.imwrite(str(path), np.pad(marker, 40, constant_values=255))
+    return ["onboard", "detect", path, "--out", tmp_path / "markers.csv", "--force", "--json", "-"]
+
+
+def said_in(log: Path) -> list[tuple[str, str]]:
+    """Level and text of each line of a log."""
+    matches = [LINE.fullmatch(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    assert all(matches)
+    return [(match[1], match[2]) for match in matches if match]
+
+
+def test_progress(run: Run, command: list[object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short work is quiet, lines say what was done, --quiet has precedence, and a variable chooses."""
+    assert run(*command).err == run(*command, "--progress", "none").err == ""
+    code, out, err = run(*command, "--progress", "lines")
+    assert code == 0
+    assert json.loads(out)
+    assert re.fullmatch(r"psotrack: markers: 1 of 1 in \d+\.\d s\n", err)
+    assert "1/1" in run(*command, "--progress", "bar").err
+    assert run(*command, "--progress", "lines", "--quiet").err == ""
+    monkeypatch.setenv("PSOTRACK_PROGRESS", "lines")
+    assert "markers: 1 of 1" in run(*command).err
+    assert run(*command, "--progress", "none").err == ""
+
+
+def test_a_log_grows(run: Run, command: list[object], tmp_path: Path) -> None:
+    log = tmp_path / "logs" / "all.log"
+    command = [*command[:5], "--log", log]
+    out = run(*command).out
+    lines = said_in(log)
+    assert lines[0][1].startswith("psotrack ")
+    assert lines[0][1].endswith(f"--log {log}")
+    assert any(re.fullmatch(r"markers: 1 of 1 in \d+\.\d s", text) for _, text in lines)
+    assert lines[-1] == ("info", out.strip())
+    code, _, err = run(*command, "--quiet")
+    assert code == 2
+    again = said_in(log)
+    assert again[: len(lines)] == lines
+    # The error on stderr without the name of the program.
+    assert again[-1] == ("error", err.strip().removeprefix("psotrack: "))
+    # Nothing is logged after the command; wrong options after the log are.
+    assert run(*command[:5], "--force").code == 0
+    assert said_in(log) == again
+    assert run("track", tmp_path, "--log", log, "--out", "t.txt").code == 2
+    assert said_in(log)[-1][0] == "error"
+
+
+def test_results_and_folders_are_no_logs(run: Run, command: list[object], tmp_path: Path) -> None:
+    tracks = tmp_path / "tracks.csv"
+    tracks.write_text("frame,drone\n", encoding="utf-8")
+    refusal = "expected a new file, or a log of psotrack"
+    assert_refused(lambda: run(*command, "--log", tracks), refusal, unchanged=tmp_path)
+    refusal = "a log file that can be written"
+    assert_refused(lambda: run(*command, "--log", tmp_path), refusal, unchanged=tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_the_work_goes_on_where_the_log_meets_a_full_disk(run: Run, command: list[object]) -> None:
+    code, out, err = run(*command, "--log", "/dev/full")
+    assert code == 0
+    assert json.loads(out)
+    assert err == "psotrack: warning: /dev/full: No space left on device; the log ends here\n"
+
+
+texts = st.text(st.characters(exclude_categories=("Cs", "Cc")), min_size=1).filter(
+    lambda text: not text.startswith("-")
+)
+
+
+#: Any values that some settings may have.
+SETTINGS = st.fixed_dictionaries(
+    {},
+    optional={
+        "swarm.particles": st.integers(2, 100_000),
+        "motion.max_speed_m_s": st.floats(1e-3, 1e9),
+        # Files have no numbers above 1e60.
+        "rate_hz": st.floats(1e-300, 1e60),
+        "drones.size_m": st.tuples(*[st.floats(1e-3, 1e9)] * 3),
+        "clocks": st.sampled_from(["given", "auto"]),
+        "method": texts,
+        "smooth": st.booleans(),
+        "silhouettes.reduction": st.integers(1, 64),
+    },
+)
+
+
+@given(values=SETTINGS)
+def test_a_saved_config_has_all_settings(tmp_path_factory: pytest.TempPathFactory, values: Any) -> None:
+    settings = TrackSettings().changed(values)
+    file = tmp_path_factory.getbasetemp() / "saved_config.toml"
+    file.write_text(config_text(settings), encoding="utf-8")
+    assert TrackSettings().changed(read_config(file)) == settings
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("swarm.partcles = 3", "found swarm.partcles; did you mean swarm.particles?"),
+        ("force = true", "force: expected the name of a setting"),
+        ('swarm.particles = "many"', 'swarm.particles: expected a whole number, found "many"'),
+        ("smooth = 1", "smooth: expected true or false, found 1"),
+        ("drones.size_m = [1, 2]", "drones.size_m: expected a list of length 3"),
+        ('clocks = "atomic"', "clocks: expected one of given, auto, found atomic"),
+        ("rate_hz = inf", "rate_hz: expected finite numbers, found inf"),
+        ("rate_hz = [", "expected valid TOML"),
+    ],
+)
+def test_a_wrong_config_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "run.toml"
+    file.write_text(text, encoding="utf-8")
+    assert_refused(lambda: read_config(file), f"psotrack: {file}", message, unchanged=tmp_path)
+
+
+def test_a_run_that_fails_saves_no_config(run: Run, tmp_path: Path) -> None:
+    words = ("track", tmp_path, "--out", tmp_path / "t.csv", "--save-config", tmp_path / "b.toml")
+    assert_refused(lambda: run(*words), unchanged=tmp_path)
+
+
+class TestTable:
+    def test_eighty_columns_and_no_cell_is_cut(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setenv("COLUMNS", "80")
+        names = (*map(str, range(10)), "[red]a drone with a long name")
+        drones, frames = len(names), 40
+        status = np.full((frames, drones), Status.TRACKED)
+        status[5:9, 1], status[20:, 2], status[:, 3] = Status.COASTING, Status.LOST, Status.LOST
+        position_m = np.ones((frames, drones, 3))
+        position_m[:, 3] = np.nan
+        # 12 m of standard deviation, and times of more than a day.
+        covariance_m2 = np.tile(144.0 * np.eye(3), (frames, drones, 1, 1))
+        tracks = Trajectories(
+            np.arange(frames),
+            90_000 + np.arange(frames) / 25,
+            names,
+            position_m,
+            status=status,
+            covariance_m2=covariance_m2,
+            num_cameras=np.full((frames, drones), 40),
+        )
+        size_m = np.full((drones, 3), 1.234)
+        size_m[4] = np.nan
+        Output().drones(tracks, size_m)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= 80
+        assert not any("…" in line for line in lines)
+        assert lines[0].split()[:5] == ["drone", "seen", "coasting", "lost", "cameras"]
+        rows = {line.split()[0]: line.split()[1:] for line in lines if line[:1].isdigit()}
+        first = ["100.0%", "0.0%", "0.0%", "40.0", "12000", "123", "123", "123", "90000", "90002"]
+        assert rows["0"] == first
+        assert rows["1"][:3] == ["100.0%", "10.0%", "0.0%"]
+        assert rows["2"][:3] == ["50.0%", "0.0%", "50.0%"]
+        # Never seen: all but the shares is unknown.
+        assert rows["3"] == ["0.0%", "0.0%", "0.0%", "-", "-", "123", "123", "123", "-", "-"]
+        # The long name is folded, not cut, and no part of it is a style.
+        last = next(number for number, line in enumerate(lines) if line.startswith("9 "))
+        folded = "".join(line[:5].strip() for line in lines[last + 1 :])
+        assert folded == names[-1].replace(" ", "")
+
+    def test_nothing_with_quiet_or_json_on_stdout(self, capsys: pytest.CaptureFixture[str]) -> None:
+        tracks = Trajectories(np.arange(1), np.zeros(1), ("a",), np.zeros((1, 1, 3)))
+        for hidden in (Output(quiet=True), Output(json_path=Path("-"))):
+            hidden.drones(tracks)
+        assert capsys.readouterr().out == ""
+        Output().drones(tracks)
+        assert "100.0%" in capsys.readouterr().out
