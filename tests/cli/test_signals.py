@@ -161,7 +161,7 @@ def start_track(start_python, flight, tmp_path):
 
 
 @each_signal
-@pytest.mark.parametrize("stage", ["imports", "computes"])
+@pytest.mark.parametrize("stage", ["imports", pytest.param("computes", marks=pytest.mark.slow)])
 def test_a_command_ends_with_one_line(start_track, tmp_path, number, stage):
     process = start_track(AT_A_TERMINAL)
     if stage == "computes":
@@ -171,6 +171,7 @@ def test_a_command_ends_with_one_line(start_track, tmp_path, number, stage):
     assert (tmp_path / "tracks.csv").read_text() == "earlier"
 
 
+@pytest.mark.slow
 def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(start_track, tmp_path):
     process = start_track(AT_A_TERMINAL.replace("signal.default_int_handler", "signal.SIG_IGN"))
     process.send_signal(signal.SIGINT)

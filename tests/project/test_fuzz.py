@@ -56,7 +56,17 @@ def judged(judge, name, content):
     return [judge.judge(0, name, read, content) for read in calls]
 
 
-@pytest.mark.parametrize("path", FINDS, ids=lambda path: f"{path.parent.name}-{path.stem}")
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path,
+            id=f"{path.parent.name}-{path.stem}",
+            marks=[pytest.mark.slow] * FORMATS[path.parent.name].is_slow,
+        )
+        for path in FINDS
+    ],
+)
 def test_what_was_found_is_mended(path, judges):
     name = path.parent.name
     assert [trial for trial in judged(judges(name), name, path.read_bytes()) if trial.fault] == []

@@ -256,8 +256,9 @@ def reaches(path, source):
 
     The tests of a room, in the folder of its name, may import all modules of their room. No test imports a test.
     """
-    found = {name for name in imports(source) if re.match(r"test_\w+$", name)}
-    for name in imports(source):
+    names = imports(source)
+    found = {name for name in names if re.match(r"test_\w+$", name)}
+    for name in names:
         top, _, rest = name.partition(".")
         room, _, last = rest.rpartition(".")
         if top != "psotrack" or not room or rest in ORDER or is_within(rest, {path.parts[0]}):
