@@ -356,6 +356,7 @@ def test_strips_cover_each_row_once_and_its_time_on_average(height, motion_px):
         assert np.abs(times - rows).max() <= 0.5 + max(0.5 / motion_px, 4) / 16
 
 
+@pytest.mark.slow
 def test_each_row_is_what_a_global_shutter_shows_at_its_time():
     line_time_s, frame = 0.03 / SIZE_WH[1], 40
     fixed = made()
@@ -414,6 +415,7 @@ def test_the_exposure_swings_between_its_limits():
     assert OnboardRenderer(made(), 0).sensor.exposure(0.7) == 1.0
 
 
+@pytest.mark.slow
 def test_a_simulated_sequence_with_distortion_has_the_lens_of_each_drone(tmp_path):
     camera = {"image_size_wh": list(SIZE_WH), "fov_deg": list(FOV_DEG), "distortion": [-0.1, 0.03, 0.0, 0.0]}
     recipe = change_scenario(
