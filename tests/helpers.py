@@ -166,8 +166,9 @@ def listening_at(process: int) -> set[str]:
 def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """The folder `name`, which `make` fills once per test run: the first worker that needs the folder calls `make`.
 
-    Tests must not change the folder, because the tests of all workers read it.
+    Tests must not change the folder, because the tests of all workers read it. A name belongs to one maker.
     """
+    maker = f"{make.__module__}.{make.__qualname__}"
     base = tmp_path_factory.getbasetemp()
     # Each worker has a folder of its own within the folder of the run.
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
@@ -176,7 +177,8 @@ def make_once(tmp_path_factory: pytest.TempPathFactory, name: str, make: Callabl
         if not finished.exists():
             folder.mkdir(exist_ok=True)
             make(folder)
-            finished.touch()
+            finished.write_text(maker)
+        assert finished.read_text() == maker, f"two worlds of the tests have the name {name}"
     return folder
 
 

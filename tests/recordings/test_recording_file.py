@@ -37,7 +37,7 @@ def folder(tmp_path_factory, tmp_path):
         write_video(folder / "right.avi", 6)
         write_video(folder / "wide.avi", 11, 50.0, (96, 48))
 
-    return shutil.copytree(make_once(tmp_path_factory, "three_videos", make), tmp_path / "flight")
+    return shutil.copytree(make_once(tmp_path_factory, "videos_of_two_rates", make), tmp_path / "flight")
 
 
 def write(folder, *tables, top=""):

@@ -423,7 +423,9 @@ def pyglet(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_a_missing_controller_or_display_is_one_line(name, modules, words, pyglet, tmp_path):
+def test_a_missing_controller_or_display_is_one_line(name, modules, words, pyglet, tmp_path, monkeypatch):
+    # The fake modules are below the folder that must not change.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     pyglet(**modules)
     device = open_device(name, LABORATORY)
     assert_refused(device.__enter__, f"device {name}: ", words, unchanged=tmp_path)
