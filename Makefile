@@ -20,7 +20,7 @@ failed = echo "psotrack: set-up failed: the packages of pyproject.toml could not
 # every worker and every command that a test starts would compile the package again.
 pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: help demo test test-slow nightly real fuzz kills lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results reference-flights clean
+.PHONY: help demo test test-slow nightly real fuzz kills mutants lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results reference-flights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -66,6 +66,11 @@ fuzz: $(VENV)/.installed  ## damaged files for every reader, three minutes; MINU
 
 kills: $(VENV)/.installed  ## kill commands at random moments and run them again; COUNT=1000 for more, SEED=7 for others
 	@$(BIN)/python experiments/kills.py --count $(or $(COUNT),300) --seed $(or $(SEED),0) --out build/kills-$(or $(SEED),0)
+
+mutants: $(VENV)/.installed  ## how many changed lines of the package the tests notice: hours; goes on where it was stopped
+	@$(call install,mutants)
+	@test -f build/mutants/seconds.tsv || $(BIN)/python tests/mutants.py cover
+	@$(BIN)/python tests/mutants.py run
 
 lint: $(VENV)/.installed  ## ruff, its format check, mypy
 	@$(BIN)/ruff check .
