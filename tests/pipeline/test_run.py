@@ -56,7 +56,7 @@ def test_ctrl_c_in_a_step_ends_the_run(
         run_psotrack("run", two_videos)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_videos_and_a_board_become_a_report(run_psotrack: Run, tmp_path: Path) -> None:
     lab = tmp_path / "lab"
     options = ("--as-own-cameras", "--frames", 50, "--scale", 0.5, "--out", lab, "--quiet")
