@@ -69,7 +69,6 @@ BAD = {
     "5,1,2,3,4,5,6": ("line 2: expected a frame number and 7 values per detection ", ", found 6 values"),
     "5,1,2,3,4,5,6,x": ("line 2, column 8: expected a number, found 'x'",),
     "5,1,2,,4,5,6,0.5": ("line 2, column 4: expected a value, found nothing",),
-    "5,1,2,nan,4,5,6,0.5": ("line 2, column 4: expected a finite number, found 'nan'",),
     "5,1,2,-3,4,5,6,0.5": ("line 2, column 4: expected a size w of 0 or more pixels, found -3",),
     "5,1,2,3,4,5,6,1.5": ("line 2, column 8: expected a confidence from 0 to 1, found 1.5",),
     "5.5,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '5.5'",),
@@ -177,8 +176,14 @@ class Own:
 
 
 def test_recordings_without_videos(run_psotrack, folder, tmp_path):
-    recording = pt.read_recording(folder, cameras="C-2", num_frames=20)
-    assert (recording.rig.names, recording.num_frames) == (("c2",), 20)
+    recording = open_recording(folder)
+    assert not recording.videos
+    assert recording.usable(videos=False).rig.names == tuple(CLOCKS)
+    longer = tmp_path / "longer.csv"
+    longer.write_text("99,10,20,30,40,25,40,0.9\n")
+    assert recording.with_detections({"c1": longer}).usable(videos=False).num_frames == 100
+    chosen = pt.read_recording(folder, cameras="C-2", num_frames=20)
+    assert (chosen.rig.names, chosen.num_frames) == (("c2",), 20)
     shown = run_psotrack("init", "--show", folder).out
     for word in ("no video", "1280 x 960", "50 Hz"):
         assert word in shown
@@ -186,7 +191,7 @@ def test_recordings_without_videos(run_psotrack, folder, tmp_path):
         (lambda: pt.read_recording(folder, cameras="camera9"), ("cameras: expected some of",)),
         (
             lambda: run_psotrack("track", folder, "--out", tmp_path / "tracks.csv", "--quiet"),
-            ("expected a video for each of the cameras ", "found none"),
+            ("expected a video for each of the cameras c0, c1, ", "found none"),
         ),
         (
             lambda: pt.track(folder, {"method": "projection-lines"}, method=Own(), cache=tmp_path),

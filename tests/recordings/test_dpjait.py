@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from dpjait_folders import (
     POSE_HEADER,
+    REAL_HEADER,
     SERIALS,
     SIMULATED_HEADER,
     make_real,
@@ -434,13 +435,10 @@ BAD = {
                        ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
     "focal length 0": (_cameras("1158.3", "0"), "line 3, column focal_length: expected a focal length above 0 pixels"),
     "focal length below 0": (_cameras("1158.3", "-1158.3"), "column focal_length: expected a focal length above 0"),
-    "a pose of NaN": (_poses("\n2;0.20", "\n2;nan"), "dron1_pos_25.csv, line 4, column pos_x[m]: expected a finite"),
-    "no position": (_poses("\n2;0.20;", "\n2;;"), "line 4, column pos_x[m]: expected a value, found nothing"),
     "a frame twice": (_poses("\n2;0.2", "\n1;0.2"),
                       "line 4, column id: expected each frame once, found 1 again, after line 3"),
     "half a frame": (_poses("\n2;0.2", "\n2.5;0.2"),
                      "line 4, column id: expected a whole number, 0 or more, found '2.5'"),
-    "few values of a pose": (_poses("\n2;0.20;2;1.5", "\n2;0.20;2"), "line 4: expected 11 values as in the header"),
     "a long quaternion": (_poses("0;0;0;1\n2", "0;0;0;7\n2"),
                           "line 3, column q_w: expected a quaternion of length 1, found length 7"),
     "no column of x": (_poses("pos_x", "x"), "csv: expected a column pos_x, found only id, x[m]"),
@@ -492,13 +490,10 @@ BAD_ONBOARD = {
                      "dron2_cam_s.avi: expected 64 x 48 pixels as dron2 has in", "found 32 x 32"),
     "another rate": (lambda folder: (folder / "dron2_cam_25.csv").rename(folder / "dron2_cam_30.csv"),
                      "dron2_cam_30.csv: expected poses at the 25 Hz of the video, found 30 Hz"),
-    "no number": (edit("dron1_cam_25.csv", "1.5", "one and a half"),
-                  "dron1_cam_25.csv, line 3, column pos_z[m]: expected a number"),
     "a drone twice": (_intrinsics("dron2", "dron1"),
                       "line 3, column cam_name: expected each camera once, found dron1 again"),
     "below 0": (_intrinsics("60.5", "-60.5"),
                 "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
-    "zero": (_intrinsics("60.25", "0"), "line 2, column focal_length_y: expected a number of pixels above 0"),
     "no height": (_intrinsics(";48", ";0"), "line 2, column height: expected a number of pixels above 0"),
     "half a pixel": (_intrinsics(";64", ";64.5"), "line 2, column width: expected a whole number"),
     "no cx": (_intrinsics("cx", "c_x"), f"{ONBOARD_CALIBRATION}: expected a column cx, found only"),
@@ -560,18 +555,12 @@ def test_a_written_rig_is_read_back(tmp_path_factory, poses, dist, unit):
 
 
 def test_written_files_look_like_the_published_ones(tmp_path):
-    for unit, dist, header, row in (
-        ("m", (), SIMULATED_HEADER, "1.0;2.0;3.0;0.0;0.0;0.0;1000.0;960.0;540.0"),
-        (
-            "mm",
-            (0.1, 0.0, 0.0, 0.0),
-            f"{SIMULATED_HEADER.replace('[m]', '[mm]')};coeff_1;coeff_2;coeff_3;coeff_4",
-            "1000.0;2000.0;3000.0;0.0;0.0;0.0;1000.0;960.0;540.0;0.1;0.0;0.0;0.0",
-        ),
-    ):
-        rig = make_rig({"cam1i": camera_at(Rotation.identity(), (1.0, 2.0, 3.0), dist=dist)})
-        write_calibration(tmp_path / CALIBRATION, rig, unit)
-        assert (tmp_path / CALIBRATION).read_text().splitlines() == [header, f"cam1i;{row}"]
+    rig = make_rig({"cam1i": camera_at(Rotation.identity(), (1.0, 2.0, 3.0), dist=(0.1, 0.0, 0.0, 0.0))})
+    write_calibration(tmp_path / CALIBRATION, rig, "mm")
+    assert (tmp_path / CALIBRATION).read_text().splitlines() == [
+        REAL_HEADER,
+        "cam1i;1000.0;2000.0;3000.0;0.0;0.0;0.0;1000.0;960.0;540.0;0.1;0.0;0.0;0.0",
+    ]
     write_poses(tmp_path / pose_file(1), np.ones((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
     assert (tmp_path / "dron1_pos_25.csv").read_text().splitlines() == [
         POSE_HEADER,
@@ -682,7 +671,6 @@ def test_written_marker_corners_are_read_back(tmp_path_factory, corners):
     [
         ("7;", "5;", "line 3, column id: expected each marker once, found 5 again"),
         ("z4[m]", "z5[m]", "expected a column z4"),
-        ("7;0.5", "7;nan", "line 3, column x1[m]: expected a finite number"),
     ],
 )
 def test_wrong_marker_corners_are_refused(tmp_path, old, new, words):
