@@ -112,7 +112,7 @@ def copies(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @each_script
 def test_notebook_runs_at_tiny_size(script, copies):
     """Run by nbmake in another pytest process, because this one turns warnings of Jupyter's machinery into errors."""
