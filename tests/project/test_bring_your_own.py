@@ -446,6 +446,8 @@ def site(tmp_path_factory):
 def run_track(site, root, run_psotrack, monkeypatch, tmp_path):
     """Runs `psotrack track` with the options where the package of `site` is installed: the tracks and the record."""
     monkeypatch.syspath_prepend(site)
+    # A worker may have made this module's folder before: the package would still be imported from there.
+    sys.modules.pop("own_parts", None)
 
     def run_track(*options):
         out = tmp_path / "tracks.csv"
