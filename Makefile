@@ -23,7 +23,7 @@ pytest = env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n auto --dist w
 .PHONY: help demo test test-slow nightly real fuzz kills mutants lint format size bench bench-videos bench-live bench-batch notebooks table4 table5 table5-quick table7 docs results reference-flights clean
 
 help:  ## list the targets
-	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(VENV)/.package: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
@@ -49,7 +49,7 @@ demo: $(VENV)/.package  ## simulate four drones, track them from the videos, pri
 test: $(VENV)/.installed  ## the fast tests, some minutes; NAMES="tests/recordings/test_video.py ..." for some files
 	@$(pytest) -m 'not slow and not nightly' $(NAMES)
 
-test-slow: $(VENV)/.installed  ## the slow tests: whole programs, notebooks and experiments at small sizes
+test-slow: $(VENV)/.installed  ## the slow tests: whole programs and experiments at small sizes
 	@$(pytest) -m 'slow and not nightly' $(NAMES)
 
 nightly: $(VENV)/.installed  ## what takes long and finds little: the fast tests with types checked, nightly tests, fuzz, kills
@@ -104,7 +104,7 @@ table5-quick: $(VENV)/.installed  ## a small form of Table 5: the smallest and t
 table7: $(VENV)/.installed  ## the paper's Tables 6 to 8 and figure 11: drones' own cameras and markers; DATA=FOLDER for the published sequences
 	@$(BIN)/python experiments/table7/table7.py $(if $(DATA),--data $(DATA))
 
-docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning, and on a figure that is missing or of another version of tracking
+docs: $(VENV)/.installed  ## build the documentation into build/docs; fails on a warning and on a missing figure; names figures of another version of tracking
 	@$(call install,docs)
 	@$(BIN)/python docs/readme.py --check || echo 'psotrack: older figures are said, and do not fail the build until each was made once by version 1' >&2
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --config-file docs/mkdocs.yml

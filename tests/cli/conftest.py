@@ -1,5 +1,7 @@
-"""The small recording of the tests of commands, which no test changes."""
+"""The small recording of the tests of commands, which no test changes, and a limit on memory."""
 
+import resource
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,3 +18,13 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def flight(world: Path) -> Path:
     """A recording of two drones by three cameras."""
     return world / "flight"
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """A wrong allocation is an error, not a machine that swaps; the limit is far above what the tests need."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)

@@ -3,7 +3,6 @@
 import io
 import json
 import math
-import resource
 import shutil
 import struct
 import zipfile
@@ -31,16 +30,6 @@ HUGE = "9" * 5000
 HEAD = "frame,time_s,drone,x_m,y_m,z_m\n"
 CORNERS = f"id;{';'.join(f'{axis}{corner}' for corner in '1234' for axis in 'xyz')}\n"
 ZEROS = f"{';0' * 12}\n"
-
-
-@pytest.fixture
-def little_memory():
-    """A wrong allocation is an error, not a machine that swaps; the limit is far above what the tests need."""
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 # --- commands

@@ -257,7 +257,7 @@ LARGE = (300, 200, 380, 250)
 
 
 def detected(scene, count, *others, share=1.0, **values):
-    """The detections in so many frames of a large drone, which is seen to a share, and of other silhouettes."""
+    """Detections in the first `count` frames: of a large drone, whose visible fraction is `share`, and of others."""
     made, silhouette = scene_with_detector(scene, **values), make_silhouette(scene, LARGE, share=share)
     return [detect(made, 0, frame, [silhouette, *others]) for frame in range(count)]
 
