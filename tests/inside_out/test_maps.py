@@ -311,13 +311,23 @@ def with_insets(seen, seed):
     return replace(seen, corners_px=seen.corners_px - inset_px[seen.marker, None, None] * outward(seen))
 
 
-@pytest.mark.parametrize("rooms", [4, pytest.param(12, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize(("inset", "noise_px"), [(False, 0.3), (True, 0.1)])
-def test_the_covariance_agrees_with_the_errors(inset, noise_px, rooms):
-    """Found: an average of 1.6, because the covariance had whole insets, and the adjustment finds a part of them."""
+@pytest.mark.parametrize(
+    ("inset", "noise_px", "rooms", "least"),
+    [
+        (False, 0.3, 4, 1.2),
+        (True, 0.1, 4, 1.8),
+        pytest.param(False, 0.3, 12, 1.2, marks=pytest.mark.nightly),
+        pytest.param(True, 0.1, 12, 1.4, marks=pytest.mark.nightly),
+    ],
+)
+def test_the_covariance_agrees_with_the_errors(inset, noise_px, rooms, least):
+    """Found: an average three quarters as large, because the covariance had whole insets.
+
+    The adjustment finds a part of an inset. Measured today with insets: 2.1 for 4 rooms, 1.7 for 12.
+    """
     normalised, corners_inside = [], []
     for seed in range(rooms):
-        seen = sightings(noise_px=noise_px, num_views=40, seed=seed)
+        seen = sightings(noise_px=noise_px, num_views=50, seed=seed)
         built = build_map(with_insets(seen, seed) if inset else seen, {7: ROOM[7]})
         truth_m = np.array([ROOM[marker].mean(axis=0) for marker in built.ids.tolist()])
         off = (built.marker_map.centres_m - truth_m)[~built.known]
@@ -330,7 +340,7 @@ def test_the_covariance_agrees_with_the_errors(inset, noise_px, rooms):
     # The expectation is 3; less, because the covariance allows for errors common to all frames, which these corners do
     # not have, and insets that differ among markers also count as errors that last. The 15 markers of a room share
     # errors, so 4 rooms have about 20 degrees of freedom: 3 +- 0.9.
-    assert 1.2 < np.mean(normalised) < 4.5
+    assert least < np.mean(normalised) < 4.0
     assert np.mean(np.concatenate(normalised) < chi2.ppf(0.9, 3)) > 0.85
     # The one standard deviation of a marker's corners, which the table has.
     assert np.mean(corners_inside) > 0.85
