@@ -5,6 +5,7 @@ Imports are read from the syntax tree of every module, so that imports inside fu
 
 import ast
 import doctest
+import functools
 import importlib
 import os
 import re
@@ -74,6 +75,7 @@ def read_order():
 ORDERS = read_order()
 
 
+@functools.cache
 def imports(source, package="psotrack"):
     """Set of the dotted names that a source imports when it runs; relative imports are resolved in `package`.
 

@@ -1,8 +1,8 @@
 """Files of strangers are data: no reader runs what is in them."""
 
-import ast
 import contextlib
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,67 +21,40 @@ from psotrack.sweeps import read_grid
 from psotrack.trajectories import read_trajectories
 
 PACKAGE = Path(psotrack.__file__).parent
-#: Modules whose readers run code, and calls that do. Written as parts of dotted names.
-MODULES = {
-    *("pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "torch", "runpy", "code"),
-}
-CALLS = {"eval", "exec", "compile", "__import__", "execfile"}
-ARGUMENTS = {"allow_pickle", "shell"}
-#: `yaml.load` takes a loader; only safe loaders build no objects.
-LOADERS = {"load", "load_all", "full_load", "unsafe_load", "FullLoader", "UnsafeLoader", "Loader"}
-
-
-def suspects(tree: ast.AST) -> set[str]:
-    """What in a module could run code from data."""
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found |= {one.name for one in node.names if one.name.partition(".")[0] in MODULES}
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in MODULES:
-            found.add(str(node.module))
-        elif isinstance(node, ast.Call):
-            if isinstance(node.func, ast.Name) and node.func.id in CALLS:
-                found.add(node.func.id)
-            of = node.func.value if isinstance(node.func, ast.Attribute) else None
-            if isinstance(of, ast.Name) and of.id == "yaml" and node.func.attr in LOADERS:
-                found.add(f"yaml.{node.func.attr}")
-            if isinstance(of, ast.Name) and (of.id, node.func.attr) in {("os", "system"), ("os", "popen")}:
-                found.add(f"os.{node.func.attr}")
-            for word in node.keywords:
-                if word.arg in ARGUMENTS and not (
-                    isinstance(word.value, ast.Constant) and word.value.value is False
-                ):
-                    found.add(str(word.arg))
-    return found
+#: Modules whose readers run code, functions that do, and arguments that allow it. `yaml.load` takes a loader, and only
+#: safe loaders build no objects.
+SUSPECT = re.compile(
+    r"""^\s*(?:import|from)\ (?:pickle|cPickle|dill|cloudpickle|joblib|marshal|shelve|torch|runpy|code)\b
+    | (?<![\w.])(?<!def\ )(?:eval|exec|compile|__import__|execfile)\(
+    | \b(?:allow_pickle|shell)=(?!False\b)
+    | \byaml\.(?:load|load_all|full_load|unsafe_load|FullLoader|UnsafeLoader|Loader)\b
+    | \bos\.(?:system|popen)\b""",
+    re.MULTILINE | re.VERBOSE,
+)
 
 
 def test_the_package_calls_nothing_that_runs_data():
-    found = {
-        (path.relative_to(PACKAGE).as_posix(), name)
-        for path in PACKAGE.rglob("*.py")
-        for name in suspects(ast.parse(path.read_text(encoding="utf-8")))
-    }
-    assert not found
+    sources = {path: path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
+    assert {
+        path.name: found[0] for path, source in sources.items() if (found := SUSPECT.search(source))
+    } == {}
 
 
 @pytest.mark.parametrize(
     "text",
     [
         "import pickle",
-        "from joblib import load",
+        "    from joblib import load",
         "import torch.serialization",
-        "eval('1')",
-        "exec(text)",
-        "np.load(path, allow_pickle=True)",
+        "value = eval('1')",
         "np.load(path, allow_pickle=trusted)",
         "subprocess.run(text, shell=True)",
         "yaml.load(text)",
-        "yaml.unsafe_load(text)",
         "os.system(text)",
     ],
 )
 def test_the_search_finds(text):
-    assert suspects(ast.parse(text))
+    assert SUSPECT.search(text)
 
 
 class Bomb:
@@ -121,17 +94,15 @@ def read_any_rig(path):
     ],
 )
 def test_a_pickle_in_the_place_of_a_file(name, read, tmp_path, mark):
-    path = tmp_path / name
-    path.write_bytes(pickle.dumps(Bomb(mark)))
-    assert_refused(lambda: read(path), unchanged=tmp_path)
+    (tmp_path / name).write_bytes(pickle.dumps(Bomb(mark)))
+    assert_refused(lambda: read(tmp_path / name), unchanged=tmp_path)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_arrays_of_objects(suffix, tmp_path, mark):
-    path = tmp_path / f"rig{suffix}"
+@pytest.mark.parametrize("name", ["rig.npy", "rig.npz"])
+def test_arrays_of_objects(name, tmp_path, mark):
     objects = np.array([Bomb(mark)], object)
-    np.save(path, objects) if suffix == ".npy" else np.savez(path, K=objects)
-    assert_refused(lambda: read_any_rig(path), unchanged=tmp_path)
+    np.save(tmp_path / name, objects) if name == "rig.npy" else np.savez(tmp_path / name, K=objects)
+    assert_refused(lambda: read_any_rig(tmp_path / name), unchanged=tmp_path)
 
 
 @pytest.mark.parametrize("tag", ["python/object/apply:os.mkdir", "python/object/new:os.mkdir"])
@@ -144,26 +115,17 @@ def test_tags_of_yaml(tag, text, tmp_path, mark):
 
 @pytest.mark.parametrize("key", [b"pandas", b"ARROW:schema", b"psotrack.units", b"PANDAS_ATTRS"])
 def test_metadata_of_parquet(key, tmp_path, mark):
-    """Tracks with a pickle in the metadata of file and column are read as tracks."""
-    columns = {"frame": [0], "time_s": [0.0], "drone": ["a"], "x_m": [0.0], "y_m": [0.0], "z_m": [1.0]}
-    table = pa.table(columns)
-    path = tmp_path / "t.parquet"
-    pq.write_table(table.replace_schema_metadata({key: pickle.dumps(Bomb(mark))}), path, store_schema=False)
+    """Tracks with a pickle in the metadata of file and column are read as tracks.
+
+    Arrow had a type of columns that was stored as a pickle, and loaded with its file.
+    """
+    bomb = pickle.dumps(Bomb(mark))
+    extension = {b"ARROW:extension:name": b"arrow.py_extension_type", b"ARROW:extension:metadata": bomb}
+    columns = {"frame": [0], "time_s": [0.0], "drone": ["a"], "y_m": [0.0], "z_m": [1.0]}
+    x_m = pa.field("x_m", pa.float64(), metadata=extension)
+    table = pa.table(columns).append_column(x_m, [[0.0]]).replace_schema_metadata({key: bomb})
+    pq.write_table(table, tmp_path / "t.parquet", store_schema=key != b"ARROW:schema")
     # Refused is right, too: Arrow cannot decode such a schema.
     with contextlib.suppress(InputError):
-        assert read_trajectories(path).drones == ("a",)
-    assert not mark.exists()
-
-
-def test_an_extension_type_of_parquet(tmp_path, mark):
-    """Arrow had a type that was stored as a pickle, and loaded with its file."""
-    storage = pa.field("x_m", pa.float64(), metadata={
-        b"ARROW:extension:name": b"arrow.py_extension_type",
-        b"ARROW:extension:metadata": pickle.dumps(Bomb(mark)),
-    })  # fmt: skip
-    names = [pa.field("frame", pa.int64()), pa.field("time_s", pa.float64()), pa.field("drone", pa.string())]
-    schema = pa.schema([*names, storage, pa.field("y_m", pa.float64()), pa.field("z_m", pa.float64())])
-    values = [[0], [0.0], ["a"], [0.0], [0.0], [1.0]]
-    pq.write_table(pa.table(values, schema=schema), tmp_path / "t.parquet")
-    assert read_trajectories(tmp_path / "t.parquet").drones == ("a",)
+        assert read_trajectories(tmp_path / "t.parquet").drones == ("a",)
     assert not mark.exists()

@@ -1,4 +1,7 @@
-"""Commands and Python on the pages: every command line is understood, and the newcomer's pages run as they stand."""
+"""Links, commands and Python on the pages: commands are understood, and the newcomer's pages run as they stand.
+
+`make docs` follows the links of the pages of the documentation, and refuses those that lead nowhere.
+"""
 
 import os
 import re
@@ -16,15 +19,53 @@ from psotrack.cli import cli
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "pages"
-WRITTEN = [
-    *ROOT.glob("*.md"),
-    *PAGES.rglob("*.md"),
-    *ROOT.glob("notebooks/*.md"),
-    *ROOT.glob("experiments/**/*.md"),
-]
+#: Pages outside of the documentation, and all pages with commands.
+OUTSIDE = [*ROOT.glob("*.md"), *ROOT.glob("notebooks/*.md"), *ROOT.glob("experiments/**/*.md")]
+WRITTEN = [*OUTSIDE, *PAGES.rglob("*.md")]
 #: The pages of the newcomer's path, in their order: those after the installation.
 NEWCOMER = [PAGES / "start" / f"{name}.md" for name in ("own_cameras", "look", "evaluate", "python")]
 BLOCK = re.compile(r"^```(console|sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+LINK = re.compile(r"\]\((?!\w+:)([^()\s#]*)#?([^()\s]*)\)")
+#: Pages of which a program writes the headings.
+GENERATED = re.compile(r"\{\{ (?:cli_reference|struct_tables)")
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings of a page, as MkDocs and GitHub make them."""
+    titles = re.findall(
+        r"^#+ (.*)$", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL), re.MULTILINE
+    )
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def broken_links(page: Path) -> list[str]:
+    """Relative links of a page that lead to no file, or to no heading."""
+    found = []
+    for target, anchor in LINK.findall(CODE.sub("", page.read_text(encoding="utf-8"))):
+        path = page.parent / target if target else page
+        is_read = anchor and path.is_file() and not GENERATED.search(path.read_text(encoding="utf-8"))
+        if not path.exists() or (is_read and anchor not in anchors(path)):
+            found.append(f"{page}: {target}#{anchor}")
+    return found
+
+
+def test_every_relative_link_leads_to_a_file_and_a_heading(tmp_path: Path) -> None:
+    assert [link for page in OUTSIDE for link in broken_links(page)] == []
+    page = tmp_path / "a.md"
+    (tmp_path / "b.md").write_text("# Part one\n")
+    page.write_text(
+        "[a](b.md) [b](b.md#part-one) `[c](c.md)` [d](c.md) [e](b.md#part-two) [f](#g) [h](https://i)"
+    )
+    assert broken_links(page) == [f"{page}: {link}" for link in ("c.md#", "b.md#part-two", "#g")]
+
+
+def test_nothing_links_to_an_address_of_the_package() -> None:
+    """Found: links to a repository, a package and pages that nobody has published."""
+    command = ["git", "grep", "-nIE", "https?://[^ ]*psotrack", "--", ":!tests"]
+    found = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
+    # Git's exit code where it finds nothing.
+    assert (found.returncode, found.stdout) == (1, "")
 
 
 def blocks(page: Path) -> Iterator[tuple[str, str]]:
@@ -60,12 +101,20 @@ def inner_command(words: list[str]) -> tuple[click.Context, list[str]]:
     return context, words
 
 
-def complaint(words: list[str]) -> str | None:
-    """What is wrong with a command: an unknown name, a value that no option takes, or something that is missing."""
+def complaint(words: list[str], *, whole: bool = True) -> str | None:
+    """What is wrong with a command: an unknown name, a value that no option takes, or something that is missing.
+
+    Of commands within a sentence, which are not whole, the names and the options count.
+    """
     try:
         context, rest = inner_command(words)
+        params = context.command.get_params(context)
+        if not whole:
+            options = [word for word in rest if word.startswith("--")]
+            unknown = set(options) - {name for param in params for name in param.opts}
+            return f"{words}: {unknown}" if unknown else None
         values, _, _ = context.command.make_parser(context).parse_args(list(rest))
-        for param in context.command.get_params(context):
+        for param in params:
             given = values.get(param.name)
             if given is None and param.required and "config" not in values:
                 raise click.UsageError(f"{param.name} is missing")
@@ -84,42 +133,21 @@ def all_commands(group: click.Group, context: click.Context) -> Iterator[click.C
         yield from all_commands(command, context) if isinstance(command, click.Group) else [command]
 
 
-def test_every_command_on_a_page_is_understood() -> None:
-    found = [
-        (page, words)
-        for page in WRITTEN
-        for language, text in blocks(page)
-        if language != "python"
-        for words in commands(text)
-    ]
-    assert len(found) > 50
-    wrong = {f"{page.relative_to(ROOT)}: {said}" for page, words in found if (said := complaint(words))}
-    assert wrong == set()
+def test_every_command_on_a_page_and_in_a_help_is_understood() -> None:
+    shells = [text for page in WRITTEN for language, text in blocks(page) if language != "python"]
+    for command in all_commands(cli, click.Context(cli, info_name="psotrack")):
+        shells += re.split(r"\n *Examples?:\n", command.help or "")[1:]
+    found = [words for text in shells for words in commands(text)]
+    assert len(found) > 80
+    assert [said for words in found if (said := complaint(words))] == []
 
 
 def test_every_command_within_a_sentence_has_its_name_and_its_options() -> None:
-    wrong = set()
-    for page in WRITTEN:
-        text = BLOCK.sub("", page.read_text(encoding="utf-8"))
-        for said in re.findall(r"`psotrack ([a-z][^`]*)`", text):
-            try:
-                context, rest = inner_command(re.findall(r"[^\s\[\]|]+", said))
-                known = {name for param in context.command.get_params(context) for name in param.opts}
-                options = re.findall(r"(?<![\w-])--[a-z][\w-]*", " ".join(rest))
-                wrong |= {
-                    f"{page.relative_to(ROOT)}: psotrack {said}: {name}" for name in set(options) - known
-                }
-            except click.UsageError as error:
-                wrong.add(f"{page.relative_to(ROOT)}: psotrack {said}: {error.format_message()}")
-    assert wrong == set()
-
-
-def test_every_example_of_a_help_is_understood() -> None:
-    context = click.Context(cli, info_name="psotrack")
-    helps = [re.split(r"\n *Examples?:\n", command.help or "")[1:] for command in all_commands(cli, context)]
-    examples = [words for parts in helps for text in parts for words in commands(text)]
-    assert len(examples) > 20
-    assert [said for words in examples if (said := complaint(words))] == []
+    sentences = [BLOCK.sub("", page.read_text(encoding="utf-8")) for page in WRITTEN]
+    said = [words for text in sentences for words in re.findall(r"`psotrack ([a-z][^`]*)`", text)]
+    assert len(said) > 50
+    found = [re.findall(r"[^\s\[\]|]+", words) for words in said]
+    assert [wrong for words in found if (wrong := complaint(words, whole=False))] == []
 
 
 @pytest.mark.parametrize(
@@ -138,67 +166,57 @@ def test_a_wrong_command_is_found(line: str, what: str | None) -> None:
     assert said is None if what is None else what in str(said)
 
 
-class Shell:
-    """Runs the blocks of pages in a folder, with a cache of its own."""
+@pytest.fixture
+def shell(tmp_path: Path) -> Callable[[str, str], str]:
+    """Runs a block of a page in the folder, with a cache of its own: what it prints."""
+    environment = os.environ | {"PSOTRACK_CACHE": str(tmp_path / "users_cache"), "PYTHONPATH": str(ROOT)}
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        settings = {
-            "PSOTRACK_CACHE": str(folder / "users_cache"),
-            "PYTHONPATH": str(ROOT),
-            "PSOTRACK_PROGRESS": "none",
-        }
-        self.environment = os.environ | settings
-
-    def run(self, language: str, text: str) -> str:
-        """What a program prints; it must end well, except the doctor, which may find something."""
-        if language == "python":
-            (self.folder / "page.py").write_text(text)
-            program = [sys.executable, "page.py"]
-        else:
-            function = f'psotrack() {{ {shlex.quote(sys.executable)} -m psotrack "$@"; }}'
-            program = ["bash", "-c", f"{function}\n{text}"]
-        ran = subprocess.run(
-            program, cwd=self.folder, env=self.environment, capture_output=True, text=True, check=False
+    def shell(language: str, text: str) -> str:
+        (tmp_path / "page.py").write_text(text)
+        function = f'psotrack() {{ {shlex.quote(sys.executable)} -m psotrack "$@"; }}'
+        program = (
+            [sys.executable, "page.py"] if language == "python" else ["bash", "-c", f"{function}\n{text}"]
         )
+        ran = subprocess.run(
+            program, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        # It must end well, except the doctor, which may find something.
         finding = text.startswith("psotrack doctor") and ran.returncode == 1 and ran.stdout
         assert ran.returncode == 0 or finding, f"{text}\n{ran.stdout}{ran.stderr}"
         return ran.stdout
 
+    return shell
+
 
 @pytest.mark.nightly
-def test_the_newcomers_pages_run_as_they_stand(tmp_path: Path) -> None:
+def test_the_newcomers_pages_run_as_they_stand(shell: Callable[[str, str], str], tmp_path: Path) -> None:
     """From the simulated laboratory with its board to tracks, pictures, errors and Python."""
-    shell = Shell(tmp_path)
-    for page in NEWCOMER:
-        for language, text in blocks(page):
-            lines = [text] if language == "python" else text.splitlines()
-            for line in lines:
-                if line.startswith("psotrack simulate"):
-                    line += " --frames 50"
-                # A window and a page need somebody who looks.
-                if language == "python" or (line.startswith("psotrack ") and not is_shown(line)):
-                    shell.run(language, line)
-    for name in ("rig.toml", "recording.toml", "tracks.csv", "tracks.png", "errors.json"):
-        assert (tmp_path / "my_lab" / name).stat().st_size > 0, name
-    for name in ("flight.rrd", "report.html", "videos/mosaic.mp4"):
+    for language, text in (block for page in NEWCOMER for block in blocks(page)):
+        for line in [text] if language == "python" else text.splitlines():
+            if line.startswith("psotrack simulate"):
+                line += " --frames 50"
+            # A window and a page need somebody who looks.
+            is_shown = line.startswith("psotrack view") and "--save" not in line
+            if language == "python" or (line.startswith("psotrack ") and not is_shown):
+                shell(language, line)
+    results = [
+        f"my_lab/{name}" for name in ("rig.toml", "recording.toml", "tracks.csv", "tracks.png", "errors.json")
+    ]
+    for name in (*results, "flight.rrd", "report.html", "videos/mosaic.mp4"):
         assert (tmp_path / name).stat().st_size > 0, name
 
 
-def is_shown(line: str) -> bool:
-    return line.startswith("psotrack view") and "--save" not in line
-
-
 @pytest.mark.nightly
-def test_the_python_of_the_readme_uses_the_silhouettes_that_track_has_stored(tmp_path: Path) -> None:
-    shell = Shell(tmp_path)
+def test_the_python_of_the_readme_uses_the_silhouettes_that_track_has_stored(
+    shell: Callable[[str, str], str],
+) -> None:
     section = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Python")[2]
     for language, text in BLOCK.findall(section):
         if language == "console":
             lines = text.replace("$ ", "").replace("--no-onboard", "--no-onboard --scale 0.5 --frames 40")
-            shell.run(language, lines)
+            shell(language, lines)
         else:
-            said = shell.run(language, f"{text}    print(tracked.record['seconds'])\n")
+            said = shell(language, f"{text}    print(tracked.record['seconds'])\n")
             assert "'decode': 0.0, 'foreground': 0.0" in said
 
 
@@ -215,4 +233,4 @@ def test_the_demonstration_ends_with_a_command_that_is_understood(
     assert complaint(words) is None
     paths = [word for word in words if "/" in word]
     assert len(paths) == 2
-    assert all(os.path.exists(path) for path in paths)
+    assert all(map(os.path.exists, paths))
