@@ -1,6 +1,6 @@
 """`Trajectories`: checks of the arrays, `seen`, and the choice of frames."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pandas as pd
@@ -70,43 +70,41 @@ def test_a_known_covariance_must_be_symmetric_within_rounding():
 
 
 def test_a_data_frame_has_the_columns_and_rows_of_a_file(tmp_path):
-    position_m = np.arange(18.0).reshape(3, 2, 3)
-    position_m[1, 1] = np.nan
-    tracks = Trajectories(
-        np.arange(3), np.arange(3) / 25, ("a", "b"), position_m, num_cameras=np.full((3, 2), 4)
-    )
+    tracks = make_trajectories(num_cameras=np.full((FRAMES, DRONES), 4))
+    tracks.position_m[1, 1] = np.nan
     write_trajectories(tmp_path / "tracks.csv", tracks)
-    frame, written = tracks.to_pandas(), pd.read_csv(tmp_path / "tracks.csv")
-    pd.testing.assert_frame_equal(frame, written, check_dtype=False)
-    assert frame["num_cameras"].tolist() == [4] * 6
-    unknown = replace(tracks, num_cameras=None).to_pandas()
-    assert unknown["num_cameras"].isna().all()
+    frame = tracks.to_pandas()
+    pd.testing.assert_frame_equal(frame, pd.read_csv(tmp_path / "tracks.csv"), check_dtype=False)
+    assert make_trajectories().to_pandas()["num_cameras"].isna().all()
+
+
+def turning(sample_s, turn_deg):
+    """A drone that turns about the vertical."""
+    turns = Rotation.from_rotvec(turn_deg[:, None] * [0.0, 0.0, 1.0], degrees=True)
+    orientation_wxyz = turns.as_quat(scalar_first=True)[:, None]
+    count = len(sample_s)
+    return Trajectories(
+        np.arange(count), sample_s, ("a",), np.zeros((count, 1, 3)), orientation_wxyz=orientation_wxyz
+    )
 
 
 def test_orientations_between_samples_are_those_of_a_steady_turn():
     """Found: splines went through the entries of rotation matrices, which are no steady turn between samples."""
     sample_s, wanted_s = np.arange(6.0), np.linspace(0, 5, 21)
-
-    def turned(at_s):
-        return Rotation.from_rotvec(np.deg2rad(60) * at_s[:, None] * [0.0, 0.0, 1.0])
-
-    given = Trajectories(
-        np.arange(6),
-        sample_s,
-        ("a",),
-        np.zeros((6, 1, 3)),
-        orientation_wxyz=turned(sample_s).as_quat(scalar_first=True)[:, None],
+    found, expected = (
+        Rotation.from_quat(each.orientation_wxyz[:, 0], scalar_first=True)
+        for each in (
+            resample(turning(sample_s, 60 * sample_s), np.arange(21), wanted_s),
+            turning(wanted_s, 60 * wanted_s),
+        )
     )
-    found = resample(given, np.arange(21), wanted_s).orientation_wxyz[:, 0]
-    apart = Rotation.from_quat(found, scalar_first=True).inv() * turned(wanted_s)
-    assert np.rad2deg(apart.magnitude()).max() < 1e-6
+    # Splines of a steady turn are exact but for roundings.
+    assert np.rad2deg((found.inv() * expected).magnitude()).max() < 1e-6
 
 
 def test_orientations_are_unknown_in_gaps_and_in_half_turns():
-    turn_deg = np.array([[0.0], [5.0], [10.0], [175.0], [180.0], [185.0]])
-    turns = Rotation.from_rotvec(turn_deg * [0.0, 0.0, 1.0], degrees=True).as_quat(scalar_first=True)
     sample_s = np.array([0.0, 0.04, 0.08, 0.12, 0.16, 1.0])
-    given = Trajectories(np.arange(6), sample_s, ("a",), np.zeros((6, 1, 3)), orientation_wxyz=turns[:, None])
+    given = turning(sample_s, np.array([0.0, 5.0, 10.0, 175.0, 180.0, 185.0]))
     wanted_s = np.array([0.02, 0.08, 0.1, 0.12, 0.14, 0.5, 1.0])
     found = resample(given, np.arange(7), wanted_s).orientation_wxyz[:, 0]
     assert np.isfinite(found).all(axis=1).tolist() == [True, True, False, True, True, False, True]
