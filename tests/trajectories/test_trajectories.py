@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from psotrack.trajectories import Status, Trajectories, resample, write_trajectories
+from psotrack.trajectories import Status, Trajectories, read_trajectories, resample, write_trajectories
 
 FRAMES, DRONES = 5, 3
 
@@ -76,6 +76,10 @@ def test_a_data_frame_has_the_columns_and_rows_of_a_file(tmp_path):
     frame = tracks.to_pandas()
     pd.testing.assert_frame_equal(frame, pd.read_csv(tmp_path / "tracks.csv"), check_dtype=False)
     assert make_trajectories().to_pandas()["num_cameras"].isna().all()
+    # Where no status is known, a drone without a position is lost; other unknown quantities stay unknown.
+    read = read_trajectories(tmp_path / "tracks.csv")
+    assert np.argwhere(read.status == Status.LOST).tolist() == [[1, 1]]
+    assert set(read.quantities()) == {"position_m", "status", "num_cameras"}
 
 
 def turning(sample_s, turn_deg):

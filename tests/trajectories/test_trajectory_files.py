@@ -139,17 +139,6 @@ def test_covariances_add_six_columns_and_parquet_has_the_same_rows_with_units(tm
     assert list(ALL_COLUMNS)[:12] == HEADER.split(",")
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_unknown_quantities_are_none(tmp_path, suffix):
-    path = tmp_path / f"tracks{suffix}"
-    without_extras = replace(two_drones(), velocity_m_s=None, fitness=None, num_cameras=None, status=None)
-    write_trajectories(path, without_extras)
-    read = read_trajectories(path)
-    assert (read.velocity_m_s, read.fitness, read.num_cameras) == (None, None, None)
-    # Drones without a position are lost.
-    assert read.status.tolist() == [[0, 0], [0, 0], [0, 2]]
-
-
 def test_exact_content_of_tum_files(tmp_path):
     orientation_wxyz = Rotation.random(6, rng=np.random.default_rng(0)).as_quat(scalar_first=True)
     turning = replace(two_drones(np.float64), orientation_wxyz=orientation_wxyz.reshape(3, 2, 4))
