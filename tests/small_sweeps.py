@@ -1,8 +1,11 @@
 """Shared by the tests of sweeps: a very small sequence, whose program is compiled once, and ways to run psotrack."""
 
+import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -12,22 +15,7 @@ from helpers import make_once
 from psotrack.simulation import SimulationSettings, simulate
 from psotrack.sweeps import sweep
 
-#: All cells use one compiled program: the number of iterations is no shape.
-GRID = """
-sequences = ["S01_D2_A"]
-runs = {runs}
-[settings]
-swarm.particles = 8
-swarm.kind = "joint"
-score.kind = "hard"
-init = "truth"
-drones.size_m = [0.5, 0.5, 0.2]
-silhouettes.reduction = 2
-[grid]
-swarm.iterations = {iterations}
-"""
-
-#: The same settings for a mapping.
+#: Settings of all cells, which use one compiled program: the number of iterations is no shape.
 SETTINGS = {
     "swarm.particles": 8,
     "swarm.kind": "joint",
@@ -36,6 +24,15 @@ SETTINGS = {
     "drones.size_m": [0.5, 0.5, 0.2],
     "silhouettes.reduction": 2,
 }
+_LINES = "\n".join(f"{name} = {json.dumps(value)}" for name, value in SETTINGS.items())
+GRID = f"""
+sequences = ["S01_D2_A"]
+runs = {{runs}}
+[settings]
+{_LINES}
+[grid]
+swarm.iterations = {{iterations}}
+"""
 
 #: Compiled programs are stored per number of devices, so one device is set, with the suite's settings of XLA.
 COMPILER = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=1"}
@@ -53,18 +50,21 @@ def environment(root: Path) -> dict[str, str]:
     return os.environ | COMPILER | {"PSOTRACK_CACHE": str(root / "cache")}
 
 
-def python(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run `python WORDS` with the caches in the small sequence's folder, and wait until it has ended.
+def psotrack(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
+    """Run `psotrack WORDS` with the caches in the small sequence's folder, and wait until it has ended.
 
     No test kills a process from outside: a process that is to be killed kills itself at a place in the program.
     """
-    command = [sys.executable, *map(str, words)]
+    command = [sys.executable, "-m", "psotrack", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, env=environment(root) | more, check=False)
 
 
-def psotrack(root: Path, *words: object, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run `psotrack WORDS` with the caches in the small sequence's folder, and wait until it has ended."""
-    return python(root, "-m", "psotrack", *words, **more)
+def wait_until(happened: Callable[[], object]) -> None:
+    """Wait for what another process or thread does, so long that a slow machine fails no test."""
+    end_s = time.monotonic() + 300
+    while not happened():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
 
 
 def small_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:

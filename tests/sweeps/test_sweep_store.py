@@ -11,8 +11,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from helpers import assert_refused
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from small_sweeps import wait_until
 
 from psotrack.errors import InputError
 from psotrack.sweeps import Store, locks
@@ -58,13 +59,6 @@ def is_free(store: Store) -> bool:
         return locked
 
 
-def wait_until(happened) -> None:
-    until_s = time.monotonic() + 300
-    while not happened():
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
-
-
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     return Store(tmp_path)
@@ -78,12 +72,9 @@ def test_rows_of_more_seeds_are_added_and_a_seed_that_is_run_again_replaces_its_
     pd.testing.assert_frame_equal(store.rows(), rows(0, 1, 2))
     store.add(KEY, rows(1, error_m=5.0))
     assert store.rows()["mean_error_m"].tolist() == [0.01, 6.0, 2.01]
-
-
-def test_rows_of_some_cells_and_seeds(store: Store) -> None:
-    store.add(KEY, rows(0, 1, 2))
+    # Rows of some cells and seeds.
     store.add(OTHER, rows(0, error_m=5.0))
-    pd.testing.assert_frame_equal(store.rows({KEY: range(1, 3)}), rows(1, 2))
+    assert store.rows({KEY: range(1, 3)})["seed"].tolist() == [1, 2]
     assert store.rows({OTHER: [0], KEY: [0], "2" * 40: [0]})["mean_error_m"].tolist() == [5.0, 0.01]
 
 
@@ -106,21 +97,10 @@ def test_cells_are_sorted_by_their_settings(store: Store) -> None:
     assert store.rows()["settings.swarm.particles"].tolist() == [3, 20, 100]
 
 
-def test_a_half_written_file_is_no_result(store: Store) -> None:
-    """A runner that is killed while it writes leaves a temporary file."""
-    store.add(KEY, rows(0))
-    left = store.folder / "cells" / f".{KEY}.0a1b2c3d.partial.parquet"
-    left.write_bytes(b"PAR1")
-    assert len(store.rows()) == store.status()["finished"] == 1
-    store.tidy()
-    assert left.exists(), "another process may be writing the file"
-    os.utime(left, (0, 0))
-    store.tidy()
-    assert not left.exists()
-
-
 def test_the_folder_is_a_parquet_data_set_of_the_rows(store: Store) -> None:
-    """Also with a failure, grids that were run and a locked cell in the folder."""
+    """Also with a failure, grids that were run, a locked cell and a half-written file in the folder."""
+    assert_refused(store.status, "expected results of a sweep, found none", unchanged=store.folder)
+    assert_refused(store.rows, "no finished cell", unchanged=store.folder)
     store.add(KEY, rows(0, 1))
     store.add(OTHER, rows(2))
     store.add_failure("2" * 40, "no such camera", {"sequence": "S01", "method": "ours"})
@@ -129,6 +109,9 @@ def test_the_folder_is_a_parquet_data_set_of_the_rows(store: Store) -> None:
     # Each grid and version is noted once.
     noted = [json.loads(path.read_text()) for path in (store.folder / "_runs").iterdir()]
     assert sorted(noted, key=len) == [RUN, RUN | {"commit": "1"}]
+    # A runner that is killed while it writes leaves a temporary file.
+    left = store.folder / "cells" / f".{KEY}.0a1b2c3d.partial.parquet"
+    left.write_bytes(b"PAR1")
     with store.lock("3" * 40):
         pd.testing.assert_frame_equal(pd.read_parquet(store.folder), store.rows())
     found = {"finished": 2, "failed": 1, "claimed": 0, "errors": ["S01 ours: no such camera"], "at_work": []}
@@ -136,11 +119,11 @@ def test_the_folder_is_a_parquet_data_set_of_the_rows(store: Store) -> None:
     for _ in range(2):
         store.remove_failure("2" * 40)
         assert store.status()["failed"] == 0
-
-
-def test_missing_results_are_one_line(store: Store) -> None:
-    assert_refused(store.status, "expected results of a sweep, found none", unchanged=store.folder)
-    assert_refused(store.rows, "no finished cell", unchanged=store.folder)
+    store.tidy()
+    assert left.exists(), "another process may be writing the file"
+    os.utime(left, (0, 0))
+    store.tidy()
+    assert not left.exists()
 
 
 # --- locks
@@ -237,7 +220,6 @@ def one_cell(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return store
 
 
-@settings(max_examples=60)
 @given(data=st.data())
 def test_damage_is_an_error_that_names_the_file_and_never_another_result(
     one_cell: Store, data: st.DataObject
@@ -245,26 +227,21 @@ def test_damage_is_an_error_that_names_the_file_and_never_another_result(
     """One changed bit, or a file cut short: the same content as before, or an error of one line."""
     whole, file = one_cell.rows().to_csv(), cell_path(one_cell)
     content = file.read_bytes()
-    damaged, cut = bytearray(content), data.draw(st.booleans())
-    place = data.draw(st.integers(0, len(content) - 1))
-    if cut:
+    damaged, place = bytearray(content), data.draw(st.integers(0, len(content) - 1))
+    if data.draw(st.booleans()):
         del damaged[place:]
     else:
         damaged[place] ^= 1 << data.draw(st.integers(0, 7))
-    found: object = None
     try:
         file.write_bytes(damaged)
         found = one_cell.rows().to_csv()
     except InputError as error:
-        found = error
+        found = f"{error}"
     finally:
         file.write_bytes(content)
-    if isinstance(found, InputError):
-        assert f"{found}".startswith(f"{file}: expected ")
-        assert "run the same `psotrack sweep` again" in f"{found}"
-    else:
-        # A bit of the digest's own key.
-        assert found == whole
+    # The same rows where the bit belongs to the name of the digest.
+    error = f"{re.escape(str(file))}: expected .*; run the same `psotrack sweep` again"
+    assert found == whole or re.match(error, found)
 
 
 def test_a_damaged_cell_is_run_again(store: Store, caplog: pytest.LogCaptureFixture) -> None:
@@ -272,7 +249,6 @@ def test_a_damaged_cell_is_run_again(store: Store, caplog: pytest.LogCaptureFixt
     content = bytearray(cell_path(store).read_bytes())
     content[len(content) // 3] ^= 1
     cell_path(store).write_bytes(content)
-    assert_refused(store.rows, "run the same `psotrack sweep` again", unchanged=store.folder)
     assert store.finished_seeds(KEY) == set()
     assert f"{cell_path(store)}: damaged rows of a cell" in caplog.text
     store.add(KEY, rows(0, 1))

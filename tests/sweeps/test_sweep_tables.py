@@ -1,7 +1,4 @@
-"""Tables: figures equal those of the standard library and of pandas; layouts equal texts written by hand.
-
-And the figure of Table 5, whose lines and bars must equal the results.
-"""
+"""Tables: figures equal those of the standard library; layouts equal texts written by hand."""
 
 import csv
 import functools
@@ -9,10 +6,7 @@ import io
 import logging
 import math
 import statistics
-import sys
-from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 from helpers import assert_refused
@@ -20,9 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.sweeps import pivot, render_table
-
-sys.path.append(str(Path(__file__).parents[2] / "experiments" / "table5"))
-import _pareto
 
 #: Two methods at two swarm sizes, three runs each; errors in metres.
 ERRORS_M = {
@@ -89,7 +80,6 @@ def test_failed_runs_do_not_count_and_a_single_run_has_no_spread():
 @pytest.mark.parametrize(
     ("value", "scale", "name"),
     [
-        ("mean_error_m", 1000.0, "mean_error_mm"),
         ("track_s", 1000.0, "track_ms"),
         ("speed_m_s", 1000.0, "speed_m_s x 1000"),
         ("missed_rate", 100.0, "missed_rate x 100"),
@@ -97,21 +87,14 @@ def test_failed_runs_do_not_count_and_a_single_run_has_no_spread():
     ],
 )
 def test_the_name_of_scaled_numbers(value, scale, name):
-    table = pivot(
-        pd.DataFrame({"a": [1], value: [0.5]}), rows_by=["a"], columns_by=[], value=value, scale=scale
-    )
+    rows = pd.DataFrame({"a": [1], value: [0.5]})
+    table = pivot(rows, rows_by=["a"], columns_by=[], value=value, scale=scale)
     assert table.attrs["value"] == name
     assert table.loc[1, "mean"] == 0.5 * scale
 
 
 #: Name of the case -> what is wrong in the call, and words of the line.
 BAD = {
-    "rows": (
-        {"rows_by": ["methd"]},
-        "rows: expected the name of one column",
-        "found methd; did you mean method?",
-    ),
-    "columns": ({"columns_by": ["partcles"]}, "found partcles; did you mean settings.swarm.particles?"),
     "a typing error": ({"value": "mean_eror_m"}, "value: ", "found mean_eror_m; did you mean mean_error_m?"),
     "a beginning": ({"value": "mean"}, "value: ", "found mean; did you mean mean_error_m?"),
     "two beginnings": ({"value": "median"}, "found median; it may be median_a_m or median_b_m"),
@@ -120,15 +103,20 @@ BAD = {
     "words": ({"value": "sequence"}, "value: expected a column of numbers, found sequence"),
     "no rows": ({"rows_by": []}, "rows: expected at least one column, and each only once, found none"),
     "twice": ({"rows_by": ["particles"]}, "rows: ", "found settings.swarm.particles twice"),
+    "format": ({"format": "latx"}, "format: expected one of text, ", "found latx; did you mean latex"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_wrong_columns_are_one_line(case, tmp_path):
+def test_wrong_columns_and_formats_are_one_line(case, tmp_path):
     changes, *words = BAD[case]
     rows = results(**{"a.share": 1, "b.share": 1, "median_a_m": 1.0, "median_b_m": 1.0})
     sound = {"rows_by": ["method"], "columns_by": ["settings.swarm.particles"], "value": "mean_error_m"}
-    assert_refused(functools.partial(pivot, rows, **sound | changes), *words, unchanged=tmp_path)
+
+    def call(format="text", **names):
+        return render_table(pivot(rows, **names), format)
+
+    assert_refused(functools.partial(call, **sound | changes), *words, unchanged=tmp_path)
 
 
 def test_a_warning_names_what_a_figure_mixes_besides_draws(caplog):
@@ -219,64 +207,10 @@ def test_latex():
     assert line == r"a\textbackslash b\textasciitilde c\textasciicircum d\&\%\$\#\_\{\} & -- \\"
 
 
-def test_csv_has_all_digits(tmp_path):
+def test_csv_has_all_digits():
     table = in_mm(results({("a, b", 20): [0.1, 0.2], ("a, b", 100): [1 / 3]}))
     head, row = csv.reader(io.StringIO(render_table(table, "csv")))
     assert head == ["method", *(f"particles {n} {of}" for n in (20, 100) for of in ("mean", "std", "runs"))]
     assert row[0] == "a, b"
     assert [float(row[1]), float(row[2]), float(row[4])] == [*table.iloc[0, [0, 1, 3]]]
     assert (row[3], row[5], row[6]) == ("2", "", "1")
-    words = "format: expected one of text, ", "found latx; did you mean latex"
-    assert_refused(functools.partial(render_table, table, "latx"), *words, unchanged=tmp_path)
-
-
-# --- the figure of Table 5
-
-numbers = st.one_of(st.integers(0, 5).map(float), st.just(float("nan")))
-
-
-@given(st.lists(st.tuples(numbers, numbers), max_size=12))
-def test_no_cell_dominates_a_cell_of_the_front(cells):
-    """Compared with a search through all pairs of cells; of equal cells only the first is on the front."""
-    work, error = np.array(cells, float).reshape(-1, 2).T
-    expected = [
-        one
-        for one, cell in enumerate(cells)
-        if np.isfinite(cell).all()
-        and cell not in cells[:one]
-        and not any(other != cell and other[0] <= cell[0] and other[1] <= cell[1] for other in cells)
-    ]
-    front = _pareto.pareto_front(work, error)
-    assert sorted(front) == expected
-    assert (np.diff(work[front]) > 0).all()
-    assert (np.diff(error[front]) < 0).all()
-
-
-def test_points_front_and_published():
-    """The paper's method with 20 x 50 has the smallest work, ours with 30 x 50 the smallest error."""
-    cells = (("paper", 20, 0.05), ("paper", 50, 0.03), ("ours", 30, 0.02))
-    table = [
-        (sequence, method, particles, 50, seed, particles / 2, error_m + 0.001 * seed)
-        for sequence in ("S01", "S02")
-        for method, particles, error_m in cells
-        for seed in (0, 1)
-    ]
-    names = ("sequence", "method", "settings.swarm.particles", "settings.swarm.iterations", "seed")
-    rows = pd.DataFrame(table, columns=[*names, "track_ms_per_frame", "mean_error_m"])
-    colours = []
-    for each in (rows, rows.sort_values("seed", ascending=False).sort_values("sequence", kind="stable")):
-        first, second = _pareto.error_against_work(each, published={"S02": (0.068, 0.068)}).axes
-        assert [axes.get_title(loc="left") for axes in (first, second)] == ["S01", "S02"]
-        lines = {line.get_label(): line.get_xydata() for line in first.lines}
-        np.testing.assert_allclose(lines["Pareto front"], [(10, 50.5), (15, 20.5)])
-        assert [text.get_text() for text in first.texts] == ["20 x 50", "30 x 50"]
-        bars = {container.get_label(): container.lines[0] for container in first.containers}
-        np.testing.assert_allclose(np.sort(bars["paper"].get_xydata(), axis=0), [(10, 30.5), (25, 50.5)])
-        np.testing.assert_allclose(bars["ours"].get_xydata(), [(15, 20.5)])
-        assert [patch.get_label() for patch in second.patches] == ["published"]
-        assert not first.patches
-        labels = (first.get_xlabel(), first.get_ylabel())
-        assert labels == ("track stage (ms per frame)", "mean error (mm)")
-        colours.append({label: bar.get_color() for label, bar in bars.items()})
-    # Found: the order, and so the colours, was that of digests.
-    assert colours[0] == colours[1]
