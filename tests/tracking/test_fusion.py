@@ -85,13 +85,14 @@ def test_information_adds_up():
     assert (fused.status == Status.TRACKED).all()
 
 
-def test_the_offset_between_the_middles_has_a_standard_error():
+def test_the_offset_between_the_middles_has_a_standard_error_and_disagreement_leaves_the_swarm():
     truth_m, off_m = circular_paths(4), np.array([0.01, 0.0, 0.08])
     first = simulate_method(truth_m, SWARM_STD_M, seed=0)
     second = simulate_method(truth_m, LINES_STD_M, seed=1, offset_m=off_m)
     # In a tenth of the frames, the first drone's measurement is that of another object.
     second.measured_m[20:40, 0] += 0.2
     fused, middles = fuse(first, second)
+    np.testing.assert_array_equal(fused.measured_m[20:40, 0], first.measured_m[20:40, 0])
     # The fused point is the middle of the silhouette: the tracks do not have this offset.
     np.testing.assert_allclose((fused.measured_m - truth_m)[40:].mean(axis=(0, 1)), 0.0, atol=0.003)
     # Standard error of a median of 200 independent differences.
@@ -130,25 +131,12 @@ def test_methods_with_the_same_foreground_have_correlated_errors():
     assert np.median(np.linalg.det(correlated.measured_covariance_m2)) > smaller
 
 
-def test_a_drone_found_by_one_method_only_has_no_offset():
-    truth_m = circular_paths(3)
-    swarm = simulate_method(truth_m[:, :2], SWARM_STD_M, seed=0)
-    lines = simulate_method(truth_m[:, 1:], LINES_STD_M, seed=1)
-    fused, middles = fuse(swarm, lines)
-    assert fused.num_drones == 3
-    assert np.isfinite(middles.offset_m).all(axis=-1).tolist() == [False, True, False]
-    np.testing.assert_array_equal(np.isnan(middles.offset_m), np.isnan(middles.offset_std_m))
-    # With the same foreground, a track of lines alone is no drone.
-    assert fuse(swarm, lines, same_foreground=True)[0].num_drones == 2
-
-
-def test_where_one_method_has_no_measurement_the_other_is_used():
+def test_where_one_method_has_no_measurement_the_other_is_used_and_where_both_have_none_a_drone_is_lost():
     truth_m = circular_paths(2)
-    hidden = [(0, 50, 100)]
-    first = simulate_method(truth_m, SWARM_STD_M, seed=0, hidden=hidden)
-    second = simulate_method(truth_m, LINES_STD_M, seed=1, hidden=[(1, 120, 150)])
+    first = simulate_method(truth_m, SWARM_STD_M, seed=0, hidden=[(0, 50, 100), (0, 150, 200)])
+    second = simulate_method(truth_m, LINES_STD_M, seed=1, hidden=[(1, 120, 150), (0, 150, 200)])
     fused, middles = fuse(first, second)
-    assert (fused.status == Status.TRACKED).all()
+    assert (fused.status[:150] == Status.TRACKED).all()
     # Measurements of the lines alone are only moved by the constant offset between the middles.
     moved_m = fused.measured_m[50:100, 0] - second.measured_m[50:100, 0]
     assert np.ptp(moved_m, axis=0).max() < 1e-12
@@ -157,38 +145,27 @@ def test_where_one_method_has_no_measurement_the_other_is_used():
     np.testing.assert_allclose(diagonal_m2, LINES_STD_M**2 + middles.offset_std_m[0] ** 2, rtol=1e-9)
     np.testing.assert_array_equal(fused.measured_m[120:150, 1], first.measured_m[120:150, 1])
     assert np.linalg.norm(fused.position_m[50:100, 0] - truth_m[50:100, 0], axis=-1).max() < 0.06
-
-
-def test_a_drone_without_measurements_coasts_and_is_lost():
-    truth_m = circular_paths(1)
-    fused, _ = fuse(*both_methods(truth_m, hidden=[(0, 50, 100)]))
-    status = fused.status[:, 0]
-    frames = round(MAX_COASTING_S * FPS)
-    assert (status[50 : 50 + frames] == Status.COASTING).all()
-    assert (status[50 + frames : 100] == Status.LOST).all()
-    variance = np.trace(fused.covariance_m2[49:100, 0], axis1=1, axis2=2)
+    lost_from = 150 + round(MAX_COASTING_S * FPS)
+    assert (fused.status[150:lost_from, 0] == Status.COASTING).all()
+    assert (fused.status[lost_from:, 0] == Status.LOST).all()
+    variance = np.trace(fused.covariance_m2[149:, 0], axis1=1, axis2=2)
     assert (np.diff(variance) > 0).all()
 
 
-def test_drones_found_only_by_the_lines_come_last():
+def test_drones_found_only_by_the_lines_come_last_and_have_no_offset():
     truth_m = circular_paths(3)
     swarm = simulate_method(truth_m[:, [2, 0]], SWARM_STD_M, seed=0, arrivals=[Arrival(3, 1, again=False)])
     arrivals = [Arrival(9, 0, again=False), Arrival(20, 1, again=True)]
     lines = simulate_method(truth_m, LINES_STD_M, seed=1, arrivals=arrivals)
-    fused, _ = fuse(swarm, lines)
+    fused, middles = fuse(swarm, lines)
     np.testing.assert_allclose(fused.measured_m, truth_m[:, [2, 0, 1]], atol=0.1)
+    for offset in (middles.offset_m, middles.offset_std_m):
+        assert np.isfinite(offset).all(axis=-1).tolist() == [True, True, False]
     # The first arrival of the projection lines is ignored, because the swarm has a track of this drone.
     assert fused.arrivals == (Arrival(3, 1, again=False), Arrival(20, 2, again=True))
     assert fused.size_m.shape == (3, 3)
-    assert fused.measured_m.shape == (FRAMES, 3, 3)
-
-
-def test_where_the_methods_disagree_the_swarm_is_used():
-    truth_m = circular_paths(1)
-    swarm, lines = both_methods(truth_m)
-    lines.measured_m[80:90] += 0.5
-    fused, _ = fuse(swarm, lines)
-    np.testing.assert_array_equal(fused.measured_m[80:90], swarm.measured_m[80:90])
+    # With the same foreground, a track of lines alone is no drone.
+    assert fuse(swarm, lines, same_foreground=True)[0].num_drones == 2
 
 
 def test_methods_may_have_no_tracks():

@@ -27,10 +27,6 @@ from psotrack.tracking.swarm import (
 )
 
 
-def with_setting(name: str, value: object) -> Callable[[], object]:
-    return lambda: TrackSettings().changed({name: value})
-
-
 def causal(name: str, value: object) -> Callable[[], object]:
     return lambda: causal_settings(TrackSettings().changed({name: value}))
 
@@ -72,11 +68,6 @@ POSITION = "expected a position and a positive definite covariance where it was 
 TIMES = "time_s: expected increasing times, found repeats, steps back or no numbers"
 #: Name of the case -> how the bad input is made, words of the line.
 BAD = {
-    "negative rig error": (with_setting("errors.rig_deg", -0.1), "errors.rig_deg: expected", "found -0.1"),
-    "unknown pixel error": (with_setting("errors.pixel_px", float("nan")), "errors.pixel_px: expected"),
-    "negative rate": (with_setting("rate_hz", -5.0), "rate_hz: expected a number above 0, found -5"),
-    "rate 0": (with_setting("rate_hz", 0.0), "rate_hz: expected a number above 0, found 0"),
-    "clocks": (with_setting("clocks", "guessed"), "clocks: expected one of given, auto, found guessed"),
     "causal method": (causal("method", "fused"), "method: expected swarm without the future, found fused"),
     "causal smoothing": (causal("smooth", True), "smooth: expected False without the future, found True"),
     "causal start": (causal("init", "truth"), "init: expected auto without the future, found truth"),

@@ -67,7 +67,7 @@ def test_the_vertex_is_the_centre_of_an_ellipsoid():
     """From any start near the true centre, the vertex is closer to the centre than one pixel of the silhouettes."""
     rng = np.random.default_rng(0)
     errors_m = []
-    for _ in range(10):
+    for _ in range(6):
         truth = rng.uniform([-0.8, -0.8, 0.7], [0.8, 0.8, 1.8])[None]
         start = truth + rng.uniform(-0.02, 0.02, 3)
         errors_m.append(np.linalg.norm(found(score_view(truth), start).position_m[0] - truth[0]))

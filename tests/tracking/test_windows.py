@@ -117,22 +117,23 @@ RIG = ring_rig(5, image_size_wh=(324, 244))
 TRUTH_M = np.array([[0.3, -0.2, 1.3], [-0.6, 0.5, 0.9]])
 SIZE_M = np.array([[0.5, 0.5, 0.3], [0.6, 0.6, 0.35]])
 REACH_M = 0.15
-SMALL_M = np.array([[0.4, 0.4, 0.25]]).repeat(2, axis=0)
+#: The silhouettes are noise of odd sides.
+ODD = NOISE[:1, :122, :162].repeat(5, axis=0)
+#: In the corners of the room, where some cameras see a part of a drone, and some none.
+CORNERS_M = np.array([[2.6, -2.1, 0.1], [0.3, 2.9, 2.9]])
 
 
 @pytest.mark.parametrize("where", ["in the room", "all about"])
 def test_scores_agree_with_those_from_whole_images(where):
     """Within reach of the expected position, a window of the finest level contains all pixels that the score reads."""
-    rng = np.random.default_rng(1)
-    images = rng.integers(0, 256, (5, 122, 162)).astype(np.uint8)
-    expected_m = TRUTH_M if where == "in the room" else np.array([[2.6, -2.1, 0.1], [0.3, 2.9, 2.9]])
-    patches = cut_at(RIG, images, expected_m, SIZE_M, reach_m=REACH_M, occluding=None, reduction=REDUCTION)
+    expected_m = TRUTH_M if where == "in the room" else CORNERS_M
+    patches = cut_at(RIG, ODD, expected_m, SIZE_M, reach_m=REACH_M, occluding=None, reduction=REDUCTION)
     fine = levels(patches, REDUCTION) == 0
-    offset = rng.standard_normal((50, 2, 3))
+    offset = np.random.default_rng(1).standard_normal((50, 2, 3))
     position_m = expected_m + REACH_M * offset / np.linalg.norm(offset, axis=-1, keepdims=True)
     score, weight = evaluate(camera_scores, RIG, patches, position_m, SIZE_M)
     arrays = float32((RIG.cameras, position_m, SIZE_M))
-    whole = evaluate_whole(camera_scores, REDUCTION, images, *arrays)
+    whole = evaluate_whole(camera_scores, REDUCTION, ODD, *arrays)
     assert (np.asarray(whole[0])[:, fine] > 0.1).any(axis=0).sum() >= 3
     # Edges of boxes are good to 1e-5 px, and boxes are at least 20 px wide.
     np.testing.assert_allclose(score[:, fine], np.asarray(whole[0])[:, fine], atol=1e-5)
@@ -145,23 +146,17 @@ def test_scores_agree_with_those_from_whole_images(where):
 
 def test_a_small_image_ends_at_its_own_border():
     """In an array that larger images of other cameras need, a drone beyond a small image's border is not in view."""
-    rng = np.random.default_rng(1)
-    images = rng.integers(0, 256, (5, 122, 162)).astype(np.uint8)
-    filled_up = np.pad(images, ((0, 0), (0, 30), (0, 40)))
-    position_m = np.array([[2.6, -2.1, 0.1], [0.3, 2.9, 2.9]])
     (alone, alone_weight), (score, weight) = (
-        evaluate(
-            camera_scores,
-            RIG,
-            cut_at(RIG, each, position_m, SIZE_M, reach_m=REACH_M, occluding=None, reduction=REDUCTION),
-            position_m,
-            SIZE_M,
-        )
-        for each in (images, filled_up)
+        scores_at(images, CORNERS_M, CORNERS_M) for images in (ODD, np.pad(ODD, ((0, 0), (0, 30), (0, 40))))
     )
     assert ((alone_weight > 0) & (alone_weight < 1)).any()
     np.testing.assert_array_equal(weight, alone_weight)
     np.testing.assert_allclose(score[alone_weight > 0], alone[alone_weight > 0], atol=1e-5)
+
+
+def scores_at(images, expected_m, position_m):
+    how = {"reach_m": REACH_M, "occluding": None, "reduction": REDUCTION}
+    return evaluate(camera_scores, RIG, cut_at(RIG, images, expected_m, SIZE_M, **how), position_m, SIZE_M)
 
 
 @given(
@@ -171,11 +166,10 @@ def test_a_small_image_ends_at_its_own_border():
 )
 def test_scores_are_finite_for_any_expected_position(expected_m, reach_m, camera):
     """Expected positions inside and outside the room, behind cameras, and at a camera's centre."""
-    images = NOISE[:1, :122, :162].repeat(5, axis=0)
     somewhere = np.array(expected_m).reshape(2, 3)
     at_camera = np.stack([RIG.cameras.centre_world[camera], somewhere[1]])
     for expected in (somewhere, at_camera):
-        patches = cut_at(RIG, images, expected, SIZE_M, reach_m=reach_m, reduction=REDUCTION)
+        patches = cut_at(RIG, ODD, expected, SIZE_M, reach_m=reach_m, reduction=REDUCTION)
         for leaf in jax.tree.leaves(patches):
             assert np.isfinite(leaf).all()
         assert ((patches.clear >= 0) & (patches.clear <= 1)).all()
@@ -275,12 +269,8 @@ def test_foreground_that_neighbours_cover_is_occluded_except_in_the_core(occludi
         left_out += found[drone, camera].any()
     assert left_out >= 4
     assert kept_in_core >= 2
-
-
-def test_a_single_drone_is_not_occluded():
-    one, alone = (
-        cut_at(far_rig(1), NOISE, CLOSE_M[:1], SIZES_M[:1], occluding=occluding) for occluding in (True, None)
-    )
+    # A single drone is not occluded.
+    one, alone = (cut_at(far_rig(1), NOISE, CLOSE_M[:1], size_m[:1], occluding=each) for each in (True, None))
     np.testing.assert_array_equal(one.tables, alone.tables)
     np.testing.assert_array_equal(one.clear, 1)
     assert one.packed is alone.packed is False
