@@ -1,18 +1,16 @@
 """What the simulator refuses: each bad input is one line with the field, and nothing is written."""
 
-import functools
 import json
 import sys
 import zipfile
 
+import msgspec
 import numpy as np
 import pytest
-import trimesh
 from helpers import assert_refused
 from hypothesis import given
 from hypothesis import strategies as st
 from made_flights import CROSSINGS, NEAR, NO_VARIATION, ORBIT, POINTS, WIDE, make_scenario, write_tracks
-from msgspec import json as msgspec_json
 from msgspec.structs import replace
 from placed_drones import S02
 
@@ -54,41 +52,22 @@ SCRIPT = (Sample(0.0, Sticks(1.0, -0.5, 0.1, 0.0)), Sample(1 / 3, Sticks(turn=-1
 # runs commands, which writes the files that are needed and gives the call that must be refused.
 
 
-def text(content):
-    """A scenario file with this text."""
+def edited(old, new):
+    """The file of a preset with one change."""
 
     def make(folder, run):
-        path = folder / "mine.toml"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        path, preset = folder / "mine.toml", preset_text("S02_D4_A")
+        assert old in preset
+        path.write_text(preset.replace(old, new, 1))
         return lambda: load(path)
 
     return make
 
 
-def edited(old, new):
-    """The file of a preset with one change."""
-    preset = preset_text("S02_D4_A")
-    assert old in preset
-    return text(preset.replace(old, new, 1))
-
-
-def changed(path, value):
-    """A changed field of a scenario."""
-    return lambda folder, run: lambda: change_scenario(S02, {path: value})
-
-
 def scene(**changes):
-    """A scenario whose fields do not fit the hall or each other; `__` stands for a dot."""
+    """A scenario with changed fields; `__` stands for a dot."""
     named = {name.replace("__", "."): value for name, value in changes.items()}
     return lambda folder, run: lambda: build(change_scenario(S02, named), scale=0.1)
-
-
-def first_drone(**fields):
-    return lambda folder, run: (
-        lambda: build(
-            change_scenario(S02, {f"drones[0].{name}": value for name, value in fields.items()}), scale=0.1
-        )
-    )
 
 
 def flights(*records, num_frames=250, variation=NO_VARIATION, **limits):
@@ -117,13 +96,11 @@ def replayed(tail=(), num_frames=250, **fields):
     return make
 
 
-def tracks(text=None, **options):
+def tracks(**options):
     """A file of tracks that is no flight."""
 
     def make(folder, run):
         path = write_tracks(folder / "loop.csv", **options)
-        if text:
-            path.write_text(path.read_text().replace(*text))
         return lambda: read_recorded_flight(path)
 
     return make
@@ -137,13 +114,6 @@ def mesh(content, name="a.obj", **fields):
         return lambda: drones.model(Mesh(file=str(folder / name), **fields))
 
     return make
-
-
-def rotor(**fields):
-    """A cube of 1024 units, which the scale makes 1 m, with a rotor in the units of the file."""
-    sound = Rotor(centre_m=(0.1, 0.1, 0.0), radius_m=0.05)
-    content = trimesh.creation.box((1024, 1024, 1024)).export(file_type="obj")
-    return mesh(content, scale=1 / 1024, rotors=(sound, Rotor(**fields)))
 
 
 def flown(*samples, start_m=(0.0, 0.0, 1.0), **options):
@@ -204,7 +174,6 @@ _PLY = (
     "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
 )
 _TRIANGLE = "v 0 0 0\nv 0.3 0 0\nv 0 0.3 0\n"
-_UNREADABLE = "expected a mesh, found a file that cannot be read"
 _IN_HALL = "in the hall, x within 5 m of 0, y within 4 m, z from 0 to 4 m, found ["
 _HALF_TURNED = np.tile([1.0, 0, 0, 0], (8, 1, 1))
 _HALF_TURNED[5] = np.nan
@@ -214,55 +183,36 @@ BAD = {
     # Scenario files.
     "a negative period": (edited("period_s = 7.4", "period_s = -7.4"),
         "mine.toml: drones[0].flight.terms[0].period_s: expected a number of at least 0.001, found -7.4"),
-    "a field with a wrong letter": (edited("period_s = 7.4", "periods = 7.4"),
-        "terms[0].periods: expected one of amplitude_m, period_s, phase_deg, found periods; did you mean period_s?"),
-    "an unknown kind of flight": (edited('kind = "harmonics"', 'kind = "harmonic"'),
+    "an unknown kind of flight": (scene(**{"drones[0].flight": {"kind": "harmonic"}}),
         "drones[0].flight.kind: expected one of harmonics, orbit, crossing, formation, following, near_pass, "
         "waypoints, recording, found harmonic; did you mean harmonics?"),
-    "a place that is no number": (edited("centre_m = [0.0, 0.0, 1.85]", "centre_m = [0.0, nan, 1.85]"),
-        "drones[0].flight.centre_m[1]: expected a finite number, found nan"),
-    "no frames": (edited("num_frames = 250", "num_frames = 0"),
-        "num_frames: expected a whole number of at least 1, found 0"),
-    "more frames than a disk holds": (edited("num_frames = 250", "num_frames = 2500000000"),
+    "more frames than a disk holds": (scene(num_frames=2500000000),
         "num_frames: expected a whole number of at most 1000000, found 2500000000"),
-    "a right angle of tilt": (edited("max_tilt_deg = 20.0", "max_tilt_deg = 90"),
-        "limits.max_tilt_deg: expected a number below 90, found 90"),
-    "a name that is a path": (edited('name = "S02_D4_A"', 'name = "../up"'),
+    "a name that is a path": (scene(name="../up"),
         "name: expected a name of letters, digits, dots, dashes and underscores", 'found "../up"'),
-    "invalid TOML": (text('name = "x"\nfps = \n'), "mine.toml, line 2: expected valid TOML, found an error"),
-    "a number of 5000 digits": (text(f"fps = {'1' * 5000}"), "expected valid TOML", "exceeds the limit"),
-    "bytes": (text(b'name = "\xff"'), "mine.toml: expected UTF-8 text, found an invalid byte at offset 8"),
-    "no file": (lambda folder, run: lambda: load(folder / "none.toml"),
-        "none.toml: expected a file to read, found no such file or directory"),
     "no preset": (lambda folder, run: lambda: scenario("S99"), "scenario: expected one of S01_D2_A, ", "found S99"),
     # Changed fields.
-    "an unknown field": (changed("imaging.reflection", 0),
+    "an unknown field": (scene(imaging__reflection=0),
         "imaging.reflection: expected one of antialiasing, ", "; did you mean reflections?"),
-    "a negative share": (changed("imaging.reflections", -1),
-        "imaging.reflections: expected a number of at least 0, found -1"),
-    "a drone that is not there": (changed("drones[4].yaw_deg", 0),
+    "a drone that is not there": (scene(**{"drones[4].yaw_deg": 0}),
         "drones[4].yaw_deg: expected a field of the scenario, found none"),
     # Values beyond the limits of codecs, memory or computing time.
-    "a rate too low": (changed("fps", 0.01), "fps: expected a number of at least 0.1, found 0.01"),
-    "a rate too high": (changed("fps", 1e5), "fps: expected a number of at most 1000, found 100000.0"),
-    "a blur of the whole image": (changed("imaging.lens_blur_px", 1e6), "imaging.lens_blur_px: ", "at most 50"),
-    "a million alarms": (changed("detector.false_alarms_per_frame", 1e6), "at most 1000, found 1000000.0"),
-    "a long focal length": (changed("cameras", [CAMERA | {"focal_length_px": 1e9}]),
+    "a rate too high": (scene(fps=1e5), "fps: expected a number of at most 1000, found 100000.0"),
+    "a million alarms": (scene(detector__false_alarms_per_frame=1e6), "at most 1000, found 1000000.0"),
+    "a long focal length": (scene(cameras=[CAMERA | {"focal_length_px": 1e9}]),
         "cameras[0].focal_length_px: expected a number of at most 100000, found 1000000000.0"),
     # What does not fit the hall.
     "no hall": (scene(hall="lab"), "scenario S02_D4_A: hall: expected one of laboratory, large_hall, found lab"),
     "no rig": (scene(cameras="rig"),
         "cameras: expected one of laboratory, laboratory_corners, large_hall, or a list, found rig"),
     "a rig of a larger hall": (scene(cameras="large_hall"), f"cameras: expected a place {_IN_HALL}"),
-    "no model": (first_drone(model="quad"),
+    "no model": (scene(**{"drones[0].model": "quad"}),
         "drones[0].model: expected one of x_frame, x_frame_racer, camera_drone, hexacopter, tall_cross, or a mesh, "
         "found quad"),
     "a camera in the wall": (scene(cameras=[CAMERA, CAMERA | {"position_m": [5.0, 0.0, 2.0]}]),
         f"cameras[1].position_m: expected a place {_IN_HALL}5.0, 0.0, 2.0]"),
     "a camera in a pillar": (scene(cameras=[CAMERA | {"position_m": [-2.0, 2.9, 2.0]}]),
         "cameras[0].position_m: expected a place outside of the furniture, found [-2.0, 2.9, 2.0]"),
-    "a camera that looks at itself": (scene(cameras=[CAMERA, CAMERA | {"target_m": CAMERA["position_m"]}]),
-        "cameras[1].target_m: expected a point that is not straight above or below the camera, nor at its place"),
     "a camera that looks down": (scene(cameras=[CAMERA | {"target_m": [-4.0, -3.0, 0.0]}]),
         "cameras[0].target_m: expected a point that is not straight above"),
     "limits beyond a wall": (scene(limits__lower_m=[-6.0, -1.9, 0.7]),
@@ -282,31 +232,26 @@ BAD = {
     "an exposure on board": (scene(onboard__shutter_s=0.05), "onboard.shutter_s: expected at most 0.04 s"),
     "exposures in the wrong order": (scene(imaging__exposure=[1.2, 0.8]),
         "imaging.exposure: expected the smaller factor first"),
-    "exposures on board": (scene(onboard__exposure=[2.0, 0.5]), "onboard.exposure: expected the smaller factor first"),
     "a slow shutter": (scene(onboard__line_time_s=1e-3),
         "onboard.line_time_s: expected at most 3.7e-05 s: 1080 rows in 0.04 s"),
-    "a backward shutter": (changed("onboard.line_time_s", -1e-6), "onboard.line_time_s: expected a number of at"),
     "one coefficient on board": (scene(onboard__distortion=[0.1]), "0, 4, 5, 8, 12, 14 coefficients"),
     "three coefficients": (scene(cameras=[CAMERA | {"distortion": (0.1, 0.2, 0.3)}]),
         "cameras[0].distortion: expected 0, 4, 5, 8, 12, 14 coefficients, found 3"),
     "five coefficients of a fisheye": (scene(cameras=[CAMERA | {"distortion": (0.1,) * 5, "fisheye": True}]),
         "expected 0, 4 coefficients of a fisheye, found 5"),
-    "no mesh": (first_drone(model={"file": "none.obj"}), "none.obj: expected a mesh file, found No such file"),
-    "no recorded flight": (first_drone(flight={"kind": "recording", "file": "none.csv"}),
+    "no mesh": (scene(**{"drones[0].model": {"file": "none.obj"}}),
+        "none.obj: expected a mesh file, found No such file"),
+    "no recorded flight": (scene(**{"drones[0].flight": {"kind": "recording", "file": "none.csv"}}),
         "none.csv: expected a file or folder of tracks, found no such"),
     # Flights.
     "a leader that is not there": (flights(ORBIT, Formation(leader=3, offset_m=(0, 0, 1))),
         "scenario T: drones[1].flight.leader: expected", "1 to 2, found 3"),
-    "a drone that passes itself": (flights(NEAR),
-        "drones[0].flight.other: expected relative flights without a cycle, found drones 1 -> 1"),
     "a cycle": (flights(Formation(leader=2, offset_m=(0, 0, 1)), FollowingFlight(leader=3, delay_s=1.0), NEAR, ORBIT),
         "drones[2].flight.other: expected relative flights without a cycle, found drones 1 -> 2 -> 3 -> 1"),
     "a side that is not perpendicular": (flights(ORBIT, replace(NEAR, side=(1.0, 0.0, 1.0))),
         "flight.side: expected a direction perpendicular to swing_m, found one at 45 degrees to it; "),
     "no side": (flights(ORBIT, replace(NEAR, side=(0.0, 0.0, 0.0))),
         "drones[1].flight.side: expected a direction, found [0, 0, 0]"),
-    "the same point again": (flights(replace(POINTS, points_m=(*POINTS.points_m, (0.0, 1.0, 1.0)))),
-        "drones[0].flight.points_m[3]: expected a point that differs", "found [0.0, 1.0, 1.0] again; "),
     "the first point again": (flights(replace(POINTS, points_m=(*POINTS.points_m, (0.0, 0.0, 1.0)))),
         "drones[0].flight.points_m[0]: expected a point that differs", "found [0.0, 0.0, 1.0] again; "),
     # Limits, with value and time.
@@ -332,8 +277,6 @@ BAD = {
         "expected positions from ", "found [nan, "),
     "every variation too far": (flights(CROSSINGS[0], variation=Variation(),
         lower_m=(-2.5, -2.5, 1.0), upper_m=(2.5, 2.5, 1.0)), "; 400 of 400 variations broke this limit: "),
-    "a formation too near": (flights(ORBIT, Formation(leader=1, offset_m=(0.0, 0.0, 0.3)), min_distance_m=0.8),
-        "drones[1].flight: expected at least 0.8 m from drones[0]"),
     # The minimum distance applies between a drone that passes another one and a third drone.
     "a third drone too near": (flights(ORBIT, replace(NEAR, distance_m=0.3, swing_m=(1.5, 0.0, 0.0)),
         Formation(leader=2, offset_m=(0.0, 0.0, 0.5)), min_distance_m=0.8),
@@ -349,32 +292,25 @@ BAD = {
     "five positions": (tracks(count=5), "loop.csv: expected at least 6 positions, found 5"),
     "orientations with a gap": (tracks(orientation_wxyz=_HALF_TURNED),
         "loop.csv: expected an orientation with each position, or no orientations, found none at 0.5 s"),
-    "a word in a position": (tracks(("3.0,6.0", "3.0,six")), "loop.csv, line 5: expected a number in y_m, found 'six'"),
-    "a folder that is a file": (lambda folder, run: lambda: write_recorded_flight(
-        folder / "mine" / "loop.csv", np.arange(9.0), np.zeros((9, 3)), None), "expected a path"),
     # Meshes.
     "another suffix": (mesh("solid", "a.stl"), "a.stl: expected a mesh, .obj or .ply, found .stl; export"),
-    "an empty PLY file": (mesh("", "a.ply"), f"a.ply: {_UNREADABLE}", "; export"),
-    "a letter": (mesh("a letter to a friend\n"), "a.obj: expected faces with an area, found no faces; export"),
+    "an empty PLY file": (mesh("", "a.ply"), "a.ply: expected a mesh, found a file that cannot be read", "; export"),
     "corners without faces": (mesh(_TRIANGLE), "expected faces with an area, found no faces; export a surface"),
     "faces without area": (mesh(_TRIANGLE + "f 1 2 2\nf 3 3 3\n"), "faces with an area, found 2 without; export"),
-    "a corner that is not there": (mesh(_TRIANGLE + "f 1 2 7\n"), f"a.obj: {_UNREADABLE}"),
     "no number": (mesh("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n"), "expected numbers as vertices, found NaN"),
-    "infinity": (mesh(_PLY + "0 0 0\ninf 0 0\n0 1 0\n3 0 1 2\n", "a.ply"), "expected numbers as vertices, found NaN"),
     "vertex 7 of 3": (mesh(_PLY + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "a.ply"),
         "expected faces of its 3 vertices, found vertex 7"),
     "millimetres": (mesh("v 0 0 0\nv 300 0 0\nv 0 300 0\nf 1 2 3\n"),
         "expected a drone of 0.02 to 3 m over all, found 300 m; set scale"),
     "a far origin": (mesh("v 9 0 0\nv 9.5 0 0\nv 9 0.5 0\nf 1 2 3\n"),
         "expected the body origin in or near the drone, found ", "(9.25, 0.25, 0) m; set origin_m"),
-    "a rotor far away": (rotor(centre_m=(120.0, 80.0, 0.0), radius_m=0.05),
+    "a rotor far away": (mesh(_TRIANGLE + "f 1 2 3\n",
+        rotors=(Rotor(centre_m=(0, 0, 0), radius_m=0.05), Rotor(centre_m=(120, 80, 0), radius_m=0.05))),
         "expected rotors within 3 m of the body origin, found rotors[1] that reaches 144 m; "),
-    "a large rotor": (rotor(centre_m=(0, 0, 0), radius_m=76), "found rotors[1] that reaches 76 m; "),
     # Flights by hand.
     "a start above the ceiling": (flown(Sample(0.0, Sticks()), start_m=(0.0, 0.0, 4.0)),
         "start: expected a point from (-4.6, -3.6, 0.15) to (4.6, 3.6, 3.6), found (0, 0, 4)"),
     "a start that is no place": (flown(Sample(0.0, Sticks()), start_m=(0.0, np.nan, 1.0)), "found (0, nan, 1)"),
-    "a rate of 0": (flown(Sample(0.0, Sticks()), rate_hz=0.0), "rate: expected a number above 0, found 0"),
     "times that stand still": (flown(*(Sample(time_s, Sticks()) for time_s in (0.0, 1.0, 1.0))),
         "sticks: expected a time after 1 s, found 1 s"),
     "a flight of four samples": (flown(Sample(0.0, Sticks(1.0)), Sample(0.13, Sticks())),
@@ -384,23 +320,16 @@ BAD = {
     "times that go back": (sticks("2.5", "0.2"), "line 4, column time_s: expected a time above 0.333333, found 0.2"),
     "a time before the start": (sticks("0.0,1.0", "-1,1.0"),
         "line 2, column time_s: expected a time of 0 or more, found -1"),
-    "a column of another name": (sticks("turn", "roll"),
-        "expected a column turn, found only time_s, forward, left, up, roll"),
     "an unknown device": (device("joystick"), "device: expected gamepad, keyboard, or a file ", "found joystick"),
     # Archives of masks.
     "no camera in a name": (masks("a/b/0.png"), "expected images such as cam1i/dron1/000000.png", "found a/b/0.png"),
     "no images": (masks("masks.avi", "b.txt"), "expected images such as ", "found masks.avi, b.txt"),
-    "an empty archive": (masks(), "expected images such as ", "found no files"),
     "one frame twice": (masks("cam1i/dron1/1.png", "cam1i/dron1/01.png"),
         "one image per camera", "found cam1i/dron1/1.png and "),
-    "no archive": (lambda folder, run: lambda: read_masks(folder / "mine"),
-        "mine: expected a ZIP archive of masks, found file is not"),
     "no image": (masks("cam1i/dron1/0.png", drone=1), "cam1i/dron1/0.png: expected an image, found a file that"),
     "no such drone": (masks("cam1i/dron1/0.png", drone=3), "expected a mask of dron3 in frame 0 of cam1, found none"),
     # Sequences.
-    "frames of 0": (simulated(num_frames=0), "frames: expected 1 to 250, the length of S02_D4_A, found 0"),
     "frames beyond the flight": (simulated(num_frames=251), "frames: expected 1 to 250", "found 251"),
-    "a scale of 0": (simulated(scale=0.0), "scale: expected a number above 0, found 0"),
     "tiny images": (simulated(scale=0.01), "scale: expected images of at least 32 pixels a side, found 20 x 10"),
     "huge images": (simulated(scale=5.0),
         "scale: expected images of at most 8190 pixels a side, found 9600 x 5400"),
@@ -415,16 +344,13 @@ BAD = {
         "simulate: expected the NAME of a scenario or --scenario FILE.toml, found neither"),
     "a change without a value": (command("S01_D2_A", "--out", "x", "--set", "imaging"),
         "--set: expected FIELD=VALUE"),
-    "a change of no field": (command("S01_D2_A", "--out", "x", "--set", "imaging.noise=1"), "imaging.noise"),
     "a number of 5000 digits in a change": (command("S01_D2_A", "--out", "x", "--set", f"fps={'1' * 5000}"),
         "fps: expected a number, found "),
-    "a file that is not there": (command("--scenario", "missing.toml", "--out", "x"), "missing.toml"),
     "a file to show": (command("--scenario", "missing.toml", "--show"), "--show: expected the NAME of a scenario"),
     "changes of what is shown": (command("S01_D2_A", "--show", "--set", "fps=50"),
         "whose file is shown as it is, found fps=50"),
     "unrest of what is shown": (command("S01_D2_A", "--show", "--restless"),
         "whose file is shown as it is, found --restless"),
-    "no file of sticks": (flying("--device", "none.csv"), "none.csv: expected a file to read, found no such file"),
     "no hall to fly in": (flying("--device", "script.csv", "--hall", "barn"), "hall: expected one of laboratory"),
     "an output of another kind": (command("fly", "--device", "script.csv", "--out", "loop"),
         "--out: expected a file that ends in .csv, found loop"),
@@ -435,7 +361,6 @@ BAD = {
 def test_bad_input_is_refused_in_one_line(name, tmp_path, monkeypatch, run_psotrack, capfd):
     make, *words = BAD[name]
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine").write_text("a file where a folder should be")
     assert_refused(make(tmp_path, run_psotrack), *words, unchanged=tmp_path)
     assert capfd.readouterr() == ("", "")
 
@@ -454,21 +379,19 @@ def test_without_pyglet_the_error_says_how_to_install_it(name, tmp_path, monkeyp
 
 def field_paths(value, path=""):
     """Yield the dotted path of every field of nested dictionaries and lists."""
-    if path:
-        yield path
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from field_paths(inner, f"{path}.{key}" if path else key)
-    elif isinstance(value, list):
-        for index, inner in enumerate(value):
-            yield from field_paths(inner, f"{path}[{index}]")
+    yield path
+    items = value.items() if isinstance(value, dict) else ()
+    for name, inner in items:
+        yield from field_paths(inner, f"{path}.{name}".lstrip("."))
+    for index, inner in enumerate(value if isinstance(value, list | tuple) else ()):
+        yield from field_paths(inner, f"{path}[{index}]")
 
 
-def plain_data(recipe):
-    return msgspec_json.decode(msgspec_json.encode(recipe))
-
-
-NAMES = ("S02_D4_A", "S06_D6", "S12_D3")
+#: Name of a scenario -> paths of all its fields.
+PATHS = {
+    name: [path for path in field_paths(msgspec.to_builtins(scenario(name))) if path]
+    for name in ("S02_D4_A", "S06_D6", "S12_D3")
+}
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: (
@@ -478,23 +401,16 @@ VALUES = st.recursive(
 )
 
 
-@functools.cache
-def every_path(name):
-    return list(field_paths(plain_data(scenario(name))))
-
-
-@given(name=st.sampled_from(NAMES), data=st.data(), value=VALUES)
+@given(name=st.sampled_from(sorted(PATHS)), data=st.data(), value=VALUES)
 def test_any_value_of_a_field_is_accepted_or_refused_in_one_line(name, data, value):
-    path = data.draw(st.sampled_from(every_path(name)))
-    refusal, recipe = "", None
+    path = data.draw(st.sampled_from(PATHS[name]))
     try:
         recipe = change_scenario(scenario(name), {path: value})
     except SettingsError as error:
         refusal = str(error)
-    if recipe is not None:
-        json.dumps(plain_data(recipe), allow_nan=False)
-        return
-    # The message begins with the field, with its parent, or with a field inside the given value.
-    assert refusal.startswith(path.rpartition(".")[0])
-    assert ": expected " in refusal
-    assert not {"\n", "`", "$"} & set(refusal.replace(json.dumps(value, default=str)[:60], ""))
+        # The message begins with the field, with its parent, or with a field inside the given value.
+        assert refusal.startswith(path.rpartition(".")[0])
+        assert ": expected " in refusal
+        assert not {"\n", "`", "$"} & set(refusal.replace(json.dumps(value, default=str)[:60], ""))
+    else:
+        json.dumps(msgspec.to_builtins(recipe), allow_nan=False)
