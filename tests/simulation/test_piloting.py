@@ -3,7 +3,10 @@
 import re
 import signal
 import sys
+from collections import defaultdict
 from dataclasses import replace
+from functools import partial
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from psotrack.errors import install_command
 from psotrack.simulation import flight_space, write_recorded_flight
 from psotrack.simulation.flights import devices
 from psotrack.simulation.flights.devices import Gamepad, Panel, flying, key_sticks, open_device, poll
@@ -210,12 +214,9 @@ def test_flights_of_all_rates_are_nearly_the_same():
     there_m = np.array([np.interp(recorded.time_s, fine.time_s, x) for x in fine.position_m.T]).T
     # Sticks take effect at the next step, here 3.7 ms instead of 4 ms long: a shift of at most 3.7 ms at 3.5 m/s.
     assert np.abs(recorded.position_m - there_m).max() < 0.013
-
-
-@pytest.mark.parametrize("end_s", [1.4, 1.64, 2.28])
-def test_an_end_time_that_rounds_down_is_recorded(end_s):
-    assert int(end_s / (1 / 250)) < round(end_s * 250), "the division must round down"
-    assert record_flight((0, 1, 0, 0, 0), (end_s,)).time_s[-1] == end_s
+    for end_s in (1.4, 1.64, 2.28):
+        assert int(end_s / (1 / 250)) < round(end_s * 250), "the division must round down"
+        assert record_flight((0, 1, 0, 0, 0), (end_s,)).time_s[-1] == end_s
 
 
 def test_a_flight_ends_at_the_maximum_duration():
@@ -257,52 +258,6 @@ def test_written_sticks_are_read_back_exactly(tmp_path):
         assert tuple(samples) == SCRIPT
 
 
-class FakePanel(Panel):
-    """Fake of the pilot's window, which closes after `lasts` calls of `pump`; `on_pump` is called by each.
-
-    The fake clock, `now_s`, is advanced by `sleep` and `pump`.
-    """
-
-    def __init__(self, lasts=10**9, on_pump=lambda: None):
-        self.lasts, self.on_pump, self.now_s, self.shown = lasts, on_pump, 100.0, []
-        self.closed, self.gone = False, False
-
-    def pump(self):
-        self.lasts -= 1
-        self.now_s += 1e-4
-        self.on_pump()
-        self.closed = self.closed or self.lasts <= 0
-
-    def draw(self, time_s, state):
-        self.shown.append((time_s, state.position_m))
-
-    def close(self):
-        self.gone = True
-
-    def sleep(self, seconds):
-        assert seconds > 0
-        self.now_s += seconds
-
-    def timing(self):
-        return {"clock": lambda: self.now_s, "sleep": self.sleep}
-
-
-class FakeController:
-    """Fake of `pyglet.input.Controller` with the methods that the devices use; y is up in its events."""
-
-    def __init__(self):
-        self.handlers = {}
-
-    def push_handlers(self, **handlers):
-        self.handlers |= handlers
-
-    def move(self, stick, x, y):
-        self.handlers["on_stick_motion"](self, stick, (x, y))
-
-    def press(self, button):
-        self.handlers["on_button_press"](self, button)
-
-
 @pytest.mark.parametrize(
     ("keys", "sticks"),
     [
@@ -318,33 +273,69 @@ def test_keys_act_as_full_sticks_and_opposite_keys_cancel(keys, sticks):
     assert key_sticks(lambda name: name in keys.split()) == sticks
 
 
+def controlled(end):
+    """A game controller, and the functions that pyglet calls when a stick moves (y is up) or a button is pressed."""
+    controller = Mock()
+    device = Gamepad(controller, end)
+    handlers = controller.push_handlers.call_args.kwargs
+    return (
+        device,
+        partial(handlers["on_stick_motion"], controller),
+        partial(handlers["on_button_press"], controller),
+    )
+
+
 def test_a_controller_uses_mode_2_and_rests_within_a_dead_zone():
-    pad = FakeController()
-    device = Gamepad(pad, lambda: None)
-    pad.move("leftstick", 1.0, 0.0)
+    device, move, _ = controlled(lambda: None)
+    move("leftstick", (1.0, 0.0))
     assert device.sticks == Sticks(turn=-1.0)
-    pad.move("leftstick", 0.0, -1.0)
-    pad.move("rightstick", -1.0, 1.0)
+    move("leftstick", (0.0, -1.0))
+    move("rightstick", (-1.0, 1.0))
     assert device.sticks == Sticks(forward=1.0, left=1.0, up=-1.0)
     for raw, live in ((0.0, 0.0), (0.11, 0.0), (-0.12, 0.0), (0.56, 0.5), (-0.56, -0.5), (-1.01, -1.0)):
-        pad.move("rightstick", 0.0, raw)
+        move("rightstick", (0.0, raw))
         assert device.sticks.forward == pytest.approx(live, abs=1e-12)
 
 
+class FakePanel(Panel):
+    """Fake of the pilot's window, with a clock of its own; `on_pump` is called with the number of each reading."""
+
+    def __init__(self, on_pump):
+        self.on_pump, self.count, self.now_s, self.shown = on_pump, 0, 100.0, []
+        self.closed, self.gone = False, False
+
+    def pump(self):
+        self.count += 1
+        self.now_s += 1e-4
+        self.on_pump(self.count)
+
+    def draw(self, time_s, state):
+        self.shown.append((time_s, state.position_m))
+
+    def close(self):
+        self.gone = True
+
+    def sleep(self, seconds):
+        assert seconds > 0
+        self.now_s += seconds
+
+    def samples(self, sticks):
+        return poll(self, sticks, clock=lambda: self.now_s, sleep=self.sleep)
+
+
 def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
-    panel, pad = FakePanel(), FakeController()
+    def pilot(count):
+        moves = {30: ("leftstick", (-0.6, 1.0)), 90: ("rightstick", (0.2, 0.9)), 200: ("leftstick", (0, 0))}
+        if count in moves:
+            move(*moves[count])
+        if count == 241:
+            press("a")
+            assert not panel.closed
+            press("start")
 
-    def pilot():
-        moves = {-30: ("leftstick", -0.6, 1.0), -90: ("rightstick", 0.2, 0.9), -200: ("leftstick", 0.0, 0.0)}
-        if panel.lasts - 10**9 in moves:
-            pad.move(*moves[panel.lasts - 10**9])
-        if panel.lasts - 10**9 == -241:
-            pad.press("a")
-            pad.press("start")
-
-    panel.on_pump = pilot
-    gamepad = Gamepad(pad, panel.end)
-    samples = poll(panel, lambda: gamepad.sticks, **panel.timing())
+    panel = FakePanel(pilot)
+    gamepad, move, press = controlled(panel.end)
+    samples = panel.samples(lambda: gamepad.sticks)
     with flying(panel):
         recorded, used = fly(samples, START_M, LABORATORY, watch=panel.draw)
     assert panel.gone
@@ -361,146 +352,86 @@ def test_a_live_flight_is_sampled_at_60_hz_shown_and_reproducible():
 
 
 def test_samples_missed_in_a_stall_are_not_repeated():
-    panel = FakePanel(lasts=60)
-    panel.on_pump = lambda: panel.sleep(1.0 if panel.lasts == 50 else 1e-4)
-    samples = poll(panel, lambda: Sticks(forward=1.0), **panel.timing())
-    gaps_s = np.diff([sample.time_s for sample in samples])
+    panel = FakePanel(lambda count: panel.sleep(1.0) if count == 10 else count == 60 and panel.end())
+    gaps_s = np.diff([sample.time_s for sample in panel.samples(Sticks)])
     assert gaps_s.max() > 0.99
     # About sixty samples were missed; at most two samples come early to return to the schedule.
     assert np.count_nonzero(gaps_s < 1 / 60 - 3e-4) <= 2
 
 
 def test_ctrl_c_ends_a_flight_keeps_it_and_is_restored_afterwards():
-    panel = FakePanel()
-    panel.on_pump = lambda: panel.lasts == 10**9 - 60 and signal.raise_signal(signal.SIGINT)
+    panel = FakePanel(lambda count: count == 60 and signal.raise_signal(signal.SIGINT))
     before = signal.getsignal(signal.SIGINT)
     with flying(panel):
-        recorded, used = fly(poll(panel, lambda: Sticks(up=1.0), **panel.timing()), START_M, LABORATORY)
+        recorded, used = fly(panel.samples(lambda: Sticks(up=1.0)), START_M, LABORATORY)
     assert len(used) in (60, 61)
     assert recorded.position_m[-1, 2] > 1.3
     assert signal.getsignal(signal.SIGINT) == before
 
 
-# --- fakes of the package pyglet
+# --- the package pyglet, whose modules are fakes here, whether it is installed or not
 
 
 @pytest.fixture
-def pyglet(tmp_path, monkeypatch):
-    """Return a function that installs fake modules of pyglet, whether pyglet is installed or not."""
-    for name in [name for name in sys.modules if name.partition(".")[0] == "pyglet"]:
-        monkeypatch.delitem(sys.modules, name)
-    folder = tmp_path / "site" / "pyglet"
-    folder.mkdir(parents=True)
-    (folder / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(str(folder.parent))
+def pyglet(monkeypatch):
+    """Return a function that gives pyglet other modules, by name; None stands for one that cannot be imported."""
 
-    def install_modules(**modules):
-        for name, text in modules.items():
-            (folder / f"{name}.py").write_text(text)
+    def install(**changed):
+        modules = {name: Mock() for name in ("app", "input", "shapes", "window")} | changed
+        monkeypatch.setitem(sys.modules, "pyglet", modules.pop("pyglet", Mock()))
+        for name, module in modules.items():
+            monkeypatch.setitem(sys.modules, f"pyglet.{name}", module)
+        return modules
 
-    yield install_modules
-    for name in [name for name in sys.modules if name.partition(".")[0] == "pyglet"]:
-        del sys.modules[name]
+    return install
 
 
-@pytest.mark.parametrize(
-    ("name", "modules", "words"),
-    [
-        (
-            "gamepad",
-            {"input": "def get_controllers(): return []"},
-            "expected a game controller, found none; plug",
-        ),
-        (
-            "gamepad",
-            {"input": "import os\ndef get_controllers(): os.listdir('/no/dev')"},
-            "found none; plug one in",
-        ),
-        (
-            "keyboard",
-            {"app": "", "shapes": "", "window": "raise RuntimeError('Cannot connect to \"None\"')"},
-            "expected a display with OpenGL for the pilot's window, found Cannot connect to",
-        ),
-    ],
-)
-def test_a_missing_controller_or_display_is_one_line(name, modules, words, pyglet, tmp_path, monkeypatch):
-    # The fake modules are below the folder that must not change.
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+NO_WINDOW = RuntimeError('Cannot connect to "None"')
+#: Name of the case -> device, modules of pyglet, and words of the line.
+NOTHING_TO_FLY_WITH = {
+    "no package": ("gamepad", {"pyglet": None}, "pyglet, found it is not installed; " + install_command("control")),
+    "no controller": ("gamepad", {"input": Mock(**{"get_controllers.return_value": []})},
+        "expected a game controller, found none; plug"),
+    "no folder of devices": ("gamepad", {"input": Mock(**{"get_controllers.side_effect": OSError})},
+        "found none; plug one in"),
+    "no display": ("keyboard", {"window": None},
+        "expected a display with OpenGL for the pilot's window, found import of pyglet.window"),
+    "no window": ("keyboard", {"window": Mock(**{"Window.side_effect": NO_WINDOW})},
+        "a display with OpenGL for the pilot's window, found Cannot connect to"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", NOTHING_TO_FLY_WITH)
+def test_a_missing_package_controller_or_display_is_one_line(case, pyglet, tmp_path):
+    name, modules, words = NOTHING_TO_FLY_WITH[case]
     pyglet(**modules)
     device = open_device(name, LABORATORY)
     assert_refused(device.__enter__, f"device {name}: ", words, unchanged=tmp_path)
 
 
-FAKE_WINDOW = """
-from types import SimpleNamespace
-
-key = SimpleNamespace(W=1, S=2, A=3, D=4, UP=5, DOWN=6, LEFT=7, RIGHT=8)
-log = []
-
-class KeyStateHandler(dict):
-    def __getitem__(self, name):
-        return self.get(name, False)
-
-key.KeyStateHandler = KeyStateHandler
-
-class Window:
-    has_exit = False
-    count = 0
-
-    def __init__(self, width, height, caption, vsync):
-        assert isinstance(width, int) and isinstance(height, int)
-        log.append("open")
-
-    def push_handlers(self, keys):
-        self.keys = keys
-
-    def set_caption(self, words):
-        log.append(("caption", words))
-
-    def dispatch_events(self):
-        self.count += 1
-        self.keys[key.W] = self.count > 5
-        self.has_exit = self.count > 40
-
-    def switch_to(self): pass
-    def clear(self): log.append("clear")
-    def flip(self): log.append("flip")
-    def close(self): log.append("close")
-"""
-
-
-FAKE_SHAPES = """
-from pyglet.window import log
-
-class Shape:
-    def __init__(self, *arguments, **options):
-        self.arguments = arguments
-
-    def draw(self):
-        log.append((type(self).__name__, *self.arguments))
-"""
-
-
 def test_the_keyboard_flies_in_a_window_that_shows_keys_and_position(pyglet):
-    kinds = "".join(f"\nclass {name}(Shape): pass\n" for name in ("Box", "Line", "Circle"))
-    pyglet(
-        app="class platform_event_loop:\n    start = stop = lambda *ignored: None\n    step = lambda timeout: None\n",
-        window=FAKE_WINDOW,
-        shapes=FAKE_SHAPES + kinds,
-    )
+    modules, keys = pyglet(), defaultdict(bool)
+    modules["window"].key.KeyStateHandler.return_value = keys
+    window = modules["window"].Window.return_value
+    window.has_exit = False
+
+    def dispatch():
+        keys[modules["window"].key.W] = window.dispatch_events.call_count > 5
+        window.has_exit = window.dispatch_events.call_count > 40
+
+    window.dispatch_events.side_effect = dispatch
     with open_device("keyboard", LABORATORY) as (samples, watch):
         _, used = fly(samples, START_M, LABORATORY, watch=watch)
-    log = sys.modules["pyglet.window"].log
-    assert log[0] == "open"
-    assert log[-1] == "close"
-    assert log.count("flip") == len(used) == 41
-    title = next(entry[1] for entry in log if entry[0] == "caption")
+    assert [type(side) for side in modules["window"].Window.call_args.args] == [int, int]
+    assert window.mock_calls[-1] == call.close()
+    assert window.flip.call_count == len(used) == 41
+    title = window.set_caption.call_args_list[0].args[0]
     # The device uses the real clock, so the first time may be above 0.
     assert re.match(r"\d+\.\d s  x \+0\.00  y \+0\.00  z 1\.00 m  0\.00 m/s", title)
     assert devices.KEYBOARD_HELP in title
     assert used[0].sticks == Sticks()
     assert used[-1].sticks == Sticks(forward=1.0)
-    places = np.array([entry[1:3] for entry in log if entry[0] == "Circle"])
+    places = np.array([circle.args[:2] for circle in modules["shapes"].Circle.call_args_list])
     assert np.all(np.diff(places[:, 0]) >= 0)
     assert places[-1, 0] - places[0, 0] > 1
     assert np.ptp(places[:, 1]) == 0

@@ -1,7 +1,6 @@
 """What the simulator refuses: each bad input is one line with the field, and nothing is written."""
 
 import json
-import sys
 import zipfile
 
 import msgspec
@@ -14,7 +13,7 @@ from made_flights import CROSSINGS, NEAR, NO_VARIATION, ORBIT, POINTS, WIDE, mak
 from msgspec.structs import replace
 from placed_drones import S02
 
-from psotrack.errors import SettingsError, install_command
+from psotrack.errors import SettingsError
 from psotrack.recordings.datasets import read_masks
 from psotrack.simulation import (
     SimulationSettings,
@@ -363,15 +362,6 @@ def test_bad_input_is_refused_in_one_line(name, tmp_path, monkeypatch, run_psotr
     monkeypatch.chdir(tmp_path)
     assert_refused(make(tmp_path, run_psotrack), *words, unchanged=tmp_path)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("name", ["gamepad", "keyboard"])
-def test_without_pyglet_the_error_says_how_to_install_it(name, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyglet", None)
-    words = (
-        f"device {name}: expected the package pyglet, found it is not installed; {install_command('control')}"
-    )
-    assert_refused(device(name)(tmp_path, None), words, unchanged=tmp_path)
 
 
 # --- any value of any field
