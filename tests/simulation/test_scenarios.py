@@ -142,8 +142,11 @@ def test_the_catalogue_and_the_text_are_those_of_the_presets(run_psotrack):
         assert row["markers"] == row["onboard"] == row["name"].endswith("_A")
         assert f"{row['name']}: {drones} drones, {cameras} cameras, {frames} frames, {row['hall']}" in shown
         assert row["description"] in shown
-    speed_m_s = {row["name"][:3]: row["mean_speed_m_s"] for row in rows}
-    assert 3.4 <= speed_m_s["S08"] <= 4.0
-    assert 0.25 <= speed_m_s["S11"] <= 0.43
+    # Speeds measured on the dataset: the fast sequences, the sequences flown by hand, and all others.
+    fast = dict.fromkeys(("S08_D8", "S09_D6", "S10_D6"), (3.4, 4.0))
+    by_hand = dict.fromkeys(("S11_D4", "S12_D3", "S13_D3"), (0.25, 0.43))
+    for row in rows:
+        least, most = (fast | by_hand).get(row["name"], (0.5, 3.0))
+        assert least <= row["mean_speed_m_s"] <= most
     assert run_psotrack("simulate", "S01_D2_A", "--show").out == preset_text("S01_D2_A")
     assert tomllib.loads(preset_text("S01_D2_A"))["name"] == "S01_D2_A"
