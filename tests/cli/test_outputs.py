@@ -1,13 +1,26 @@
-"""Outputs of all commands: kept without --force, whole or as they were on a full disk, and paths that are no files."""
+"""Outputs of all commands: kept without --force, whole or as they were on a full disk, and paths that are no files.
 
+A limit on the size of files stands for a full disk. `make nightly` also mounts small file systems in memory, whose free
+pages and number of files are counted over all files together, so that a limit meets each write of a command in turn,
+those of other libraries included.
+"""
+
+import contextlib
 import json
 import os
+import re
+import shutil
 import stat
+import subprocess
 import threading
 from pathlib import Path
 
+import pandas as pd
 import pytest
-from helpers import assert_refused, content_of, files_up_to
+from helpers import assert_refused, content_of, files_up_to, make_once
+from small_sweeps import all_rows, grid_file, psotrack, small_sequence, stamps
+
+from psotrack.show.flights import find_recording
 
 #: What is there before -> words of the command that would replace it.
 OUTPUTS = {
@@ -244,3 +257,260 @@ def test_track_refuses_a_folder_before_it_tracks(run_psotrack, world, place, nam
 )
 def test_a_dash_makes_no_file_of_this_name(run_psotrack, world, place, words):
     assert_refused(lambda: run_psotrack(*words_of(words, world)), unchanged=place.parent)
+
+
+# --- small disks
+
+PAGE_BYTES = 4096
+#: Seconds of stages and of the whole run, which differ from run to run.
+TIMES = re.compile(rb'("seconds": )\{[^}]*\}|("(?:real_time_factor\w*|start_s)": )[-+.e0-9]+')
+
+
+class SmallDisk:
+    """A file system in memory, at `place`; a page is in use, because a file system without any has no limit."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.place = folder, folder / "place"
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", "size=1g", "tmpfs", str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"a file system cannot be mounted here: {done.stderr.strip()}")
+        (folder / "filler").write_bytes(bytes(PAGE_BYTES))
+        self.place.mkdir()
+        self.empty = self.used()
+
+    def remount(self, *options: str) -> None:
+        subprocess.run(["mount", "-o", ",".join(["remount", *options]), str(self.folder)], check=True)
+
+    def used(self) -> dict[str, int]:
+        """Pages and files that are in use."""
+        status = os.statvfs(self.folder)
+        pages = (status.f_blocks - status.f_bfree) * status.f_frsize // PAGE_BYTES
+        return {"pages": pages, "files": status.f_files - status.f_ffree}
+
+    def taken(self) -> dict[str, int]:
+        """Pages and files that the outputs take."""
+        return {kind: count - self.empty[kind] for kind, count in self.used().items()}
+
+    @contextlib.contextmanager
+    def room_for(self, *, pages: int = 10**5, files: int = 10**5):
+        """The outputs have this many pages and files in all until the block ends."""
+        # No limit would be 0.
+        size = max(1, self.empty["pages"] + pages) * PAGE_BYTES
+        self.remount(f"size={size}", f"nr_inodes={self.empty['files'] + files}")
+        try:
+            yield
+        finally:
+            self.remount("size=1g", "nr_inodes=1000000")
+
+
+@pytest.fixture
+def disk(tmp_path, monkeypatch):
+    """A small disk, whose folder `place` is the current folder."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(tmp_path / "cache"))
+    found = SmallDisk(tmp_path / "disk")
+    try:
+        monkeypatch.chdir(found.place)
+        yield found
+    finally:
+        os.chdir(tmp_path)
+        subprocess.run(["umount", "--lazy", str(found.folder)], check=True)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return small_sequence(tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory, root):
+    """Inputs of the commands, which no test changes."""
+
+    def make(folder):
+        done = psotrack(root, *TRACK.format(root=root).split(), "--out", folder / "tracks.csv")
+        assert done.returncode == 0, done.stderr
+        grid_file(folder, [2, 3]).rename(folder / "grid.toml")
+
+    return make_once(tmp_path_factory, "inputs_of_small_disks", make)
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """Path of every file, hidden ones included, -> bytes without times; of a folder -> None."""
+    return {name: content and TIMES.sub(rb"\1\2", content) for name, content in content_of(folder).items()}
+
+
+def rooms(taken: dict[str, int], tries: int) -> list[dict[str, int]]:
+    """Rooms of fewer pages and of fewer files than outputs take: none, one less, and some between."""
+    return [
+        {kind: room}
+        for kind, count in taken.items()
+        for room in sorted({round(i * (count - 1) / (tries - 1)) for i in range(tries)} if count else ())
+    ]
+
+
+def assert_says(result, *names: str) -> None:
+    """One line with one of the names."""
+    assert (result.code, result.err.count("\n")) == (2, 1), result
+    assert any(name in result.err for name in names), result
+
+
+#: The small sequence with little effort; the program is the one that `small_sequence` compiles.
+TRACK = (
+    "track {root}/Simulated_Data/S01_D2_A --particles 8 --iterations 2 --swarm joint --score hard --init truth "
+    "--drone-size 0.5,0.5,0.2 --reduction 2 --jobs 1 --force --quiet"
+)
+#: Outputs, which belong together -> words of the command that replaces them.
+TOGETHER = {
+    "tracks.csv tracks.ambiguity.csv tracks.json": f"{TRACK} --out tracks.csv",
+    "tracks.parquet tracks.ambiguity.csv tracks.json": f"{TRACK} --out tracks.parquet",
+    "videos.psotrack": "archive {inputs}/tracks.csv {root}/Simulated_Data/S01_D2_A --videos "
+    "--out videos.psotrack --force",
+    "markers.csv": "onboard detect {flight}/c0.avi --frames 4 --out markers.csv --force --quiet",
+}
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("outputs", TOGETHER)
+def test_outputs_of_one_run_are_whole_or_as_they_were(
+    run_psotrack, disk, root, inputs, flight, outputs, monkeypatch
+):
+    monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
+    words, names = TOGETHER[outputs].format(root=root, inputs=inputs, flight=flight).split(), outputs.split()
+    assert run_psotrack(*words).code == 0
+    whole = contents(disk.place)
+    older = dict.fromkeys(names, OLDER)
+    for room in rooms(disk.taken(), 3):
+        for name in names:
+            Path(name).write_bytes(OLDER)
+        # The older files stay beside the new ones until these are whole.
+        kept = {kind: count + disk.taken()[kind] for kind, count in room.items()}
+        with disk.room_for(**kept):
+            result = run_psotrack(*words)
+        assert_says(result, *names)
+        assert contents(disk.place) == older, room
+    assert run_psotrack(*words).code == 0
+    assert contents(disk.place) == whole
+
+
+#: Output folders of commands that go on where the last call has ended -> words of the command.
+GO_ON = {
+    "data": "simulate S01_D2_A --out data --frames 3 --scale 0.1 --jobs 1 --no-onboard --quiet",
+    "cache": "detect --silhouettes {flight} --cache cache --jobs 1 --quiet",
+    "videos": "overlay {tracks} {flight} --out videos --jobs 1 --quiet",
+}
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", GO_ON)
+def test_the_next_run_goes_on(run_psotrack, disk, world, name):
+    """The disk grows from call to call, and is never emptied."""
+    words = words_of(GO_ON[name], world)
+    assert run_psotrack(*words).code == 0
+    whole, tries = contents(disk.place), rooms(disk.taken(), 4)
+    shutil.rmtree(disk.place / name)
+    for room in tries:
+        if any(count < disk.taken()[kind] for kind, count in room.items()):
+            continue
+        with disk.room_for(**room):
+            result = run_psotrack(*words)
+        assert_says(result, name)
+        left = contents(disk.place)
+        assert not [path for path in left if ".partial" in path], room
+        finished = {path: content for path, content in left.items() if "/." not in path and content}
+        assert finished.items() <= whole.items(), room
+    assert run_psotrack(*words).code == 0
+    assert contents(disk.place) == whole
+
+
+@pytest.mark.nightly
+def test_a_sweep_goes_on(run_psotrack, disk, root, inputs, monkeypatch):
+    monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
+    words = ["sweep", inputs / "grid.toml", "--data", root, "--quiet", "--out"]
+    assert run_psotrack(*words, "whole").code == 0
+    # Until the disk takes the first cell.
+    tries = [*(("files", n) for n in range(4)), *(("pages", n) for n in range(0, 100, 3))]
+    while not stamps(Path("results")):
+        kind, more = tries.pop(0)
+        with disk.room_for(**{kind: disk.taken()[kind] + more}):
+            result = run_psotrack(*words, "results")
+        assert_says(result, "results")
+        assert not [path for path in contents(disk.place) if ".partial" in path], (kind, more)
+        # No cell has failed: the disk has.
+        assert not list(disk.place.glob("results/cells/*.error.json")), (kind, more)
+    finished = stamps(Path("results"))
+    assert len(finished) == 1
+    assert run_psotrack(*words, "results").code == 0
+    assert finished.items() < stamps(Path("results")).items(), "a finished cell is not run again"
+    expected, found = (
+        all_rows(Path(name)).set_index("settings.swarm.iterations").sort_index().filter(regex="error")
+        for name in ("whole", "results")
+    )
+    assert len(expected.columns) > 0
+    pd.testing.assert_frame_equal(found, expected)
+
+
+@pytest.mark.nightly
+def test_a_demonstration_goes_on(run_psotrack, disk, monkeypatch):
+    """Found: after a full disk, the next call refused the sequence that the first one had simulated."""
+    monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
+    monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
+    words = ["demo", "--out", "demo", "--jobs", "1", "--quiet"]
+    assert run_psotrack(*words).code == 0
+
+    def simulated():
+        return {path: path.stat().st_mtime_ns for path in Path("demo/Simulated_Data").rglob("*")}
+
+    whole, made = contents(disk.place), simulated()
+    results = [
+        Path("demo", name) for name in ("tracks.csv", "tracks.json", "tracks.ambiguity.csv", "demo.png")
+    ]
+    # Found: the demo wrote no record, so that `psotrack view demo/tracks.csv` had no cameras.
+    assert find_recording(results[0]).resolve() == Path("demo/Simulated_Data/S02_D4_A").resolve()
+    for pages in (0, 2, results[0].stat().st_size // PAGE_BYTES + 2):
+        for path in results:
+            path.unlink(missing_ok=True)
+        with disk.room_for(pages=disk.taken()["pages"] + pages):
+            result = run_psotrack(*words)
+        assert (result.code, result.err.count("\n")) == (2, 1), (pages, result)
+        assert not any(path.exists() for path in results), pages
+        assert ".partial" not in "".join(contents(disk.place)), pages
+    assert run_psotrack(*words).code == 0
+    assert contents(disk.place) == whole
+    assert simulated() == made
+    for path in results:
+        path.unlink()
+    other = run_psotrack(*words, "--seed", 2)
+    assert other.code == 2
+    assert "S02_D4_A: expected a path that does not exist yet" in other.err
+
+
+#: More commands that write: what is on the disk that cannot be written is at `out`.
+WRITING = [
+    "track {flight} --out tracks.csv --causal",
+    "track {flight} --out ../tracks.csv --log steps.log",
+    "track {flight} --out ../tracks.csv --cache cache",
+    "detect --silhouettes {flight} --cache cache",
+]
+
+
+@pytest.mark.nightly
+def test_a_disk_that_cannot_be_written_is_named_before_the_work(run_psotrack, disk, world, tmp_path):
+    """Neither silhouettes nor tracks are computed."""
+    disk.remount("ro")
+    for command in (*OUTPUTS.values(), *WRITING):
+        words = words_of(command, world)
+        assert_refused(lambda words=words: run_psotrack(*words), "can be written", unchanged=tmp_path)
+
+
+@pytest.mark.nightly
+def test_a_cache_that_cannot_be_written_is_read(run_psotrack, disk, root, tmp_path, monkeypatch):
+    shutil.copytree(root / "cache", "cache")
+    monkeypatch.setenv("PSOTRACK_CACHE", str(disk.place / "cache"))
+    disk.remount("ro")
+    words = TRACK.format(root=root).split()
+    result = run_psotrack(*words, "--out", tmp_path / "tracks.csv")
+    assert (result.code, result.err) == (0, "")
+    monkeypatch.setenv("PSOTRACK_CACHE", str(root / "cache"))
+    assert run_psotrack(*words, "--out", tmp_path / "again.csv").code == 0
+    assert (tmp_path / "tracks.csv").read_bytes() == (tmp_path / "again.csv").read_bytes()
