@@ -1,46 +1,42 @@
 """Search, score, method, background model and detector of one's own, from Python and by name on the command line."""
 
-import inspect
 import json
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_refused, make_once
+from helpers import assert_refused
+from worlds import NUM_FRAMES, two_flights
 
 import psotrack as pt
+from psotrack.foreground.detection import DetectorSettings, find_detector
 from psotrack.foreground.silhouettes import ForegroundSettings, find_background
 from psotrack.geometry import project_boxes
 from psotrack.recordings import read_frames
-from psotrack.simulation import SimulationSettings, simulate
 from psotrack.support import identify
 from psotrack.tracking.swarm import camera_weights, find_score, find_search, foreground_and_area
 from psotrack.trajectories import Status, Tracks
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[2]
-#: Few cameras, particles and frames, because compiling takes most of the time.
-CAMERAS, NUM_FRAMES = ("cam1", "cam3", "cam6", "cam8"), 8
+#: Few particles, because compiling takes most of the time.
 SETTINGS = {
     "init": "truth",
-    "drones.size_m": (0.5, 0.5, 0.2),
+    "drones.size_m": (0.3, 0.3, 0.15),
     "swarm.particles": 16,
     "swarm.iterations": 6,
     "silhouettes.reduction": 1,
     "silhouettes.working_reduction": 1,
     "silhouettes.min_blob_px": 8,
 }
-#: A drone is about 0.5 m wide: with a larger mean error the tracks do not follow the drones.
+#: A drone is 0.3 m wide: with a larger mean error the tracks do not follow the drones.
 NEAR_M = 0.1
+#: Pictures of the empty hall, whose walls are grey.
+EMPTY_HALL = (np.full((240, 320, 3), 125, np.uint8),)
 
 
 # --8<-- [start:search]
@@ -185,99 +181,6 @@ class HighDice(Dice):
         return 0.9 + 0.1 * score, weight
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    """A data folder with a sequence of two drones at a quarter of the image size."""
-
-    def make(folder):
-        settings = SimulationSettings(num_frames=NUM_FRAMES, scale=0.25, masks=False, onboard=False)
-        simulate("S01_D2_A", folder, settings, jobs=1)
-
-    return make_once(tmp_path_factory, "bring_your_own", make)
-
-
-@pytest.fixture(scope="module")
-def recording(root):
-    return pt.read_recording(root / "Simulated_Data" / "S01_D2_A", cameras=CAMERAS)
-
-
-@pytest.fixture(scope="module")
-def track(recording, tmp_path_factory):
-    """Tracks the recording with parts of one's own, in this process."""
-    cache = tmp_path_factory.mktemp("cache")
-
-    def track(settings=None, **parts):
-        return pt.track(recording, SETTINGS | (settings or {}), cache=cache, jobs=1, **parts)
-
-    return track
-
-
-@pytest.fixture(scope="module")
-def empty_hall(recording):
-    """A picture of each camera without drones, (height, width, 3) uint8: the median of the frames."""
-    return tuple(
-        np.median(list(read_frames(video)), axis=0).astype(np.uint8) for video in recording.videos.values()
-    )
-
-
-def mean_error_m(trajectories, recording):
-    return pt.evaluate(trajectories, recording.truth).mean_error_m
-
-
-def test_search_score_and_background_together_find_the_drones(track, recording):
-    parts = {"score": HighDice(), "background": MedianBackground()}
-    tracked = track(search=RandomSearch(), **parts)
-    found = tracked.trajectories
-    assert found.seen.all()
-    assert mean_error_m(found, recording) < NEAR_M
-    names = {kind: part["class"].rpartition(".")[2] for kind, part in tracked.record["parts"].items()}
-    assert names == {"search": "RandomSearch", "score": "HighDice", "background": "MedianBackground"}
-    assert tracked.record["parts"]["background"]["key"] == {"threshold": 25, "reduction": 1}
-    # The score decides the fitness.
-    assert (found.fitness >= 0.9).all()
-    assert (found.fitness < 1.0).all()
-    # The search decides the positions: without steps the best of the first positions remains. The median may take a
-    # slow drone as background; this drone coasts, and no search moves it.
-    without_steps = track(search=RandomSearch(step_m=0.0), **parts).trajectories
-    moved = (found.status == Status.TRACKED).all(axis=0)
-    assert moved.any()
-    assert (found.position_m != without_steps.position_m)[:, moved].any(axis=2).all()
-    # The first positions are so near that the vertices, which the fitness is of, are nearly the same.
-    assert found.fitness.mean() > without_steps.fitness.mean() - 1e-4
-    # A model that sees no foreground loses the drones; its silhouettes are stored under another key.
-    blind = track(search=RandomSearch(), score=HighDice(), background=MedianBackground(threshold=255))
-    assert not (blind.trajectories.status == Status.TRACKED).any()
-    keys = [set(each.record["input_keys"].values()) for each in (tracked, blind)]
-    assert not keys[0] & keys[1]
-
-
-def test_the_tracks_of_a_method_are_the_result(track):
-    tracked = track(method=Hover())
-    assert tracked.trajectories.position_m.shape == (NUM_FRAMES, 2, 3)
-    assert (tracked.trajectories.position_m == np.asarray(tracked.record["start"]["position_m"])).all()
-    assert tracked.record["parts"]["method"]["class"].endswith("Hover")
-
-
-def test_the_detector_decides_the_detections(track, recording, empty_hall):
-    """A method of one's own that reads detections is given those of the detector, and no others."""
-    tracked = track({"method": "projection-lines"}, detector=EmptyHallDetector(empty_hall))
-    assert tracked.trajectories.seen.all()
-    assert mean_error_m(tracked.trajectories, recording) < NEAR_M
-    assert tracked.record["parts"]["detector"]["key"]["threshold"] == 25
-    given = []
-
-    class Reads(Hover):
-        def __call__(self, inputs, report=None):
-            given.append(inputs.sightings)
-            return super().__call__(inputs, report)
-
-    empty = tuple(next(read_frames(video)) for video in recording.videos.values())
-    track(method=Reads(reads_detections=True), detector=EmptyHallDetector(empty))
-    # Frame 0 is the picture of the empty hall itself, so nothing differs.
-    assert np.isnan(given[0].centre_px[0]).all()
-    assert np.isfinite(given[0].centre_px[-1]).any()
-
-
 class CoarseBackground(MedianBackground):
     """Forgets the reduction that the settings ask for."""
 
@@ -285,187 +188,142 @@ class CoarseBackground(MedianBackground):
         return (mask[::2] for mask in super().foreground(learning, frames))
 
 
-def test_parts_that_do_not_fit_are_one_line(track, empty_hall, tmp_path):
-    size = "CoarseBackground: expected 8 masks of type uint8 and shape (270, 480)"
-    assert_refused(
-        lambda: track(background=CoarseBackground()), size, "found uint8 (135, 480)", unchanged=tmp_path
-    )
-    reads = "detector: expected a method that reads detections"
-    assert_refused(lambda: track(detector=EmptyHallDetector(empty_hall)), reads, unchanged=tmp_path)
-    # What silhouettes are made of, and so their key, is the class too.
-    assert MedianBackground().key == CoarseBackground().key
-    assert identify(MedianBackground()) != identify(CoarseBackground())
-
-
-#: Registers a search and a score by name; in a process of its own, because a plugin stays for the whole process.
-REGISTERED_PARTS = """
-import psotrack as pt
-from own_parts import Dice, RandomSearch
-from psotrack.errors import SettingsError
-from psotrack.tracking.swarm import tracker_settings
-
-settings = [pt.TrackSettings().changed({name: "own"}) for name in ("swarm.search", "score.kind")]
-for each in settings:
-    try:
-        tracker_settings(each)
-    except SettingsError as error:
-        print(error)
-pt.register_plugin("search", "own", lambda swarm: RandomSearch(step_m=2 * swarm.spread_m))
-pt.register_plugin("score", "own", lambda score: Dice(ring=2 * score.windows[-1]))
-print(tracker_settings(settings[0]).search)
-print(tracker_settings(settings[1]).camera_score)
-pt.register_plugin("search", "own", lambda swarm: RandomSearch(shrink=0.5))
-print(tracker_settings(settings[0]).search)
-"""
-
-
-def run_python(code, *folders):
-    """Run code in a new interpreter that imports from the folders and from this checkout."""
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-
-
-def test_a_registered_plugin_is_found_by_name(tmp_path):
-    """The plugin is made from its part of the settings, and a second call replaces the plugin."""
-    write_own_parts(tmp_path)
-    assert run_python(REGISTERED_PARTS, tmp_path).stdout.splitlines() == [
-        "swarm.search: expected one of pso, pso-kernel, found own; no installed package adds more "
-        "(entry points psotrack.searches)",
-        "score.kind: expected one of soft, hard, found own; no installed package adds more "
-        "(entry points psotrack.scores)",
-        "RandomSearch(step_m=0.1, shrink=0.8)",
-        "Dice(ring=2.0, whole_pixels=False, min_cameras=2)",
-        "RandomSearch(step_m=0.05, shrink=0.5)",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("part", "value", "face"),
-    [
-        ("search", 1, "Search, found an object of int"),
-        ("score", print, "Score, found an object of builtin_function_or_method"),
-        ("method", print, "Method, found an object of builtin_function_or_method"),
-        ("background", print, "BackgroundModel, found an object of builtin_function_or_method"),
-        ("detector", print, "Detector, found an object of builtin_function_or_method"),
-    ],
-)
-def test_parts_without_the_interface_are_one_line(recording, part, value, face, tmp_path):
-    line = f"psotrack: {part}: expected an object with the attributes of psotrack.{face}\n"
-    call = partial(pt.track, recording, SETTINGS, cache=tmp_path / "cache", **{part: value})
-    assert_refused(call, line, unchanged=tmp_path)
-
-
-def test_what_cannot_be_registered_is_one_line(tmp_path):
-    kinds = "kind: expected one of search, score, method, background, detector, found 'searches'"
-    assert_refused(lambda: pt.register_plugin("searches", "own", print), kinds, unchanged=tmp_path)
-    makes = "register_plugin(), make: expected a function, found 1"
-    assert_refused(lambda: pt.register_plugin("search", "own", 1), makes, unchanged=tmp_path)
-
-
-#: A package that adds plugins of all kinds; the classes of `OWN_PARTS` follow. Its search returns the tracker's
-#: prediction, and its detector reads pictures of the empty hall from a file beside the module.
-PACKAGE = """
-from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
-
-import cv2
-import jax
-import jax.numpy as jnp
-import numpy as np
-
-from psotrack.geometry import project_boxes
-from psotrack.tracking.swarm import camera_weights, foreground_and_area
-from psotrack.trajectories import Status, Tracks
-
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Prediction:
+    """A search that keeps the tracker's prediction."""
+
     def __call__(self, key, objective, first, region, num_iterations):
         return first[0]
+
 
 def prediction(settings):
     return Prediction()
 
+
 def high_dice(settings):
     return HighDice(ring=1.5 * settings.windows[-1])
 
+
 def hover(settings):
-    return Hover(reads_detections=settings.method != "hover")
+    return Hover()
+
 
 def median(settings):
     return MedianBackground(reduction=settings.working_reduction)
 
+
 def empty_hall(settings):
-    pictures = np.load(Path(__file__).with_name("empty_hall.npy"))
-    return EmptyHallDetector(tuple(pictures), threshold=round(100 * settings.confidence))
+    return EmptyHallDetector(EMPTY_HALL, threshold=round(100 * settings.confidence))
+
 
 def broken(settings):
     return "no detector"
-"""
-OWN_PARTS = (RandomSearch, Dice, HighDice, Hover, MedianBackground, EmptyHallDetector)
-ENTRY_POINTS = """
-[psotrack.searches]
-prediction = own_parts:prediction
-[psotrack.scores]
-high-dice = own_parts:high_dice
-[psotrack.methods]
-hover = own_parts:hover
-[psotrack.backgrounds]
-median = own_parts:median
-absent = own_parts:no_such_function
-[psotrack.detectors]
-empty-hall = own_parts:empty_hall
-broken = own_parts:broken
-"""
 
 
-def write_own_parts(folder):
-    """Write the module `own_parts`, which no entry point names yet."""
-    (folder / "own_parts.py").write_text("\n\n".join([PACKAGE, *map(inspect.getsource, OWN_PARTS)]))
+#: What an installed package adds: group of entry points -> name of the part and of the function that makes it.
+ENTRY_POINTS = {
+    "searches": {"prediction": "prediction"},
+    "scores": {"high-dice": "high_dice"},
+    "methods": {"hover": "hover"},
+    "backgrounds": {"median": "median", "absent": "no_such_function"},
+    "detectors": {"empty-hall": "empty_hall", "broken": "broken"},
+}
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """A folder with an installed package that has entry points."""
+@pytest.fixture(autouse=True)
+def installed(tmp_path_factory, monkeypatch):
+    """A package is installed whose entry points name functions of this module; nothing is registered."""
     site = tmp_path_factory.mktemp("site")
-    write_own_parts(site)
     info = site / "own_parts-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-parts\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(ENTRY_POINTS)
-    return site
+    lines = []
+    for group, parts in ENTRY_POINTS.items():
+        lines += [f"[psotrack.{group}]", *(f"{name} = {__name__}:{made}" for name, made in parts.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setattr("psotrack.support.plugins._registered", {})
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    return two_flights(tmp_path_factory) / "flight"
+
+
+@pytest.fixture(scope="module")
+def recording(flight):
+    return pt.read_recording(flight)
+
+
+@pytest.fixture(scope="module")
+def track(recording, tmp_path_factory):
+    """Tracks the recording with parts of one's own, in this process."""
+    return partial(pt.track, recording, SETTINGS, cache=tmp_path_factory.mktemp("cache"), jobs=1)
 
 
 @pytest.fixture
-def run_track(site, root, run_psotrack, monkeypatch, tmp_path):
-    """Runs `psotrack track` with the options where the package of `site` is installed: the tracks and the record."""
-    monkeypatch.syspath_prepend(site)
-    # A worker may have made this module's folder before: the package would still be imported from there.
-    sys.modules.pop("own_parts", None)
+def run_track(flight, run_psotrack, tmp_path):
+    """Runs `psotrack track` with some options: the tracks and the record."""
 
     def run_track(*options):
         out = tmp_path / "tracks.csv"
-        words = ["track", root / "Simulated_Data" / "S01_D2_A", "--out", out, "--cache", tmp_path / "cache"]
-        words += ["--init", "truth", "--drone-size", "0.5,0.5,0.2", "--cameras", ",".join(CAMERAS)]
-        ran = run_psotrack(*words, "--particles", 16, "--jobs", 1, "--force", *options)
+        words = ["track", flight, "--out", out, "--cache", tmp_path / "cache", "--jobs", 1, "--force"]
+        words += ["--init", "truth", "--drone-size", "0.3,0.3,0.15", "--particles", 16, *options]
+        ran = run_psotrack(*words)
         assert ran.code == 0, ran
         return pt.read_trajectories(out, fps=25.0), json.loads(out.with_suffix(".json").read_text())
 
     return run_track
 
 
+def mean_error_m(trajectories, recording):
+    return pt.evaluate(trajectories, recording.truth).mean_error_m
+
+
+def test_search_score_and_background_together_find_the_drones(track, recording):
+    parts = {"search": RandomSearch(), "score": HighDice()}
+    tracked = track(background=MedianBackground(), **parts)
+    assert tracked.trajectories.seen.all()
+    assert mean_error_m(tracked.trajectories, recording) < NEAR_M
+    names = {kind: part["class"].rpartition(".")[2] for kind, part in tracked.record["parts"].items()}
+    assert names == {"search": "RandomSearch", "score": "HighDice", "background": "MedianBackground"}
+    assert tracked.record["parts"]["background"]["key"] == {"threshold": 25, "reduction": 1}
+    # The score decides the fitness, which is unknown where a drone coasts.
+    fitness = tracked.trajectories.fitness[tracked.trajectories.status == Status.TRACKED]
+    assert len(fitness) > NUM_FRAMES
+    assert (fitness >= 0.9).all()
+    assert (fitness < 1.0).all()
+    # A model that sees no foreground loses the drones; its silhouettes are stored under another key.
+    blind = track(background=MedianBackground(threshold=255), **parts)
+    assert not (blind.trajectories.status == Status.TRACKED).any()
+    assert not {*tracked.record["input_keys"].values()} & {*blind.record["input_keys"].values()}
+
+
+def test_a_method_is_given_the_boxes_of_the_detector_and_its_tracks_are_the_result(track, recording):
+    given = []
+
+    class Reads(Hover):
+        def __call__(self, inputs, report=None):
+            given.append(inputs.sightings)
+            return super().__call__(inputs, report)
+
+    first = tuple(next(read_frames(video)) for video in recording.videos.values())
+    tracked = track(method=Reads(reads_detections=True), detector=EmptyHallDetector(first))
+    start_m = np.asarray(tracked.record["start"]["position_m"])
+    assert (tracked.trajectories.position_m == np.broadcast_to(start_m, (NUM_FRAMES, 2, 3))).all()
+    assert tracked.record["parts"]["method"]["class"].endswith("Reads")
+    # Frame 0 is the picture of the empty hall itself, so nothing differs.
+    assert np.isnan(given[0].centre_px[0]).all()
+    assert np.isfinite(given[0].centre_px[-1]).any()
+
+
 def test_search_background_and_score_by_entry_points(run_track):
     tracks, record = run_track("--search", "prediction", "--background", "median", "--score", "hard")
     assert record["settings"]["swarm"]["search"] == "prediction"
-    assert record["parts"] == {
-        "background": {"class": "own_parts.MedianBackground", "key": {"threshold": 25, "reduction": 1}}
-    }
+    # Small images are not reduced.
+    key = {"threshold": 25, "reduction": 1}
+    assert record["parts"] == {"background": {"class": f"{__name__}.MedianBackground", "key": key}}
     # The measured position is always the predicted one, so the drones fly on with the velocity of frame 0.
     steps_m = np.diff(tracks.position_m, axis=0)
     assert np.abs(steps_m).max() > 0.01
@@ -477,55 +335,73 @@ def test_search_background_and_score_by_entry_points(run_track):
     assert (tracks.fitness < 1.0).all()
 
 
-def test_a_method_and_a_detector_by_entry_points(run_track, site, recording, empty_hall):
+def test_a_method_and_a_detector_by_entry_points(run_track, recording):
     """No method of the package writes such tracks of flying drones: they stay where they are at frame 0."""
     tracks, record = run_track("--method", "hover")
     assert record["settings"]["method"] == "hover"
     start_m = np.asarray(record["start"]["position_m"])
     np.testing.assert_allclose(tracks.position_m, np.broadcast_to(start_m, (NUM_FRAMES, 2, 3)), atol=1e-4)
-    np.save(site / "empty_hall.npy", np.stack(empty_hall))
     tracks, record = run_track("--method", "projection-lines", "--detector", "empty-hall")
     detector = record["parts"]["detector"]
-    assert detector["class"] == "own_parts.EmptyHallDetector"
+    assert detector["class"] == f"{__name__}.EmptyHallDetector"
     # The threshold is made from the smallest confidence of the detector's settings, 0.25.
     assert detector["key"]["threshold"] == 25
     assert tracks.seen.all()
     assert mean_error_m(tracks, recording) < NEAR_M
 
 
-#: What asks for a plugin, or the name of a detector for a command, and how the line goes on.
-NOT_THERE = [
+def test_a_registered_plugin_is_made_from_its_part_of_the_settings_and_replaced():
+    pt.register_plugin("search", "own", lambda swarm: RandomSearch(step_m=2 * swarm.spread_m))
+    pt.register_plugin("score", "own", lambda score: Dice(ring=2 * score.windows[-1]))
+    assert find_search(pt.SwarmSettings(search="own")) == RandomSearch(step_m=0.1)
+    assert find_score(pt.ScoreSettings(kind="own")) == Dice(ring=2.0)
+    pt.register_plugin("search", "own", lambda swarm: RandomSearch(shrink=0.5))
+    assert find_search(pt.SwarmSettings(search="own")) == RandomSearch(shrink=0.5)
+
+
+def test_what_silhouettes_are_made_of_is_the_class_too():
+    assert MedianBackground().key == CoarseBackground().key
+    assert identify(MedianBackground()) != identify(CoarseBackground())
+
+
+#: What an object that is no part lacks.
+FACE = "expected an object with the attributes of psotrack."
+#: The call, with a function that tracks, and what the line says.
+BAD = [
+    (lambda track: track(search=1), f"search: {FACE}Search, found an object of int"),
+    (lambda track: track(score=print), f"score: {FACE}Score, found an object of builtin_function"),
+    (lambda track: track(method=print), f"method: {FACE}Method, found an object of builtin_function"),
+    (lambda track: track(background=print), f"background: {FACE}BackgroundModel, found an object of builtin"),
+    (lambda track: track(detector=print), f"detector: {FACE}Detector, found an object of builtin_function"),
     (
-        lambda: find_search(pt.SwarmSettings(search="predict")),
+        lambda track: find_detector("broken", DetectorSettings()),
+        f"detector broken: {FACE}Detector, found an ",
+    ),
+    (
+        lambda track: track(background=CoarseBackground()),
+        "expected 14 masks of type uint8 and shape (240, 320)",
+    ),
+    (lambda track: track(detector=EmptyHallDetector(EMPTY_HALL)), "expected a method that reads detections"),
+    (
+        lambda track: pt.register_plugin("searches", "own", print),
+        "kind: expected one of search, score, method, background, detector, found 'searches'",
+    ),
+    (lambda track: pt.register_plugin("search", "own", 1), "make: expected a function, found 1"),
+    (
+        lambda track: find_search(pt.SwarmSettings(search="predict")),
         "swarm.search: expected one of pso, pso-kernel, prediction, found predict; did you mean prediction?",
     ),
     (
-        lambda: find_score(pt.ScoreSettings(kind="iou")),
-        "score.kind: expected one of soft, hard, high-dice, found iou",
+        lambda track: find_detector("yolo", DetectorSettings()),
+        "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo",
     ),
     (
-        lambda: find_background("mean", ForegroundSettings()),
-        "background: expected one of mog2, living, absent, median, found mean",
-    ),
-    (
-        lambda: find_background("absent", ForegroundSettings()),
-        "background absent: expected own_parts:no_such_function to be importable, found module 'own_parts' has no "
-        "attribute 'no_such_function'",
-    ),
-    ("yolo", "detector: expected one of MODEL.onnx (a file), broken, empty-hall, found yolo"),
-    (
-        "broken",
-        "detector broken: expected an object with the attributes of psotrack.Detector, found an object of str",
+        lambda track: find_background("absent", ForegroundSettings()),
+        "background absent: expected test_bring_your_own:no_such_function to be importable, found module ",
     ),
 ]
 
 
-@pytest.mark.parametrize(("find", "message"), NOT_THERE)
-def test_the_message_names_what_is_installed(site, root, run_psotrack, monkeypatch, tmp_path, find, message):
-    monkeypatch.syspath_prepend(site)
-    sequence = root / "Simulated_Data" / "S01_D2_A"
-
-    def detect():
-        return run_psotrack("detect", sequence, "--detector", find, "--out", tmp_path / "boxes")
-
-    assert_refused(detect if isinstance(find, str) else find, f"psotrack: {message}\n", unchanged=tmp_path)
+@pytest.mark.parametrize(("call", "line"), BAD)
+def test_parts_that_do_not_fit_are_one_line(track, call, line, tmp_path):
+    assert_refused(partial(call, track), line, unchanged=tmp_path)

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import click
@@ -16,6 +17,7 @@ import pytest
 from helpers import Output
 
 from psotrack.cli import cli
+from psotrack.settings import TrackSettings
 
 ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "pages"
@@ -227,6 +229,8 @@ def test_the_demonstration_ends_with_a_command_that_is_understood(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("psotrack.cli.demo.NUM_FRAMES", 6)
     monkeypatch.setattr("psotrack.cli.demo.SCALE", 0.25)
+    # The swarm compiles for longer than it tracks so few frames.
+    monkeypatch.setattr("psotrack.settings.TrackSettings", partial(TrackSettings, method="projection-lines"))
     code, out, _ = run_psotrack("demo", "--out", "demo", "--jobs", "1")
     assert code == 0
     words = shlex.split(out.splitlines()[-1].removeprefix("next: "))[1:]
