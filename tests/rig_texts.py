@@ -13,56 +13,6 @@ K = np.array([[900.0, 0.0, 650.5], [0.0, 905.0, 350.25], [0.0, 0.0, 1.0]])
 SIZE_WH = (1280, 720)
 RADTAN = (-0.12, 0.03, 0.0008, -0.0005)
 
-#: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
-ANIPOSE = """[cam_0]
-name = "A"
-size = [ 1280, 720,]
-matrix = [ [ 822.4, 0.0, 639.5,], [ 0.0, 822.4, 359.5,], [ 0.0, 0.0, 1.0,],]
-distortions = [ -0.06, 0.0, 0.0, 0.0, 0.0,]
-rotation = [ 0.5, 0.25, -0.125,]
-translation = [ -94.5, 8.25, 500.0,]
-
-[cam_1]
-name = "B"
-size = [ 1280, 720,]
-matrix = [ [ 851.9, 0.0, 639.5,], [ 0.0, 851.9, 359.5,], [ 0.0, 0.0, 1.0,],]
-distortions = [ -0.1, 0.0, 0.0, 0.0, 0.0,]
-rotation = [ 0.0, -0.5, 0.0,]
-translation = [ 318.0, 10.0, 400.0,]
-
-[metadata]
-adjusted = false
-error = 0.26
-"""
-
-#: File as caliscope writes it: numbers as names, and ignored cameras. Older files have rotation matrices, as camera 0.
-CALISCOPE = """[cameras.0]
-cam_id = 0
-size = [1280, 720]
-rotation_count = 0
-error = 0.541
-matrix = [[903.5, 0.0, 618.25], [0.0, 907.75, 394.5], [0.0, 0.0, 1.0]]
-distortions = [-0.33, 0.046, -0.0043, 0.0041, 0.066]
-translation = [0.125, -0.25, 0.5]
-rotation = [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
-exposure = -8
-fisheye = false
-
-[cameras.1]
-port = 1
-ignore = true
-size = [640, 480]
-
-[cameras.2]
-port = 2
-size = [640, 480]
-error = "null"
-matrix = [[650.0, 0.0, 320.0], [0.0, 654.0, 240.0], [0.0, 0.0, 1.0]]
-distortions = [0.18, -0.25, 0.003, 0.002, 0.12]
-translation = "null"
-rotation = "null"
-"""
-
 #: File as a user writes it by hand.
 RIG_TOML = """[cameras.left]
 size = [1920, 1080]
@@ -70,23 +20,6 @@ K = [[1160.2, 0, 961.0], [0, 1160.9, 541.2], [0, 0, 1]]
 distortion = [-0.28, 0.09, 0, 0, 0.01]
 rvec = [1.2, -0.4, 0.3]
 tvec = [0.1, 0.2, 5.0]
-"""
-
-#: File as OpenCV's sample program for calibration writes it.
-SAMPLE = """%YAML:1.0
----
-image_width: 640
-image_height: 480
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 6.5e+02, 0., 320., 0., 6.5e+02, 240., 0., 0., 1. ]
-distortion_coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: [ 0.25, -0.5, 0., 0., 0.125 ]
 """
 
 
@@ -117,15 +50,36 @@ def matrix(name, values):
     )
 
 
-def pose2sim_file(path):
+def camera_tables(tables, more="", *, rodrigues=True):
+    """TOML with a table for each camera, with `more` in each, in which {index} and {table} are those of the camera."""
     blocks = []
-    for name, (R, t) in zip(("cam01", "int_cam02_img"), poses(), strict=True):
+    for index, (table, (R, t)) in enumerate(zip(tables, poses(), strict=True)):
+        turn = cv2.Rodrigues(R)[0].ravel() if rodrigues else R
         blocks.append(
-            f'[{name}]\nname = "{name}"\nsize = [ 1280.0, 720.0]\nmatrix = {lists(K)}\n'
-            f"distortions = {lists(RADTAN)}\nrotation = {lists(cv2.Rodrigues(R)[0].ravel())}\n"
-            f"translation = {lists(t)}\nfisheye = false\n"
+            f"[{table}]\n{more.format(index=index, table=table)}size = [ 1280, 720,]\nmatrix = {lists(K)}\n"
+            f"distortions = {lists(RADTAN)}\nrotation = {lists(turn)}\ntranslation = {lists(t)}\n"
         )
-    path.write_text("\n".join(blocks) + "\n[metadata]\nadjusted = false\nerror = 0.0\n")
+    return "\n".join(blocks)
+
+
+def pose2sim_file(path):
+    tables = camera_tables(("cam01", "int_cam02_img"), 'name = "{table}"\nfisheye = false\n')
+    path.write_text(tables.replace("[ 1280, 720,]", "[ 1280.0, 720.0]") + METADATA)
+
+
+#: The last table of anipose's files.
+METADATA = "\n[metadata]\nadjusted = false\nerror = 0.26\n"
+#: File as anipose 1.1 writes it: tables cam_0 ..., lengths in the board's unit.
+ANIPOSE = camera_tables(("cam_0", "cam_1"), 'name = "c{index}"\n') + METADATA
+#: Files as caliscope writes them: numbers as names; in older files, rotation matrices and tables of other content.
+CALISCOPE = camera_tables(
+    ("cameras.0", "cameras.1"), "cam_id = {index}\nrotation_count = 0\nerror = 0.541\nexposure = -8\n"
+)
+OLDER_CALISCOPE = (
+    "CreationDate = 2023-05-06T11:12:27\ncamera_count = 0\n"
+    + camera_tables(("cam_0", "cam_1"), "cam_id = {index}\nrotation_count = 0\n", rodrigues=False)
+    + '[charuco]\ncolumns = 4\nunits = "inch"\n'
+)
 
 
 def storage_files(folder):
@@ -152,6 +106,12 @@ def json_file(folder):
         for R, t in poses()
     ]
     (folder / "rig.json").write_text(json.dumps(dict(zip(("6-0", "left"), fields, strict=True)), indent=1))
+
+
+def sample_text():
+    """A lens as OpenCV's sample program for calibration writes it."""
+    size = "image_width: 1280\nimage_height: 720\n"
+    return f"%YAML:1.0\n---\n{size}" + matrix("camera_matrix", K) + matrix("distortion_coefficients", RADTAN)
 
 
 def ros_text(model="plumb_bob"):
@@ -231,11 +191,11 @@ def kalibr_file(path, *, distortion_model="radtan", camera_model="pinhole", chai
     path.write_text(text)
 
 
-def dlt_columns(*, upwards, skew=0.0):
+def dlt_columns(placed=None, *, upwards=False, skew=0.0):
     """11 coefficients per camera."""
     columns = []
     flip = np.array([[1.0, 0, 0], [0, -1, SIZE_WH[1]], [0, 0, 1]]) if upwards else np.eye(3)
-    for R, t in poses():
+    for R, t in placed or poses():
         P = flip @ with_skew(skew) @ np.column_stack([R, t])
         columns.append((P / P[2, 3]).ravel()[:11])
     return np.array(columns)
