@@ -31,11 +31,14 @@ class Sheet:
     axis: float = 0.0
     bow: float = 0.0
 
+    @property
+    def R(self):
+        about = np.array([np.cos(self.axis), np.sin(self.axis), 0]) * self.tilt
+        return cv2.Rodrigues(about)[0] @ cv2.Rodrigues(np.array([0, 0, self.turn]))[0]
+
     def pixels(self, u, v):
         """Pixels of places on the sheet; the marker is from -0.5 to 0.5 along u and v."""
-        about = np.array([np.cos(self.axis), np.sin(self.axis), 0]) * self.tilt
-        R = cv2.Rodrigues(about)[0] @ cv2.Rodrigues(np.array([0, 0, self.turn]))[0]
-        points = np.stack([u, v, 4 * self.bow * (0.8 * u + 0.6 * v) ** 2], axis=-1) @ R.T
+        points = np.stack([u, v, 4 * self.bow * (0.8 * u + 0.6 * v) ** 2], axis=-1) @ self.R.T
         return np.array(self.centre) + self.side_px * points[..., :2] * (FAR / (FAR + points[..., 2:]))
 
     @property
@@ -44,10 +47,15 @@ class Sheet:
 
 
 def _places(sheet, x, y):
-    """Places on the sheet that pixels show, by Newton's method."""
-    off = np.stack([x, y], axis=-1) - np.array(sheet.centre)
+    """Places on the sheet that pixels show: by a homography for a flat sheet, by Newton's method for a bent one."""
+    off_x, off_y = x - sheet.centre[0], y - sheet.centre[1]
+    if not sheet.bow:
+        to_pixels = np.array([[sheet.side_px * FAR], [sheet.side_px * FAR], [1]]) * sheet.R
+        to_pixels[:, 2] = 0, 0, FAR
+        u, v, scale = (row[0] * off_x + row[1] * off_y + row[2] for row in np.linalg.inv(to_pixels))
+        return u / scale, v / scale
     cos, sin = np.cos(sheet.turn) / sheet.side_px, np.sin(sheet.turn) / sheet.side_px
-    u, v = off[..., 0] * cos + off[..., 1] * sin, off[..., 1] * cos - off[..., 0] * sin
+    u, v = off_x * cos + off_y * sin, off_y * cos - off_x * sin
     small = 1e-4
     for _ in range(5):
         at = sheet.pixels(u, v)
