@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -133,17 +132,6 @@ def complete(monkeypatch: pytest.MonkeyPatch, run_psotrack: Run) -> Run:
     return call
 
 
-@pytest.mark.parametrize("shell", SHELLS)
-def test_the_script_that_switches_completion_on(complete: Run, shell: str) -> None:
-    if shell == "bash" and shutil.which("bash") is None:
-        pytest.skip("click runs bash to find its version")
-    result = complete(f"{shell}_source")
-    assert result.code == 0, result
-    assert f"_PSOTRACK_COMPLETE={shell}_complete" in result.out
-    switch = "compdef " if shell == "zsh" else "complete "
-    assert any(line.strip().startswith(switch) and "psotrack" in line for line in result.out.splitlines())
-
-
 def test_an_unknown_shell_is_one_line(complete: Run, tmp_path: Path) -> None:
     shells = "bash_source, zsh_source or fish_source"
     assert_refused(lambda: complete("tcsh_source"), shells, unchanged=tmp_path)
@@ -151,6 +139,13 @@ def test_an_unknown_shell_is_one_line(complete: Run, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_shells_complete_commands_and_options(complete: Run, shell: str) -> None:
+    """The script of a shell runs psotrack with what was typed in variables of the environment."""
+    if shell != "bash" or shutil.which("bash"):  # click runs bash to find its version
+        script = complete(f"{shell}_source").out
+        assert f"_PSOTRACK_COMPLETE={shell}_complete" in script
+        switch = "compdef " if shell == "zsh" else "complete "
+        assert re.search(rf"^\s*{switch}.*psotrack", script, re.MULTILINE)
+
     def completions(words: list[str], incomplete: str) -> set[str]:
         """Completions after `words` and the first characters of the next word."""
         if shell == "fish":
@@ -171,35 +166,6 @@ def test_shells_complete_commands_and_options(complete: Run, shell: str) -> None
     options = {"--scenario", "--set", "--show", "--scale", "--seed"}
     assert completions(["psotrack", "simulate", "sequence"], "--s") == options
     assert completions(["psotrack", "onboard", "fuse", "--at"], "") == {"camera", "middle"}
-
-
-#: Switches completion on in a shell, presses Tab after `psotrack sim`, and prints the completions.
-TAB = {
-    "bash": 'eval "$(_PSOTRACK_COMPLETE=bash_source psotrack)"; COMP_WORDS=(psotrack sim); COMP_CWORD=1; '
-    '_psotrack_completion psotrack sim psotrack; echo "${COMPREPLY[@]}"',
-    # zsh has no command that prints completions; its completion functions are replaced by functions that print.
-    "zsh": "compdef() { :; }; _describe() { print -r -- $completions_with_descriptions; }; "
-    'eval "$(_PSOTRACK_COMPLETE=zsh_source psotrack)"; words=(psotrack sim); CURRENT=2; '
-    "_psotrack_completion",
-    "fish": "_PSOTRACK_COMPLETE=fish_source psotrack | source; complete -C 'psotrack sim'",
-}
-
-
-@pytest.mark.parametrize("shell", SHELLS)
-def test_the_tab_key_in_a_shell(tmp_path: Path, shell: str) -> None:
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
-    program = tmp_path / "psotrack"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m psotrack "$@"\n', encoding="utf-8")
-    program.chmod(0o755)
-    result = subprocess.run(
-        [shell, "-c", TAB[shell]],
-        env=os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert re.match(r"simulate\b", result.stdout), result
 
 
 def test_hints_about_pip_are_those_of_a_checkout() -> None:
