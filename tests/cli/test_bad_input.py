@@ -198,8 +198,9 @@ def test_an_earlier_result_stays_where_a_recording_is_spoilt(file, flight, run_p
     (lab / "tracks.csv").write_text("earlier")
     spoil(lab / file)
     # Silhouettes of the sound videos may be stored.
-    words = ("track", lab, "--out", lab / "tracks.csv", "--force", "--cache", tmp_path / "cache")
+    words = ("track", lab, "--out", lab / "tracks.csv", "--force", "--cache", tmp_path / "cache", "--jobs", 1)
     assert_refused(lambda: run_psotrack(*words), *said, unchanged=lab)
+    assert_refused(lambda: run_psotrack("init", "--show", lab), *said, unchanged=lab)
 
 
 # --- settings

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from helpers import Output as Printed
 from helpers import assert_refused
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from psotrack.cli.output import Output
@@ -125,12 +125,14 @@ SETTINGS = st.fixed_dictionaries(
 )
 
 
+# To read all settings takes a twentieth of a second.
+@settings(max_examples=20)
 @given(values=SETTINGS)
 def test_a_saved_config_has_all_settings(tmp_path_factory: pytest.TempPathFactory, values: Any) -> None:
-    settings = TrackSettings().changed(values)
+    saved = TrackSettings().changed(values)
     file = tmp_path_factory.getbasetemp() / "saved_config.toml"
-    file.write_text(config_text(settings), encoding="utf-8")
-    assert TrackSettings().changed(read_config(file)) == settings
+    file.write_text(config_text(saved), encoding="utf-8")
+    assert TrackSettings().changed(read_config(file)) == saved
 
 
 @pytest.mark.parametrize(
@@ -138,10 +140,6 @@ def test_a_saved_config_has_all_settings(tmp_path_factory: pytest.TempPathFactor
     [
         ("swarm.partcles = 3", "found swarm.partcles; did you mean swarm.particles?"),
         ("force = true", "force: expected the name of a setting"),
-        ('swarm.particles = "many"', 'swarm.particles: expected a whole number, found "many"'),
-        ("smooth = 1", "smooth: expected true or false, found 1"),
-        ("drones.size_m = [1, 2]", "drones.size_m: expected a list of length 3"),
-        ('clocks = "atomic"', "clocks: expected one of given, auto, found atomic"),
         ("rate_hz = inf", "rate_hz: expected finite numbers, found inf"),
         ("rate_hz = [", "expected valid TOML"),
     ],
@@ -157,51 +155,31 @@ def test_a_run_that_fails_saves_no_config(run: Run, tmp_path: Path) -> None:
     assert_refused(lambda: run(*words), unchanged=tmp_path)
 
 
-class TestTable:
-    def test_eighty_columns_and_no_cell_is_cut(
-        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        monkeypatch.setenv("COLUMNS", "80")
-        names = (*map(str, range(10)), "[red]a drone with a long name")
-        drones, frames = len(names), 40
-        status = np.full((frames, drones), Status.TRACKED)
-        status[5:9, 1], status[20:, 2], status[:, 3] = Status.COASTING, Status.LOST, Status.LOST
-        position_m = np.ones((frames, drones, 3))
-        position_m[:, 3] = np.nan
-        # 12 m of standard deviation, and times of more than a day.
-        covariance_m2 = np.tile(144.0 * np.eye(3), (frames, drones, 1, 1))
-        tracks = Trajectories(
-            np.arange(frames),
-            90_000 + np.arange(frames) / 25,
-            names,
-            position_m,
-            status=status,
-            covariance_m2=covariance_m2,
-            num_cameras=np.full((frames, drones), 40),
-        )
-        size_m = np.full((drones, 3), 1.234)
-        size_m[4] = np.nan
-        Output().drones(tracks, size_m)
-        lines = capsys.readouterr().out.splitlines()
-        assert max(map(len, lines)) <= 80
-        assert not any("…" in line for line in lines)
-        assert lines[0].split()[:5] == ["drone", "seen", "coasting", "lost", "cameras"]
-        rows = {line.split()[0]: line.split()[1:] for line in lines if line[:1].isdigit()}
-        first = ["100.0%", "0.0%", "0.0%", "40.0", "12000", "123", "123", "123", "90000", "90002"]
-        assert rows["0"] == first
-        assert rows["1"][:3] == ["100.0%", "10.0%", "0.0%"]
-        assert rows["2"][:3] == ["50.0%", "0.0%", "50.0%"]
-        # Never seen: all but the shares is unknown.
-        assert rows["3"] == ["0.0%", "0.0%", "0.0%", "-", "-", "123", "123", "123", "-", "-"]
-        # The long name is folded, not cut, and no part of it is a style.
-        last = next(number for number, line in enumerate(lines) if line.startswith("9 "))
-        folded = "".join(line[:5].strip() for line in lines[last + 1 :])
-        assert folded == names[-1].replace(" ", "")
-
-    def test_nothing_with_quiet_or_json_on_stdout(self, capsys: pytest.CaptureFixture[str]) -> None:
-        tracks = Trajectories(np.arange(1), np.zeros(1), ("a",), np.zeros((1, 1, 3)))
-        for hidden in (Output(quiet=True), Output(json_path=Path("-"))):
-            hidden.drones(tracks)
-        assert capsys.readouterr().out == ""
-        Output().drones(tracks)
-        assert "100.0%" in capsys.readouterr().out
+def test_the_table_of_drones_has_eighty_columns_and_no_cell_is_cut(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    names = (*map(str, range(10)), "[red]a drone with a long name")
+    drones, frames = len(names), 40
+    tracks = Trajectories(
+        np.arange(frames),
+        # Times of more than a day, and 12 m of standard deviation.
+        90_000 + np.arange(frames) / 25,
+        names,
+        np.ones((frames, drones, 3)),
+        status=np.full((frames, drones), Status.TRACKED),
+        covariance_m2=np.tile(144.0 * np.eye(3), (frames, drones, 1, 1)),
+        num_cameras=np.full((frames, drones), 40),
+    )
+    for hidden in (Output(quiet=True), Output(json_path=Path("-"))):
+        hidden.drones(tracks)
+    assert capsys.readouterr().out == ""
+    Output().drones(tracks, np.full((drones, 3), 1.234))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line[:1].isdigit()}
+    first = ["100.0%", "0.0%", "0.0%", "40.0", "12000", "123", "123", "123", "90000", "90002"]
+    assert rows["0"] == first
+    # The long name is folded, not cut, and no part of it is a style.
+    last = next(number for number, line in enumerate(lines) if line.startswith("9 "))
+    folded = "".join(line.partition("100.0%")[0] for line in lines[last + 1 :])
+    assert folded.replace(" ", "") == names[-1].replace(" ", "")

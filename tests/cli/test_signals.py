@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
@@ -160,24 +159,30 @@ def start_track(start_python, flight, tmp_path):
     return start
 
 
+def assert_unchanged(folder):
+    assert not list(folder.rglob("*.partial*"))
+    assert (folder / "tracks.csv").read_text() == "earlier"
+
+
 @each_signal
-@pytest.mark.parametrize("stage", ["imports", pytest.param("computes", marks=pytest.mark.slow)])
-def test_a_command_ends_with_one_line(start_track, tmp_path, number, stage):
-    process = start_track(AT_A_TERMINAL)
-    if stage == "computes":
-        wait_for_files(process, tmp_path / "cache")
-    assert_ends(process, number)
-    assert not list(tmp_path.rglob("*.partial*"))
-    assert (tmp_path / "tracks.csv").read_text() == "earlier"
+def test_a_command_that_begins_ends_with_one_line(start_track, tmp_path, number):
+    assert_ends(start_track(AT_A_TERMINAL), number)
+    assert_unchanged(tmp_path)
 
 
 @pytest.mark.slow
-def test_where_a_shell_ignores_ctrl_c_only_sigterm_ends_a_command(start_track, tmp_path):
-    process = start_track(AT_A_TERMINAL.replace("signal.default_int_handler", "signal.SIG_IGN"))
-    process.send_signal(signal.SIGINT)
+@each_signal
+def test_a_command_at_work_ends_with_one_line(start_track, tmp_path, number):
+    """Where a shell ignores Ctrl-C, only SIGTERM ends a command."""
+    if number == signal.SIGINT:
+        process = start_track(AT_A_TERMINAL)
+    else:
+        process = start_track(AT_A_TERMINAL.replace("signal.default_int_handler", "signal.SIG_IGN"))
+        process.send_signal(signal.SIGINT)
     wait_for_files(process, tmp_path / "cache")
     assert process.poll() is None
-    assert_ends(process, signal.SIGTERM)
+    assert_ends(process, number)
+    assert_unchanged(tmp_path)
 
 
 @each_signal
@@ -205,24 +210,18 @@ def test_ctrl_c_in_a_callback_of_the_garbage_collector_ends_the_command(start_py
     assert re.fullmatch(r"psotrack: interrupted; .*\n", err)
 
 
-def test_a_killed_program_leaves_files_that_the_next_run_removes(tmp_path):
-    program = """
-import os, signal, sys
-from psotrack.support import atomic_write
-with atomic_write(sys.argv[1]) as temporary:
-    temporary.write_text("half")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-    path = tmp_path / "tracks.csv"
-    killed = subprocess.run([sys.executable, "-c", program, str(path)], check=False)
-    assert killed.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    # Of a process that runs: this one. Of another path.
-    running = tmp_path / left.name.replace(left.name.split("-")[1], f"{os.getpid()}")
-    other = tmp_path / left.name.replace(".tracks.", ".other.")
-    for file in (running, other):
-        file.touch()
-    with atomic_write(path) as temporary:
+def test_what_a_killed_program_has_left_is_removed_by_the_next_run(tmp_path):
+    with atomic_write(tmp_path / "elsewhere" / "tracks.csv") as temporary:
+        running = temporary.name
+        temporary.touch()
+    # Larger than any number of a process.
+    left = running.replace(f"-{os.getpid()}-", f"-{2**30}-")
+    other = left.replace(".tracks.", ".other.")
+    folder = tmp_path / "here"
+    folder.mkdir()
+    for name in (running, left, other):
+        (folder / name).write_text("half")
+    with atomic_write(folder / "tracks.csv") as temporary:
         temporary.write_text("whole")
-    assert {file.name for file in tmp_path.iterdir()} == {"tracks.csv", running.name, other.name}
-    assert path.read_text() == "whole"
+    assert {file.name for file in folder.iterdir()} == {"tracks.csv", running, other}
+    assert (folder / "tracks.csv").read_text() == "whole"
