@@ -10,14 +10,13 @@ from dpjait_folders import (
     POSE_HEADER,
     REAL_HEADER,
     SERIALS,
-    SIMULATED_HEADER,
     make_real,
     make_simulated,
     pose_lines,
     write_cameras,
     write_video,
 )
-from helpers import assert_refused, make_once
+from helpers import make_once
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -75,11 +74,6 @@ def edit(file, old, new, count=1):
         (folder / file).write_text(text.replace(old, new, count))
 
     return change
-
-
-def write(file, text):
-    """Function that writes a file of a folder."""
-    return lambda folder: (folder / file).write_text(text)
 
 
 # --- both halves
@@ -143,44 +137,25 @@ def test_the_cameras_on_drones(simulated):
     assert read_sequence(simulated).to_dict()["onboard"] is None
 
 
-def test_the_simulated_half_as_published(simulated):
-    """Cameras are `cam1` in the calibration and `cam1i_s` in the names of files; `cam10i_s` is another camera."""
-    names = [f"cam{i}" for i in range(1, 11)]
-    write_cameras(simulated, names)
-    for i, name in enumerate(names, start=1):
-        write_video(simulated / f"{name}i_s.avi")
-        (simulated / "dl_data" / f"{name}i_s.csv").write_text(f"{i},10,20,30,40,25,40,0.66,,,,,,,\n")
-    recording = read_sequence(simulated)
-    assert recording.rig.names == tuple(names)
-    assert {name: video.path.name for name, video in recording.videos.items()} == {
-        name: f"{name}i_s.avi" for name in names
-    }
-    for i, name in enumerate(names, start=1):
-        assert read_detections(recording.detections[name]).frame.tolist() == [i]
-    # A camera is selected by any of its names.
-    for typed in ("cam1", "cam1i", "cam1i_s", "CAM1"):
-        kept = recording.usable([typed, "cam3"])
-        assert kept.rig.names == tuple(kept.videos) == ("cam1", "cam3")
-        assert kept.rig.cameras.K[:, 0, 0].tolist() == [1157.3, 1159.3]
-    for typed, found in (
-        (["cam"], "found cam"),
-        (["cam11"], "found cam11"),
-        (["cam1", "cam1i_s"], "each once, found cam1, cam1i_s"),
-    ):
-        words = ("cameras: expected some of cam1, cam2, ", found)
-        assert_refused(lambda typed=typed: recording.usable(typed), *words, unchanged=simulated)
-
-
-def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated):
-    """`left_back_s` belongs to `left_back`, not to `left`; `left.avi` comes before `left_debug.avi`."""
-    write_cameras(simulated, ["left", "left_back"])
-    for name in ("left_back_s", "left", "left_debug"):
+@pytest.mark.parametrize(
+    ("names", "more"),
+    [
+        # Cameras are `cam1` in the calibration and `cam1i_s` in the names of files; `cam10i_s` is another camera.
+        ({"cam1": "cam1i_s", "cam2": "cam2i_s", "cam10": "cam10i_s"}, "cam11i_s"),
+        # `left_back_s` belongs to `left_back`, not to `left`; `left.avi` comes before `left_debug.avi`.
+        ({"left": "left", "left_back": "left_back_s"}, "left_debug"),
+    ],
+)
+def test_a_file_belongs_to_the_camera_with_the_longest_matching_name(simulated, names, more):
+    write_cameras(simulated, list(names))
+    for number, name in enumerate((*names.values(), more)):
         write_video(simulated / f"{name}.avi")
-    videos = read_sequence(simulated).videos
-    assert {name: video.path.name for name, video in videos.items()} == {
-        "left": "left.avi",
-        "left_back": "left_back_s.avi",
-    }
+        (simulated / "dl_data" / f"{name}.csv").write_text(f"{number},10,20,30,40,25,40,0.66,,,,,,,\n")
+    (simulated / "dl_data" / f"{more}.csv").unlink()
+    recording = read_sequence(simulated)
+    assert {name: video.path.stem for name, video in recording.videos.items()} == names
+    for number, name in enumerate(names):
+        assert read_detections(recording.detections[name]).frame.tolist() == [number]
 
 
 def test_the_real_half(real):
@@ -216,11 +191,9 @@ def test_projection_agrees_with_opencv(halves, half, metres):
 
 
 def test_forms_of_the_path_of_a_sequence(halves, monkeypatch):
-    monkeypatch.chdir(halves)
-    for typed in ("S99_D9", "S99_D9/", "./S99_D9//"):
+    for place, typed in ((halves, "./S99_D9//"), (halves / "S99_D9", ".")):
+        monkeypatch.chdir(place)
         assert read_sequence(typed).name == "S99_D9"
-    monkeypatch.chdir(halves / "S99_D9")
-    assert read_sequence(".").name == "S99_D9"
 
 
 # --- folders that differ
@@ -241,21 +214,15 @@ def test_cameras_without_video_and_videos_without_camera(simulated, caplog):
     assert recording.usable(["cam3i", "cam1i"]).num_frames == 5
 
 
-def test_videos_may_differ_in_length(simulated):
+def test_videos_may_differ_in_length_and_size(simulated):
     write_video(simulated / "cam2i_s.avi", 7)
+    write_video(simulated / "cam1i_s.avi", size_wh=(96, 64))
+    edit(CALIBRATION, "1157.3;32;24", "1157.3;47;31")(simulated)
     recording = read_sequence(simulated)
     assert recording.num_frames == recording.truth.num_frames == 7
     assert recording.truth.seen[:, 0].tolist() == [False, True, True, True, True, False, False]
     assert recording.usable().timeline().frame[4:6].tolist() == [[4, 4, 4], [-1, 5, -1]]
-
-
-def test_a_video_of_another_size(simulated):
-    write_video(simulated / "cam1i_s.avi", size_wh=(96, 64))
-    words = ("cam1i_s.avi: expected images", "principal point (32, 24), found 96 x 64 pixels")
-    assert_refused(lambda: read_sequence(simulated), *words, unchanged=simulated)
-    edit(CALIBRATION, "1157.3;32;24", "1157.3;47;31")(simulated)
-    recording = read_sequence(simulated).usable()
-    assert recording.rig.cameras.image_size_wh.tolist() == [[96, 64], [64, 48], [64, 48]]
+    assert recording.usable().rig.cameras.image_size_wh.tolist() == [[96, 64], [64, 48], [64, 48]]
 
 
 def test_poses_that_are_missing_more_than_frames_or_at_another_rate(simulated):
@@ -279,14 +246,11 @@ def test_poses_that_are_missing_more_than_frames_or_at_another_rate(simulated):
 @pytest.mark.parametrize(
     "change_text",
     [
-        lambda text: "\ufeff" + text,
-        lambda text: text.replace("\n", "\r\n"),
-        lambda text: text.replace("\n", ";\n"),
-        lambda text: text + "\n\n;;;\n",
-        lambda text: text.replace(";", " ; "),
-        lambda text: text.replace("cam_", "CAM_"),
+        lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n", ";\n") + "\n\n;;;\n",
+        lambda text: text.replace(";", " ; ").replace("cam_", "CAM_"),
     ],
-    ids=["byte order mark", "Windows", "last separator", "blank lines", "spaces", "upper case"],
+    ids=["byte order mark and Windows", "last separator and blank lines", "spaces and upper case"],
 )
 def test_harmless_differences_are_accepted(simulated, change_text):
     original = read_sequence(simulated)
@@ -303,18 +267,18 @@ def test_harmless_differences_are_accepted(simulated, change_text):
     ("names", "expected"),
     [
         ("qw;qx;qy;qz", [0, 0, 0, 1]),
-        ("quat_w;quat_x;quat_y;quat_z", [0, 0, 0, 1]),
         ("quaternion.w;quaternion.x;quaternion.y;quaternion.z", [0, 0, 0, 1]),
         ("or_q_w[-];or_q_x[-];or_q_y[-];or_q_z[-]", [0, 0, 0, 1]),
-        ("Q_W;Q_X;Q_Y;Q_Z", [0, 0, 0, 1]),
         ("q_x;q_y;q_z;q_w", [1, 0, 0, 0]),
         ("q1;q2;q3;q4", None),
     ],
 )
 def test_column_names_of_the_quaternion(tmp_path, names, expected):
-    """The names of the columns decide, not their order."""
-    (tmp_path / "dron1_pos_25.csv").write_text(pose_lines(3, 0.0).replace("q_w;q_x;q_y;q_z", names))
-    _, orientation_wxyz = read_poses(tmp_path / "dron1_pos_25.csv")
+    """The names of the columns decide, not their order. A first row with a pose is no placeholder."""
+    text = pose_lines(3, 0.0).replace("q_w;q_x;q_y;q_z", names).replace("0;0;0;-0", "0;1;2;3")
+    (tmp_path / "dron1_pos_25.csv").write_text(text)
+    position_m, orientation_wxyz = read_poses(tmp_path / "dron1_pos_25.csv")
+    assert position_m[0].tolist() == [1, 2, 3]
     assert (None if orientation_wxyz is None else orientation_wxyz[1].tolist()) == expected
 
 
@@ -351,27 +315,26 @@ def test_a_person_in_the_folder_is_no_reference(run_psotrack, real, tmp_path, ca
     assert caplog.text.count("taken for drones, because their markers are rigid") == 1
 
 
-@pytest.mark.parametrize("missing", ["dron1_cam_25.csv", ONBOARD_CALIBRATION])
-def test_the_video_of_a_drone_alone_is_enough(simulated, missing):
+@pytest.mark.parametrize(
+    ("missing", "rows", "file_name", "num_known"),
+    [
+        ("dron1_cam_25.csv", None, "dron1_cam.mp4", 0),
+        (ONBOARD_CALIBRATION, 3, "drone1_cam.avi", 2),
+        (ONBOARD_CALIBRATION, 9, "Dron_1_cam_s.AVI", 4),
+    ],
+)
+def test_the_video_of_a_drone_alone_is_enough(simulated, missing, rows, file_name, num_known):
+    """It has several names, and poses may be fewer or more than its frames."""
     (simulated / missing).unlink()
+    if rows is not None:
+        (simulated / "dron1_cam_25.csv").write_text(pose_lines(rows, 0.0))
+    (simulated / "dron1_cam_s.avi").rename(simulated / file_name)
     onboard = read_onboard(simulated)["dron1"]
+    assert onboard.video.path.name == file_name
     assert (onboard.K is None) == (missing == ONBOARD_CALIBRATION)
-    assert np.isnan(onboard.orientation_wxyz).all() == (missing == "dron1_cam_25.csv")
-    assert onboard.position_m.shape == (5, 3)
-
-
-@pytest.mark.parametrize(("rows", "num_known"), [(3, 2), (9, 4)])
-def test_onboard_poses_may_be_fewer_or_more_than_frames(simulated, rows, num_known):
-    (simulated / "dron1_cam_25.csv").write_text(pose_lines(rows, 0.0))
-    onboard = read_onboard(simulated)["dron1"]
     assert onboard.position_m.shape == (5, 3)
     assert np.isfinite(onboard.position_m).all(axis=1).sum() == num_known
-
-
-@pytest.mark.parametrize("file_name", ["drone1_cam.avi", "Dron_1_cam_s.AVI", "dron1_cam.mp4"])
-def test_other_names_of_the_video_of_a_drone(simulated, file_name):
-    (simulated / "dron1_cam_s.avi").rename(simulated / file_name)
-    assert read_onboard(simulated)["dron1"].video.path.name == file_name
+    assert np.isfinite(onboard.orientation_wxyz).all(axis=1).sum() == num_known
     assert list(read_sequence(simulated).videos) == ["cam1i", "cam2i", "cam3i"]
 
 
@@ -382,130 +345,6 @@ def test_a_sequence_is_read_without_broken_onboard_files(simulated, caplog):
     assert not recording.onboard
     assert "dron1_cam_25.csv, line 3" in caplog.text
     assert recording.truth is not None
-
-
-# --- what is refused
-
-
-def _remove(pattern):
-    def change(folder):
-        for path in folder.glob(pattern):
-            path.unlink()
-
-    return change
-
-
-def _copy(source, target):
-    return lambda folder: shutil.copy(folder / source, folder / target)
-
-
-def _cameras(old, new, count=1):
-    return edit(CALIBRATION, old, new, count)
-
-
-def _poses(old, new):
-    return edit("dron1_pos_25.csv", old, new)
-
-
-#: Name of the case -> what happens to the simulated folder, words of the line; the first ones say where.
-BAD = {
-    "no such folder": (shutil.rmtree, f"S99_D9/{CALIBRATION}: expected", "found no such file"),
-    "no videos": (_remove("*.avi"), "S99_D9: expected videos named like the cameras, cam1i.avi ..., found no .avi"),
-    "two videos": (_copy("cam1i_s.avi", "cam1i.avi"),
-                   "cam1i_s.avi: expected one such file per camera, found cam1i.avi as well"),
-    "a broken video": (write("cam1i_s.avi", ""), "cam1i_s.avi: expected a video, found an empty file"),
-    "detections that are no folder": (lambda folder: _no_folder(folder),
-                                      "dl_data: expected a folder of detections, or none, found a file"),
-    "an empty calibration": (write(CALIBRATION, ""), f"{CALIBRATION}, line 1: expected columns", "found an empty file"),
-    "no cameras": (write(CALIBRATION, f"{SIMULATED_HEADER}\n"), CALIBRATION, "found none"),
-    "commas": (_cameras(";", ",", -1), ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
-    "no focal length": (_cameras("focal_length", "focus"), ": expected a column focal_length, found only cam_name, "),
-    "feet": (_cameras("cam_x[m]", "cam_x[ft]"),
-             ": expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x[ft]"),
-    "no unit": (_cameras("cam_x[m]", "cam_x"), "expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x"),
-    "a column twice": (_cameras("cam_y[m]", "cam_x[m]"), ", line 1: expected each column once, found cam_x again"),
-    "a coefficient alone": (_cameras(";cy", ";coeff_1"), ": expected a column coeff_2"),
-    "five coefficients": (lambda folder: _five_coefficients(folder), "4 distortion coefficients, found 5"),
-    "no number": (_cameras("cam2i;2;0.5", "cam2i;2;x"), ", line 3, column cam_y[m]: expected a number, found 'x'"),
-    "NaN": (_cameras("cam2i;2;0.5", "cam2i;2;nan"), "line 3, column cam_y[m]: expected a finite number, found 'nan'"),
-    "a comma": (_cameras("cam2i;2;0.5", "cam2i;2;0,5"), ", line 3", "found '0,5'; write decimals with a point"),
-    "no value": (_cameras("cam2i;2;0.5", "cam2i;2;"), "line 3, column cam_y[m]: expected a value, found nothing"),
-    "few values": (_cameras("cam2i;2;0.5", "cam2i;0.5"), ", line 3: expected 10 values as in the header, found 9"),
-    "a camera twice": (_cameras("cam2i;2", "cam1i_s;2"),
-                       ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
-    "focal length 0": (_cameras("1158.3", "0"), "line 3, column focal_length: expected a focal length above 0 pixels"),
-    "focal length below 0": (_cameras("1158.3", "-1158.3"), "column focal_length: expected a focal length above 0"),
-    "a frame twice": (_poses("\n2;0.2", "\n1;0.2"),
-                      "line 4, column id: expected each frame once, found 1 again, after line 3"),
-    "half a frame": (_poses("\n2;0.2", "\n2.5;0.2"),
-                     "line 4, column id: expected a whole number, 0 or more, found '2.5'"),
-    "a long quaternion": (_poses("0;0;0;1\n2", "0;0;0;7\n2"),
-                          "line 3, column q_w: expected a quaternion of length 1, found length 7"),
-    "no column of x": (_poses("pos_x", "x"), "csv: expected a column pos_x, found only id, x[m]"),
-    "a drone twice": (_copy("dron1_pos_25.csv", "drone1_pos_25.csv"),
-                      "drone1_pos_25.csv: expected one file per drone, found dron1 in ", "dron1_pos_25.csv as well"),
-}  # fmt: skip
-
-
-def _no_folder(folder):
-    shutil.rmtree(folder / "dl_data")
-    (folder / "dl_data").touch()
-
-
-def _five_coefficients(folder):
-    """Five coefficients in the calibration of the first camera, where the layout has four."""
-    header, row, *_ = (folder / CALIBRATION).read_text().splitlines()
-    coefficients = ";".join(f"coeff_{number}" for number in range(1, 6))
-    (folder / CALIBRATION).write_text(f"{header};{coefficients}\n{row};0.1;0;0;0;0\n")
-
-
-@pytest.mark.parametrize(("change", "words"), [(each[0], each[1:]) for each in BAD.values()], ids=BAD)
-def test_a_wrong_sequence_is_refused(simulated, tmp_path, change, words):
-    change(simulated)
-    assert_refused(lambda: read_sequence(simulated), *words, unchanged=tmp_path)
-
-
-BAD_REAL = {
-    "two recordings": (_copy("R99.c3d", "R98.c3d"), None, "R99.c3d: expected one file per drone, found dron4 in "),
-    "no C3D": (write("R99.c3d", "hello " * 400), None, "R99.c3d: expected a C3D file, found no valid c3d file"),
-    "bodies of none": (_remove("*.c3d"), {"cf1": ["a"]},
-                       "bodies cf1: expected one C3D file that holds their markers, found none"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("change", "bodies", "words"), BAD_REAL.values(), ids=BAD_REAL)
-def test_wrong_motion_capture_is_refused(real, change, bodies, words):
-    change(real)
-    assert_refused(lambda: read_sequence(real, bodies=bodies), words, unchanged=real)
-
-
-def _intrinsics(old, new):
-    return edit(ONBOARD_CALIBRATION, old, new)
-
-
-BAD_ONBOARD = {
-    "two videos": (_copy("dron1_cam_s.avi", "drone1_cam.avi"),
-                   "drone1_cam.avi: expected one file per drone, found dron1_cam_s.avi"),
-    "another size": (lambda folder: write_video(folder / "dron2_cam_s.avi", size_wh=(32, 32)),
-                     "dron2_cam_s.avi: expected 64 x 48 pixels as dron2 has in", "found 32 x 32"),
-    "another rate": (lambda folder: (folder / "dron2_cam_25.csv").rename(folder / "dron2_cam_30.csv"),
-                     "dron2_cam_30.csv: expected poses at the 25 Hz of the video, found 30 Hz"),
-    "a drone twice": (_intrinsics("dron2", "dron1"),
-                      "line 3, column cam_name: expected each camera once, found dron1 again"),
-    "below 0": (_intrinsics("60.5", "-60.5"),
-                "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
-    "no height": (_intrinsics(";48", ";0"), "line 2, column height: expected a number of pixels above 0"),
-    "half a pixel": (_intrinsics(";64", ";64.5"), "line 2, column width: expected a whole number"),
-    "no cx": (_intrinsics("cx", "c_x"), f"{ONBOARD_CALIBRATION}: expected a column cx, found only"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("change", "words"), [(each[0], each[1:]) for each in BAD_ONBOARD.values()], ids=BAD_ONBOARD
-)
-def test_wrong_files_of_cameras_on_drones_are_refused(simulated, change, words):
-    change(simulated)
-    assert_refused(lambda: read_onboard(simulated), *words, unchanged=simulated)
 
 
 # --- files that are written
@@ -569,38 +408,6 @@ def test_written_files_look_like_the_published_ones(tmp_path):
     ]
 
 
-def test_what_the_layout_cannot_hold_is_refused(tmp_path):
-    """The message names the camera, not the first one but the one that the file cannot hold."""
-    path, upright = tmp_path / CALIBRATION, (Rotation.identity(), np.zeros(3))
-    # A fifth coefficient of zero can be left out.
-    sound = camera_at(*upright, dist=(0.1, 0.0, 0.0, 0.0, 0.0))
-    write_calibration(path, make_rig({"a": sound}))
-    cameras = {
-        "distortion by k1, k2, p1, p2 alone, found 5 coefficients": {"dist": (0.1, 0.0, 0.0, 0.0, 0.01)},
-        "one focal length, found fx 1000 and fy 1001": {"K": PLAIN_K + np.diag([0, 1.0, 0])},
-        "no skew, found 2.5": {"K": PLAIN_K + np.eye(3, k=1) * [0, 2.5, 0]},
-        "OpenCV's pinhole model, found a fisheye": {"fisheye": True},
-    }
-    for words, fields in cameras.items():
-        rig = make_rig(
-            {"a": sound, "GoPro 3": camera_at(*upright, **fields), "z": camera_at(*upright, **fields)}
-        )
-        line = f"camera GoPro 3: expected {words}; "
-        assert_refused(lambda rig=rig: write_calibration(path, rig), line, "rig.toml", unchanged=tmp_path)
-    turns, position_m = np.tile([1.0, 0, 0, 0], (3, 1)), np.ones((3, 3))
-    position_m[2, 1] = np.nan
-    words = "poses: expected finite numbers, found NaN or infinity at frame 2"
-    assert_refused(lambda: write_poses(tmp_path / "a", position_m, turns), words, unchanged=tmp_path)
-    words = "expected equal numbers of positions and orientations"
-    assert_refused(lambda: write_poses(tmp_path / "a", turns[:0, :3], turns[:0]), words, unchanged=tmp_path)
-    for intrinsics in ({}, {"dron1": (PLAIN_K + np.eye(3, k=1), FULL_HD)}):
-        assert_refused(
-            lambda intrinsics=intrinsics: write_onboard_calibration(tmp_path / "a", intrinsics),
-            "expected at least one camera, all without skew",
-            unchanged=tmp_path,
-        )
-
-
 @given(poses=st.lists(st.tuples(triples, rotations), min_size=2, max_size=9))
 def test_written_poses_are_read_back(tmp_path_factory, poses):
     path = tmp_path_factory.getbasetemp() / pose_file(1)
@@ -623,58 +430,27 @@ def test_written_poses_are_read_back(tmp_path_factory, poses):
     assert ((Rz * Ry * Rx) * rotation[1:].inv()).magnitude().max() < 1e-6
 
 
-def test_a_first_row_with_a_pose_is_a_pose(tmp_path):
-    path = tmp_path / "dron1_pos_25.csv"
-    path.write_text("id;pos_x[m];pos_y[m];pos_z[m]\n0;1;2;3\n1;1;2;3\n")
-    position_m, orientation_wxyz = read_poses(path)
-    assert position_m.tolist() == [[1, 2, 3]] * 2
-    assert orientation_wxyz is None
-
-
 @given(
     cameras=st.lists(
         st.tuples(*[st.floats(1e-3, 1e5)] * 2, *[st.floats(-1e4, 1e4)] * 2, *[st.integers(1, 8000)] * 2),
         min_size=1,
         max_size=4,
-    )
+    ),
+    corners=st.dictionaries(
+        st.integers(0, 999), st.lists(triples, min_size=4, max_size=4).map(np.array), min_size=1, max_size=5
+    ),
 )
-def test_written_intrinsics_are_read_back(tmp_path_factory, cameras):
-    path = tmp_path_factory.getbasetemp() / ONBOARD_CALIBRATION
+def test_written_intrinsics_and_marker_corners_are_read_back(tmp_path_factory, cameras, corners):
+    folder = tmp_path_factory.getbasetemp()
     intrinsics = {
         f"dron{number}": (np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (width, height))
         for number, (fx, fy, cx, cy, width, height) in enumerate(cameras, start=1)
     }
-    write_onboard_calibration(path, intrinsics)
-    again = read_onboard_calibration(path)
+    write_onboard_calibration(folder / ONBOARD_CALIBRATION, intrinsics)
+    again = read_onboard_calibration(folder / ONBOARD_CALIBRATION)
     assert list(again) == list(intrinsics)
     for name, (expected, size_wh) in intrinsics.items():
         np.testing.assert_array_equal(again[name][0], expected)
         assert again[name][1] == size_wh
-
-
-@given(
-    corners=st.dictionaries(
-        st.integers(0, 999), st.lists(triples, min_size=4, max_size=4).map(np.array), min_size=1, max_size=5
-    )
-)
-def test_written_marker_corners_are_read_back(tmp_path_factory, corners):
-    path = tmp_path_factory.getbasetemp() / MARKER_CORNERS
-    write_marker_corners(path, corners)
-    again = read_marker_corners(path)
-    assert set(again) == set(corners)
-    for marker, corners_m in corners.items():
-        np.testing.assert_array_equal(again[marker], corners_m)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("7;", "5;", "line 3, column id: expected each marker once, found 5 again"),
-        ("z4[m]", "z5[m]", "expected a column z4"),
-    ],
-)
-def test_wrong_marker_corners_are_refused(tmp_path, old, new, words):
-    path = tmp_path / MARKER_CORNERS
-    write_marker_corners(path, {5: np.zeros((4, 3)), 7: np.full((4, 3), 0.5)})
-    edit(MARKER_CORNERS, old, new)(tmp_path)
-    assert_refused(lambda: read_marker_corners(path), words, unchanged=tmp_path)
+    write_marker_corners(folder / MARKER_CORNERS, corners)
+    np.testing.assert_equal(dict(read_marker_corners(folder / MARKER_CORNERS)), corners)

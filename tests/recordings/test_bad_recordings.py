@@ -1,0 +1,606 @@
+"""What the room refuses: one line says what was expected, what was found and where, and no file appears or changes.
+
+Motion capture has a table of its own. Damaged files are a matter of the fuzzer; the words of numbers, tables and TOML
+that all rooms share are tested in `tests/support` and `tests/geometry`.
+"""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from archives_made import OLD
+from dpjait_folders import make_real, make_simulated, write_video
+from helpers import assert_refused, cameras_of, make_once, ring_rig
+from worlds import make_tracks
+
+from psotrack.geometry import make_camera, make_rig
+from psotrack.geometry.rig_files import write_calibration, write_rig
+from psotrack.recordings import (
+    Detections,
+    FrameTimes,
+    Recording,
+    VideoInfo,
+    VideoWriter,
+    make_timeline,
+    open_video,
+    probe,
+    read_detections,
+    read_frames,
+)
+from psotrack.recordings.datasets import (
+    CALIBRATION,
+    MARKER_CORNERS,
+    ONBOARD_CALIBRATION,
+    open_recording,
+    read_marker_corners,
+    read_onboard,
+    read_sequence,
+    write_marker_corners,
+    write_onboard_calibration,
+    write_poses,
+)
+from psotrack.recordings.exchange import Footage, export_tracks, read_tracks
+from psotrack.trajectories import Trajectories, write_trajectories
+
+
+@pytest.fixture
+def folder(tmp_path_factory, tmp_path):
+    """A folder of sound files, which a test may spoil: a sequence of each half, and videos of any rig."""
+
+    def make(folder):
+        make_simulated(folder / "S99_D9")
+        make_real(folder / "R99_D9")
+        any_rig = folder / "any"
+        any_rig.mkdir()
+        for name in ("left", "right"):
+            write_video(any_rig / f"{name}.avi", 6)
+        any_rig.joinpath("left.zip").write_bytes(b"PK")
+        cv2.imwrite(str(any_rig / "ignore.png"), np.zeros((10, 10), np.uint8))
+        time_s = np.arange(5.0)
+        write_trajectories(
+            any_rig / "tracks.csv", Trajectories(np.arange(5), time_s, ("drone",), np.ones((5, 1, 3)))
+        )
+        any_rig.joinpath("drone.tum").write_text("".join(f"{t} 1 1 1 0 0 0 1\n" for t in time_s))
+        any_rig.joinpath("pictures").mkdir()
+        for index in range(12):
+            cv2.imwrite(str(any_rig / "pictures" / f"frame{index}.png"), np.zeros((48, 64), np.uint8))
+
+    return shutil.copytree(make_once(tmp_path_factory, "sound_recordings", make), tmp_path / "in")
+
+
+def nothing(folder):
+    return None
+
+
+def write(file, text):
+    """Function that writes a file of a folder."""
+
+    def change(folder):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(text, encoding="utf-8")
+
+    return change
+
+
+def edit(file, old, new, count=1):
+    """Function that replaces a text in a file of a folder."""
+
+    def change(folder):
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new, count))
+
+    return change
+
+
+def remove(pattern):
+    def change(folder):
+        for path in folder.glob(pattern):
+            path.unlink()
+
+    return change
+
+
+def copy(source, target):
+    return lambda folder: shutil.copy(folder / source, folder / target)
+
+
+# --- folders of the dataset
+
+S, R, ANY = "S99_D9", "R99_D9", "any"
+CAMERAS, POSES, INTRINSICS = f"{S}/{CALIBRATION}", f"{S}/dron1_pos_25.csv", f"{S}/{ONBOARD_CALIBRATION}"
+
+
+def no_folder(folder):
+    shutil.rmtree(folder / S / "dl_data")
+    (folder / S / "dl_data").touch()
+
+
+def five_coefficients(folder):
+    """Five coefficients in the calibration of the first camera, where the layout has four."""
+    header, row, *_ = (folder / CAMERAS).read_text().splitlines()
+    coefficients = ";".join(f"coeff_{number}" for number in range(1, 6))
+    (folder / CAMERAS).write_text(f"{header};{coefficients}\n{row};0.1;0;0;0;0\n")
+
+
+#: Name of the case -> what happens to the simulated sequence, words of the line; the first ones say where.
+SEQUENCES = {
+    "no such folder": (lambda folder: shutil.rmtree(folder / S), f"{CAMERAS}: expected", "found no such file"),
+    "no videos": (remove(f"{S}/*.avi"), "S99_D9: expected videos named like the cameras, cam1i.avi ...", "no .avi"),
+    "two videos": (copy(f"{S}/cam1i_s.avi", f"{S}/cam1i.avi"),
+                   "cam1i_s.avi: expected one such file per camera, found cam1i.avi as well"),
+    "a video of another size": (lambda folder: write_video(folder / S / "cam1i_s.avi", size_wh=(96, 64)),
+                                "cam1i_s.avi: expected images", "principal point (32, 24), found 96 x 64 pixels"),
+    "detections that are no folder": (no_folder, "dl_data: expected a folder of detections, or none, found a file"),
+    "an empty calibration": (write(CAMERAS, ""), f"{CALIBRATION}, line 1: expected columns", "found an empty file"),
+    "commas": (edit(CAMERAS, ";", ",", -1), ", line 1: expected columns separated by ';', found 'cam_name,cam_x"),
+    "no focal length": (edit(CAMERAS, "focal_length", "focus"), "a column focal_length, found only cam_name"),
+    "feet": (edit(CAMERAS, "cam_x[m]", "cam_x[ft]"),
+             ": expected a column cam_x[m] or cam_x[cm] or cam_x[mm], found cam_x[ft]"),
+    "a column twice": (edit(CAMERAS, "cam_y[m]", "cam_x[m]"), ", line 1: expected each column once, found cam_x again"),
+    "a coefficient alone": (edit(CAMERAS, ";cy", ";coeff_1"), ": expected a column coeff_2"),
+    "five coefficients": (five_coefficients, "4 distortion coefficients, found 5"),
+    "no number": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;2;x"), ", line 3, column cam_y[m]: expected a number, found 'x'"),
+    "a comma": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;2;0,5"), ", line 3", "found '0,5'; write decimals with a point"),
+    "no value": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;2;"), "line 3, column cam_y[m]: expected a value, found nothing"),
+    "few values": (edit(CAMERAS, "cam2i;2;0.5", "cam2i;0.5"), ", line 3: expected 10 values as in the header, found 9"),
+    "a camera twice": (edit(CAMERAS, "cam2i;2", "cam1i_s;2"),
+                       ", line 3, column cam_name: expected each camera once, found cam1i_s again"),
+    "focal length 0": (edit(CAMERAS, "1158.3", "0"), "line 3, column focal_length: expected a focal length above 0 "),
+    "a frame twice": (edit(POSES, "\n2;0.2", "\n1;0.2"),
+                      "line 4, column id: expected each frame once, found 1 again, after line 3"),
+    "half a frame": (edit(POSES, "\n2;0.2", "\n2.5;0.2"), "column id: expected a whole number, 0 or more, found '2.5'"),
+    "a long quaternion": (edit(POSES, "0;0;0;1\n2", "0;0;0;7\n2"),
+                          "line 3, column q_w: expected a quaternion of length 1, found length 7"),
+    "a drone twice": (copy(POSES, f"{S}/drone1_pos_25.csv"),
+                      "drone1_pos_25.csv: expected one file per drone, found dron1 in ", "dron1_pos_25.csv as well"),
+}  # fmt: skip
+#: The same for the real sequence; which markers are drones' is said by the user.
+MOTION_CAPTURE = {
+    "two recordings": (copy(f"{R}/R99.c3d", f"{R}/R98.c3d"), None, "R99.c3d: expected one file per drone, found dron4"),
+    "bodies of none": (remove(f"{R}/*.c3d"), {"cf1": ["a"]},
+                       "bodies cf1: expected one C3D file that holds their markers, found none"),
+}  # fmt: skip
+#: The same for the cameras on drones.
+ONBOARD = {
+    "two videos": (copy(f"{S}/dron1_cam_s.avi", f"{S}/drone1_cam.avi"),
+                   "drone1_cam.avi: expected one file per drone, found dron1_cam_s.avi"),
+    "another size": (lambda folder: write_video(folder / S / "dron2_cam_s.avi", size_wh=(32, 32)),
+                     "dron2_cam_s.avi: expected 64 x 48 pixels as dron2 has in", "found 32 x 32"),
+    "another rate": (lambda folder: (folder / S / "dron2_cam_25.csv").rename(folder / S / "dron2_cam_30.csv"),
+                     "dron2_cam_30.csv: expected poses at the 25 Hz of the video, found 30 Hz"),
+    "a drone twice": (edit(INTRINSICS, "dron2", "dron1"),
+                      "line 3, column cam_name: expected each camera once, found dron1 again"),
+    "below 0": (edit(INTRINSICS, "60.5", "-60.5"),
+                "line 2, column focal_length_x: expected a number of pixels above 0, found -60.5"),
+    "no height": (edit(INTRINSICS, ";48", ";0"), "line 2, column height: expected a number of pixels above 0"),
+    "half a pixel": (edit(INTRINSICS, ";64", ";64.5"), "line 2, column width: expected a whole number"),
+}  # fmt: skip
+
+
+def corners(old, new):
+    """Function that writes a wrong table of marker corners."""
+
+    def change(folder):
+        write_marker_corners(folder / MARKER_CORNERS, {5: np.zeros((4, 3)), 7: np.full((4, 3), 0.5)})
+        edit(MARKER_CORNERS, old, new)(folder)
+
+    return change
+
+
+# --- recording.toml
+
+K = "[[1160.2, 0.5, 31.0], [0, 1160.9, 25.2], [0, 0, 1]]"
+PLACE = f"K = {K}\nrvec = [1.2, -0.4, 0.3]\ntvec = [0.1, 0.2, 5.0]\n"
+LEFT = f'[cameras.left]\nvideo = "left.avi"\n{PLACE}'
+RIGHT = LEFT.replace("left", "right")
+VIDEO, HOST = "cameras.left.video", "expected an address with a host, and a port below 65536"
+#: Lines of the camera left -> words of the line.
+KEYS = {
+    "fsp = 25": ("cameras.left.fsp", "did you mean fps?"),
+    "fps = 1e9": ("cameras.left.fps", "0.001 to 20000 frames per second", "found 1e+09"),
+    "size = [128, 96]": ("cameras.left.size", "64 x 48 pixels as in the video", "128 x 96"),
+    "frames = 5": ("cameras.left", "expected video or frames, found both"),
+    "R = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]": ("cameras.left", "expected rvec or R, found both"),
+    'ignore = "nothing.png"': ("cameras.left.ignore", "a file that exists", "nothing.png"),
+    'ignore = "ignore.png"': ("ignore.png", "64 x 48 pixels as camera left", "10 x 10"),
+    "line_time_s = 0.001": ("cameras.left.line_time_s", "at most 0.00083 s, a frame's time for 48 rows", "0.001"),
+    'video = "left.zip"': (VIDEO, "unpack it first"),
+    'video = "rtps://left/1"': ("a file, the number of a device, or an address that begins with rtsp://, rtsps://",),
+    'video = "rtsp:///stream"': (VIDEO, HOST, "found rtsp:///stream"),
+    'video = "http://left:99999/"': (VIDEO, HOST),
+    'video = "gstreamer://"': (VIDEO, HOST),
+    "video = -1": (VIDEO, "expected the number of a device, from 0, found -1"),
+    'video = "pictures"': ("cameras.left.fps", "expected frames per second of the pictures, or timestamps"),
+}  # fmt: skip
+#: Text of the file after its version -> words of the line.
+FILES = {
+    "": ("cameras", "[cameras.NAME]", "none"),
+    "cameras = 3\n": ("cameras", "[cameras.NAME]"),
+    f"fps = 25\n{LEFT}": ("fps", "below [cameras.NAME]"),
+    f'calibration = "no.toml"\n{LEFT}': ("calibration", "a file that exists", "no.toml"),
+    f"calibration_unit = 'm'\n{LEFT}": ("calibration", "because there is a calibration_unit"),
+    f"{LEFT}{LEFT.replace('left]', 'Left]')}": ("cameras.Left", "each camera once", "left"),
+    f"{LEFT}{LEFT.replace('left]', 'a/b]')}".replace("a/b", '"a/b"'): ("cameras", "names of files", "a/b"),
+    f"{LEFT}{LEFT.replace('left]', 'a,b]')}".replace("a,b", '"a,b"'): ("cameras", "names without commas", "a,b"),
+    f"{LEFT}{RIGHT.replace('right.avi', './left.avi')}": ("cameras.right", "a video of its own", "that of left"),
+    f"{LEFT}[world]\nbounds_m = [[0, 0, 0], [1, 0, 1]]": ("world.bounds_m", "lowest"),
+    f"{LEFT}[reference]\nfiles = ['a.tum']": ("reference.files", "a file that exists"),
+    f"{LEFT}[reference]\nfiles = ['left.avi']": ("left.avi: expected a file that ends in .csv",),
+    f"{LEFT}[reference]\nfiles = ['drone.tum', 'tracks.csv']": ("tracks.csv", "one file per drone", "drone.tum"),
+    "[cameras.left]\nsize = [64, 48]\n": ("cameras.left.fps", "no video"),
+    f"[cameras.left]\nfps = 25\n{PLACE}": ("cameras.left.size", "no video"),
+    "[cameras.left]\nimages = 'x/*.png'\n": ("cameras.left.fps", "timestamps"),
+    "[cameras.left]\nimages = 'x/*.png'\nfps = 5": ("cameras.left.images", "x/*.png"),
+}  # fmt: skip
+#: Times of the six frames, or rows of the file -> words of the line.
+TIMES = {
+    (0, 0.04, 0.03, 0.12, 0.16, 0.2): ("times that increase", "found 0.03 s for frame 2 after 0.04 s"),
+    (0, 0.04): ("times of the 6 frames of the video", "found 2"),
+    (0, "0.04\n3,0.08"): ("line 4, column frame", "frame 2: every frame once", "found 3"),
+    (0, 40, 80, 120, 160, 200): ("times in seconds, of about 25 frames per second as in left.avi", "0.025",
+                                 "divide the times by 1000"),
+    (0, 4e7, 8e7, 12e7, 16e7, 20e7): ("2.5e-08", "are the times in seconds?"),
+}  # fmt: skip
+
+
+def toml(text):
+    return write(f"{ANY}/recording.toml", f"version = 1\n{text}")
+
+
+def with_line(line):
+    """A `recording.toml` with a line of the camera left, instead of the lines that would stand in its way."""
+    key = line.partition(" ")[0]
+    kept = [each for each in LEFT.splitlines()[1:] if each.partition(" ")[0] != key]
+    return toml("\n".join(["[cameras.left]", line, *kept, ""]))
+
+
+def with_times(times):
+    def change(folder):
+        rows = "".join(f"{index},{time}\n" for index, time in enumerate(times))
+        write(f"{ANY}/times.csv", f"frame,time_s\n{rows}")(folder)
+        with_line('timestamps = "times.csv"')(folder)
+
+    return change
+
+
+def another_size(folder):
+    toml('calibration = "rig.toml"\n[cameras.c0]\nvideo = "left.avi"\n')(folder)
+    write_rig(folder / ANY / "rig.toml", ring_rig(1, image_size_wh=(128, 96)))
+
+
+def opened(name=ANY):
+    return lambda folder: open_recording(folder / name)
+
+
+def usable(folder):
+    return open_recording(folder / ANY).usable()
+
+
+#: What is no recording -> what happens to the folder, what is opened, words of the line.
+NO_RECORDINGS = {
+    "a zip file": (nothing, opened("any/left.zip"), "left.zip", "found an archive; unpack it first"),
+    "an archive": (nothing, lambda _: open_recording(OLD), "`psotrack archive ", "version_1.psotrack --out FOLDER`"),
+    "nothing": (nothing, opened("nowhere"), "nowhere", "found nothing"),
+    "a video": (nothing, opened("any/left.avi"), "left.avi", "found another file"),
+    "a folder": (nothing, opened(), "neither recording.toml nor cameras_calibration.csv", "psotrack init"),
+    "the folder above": (write("flights/late/recording.toml", ""), opened("flights"), "did you mean ", "flights/late?"),
+    "no place": (toml(f"[cameras.left]\nvideo = 'left.avi'\nK = {K}"), usable,
+                 "lens and place are known, found none for left; ", " calibrate rig"),
+    "a stream": (toml(f"{LEFT.replace('left.avi', 'rtsp://left/1')}size = [64, 48]\n"), usable,
+                 "camera left: expected a video file, found the stream rtsp://left/1"),
+    "another size than calibrated": (another_size, usable, "128 x 96 pixels as calibrated, found 64 x 48 ", "by 1/2"),
+}  # fmt: skip
+
+# --- detections, videos and pictures
+
+LINE = "4,10,20,30,40,25,40,0.9"
+#: Second line of a file of detections -> words of the line.
+DETECTIONS = {
+    "5,1,2,3,4,5,6": ("line 2: expected a frame number and 7 values per detection ", ", found 6 values"),
+    "5,1,2,3,4,5,6,x": ("line 2, column 8: expected a number, found 'x'",),
+    "5,1,2,,4,5,6,0.5": ("line 2, column 4: expected a value, found nothing",),
+    "5,1,2,-3,4,5,6,0.5": ("line 2, column 4: expected a size w of 0 or more pixels, found -3",),
+    "5,1,2,3,4,5,6,1.5": ("line 2, column 8: expected a confidence from 0 to 1, found 1.5",),
+    "5.5,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '5.5'",),
+    LINE: ("line 2, column 1: expected each frame once, found frame 4 again",),
+}
+WIDTH, HEIGHT = 64, 48
+
+
+def unordered(folder):
+    return Detections(np.array([3, 2]), np.zeros((2, 4)), np.zeros(2))
+
+
+def without_frames(folder):
+    cv2.VideoWriter(str(folder / "a.avi"), cv2.VideoWriter.fourcc(*"XVID"), 25, (WIDTH, HEIGHT)).release()
+
+
+#: Name of the case -> what makes the file a.avi, words of the line.
+VIDEOS = {
+    "nothing": (nothing, "no such file"),
+    "an empty file": (write("a.avi", ""), "an empty file"),
+    "zeros": (write("a.avi", "\0" * 5000), "a file that FFmpeg cannot open"),
+    "a folder": (lambda folder: (folder / "a.avi").mkdir(), "is a directory"),
+    "no frames": (without_frames, "no frames"),
+}
+
+
+def writes(name, fps=25.0, size_wh=(WIDTH, HEIGHT), frames=()):
+    """A function that writes a video of a name into a folder."""
+
+    def call(folder):
+        with VideoWriter(folder / name, fps, size_wh) as writer:
+            for frame in frames:
+                writer.write(frame)
+
+    return call
+
+
+LAST = "any/pictures/frame11.png"
+
+
+def frames_of(path, fps=None, step=1):
+    return lambda folder: list(read_frames(open_video(folder / path, fps), step))
+
+
+def small_picture(folder):
+    cv2.imwrite(str(folder / LAST), np.zeros((32, 64), np.uint8))
+
+
+#: Name of the case -> what happens to the folder, what is called, words of the line.
+PICTURES = {
+    "an ending": (nothing, writes("a.mkv"), "video: expected"),
+    "no rate to write": (nothing, writes("a.avi", 0.0), "fps: expected"),
+    "an odd width": (nothing, writes("a.avi", size_wh=(WIDTH + 1, HEIGHT)), "image size: expected"),
+    "no frames to write": (nothing, writes("a.avi"), "expected at least one frame"),
+    # OpenCV drops such a frame without an error.
+    "a frame of another size": (nothing, writes("a.avi", frames=[np.zeros((HEIGHT - 1, WIDTH, 3), np.uint8)]),
+                                "frame: expected shape (48, 64, 3)"),
+    "a step of 0": (nothing, frames_of("any/left.avi", step=0), "step: expected 1 or more, found 0"),
+    "pictures of no rate": (nothing, frames_of("any/pictures"), "pictures: expected the rate of its pictures, "),
+    "a single picture": (nothing, frames_of(LAST), "frame11.png: expected a video, or a folder of pictures"),
+    "a folder of other files": (nothing, frames_of("S99_D9", 25.0), "expected images, which end in .png, "),
+    "no picture": (write(LAST, "no"), frames_of("any/pictures", 25.0),
+                   "frame11.png: expected an image, found a file that is no PNG"),
+    "a small picture": (small_picture, frames_of("any/pictures", 25.0),
+                        "frame11.png: expected 64 x 48 pixels as in frame0.png, found 64 x 32"),
+}  # fmt: skip
+
+# --- times, and what belongs together
+
+
+def listed(*time_s):
+    return lambda folder: FrameTimes.listed(np.array(time_s), where="left_times.csv")
+
+
+def timeline(times, rate_hz=None):
+    return lambda folder: make_timeline({"a": times}, rate_hz)
+
+
+#: Name of the case -> what is called, words of the line.
+FRAME_TIMES = {
+    "a rate of 0": (lambda folder: FrameTimes(10, 0.0), "fps: expected a number above 0"),
+    "an infinite rate": (timeline(FrameTimes(10, 25.0), np.inf), "rate: expected a number above 0"),
+    "times that go back": (listed(0.0, 0.2, 0.1), "left_times.csv: expected times that increase from frame to frame, "
+                           "found 0.1 s for frame 2 after"),
+    "a time of NaN": (listed(0.0, np.nan, 0.1), "expected finite times, found nan s for frame 1"),
+    "a single time": (listed(0.0), "expected times of at least 2 frames, found 1"),
+    "nothing from time 0 on": (timeline(FrameTimes(10, 25.0, -1.0)), "a camera with a frame at time 0 s or later"),
+}  # fmt: skip
+NAMES = ("a", "b", "c")
+FULL_HD = (1920, 1080)
+UPRIGHT = {"R": np.eye(3), "t_m": np.zeros(3), "image_size_wh": FULL_HD}
+PLAIN_K = np.array([[1000, 0, 960], [0, 1000, 540], [0, 0, 1.0]])
+
+
+def three_cameras(**sizes_wh):
+    """A recording of three equal cameras; a video has another size, or with None there is no video."""
+    videos = {name: VideoInfo(Path(f"{name}.avi"), 250, 25.0, sizes_wh.get(name, FULL_HD)) for name in NAMES}
+    videos = {name: video for name, video in videos.items() if video.image_size_wh}
+    rig = make_rig({name: make_camera(K=PLAIN_K, **UPRIGHT) for name in NAMES})
+    return Recording("S01", Path("S01"), cameras_of(rig, video=videos))
+
+
+NO_VIDEOS = three_cameras(**dict.fromkeys(NAMES))
+SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
+SCALED = "if both show the same field of view, multiply the first two rows of K by "
+#: Name of the case -> recording, arguments of `usable`, words of the line.
+USABLE = {
+    "an unknown camera": (three_cameras(), {"cameras": ["a", "z"]}, "some of a, b, c, found z"),
+    "no name": (three_cameras(), {"cameras": []}, "cameras: expected some of a, b, c, found "),
+    "no video is named": (three_cameras(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
+    "no videos": (NO_VIDEOS, {}, "found none for a, b, c"),
+    "smaller": (three_cameras(a=(1280, 720)), {}, SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
+    "larger": (three_cameras(c=(3840, 2160)), {}, SIZE.format("c", "3840 x 2160", f"{SCALED}2/1")),
+    "another shape": (three_cameras(c=(1920, 1200)), {},
+                      SIZE.format("c", "1920 x 1200", "is it the video of another camera?")),
+    "no frames": (three_cameras(), {"num_frames": 0}, "frames: expected 1 to 250, "),
+    "more frames": (three_cameras(), {"num_frames": 251}, "frames: expected 1 to 250, "),
+}  # fmt: skip
+
+# --- tracks in the formats of other programs
+
+INSTANTS = Recording("any", Path("any"), cameras_of(ring_rig(1), times={"c0": FrameTimes(50, 50.0)}))
+#: Name of the case -> name of the file, its text, words of the line.
+TRACKS = {
+    "a file of boxes alone": ("boxes.txt", "1,1,10,10,5,5,1,-1,-1,-1\n", "positions in MOT15's 3D columns"),
+    "MOT counts from 1": ("mot.txt", "0,1,-1,-1,-1,-1,1,1,2,3\n", "whole frame numbers from 1"),
+    "MOT twice": ("mot.csv", "1,1,-1,-1,-1,-1,1,1,2,3\n" * 2, "line 2: expected one row per frame and drone"),
+    "KITTI of another length": ("k.txt", "1 0 0 1 0 1 0 2 0 0 1 3\n" * 3, "50 poses, one for each instant"),
+    "no rotation": ("k.txt", "1 0 0 1 0 2 0 2 0 0 1 3\n", "a rotation matrix"),
+    "5 numbers": ("five.txt", "1 2 3 4 5\n", "8 numbers per line (TUM), 12 (KITTI)"),
+    "an unknown ending": ("tracks.xyz", "1 2 3\n", "tracks as .csv, .parquet"),
+    "the record": ("record.json", '{"drones": []}', "the record of a run has no positions"),
+    "JSON with too few values": (
+        "few.json",
+        '{"format": "psotrack tracks", "version": 1, "frame": [0, 1], "time_s": [0, 0.1], '
+        '"drones": [{"name": "a", "position_m": [[1, 2, 3]]}]}',
+        "1 values of position_m for 2 frames",
+    ),
+    "a newer version": ("a.json", '{"format": "psotrack tracks", "version": 2}', "expected version 1, found 2"),
+    "another clock": ("late.tum", "1.7e9 1 2 3 0 0 0 1\n", "times on the recording's clock, 0 to 0.98 s"),
+    "not MCAP": ("bad.mcap", "no", "an MCAP file"),
+    "a folder without them": ("tracks/notes.md", "", "a folder without them"),
+}  # fmt: skip
+
+
+def tracks(name, recording=INSTANTS):
+    return lambda folder: read_tracks(folder / name, recording=recording)
+
+
+def exported(to, name, change=nothing):
+    """Function that writes tracks in a format into a folder, and changes what it wrote."""
+
+    def make(folder):
+        export_tracks(make_tracks(), to, folder / name)
+        change(folder)
+
+    return make
+
+
+def export(to, name, footage=None, **changes):
+    return lambda folder: export_tracks(
+        replace(make_tracks(), **changes), to, folder / name, footage=footage, force=True
+    )
+
+
+CAMERA = Footage(INSTANTS)
+#: Name of the case -> what happens to the folder, what is called, words of the line.
+EXPORTS = {
+    "a file of two": (nothing, export("tum", "a.tum"), "a folder, because a TUM file holds one drone and the tracks "),
+    "a folder like a file": (nothing, export("tum", "a.csv"), "a folder, or a file that ends in .tum or .txt"),
+    "poses in a file": (nothing, export("kitti", "poses.txt"), "--out: expected a folder"),
+    "a file without an ending": (nothing, export("c3d", "tracks"), "--out: expected a file that ends in .c3d"),
+    "positions alone": (nothing, export("mot", "mot"),
+                        "ends in .txt, for positions alone, found mot; name SEQ for a folder"),
+    "another ending": (nothing, export("json", "a.csv"), "--out: expected a file that ends in .json"),
+    "boxes of no size": (nothing, export("mot", "mot", CAMERA), "--drone-size"),
+    "a folder with a note": (exported("tum", "tum", write("tum/notes.md", "mine")), export("tum", "tum"),
+                             "notes.md", "name another folder"),
+    "one name in ROS": (nothing, export("mcap", "a.mcap", CAMERA, drones=("a b", "a_b")), "differ as names of ROS"),
+    "the name of a camera": (nothing, export("mcap", "a.mcap", CAMERA, drones=("c0", "d")), "differ as names of ROS"),
+    "no tracks": (nothing, tracks("nowhere"), "no such file or folder"),
+    "two times": (exported("kitti", "kitti", write("kitti/sequences/1/times.txt", "0.0\n0.1\n")), tracks("kitti"),
+                  "14 times, as many as 1.txt has poses"),
+    "MOT without a rate": (exported("mot", "a.txt"), tracks("a.txt", None), "name SEQ, too"),
+    "KITTI without a rate": (exported("kitti", "kitti", lambda folder: shutil.rmtree(folder / "kitti" / "sequences")),
+                             tracks("kitti", None), "name SEQ, too"),
+}  # fmt: skip
+
+# --- what the dataset's layout cannot hold
+
+SOUND = make_camera(K=PLAIN_K, **UPRIGHT)
+#: Words of the line -> fields of a camera.
+LAYOUT = {
+    "distortion by k1, k2, p1, p2 alone, found 5 coefficients": {"dist": (0.1, 0.0, 0.0, 0.0, 0.01)},
+    "one focal length, found fx 1000 and fy 1001": {"K": PLAIN_K + np.diag([0, 1.0, 0])},
+    "no skew, found 2.5": {"K": PLAIN_K + np.eye(3, k=1) * [0, 2.5, 0]},
+    "OpenCV's pinhole model, found a fisheye": {"fisheye": True},
+}
+
+
+def calibration_of(fields):
+    """The message names the camera that the file cannot hold, not the first one."""
+    camera = make_camera(**{"K": PLAIN_K, **UPRIGHT, **fields})
+    rig = make_rig({"a": SOUND, "GoPro 3": camera, "z": camera})
+    return lambda folder: write_calibration(folder / "a.csv", rig)
+
+
+def poses(position_m, num_turns):
+    turns = np.tile([1.0, 0, 0, 0], (num_turns, 1))
+    return lambda folder: write_poses(folder / "a.csv", np.array(position_m), turns)
+
+
+def intrinsics(cameras):
+    return lambda folder: write_onboard_calibration(folder / "a.csv", cameras)
+
+
+SKEW = {"dron1": (PLAIN_K + np.eye(3, k=1), FULL_HD)}
+#: Name of the case -> what happens to the folder, what is called, words of the line.
+OTHERS = {
+    "marker twice": (corners("7;", "5;"), lambda folder: read_marker_corners(folder / MARKER_CORNERS),
+                     "line 3, column id: expected each marker once, found 5 again"),
+    "no order": (nothing, unordered, "expected increasing frame numbers, found steps back"),
+    "unknown poses": (nothing, poses([[1, 1, 1], [1, np.nan, 1.0]], 2),
+                      "poses: expected finite numbers, found NaN or infinity at frame 1"),
+    "more poses than turns": (nothing, poses([[1, 1, 1.0]], 0), "expected equal numbers of positions and orientations"),
+    "no intrinsics": (nothing, intrinsics({}), "expected at least one camera, all without skew"),
+    "intrinsics with skew": (nothing, intrinsics(SKEW), "expected at least one camera, all without skew"),
+    "no rate of nothing": (nothing, lambda _: NO_VIDEOS.fps, "S01: expected at least one video, found none"),
+}  # fmt: skip
+
+
+def simulated(folder):
+    return read_sequence(folder / S)
+
+
+def real(bodies):
+    return lambda folder: read_sequence(folder / R, bodies=bodies)
+
+
+#: Name of the case, what happens to the folder, what is called, words of the line.
+BAD = [
+    *((name, change, simulated, words) for name, (change, *words) in SEQUENCES.items()),
+    *((name, change, real(bodies), words) for name, (change, bodies, *words) in MOTION_CAPTURE.items()),
+    *(
+        (name, change, lambda folder: read_onboard(folder / S), words)
+        for name, (change, *words) in ONBOARD.items()
+    ),
+    *((line, with_line(line), opened(), words) for line, words in KEYS.items()),
+    *((text, toml(text), opened(), words) for text, words in FILES.items()),
+    *((f"{times}", with_times(times), opened(), ("times.csv", *words)) for times, words in TIMES.items()),
+    *(
+        (line, write("a.csv", f"{LINE}\n{line}\n"), lambda folder: read_detections(folder / "a.csv"), words)
+        for line, words in DETECTIONS.items()
+    ),
+    *(
+        (name, change, lambda folder: probe(folder / "a.avi"), ("a.avi: expected a video", f"found {found}"))
+        for name, (change, found) in VIDEOS.items()
+    ),
+    *((name, nothing, call, words) for name, (call, *words) in FRAME_TIMES.items()),
+    *(
+        (name, nothing, lambda _, recording=recording, more=more: recording.usable(**more), words)
+        for name, (recording, more, *words) in USABLE.items()
+    ),
+    *(
+        (name, write(file, text), tracks(Path(file).parts[0]), words)
+        for name, (file, text, *words) in TRACKS.items()
+    ),
+    *(
+        (words, nothing, calibration_of(fields), (f"camera GoPro 3: expected {words}; ", "rig.toml"))
+        for words, fields in LAYOUT.items()
+    ),
+    *(
+        (name, change, call, words)
+        for table in (NO_RECORDINGS, PICTURES, EXPORTS, OTHERS)
+        for name, (change, call, *words) in table.items()
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "call", "words"), [row[1:] for row in BAD], ids=[row[0] for row in BAD])
+def test_it_is_refused(folder, change, call, words, capfd):
+    change(folder)
+    assert_refused(lambda: call(folder), *words, unchanged=folder)
+    # Libraries write nothing either.
+    assert capfd.readouterr().err == ""
+
+
+def test_times_since_1970_are_refused_before_memory_is_used_up(folder):
+    texts = (
+        each.replace("K =", f"time_offset_s = 1700000000.{number}\nK =")
+        for each, number in ((LEFT, 25), (RIGHT, 5))
+    )
+    toml("".join(texts))(folder)
+    words = (
+        "frame times: expected at most 10000000 instants from time 0 on, found 4.3e+10: 25 Hz until 1700000000.70 s, ",
+        "when camera right ends; ", " subtract 1700000000.25 s, the time of the first frame of camera left",
+    )  # fmt: skip
+    assert_refused(lambda: opened()(folder).timeline(), *words, unchanged=folder)
+    toml(LEFT + RIGHT)(folder)
+    words = ("1e+09 Hz until 0.20 s, ", "; check the rates and times")
+    assert_refused(lambda: opened()(folder).timeline(1e9), *words, unchanged=folder)
