@@ -64,26 +64,6 @@ def test_variants_of_the_format_are_read(tmp_path, text, frames):
     assert detections.xyxy.tolist() == [[10, 20, 40, 60]] * len(frames)
 
 
-#: Second line of a file -> words of the message.
-BAD = {
-    "5,1,2,3,4,5,6": ("line 2: expected a frame number and 7 values per detection ", ", found 6 values"),
-    "5,1,2,3,4,5,6,x": ("line 2, column 8: expected a number, found 'x'",),
-    "5,1,2,,4,5,6,0.5": ("line 2, column 4: expected a value, found nothing",),
-    "5,1,2,-3,4,5,6,0.5": ("line 2, column 4: expected a size w of 0 or more pixels, found -3",),
-    "5,1,2,3,4,5,6,1.5": ("line 2, column 8: expected a confidence from 0 to 1, found 1.5",),
-    "5.5,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '5.5'",),
-    "-1,1,2,3,4,5,6,0.5": ("line 2, column 1: expected a whole number, 0 or more, found '-1'",),
-    LINE: ("line 2, column 1: expected each frame once, found frame 4 again",),
-    LINE.replace(",", ";"): ("line 2, column 1: expected a number",),
-}
-
-
-@pytest.mark.parametrize(("line", "words"), BAD.items(), ids=BAD)
-def test_a_wrong_line_is_named(tmp_path, line, words):
-    path = write_file(tmp_path, f"{LINE}\n{line}\n")
-    assert_refused(lambda: read_detections(path), "cam1i_s.csv", *words, unchanged=tmp_path)
-
-
 pixels = st.floats(-1e4, 1e4)
 boxes = st.tuples(pixels, pixels, st.floats(0, 1e4), st.floats(0, 1e4), st.floats(0, 1))
 
@@ -101,13 +81,6 @@ def test_detections_are_read_as_they_were_written(tmp_path_factory, found):
     # The file has a corner and a size per box: a few roundings of numbers up to 2e4.
     np.testing.assert_allclose(again.xyxy, detections.xyxy, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(again.confidence, detections.confidence)
-
-
-def test_frames_must_be_in_order(tmp_path):
-    words = "expected increasing frame numbers, found steps back"
-    assert_refused(
-        lambda: Detections(np.array([3, 2]), np.zeros((2, 4)), np.zeros(2)), words, unchanged=tmp_path
-    )
 
 
 # --- recordings without videos

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import assert_refused, cameras_of, with_cameras
+from helpers import cameras_of, with_cameras
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -116,32 +116,6 @@ def test_timelines_by_hand(times, rate_hz, frame, offset_s):
     assert not timeline.is_synchronous
 
 
-def times(*time_s):
-    return lambda: FrameTimes.listed(np.array(time_s), where="left_times.csv")
-
-
-INCREASING = "left_times.csv: expected times that increase from frame to frame, found 0.1 s for frame 2 after"
-#: Name of the case -> what is refused, words of the line.
-BAD_TIMES = {
-    "a rate of 0": (lambda: FrameTimes(10, 0.0), "fps: expected a number above 0"),
-    "a negative rate": (lambda: FrameTimes(10, -25.0), "fps: expected a number above 0"),
-    "a rate of NaN": (lambda: FrameTimes(10, np.nan), "fps: expected a number above 0"),
-    "an infinite rate": (lambda: make_timeline({"a": LATE}, np.inf), "rate: expected a number above 0"),
-    "times that go back": (times(0.0, 0.2, 0.1), INCREASING),
-    "a time of NaN": (times(0.0, np.nan, 0.1), "expected finite times, found nan s for frame 1"),
-    "a single time": (times(0.0), "expected times of at least 2 frames, found 1"),
-    "nothing from time 0 on": (
-        lambda: make_timeline({"a": FrameTimes(10, 25.0, -1.0)}),
-        "expected a camera with a frame at time 0 s or later",
-    ),
-}
-
-
-@pytest.mark.parametrize(("bad", "words"), BAD_TIMES.values(), ids=BAD_TIMES)
-def test_wrong_times_are_refused(bad, words, tmp_path):
-    assert_refused(bad, words, unchanged=tmp_path)
-
-
 # --- what belongs together
 
 
@@ -221,44 +195,3 @@ def test_leading_frames_of_a_slow_camera_and_of_one_that_begins_later(caplog):
     assert "camera d is left out: it has no frame before instant 100" in caplog.text
     shorter = make_recording(c={"num_frames": 240}).usable(num_frames=240)
     assert {video.num_frames for video in shorter.videos.values()} == {240}
-
-
-def of_size(camera, *size_wh):
-    return make_recording(**{camera: {"image_size_wh": size_wh}})
-
-
-SIZE = "{}.avi: expected 1920 x 1080 pixels as calibrated, found {} pixels; {}"
-SCALED = "if both show the same field of view, multiply the first two rows of K by "
-NO_VIDEOS = make_recording(**dict.fromkeys(NAMES))
-#: Name of the case -> recording, arguments of `usable`, words of the line.
-BAD = {
-    "an unknown camera": (make_recording(), {"cameras": ["a", "z"]}, "some of a, b, c, d, e, found z"),
-    "no name": (make_recording(), {"cameras": []}, "cameras: expected some of a, b, c, d, e, found "),
-    "an empty name": (
-        make_recording(),
-        {"cameras": [" "]},
-        "cameras: expected some of a, b, c, d, e, found ",
-    ),
-    "no video": (make_recording(b=None), {"cameras": ["a", "b"]}, "S01: expected a video for each"),
-    "no video is named": (make_recording(b=None), {"cameras": ["a", "b"]}, "a, b, found none for b"),
-    "no videos": (NO_VIDEOS, {}, "found none for a, b, c, d, e"),
-    "smaller": (of_size("a", 1280, 720), {}, SIZE.format("a", "1280 x 720", f"{SCALED}2/3")),
-    "larger": (of_size("c", 3840, 2160), {}, SIZE.format("c", "3840 x 2160", f"{SCALED}2/1")),
-    "another shape": (
-        of_size("c", 1920, 1200),
-        {},
-        SIZE.format("c", "1920 x 1200", "is it the video of another camera?"),
-    ),
-    "no frames": (make_recording(), {"num_frames": 0}, "frames: expected 1 to 250, "),
-    "more frames": (make_recording(), {"num_frames": 251}, "frames: expected 1 to 250, "),
-}
-
-
-@pytest.mark.parametrize(("recording", "arguments", "words"), BAD.values(), ids=BAD)
-def test_what_does_not_belong_together_is_refused(recording, arguments, words, tmp_path):
-    assert_refused(lambda: recording.usable(**arguments), words, unchanged=tmp_path)
-
-
-def test_a_recording_of_nothing_has_no_rate(tmp_path):
-    refused = "S01: expected at least one video, found none"
-    assert_refused(lambda: NO_VIDEOS.fps, refused, unchanged=tmp_path)

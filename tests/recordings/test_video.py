@@ -73,8 +73,6 @@ def test_steps_and_leading_frames(tmp_path):
     over = [(frame, frame.copy()) for frame in read_frames(video, 2, into_one=True)]
     np.testing.assert_array_equal([then for _, then in over], frames[::2])
     assert len({frame.ctypes.data for frame, _ in over}) == 1
-    refused = "step: expected 1 or more, found 0"
-    assert_refused(lambda: next(read_frames(video, 0)), refused, unchanged=tmp_path)
 
 
 def test_mp4_with_29_97_by_another_writer(tmp_path):
@@ -107,12 +105,11 @@ def test_a_truncated_video_names_file_and_frame(tmp_path, fraction, capfd):
         list(read_frames(video))
     message = str(error_info.value)
     reached = int(re.search(r"only (\d+) can be decoded", message)[1])
-    assert message.startswith(f"{path}: expected 40 frames, found that only {reached} can be decoded")
     assert 0 < reached < 40
     assert message.endswith(
         f"`ffmpeg -i cam1i_s.avi -frames:v {reached} -c copy cam1i_s_cut.avi` keeps the frames before"
     )
-    refused = "expected 40 frames, found that only "
+    refused = "cam1i_s.avi: expected 40 frames, found that only "
     assert_refused(lambda: check_end(video), refused, unchanged=tmp_path)
     # With a step, the error names the same frame.
     assert_refused(lambda: list(read_frames(video, 7)), f"{refused}{reached} can", unchanged=tmp_path)
@@ -164,28 +161,6 @@ def test_opening_restores_log_levels(tmp_path, monkeypatch):
     monkeypatch.setenv("OPENCV_FFMPEG_LOGLEVEL", "16")
     probe(path)
     assert os.environ["OPENCV_FFMPEG_LOGLEVEL"] == "16"
-
-
-def without_frames(path: Path) -> None:
-    cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"XVID"), 25, (WIDTH, HEIGHT)).release()
-
-
-#: Name of the case -> what makes the file at a path, words of the line.
-BAD = {
-    "nothing": (lambda path: None, "no such file"),
-    "an empty file": (lambda path: path.write_bytes(b""), "an empty file"),
-    "zeros": (lambda path: path.write_bytes(bytes(5000)), "a file that FFmpeg cannot open"),
-    "a folder": (lambda path: path.mkdir(), "is a directory"),
-    "no frames": (without_frames, "no frames"),
-}
-
-
-@pytest.mark.parametrize(("make", "found"), BAD.values(), ids=BAD)
-def test_files_that_are_no_videos_are_refused(tmp_path, make, found, capfd):
-    path = tmp_path / "a.avi"
-    make(path)
-    assert_refused(lambda: probe(path), "a.avi: expected a video", f"found {found}", unchanged=tmp_path)
-    assert capfd.readouterr().err == ""
 
 
 # --- folders of pictures
@@ -247,24 +222,6 @@ def test_pictures_are_read_as_the_sensor_saw_them(tmp_path):
     assert next(read_frames(video)).shape == (HEIGHT, WIDTH, 3)
 
 
-def test_bad_pictures_are_refused(pictures, tmp_path):
-    for path, fps, words in (
-        (pictures, None, "left: expected the rate of its pictures, "),
-        (pictures / "frame1.png", None, "frame1.png: expected a video, or a folder of pictures"),
-        (tmp_path, 25.0, "expected images, which end in .png, "),
-    ):
-        assert_refused(lambda path=path, fps=fps: open_video(path, fps), words, unchanged=tmp_path)
-    last = pictures / "frame11.png"
-    last.write_text("no picture")
-    for read in (lambda video: list(read_frames(video)), check_end):
-        video = open_video(pictures, 25.0)
-        words = "frame11.png: expected an image, found a file that is no PNG"
-        assert_refused(lambda read=read, video=video: read(video), words, unchanged=tmp_path)
-    cv2.imwrite(str(last), noise(1)[0, :32])
-    words = "frame11.png: expected 96 x 64 pixels as in frame0.png, found 96 x 32"
-    assert_refused(lambda: list(read_frames(open_video(pictures, 25.0))), words, unchanged=tmp_path)
-
-
 # --- writing
 
 
@@ -279,35 +236,6 @@ def test_writer_makes_the_folder_and_replaces_only_when_complete(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write(path, interrupted())
     assert content_of(tmp_path) == before
-
-
-def write_as(name: str, fps: float = 25.0, size_wh: tuple[int, int] = (WIDTH, HEIGHT), frames=()):
-    """A function that writes a video of a name into a folder."""
-
-    def make(folder: Path) -> None:
-        with VideoWriter(folder / name, fps, size_wh) as writer:
-            for frame in frames:
-                writer.write(frame)
-
-    return make
-
-
-#: Name of the case -> what writes into a folder, words of the line.
-BAD_VIDEOS = {
-    "ending": (write_as("a.mkv"), "video: expected"),
-    "no rate": (write_as("a.avi", 0.0), "fps: expected"),
-    "a rate of NaN": (write_as("a.avi", float("nan")), "fps: expected"),
-    "odd width": (write_as("a.avi", size_wh=(WIDTH + 1, HEIGHT)), "image size: expected"),
-    "no height": (write_as("a.avi", size_wh=(WIDTH, 0)), "image size: expected"),
-    "no frames": (write_as("a.avi"), "expected at least one frame"),
-    # OpenCV drops such a frame without an error.
-    "another size": (write_as("a.avi", frames=[noise(1)[0, 1:]]), "frame: expected shape (64, 96, 3)"),
-}
-
-
-@pytest.mark.parametrize(("make", "words"), BAD_VIDEOS.values(), ids=BAD_VIDEOS)
-def test_videos_that_cannot_be_written_are_refused(tmp_path, make, words):
-    assert_refused(lambda: make(tmp_path), words, unchanged=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -381,24 +309,18 @@ def test_a_joined_video_decodes_as_its_parts_do(tmp_path, lengths, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_parts_that_differ_or_end_early_and_a_full_disk(tmp_path, capfd):
-    parts = [write(tmp_path / f"{i}.avi", noise(20)) for i in range(2)]
-    size = parts[0].stat().st_size
-    slow = write(tmp_path / "slow.avi", noise(2), 24.0)
-    small, cut = tmp_path / "small.avi", tmp_path / "cut.avi"
-    write_as("small.avi", 25.0, (48, 32), [np.zeros((32, 48, 3), np.uint8)])(tmp_path)
-    cut.write_bytes(parts[0].read_bytes()[:60_000])
-
-    def join(*paths):
-        return lambda: join_videos(tmp_path / "joined.avi", paths)
-
-    usual = "expected 96 x 64 pixels at 25 Hz as in 0.avi, found "
-    assert_refused(join(parts[0], slow), f"slow.avi: {usual}96 x 64 pixels at 24 Hz", unchanged=tmp_path)
-    assert_refused(join(parts[0], small), f"small.avi: {usual}48 x 32 pixels at 25 Hz", unchanged=tmp_path)
-    early = "cut.avi: expected 20 frames, found that only "
-    assert_refused(join(parts[0], cut), early, unchanged=tmp_path)
-    with files_up_to(size * 3 // 2):
-        full = "joined.avi: expected a file with 40 frames, found"
-        assert_refused(join(*parts), full, unchanged=tmp_path)
-    # OpenCV warns of each frame that is not written.
+def test_parts_that_differ_or_end_early_are_refused(tmp_path, capfd):
+    first = write(tmp_path / "0.avi", noise(20))
+    write(tmp_path / "slow.avi", noise(2), 24.0)
+    with VideoWriter(tmp_path / "small.avi", 25.0, (48, 32)) as writer:
+        writer.write(np.zeros((32, 48, 3), np.uint8))
+    (tmp_path / "cut.avi").write_bytes(first.read_bytes()[:60_000])
+    for name, words in (
+        ("slow.avi", "expected 96 x 64 pixels at 25 Hz as in 0.avi, found 96 x 64 pixels at 24 Hz"),
+        ("small.avi", "expected 96 x 64 pixels at 25 Hz as in 0.avi, found 48 x 32 pixels at 25 Hz"),
+        ("cut.avi", "expected 20 frames, found that only "),
+    ):
+        parts = [first, tmp_path / name]
+        join = lambda parts=parts: join_videos(tmp_path / "joined.avi", parts)  # noqa: E731
+        assert_refused(join, f"{name}: {words}", unchanged=tmp_path)
     assert capfd.readouterr().err == ""
