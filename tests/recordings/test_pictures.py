@@ -21,7 +21,6 @@ from psotrack.recordings.datasets import open_recording
 WIDTH, HEIGHT, FRAMES = 96, 64, 12
 #: Side of the moving square, pixels.
 SIDE = 16
-CAMERA = "\nsize = [96, 64]\nK = [[90, 0, 48], [0, 90, 32], [0, 0, 1]]\nrvec = [1.5, {turn}, 0]\ntvec = [0, 0, 5]\n"
 
 
 def place(index: int) -> tuple[int, int]:
@@ -78,19 +77,16 @@ def write_recording(folder, *lines):
     (folder / "recording.toml").write_text("\n".join(["version = 1", "[cameras.left]", *lines]) + "\n")
 
 
-def test_a_folder_is_the_video_of_a_camera(run_psotrack, pictures, caplog):
-    """With a rate or with times of its own, which make up for missing pictures; `init` writes a pattern."""
-    folder, camera = pictures.parent, CAMERA.format(turn=0)
-    write_recording(folder, 'video = "left/"', "fps = 20", camera)
-    recording = open_recording(folder).usable()
-    assert recording.videos["left"].num_frames == FRAMES
-    assert recording.fps == 20
+def test_pictures_are_the_video_of_a_camera_with_a_rate_or_times(run_psotrack, pictures, caplog):
+    """Times make up for missing pictures. Cameras whose place is not known are recordings, too."""
+    folder = pictures.parent
+    write_recording(folder, 'video = "left/"', "fps = 20")
+    video = open_recording(folder).videos["left"]
+    assert (video.num_frames, video.fps, video.image_size_wh) == (FRAMES, 20.0, (WIDTH, HEIGHT))
+    np.testing.assert_array_equal([*read_frames(video, 5)], [picture(index) for index in (0, 5, 10)])
     assert "left" in run_psotrack("init", "--show", folder).out
-    write_recording(folder, 'video = "left/"', camera)
-    no_rate = "cameras.left.fps: expected frames per second of the pictures, or timestamps"
-    assert_refused(lambda: open_recording(folder), no_rate, unchanged=folder)
     (pictures / "frame4.png").unlink()
-    write_recording(folder, 'images = "left/*.png"', "fps = 20", camera)
+    write_recording(folder, 'images = "left/*.png"', "fps = 20")
     open_recording(folder)
     assert [message.split("left: ")[1] for message in caplog.messages] == [
         "no pictures with the numbers 4: the pictures count as frames without a gap"
@@ -98,8 +94,8 @@ def test_a_folder_is_the_video_of_a_camera(run_psotrack, pictures, caplog):
     caplog.clear()
     rows = "".join(f"{index},{0.1 * index}\n" for index in range(FRAMES - 1))
     (folder / "times.csv").write_text("frame,time_s\n" + rows)
-    write_recording(folder, 'images = "left/*.png"', 'timestamps = "times.csv"', camera)
-    assert open_recording(folder).usable().fps == pytest.approx(10)
+    write_recording(folder, 'images = "left/*.png"', 'timestamps = "times.csv"')
+    assert open_recording(folder).fps == pytest.approx(10)
     assert not caplog.records
 
 
@@ -122,6 +118,9 @@ def test_blobs_of_pictures_are_detections(detect, pictures, tmp_path):
         assert np.abs(best - [x, y, x + SIDE, y + SIDE]).max() <= 8
         blobs = find_blobs(np.asarray(made.arrays[0][index]), made.reduction, made.borders[0])
         np.testing.assert_allclose(boxes.xyxy[:, :2], blobs.centre_px + 0.5 - blobs.size_px / 2)
+    # The silhouettes of the folder are those of its camera in a recording.
+    write_recording(tmp_path, 'video = "left"', "fps = 20")
+    assert "1 cameras, 12 frames: already there" in detect("--silhouettes", tmp_path)
 
 
 def test_masks_of_pictures(detect, pictures, tmp_path):
@@ -140,15 +139,12 @@ def test_masks_of_pictures(detect, pictures, tmp_path):
     assert reduced.shape == (HEIGHT, WIDTH)
     np.testing.assert_array_equal(reduced[::2, ::2], reduced[1::2, 1::2])
     assert not list(out.glob(".*"))
-
-
-@pytest.mark.parametrize("name", ["mask.mp4", "mask.avi"])
-def test_masks_as_a_video(detect, pictures, tmp_path, name):
-    detect(pictures, "--masks", tmp_path / name)
-    masks = probe(tmp_path / name)
-    assert (masks.num_frames, masks.image_size_wh) == (FRAMES, (WIDTH, HEIGHT))
-    for index, frame in enumerate(read_frames(masks)):
-        assert overlap(frame[..., 0], index) > 0.95
+    for name in ("mask.mp4", "mask.avi"):
+        detect(pictures, "--masks", tmp_path / name)
+        masks = probe(tmp_path / name)
+        assert (masks.num_frames, masks.image_size_wh) == (FRAMES, (WIDTH, HEIGHT))
+        for index, frame in enumerate(read_frames(masks)):
+            assert overlap(frame[..., 0], index) > 0.95
 
 
 def test_a_single_video(detect, tmp_path):
@@ -164,27 +160,13 @@ def test_a_single_video(detect, tmp_path):
     assert set(read_detections(tmp_path / "boxes" / "flight.csv").frame) == set(range(FRAMES))
 
 
-def test_cameras_without_a_place_have_masks_and_blobs(detect, pictures, tmp_path):
-    """Neither needs a calibration."""
-    write_recording(tmp_path, 'video = "left"', "fps = 20")
-    detect(tmp_path, "--masks", tmp_path / "masks")
-    assert len(list((tmp_path / "masks" / "left").iterdir())) == FRAMES
-    detect(tmp_path, "--blobs", "--out", tmp_path / "boxes")
-    assert len(read_detections(tmp_path / "boxes" / "left.csv")) >= FRAMES
-    assert "1 cameras, 12 frames: already there" in detect("--silhouettes", pictures)
-
-
 def spoil(folder):
     (folder / "left" / "frame7.png").write_text("no picture")
 
 
 def two_cameras(folder):
     shutil.copytree(folder / "left", folder / "right")
-    tables = [
-        f'[cameras.{name}]\nvideo = "{name}"\nfps = 20\n' + CAMERA.format(turn=turn)
-        for turn, name in enumerate(("left", "right"))
-    ]
-    (folder / "recording.toml").write_text("version = 1\n" + "".join(tables))
+    write_recording(folder, 'video = "left"', "fps = 20", "[cameras.right]", 'video = "right"', "fps = 20")
 
 
 def nothing(folder):
@@ -194,7 +176,6 @@ def nothing(folder):
 NO_VIDEO = "expected a video, a folder of pictures, or a recording, found no such file or folder"
 #: Name of the case -> change of the folder that holds the pictures in `left`, words of `detect`, words of the line.
 BAD = {
-    "a missing video": (nothing, "{0}/flight.mp4 --masks {0}/out", NO_VIDEO),
     "a missing folder": (nothing, "{0}/pictures/ --blobs --out {0}/out", NO_VIDEO),
     "neither blobs nor a detector": (nothing, "{0}/left --out {0}/out", "found none of them"),
     "both": (nothing, "{0}/left --out {0}/out --blobs --detector a.onnx", "--detector and --blobs"),
