@@ -1,325 +1,343 @@
 """Reports and 3D views: what is in the pages, and, in a real browser, that they work."""
 
 import base64
+import contextlib
 import html
 import json
+import os
 import re
 import shutil
 from dataclasses import replace
 
-import browser
 import cv2
 import numpy as np
 import pytest
 from evaluation_flights import on_x_axis
 from helpers import assert_refused, make_once
+from worlds import NUM_FRAMES, make_tracks
 
 import psotrack as pt
-from psotrack.recordings import Reference
-from psotrack.recordings.datasets import open_recording
+from psotrack.recordings import Reference, view_in_images
 from psotrack.show.flights import flight_of, read_flight
 from psotrack.show.reports import MOST_BYTES, MOST_ROWS, view_3d, write_flight_report, write_page
 from psotrack.show.reports.scene import scene_data
-from psotrack.simulation import SimulationSettings, simulate
 from psotrack.trajectories import Status, write_trajectories
 
-FRAMES = 24
+#: Frame in which a drone is found again.
+FOUND_AGAIN = 10
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """Folder with a simulated recording `S01_D2_A`, and tracks.csv with its record: the truth with small changes."""
+@pytest.fixture(scope="session")
+def reported(world, tmp_path_factory):
+    """Folder with tracks.csv, whose drone 1 is lost for a while, their record, and their report.html."""
 
     def make(folder):
-        settings = SimulationSettings(num_frames=FRAMES, scale=0.25, masks=False, onboard=False)
-        simulate("S01_D2_A", folder, settings, jobs=1)
-        truth = open_recording(folder / "Simulated_Data" / "S01_D2_A").truth
-        status = np.full((FRAMES, 2), Status.TRACKED)
-        status[8:12, 1] = Status.LOST
-        tracks = replace(
-            truth,
-            drones=("0", "<b>1</b>"),
-            position_m=truth.position_m + 0.02,
-            orientation_wxyz=None,
-            status=status,
-            fitness=np.full((FRAMES, 2), 0.5),
-            num_cameras=np.full((FRAMES, 2), 8),
-            covariance_m2=np.broadcast_to(4e-4 * np.eye(3), (FRAMES, 2, 3, 3)).copy(),
+        status = np.full((NUM_FRAMES, 2), int(Status.TRACKED))
+        status[6:FOUND_AGAIN, 1] = Status.LOST
+        write_trajectories(
+            folder / "tracks.csv", replace(make_tracks(0.01), drones=("0", "<b>1</b>"), status=status)
         )
-        write_trajectories(folder / "tracks.csv", tracks)
         record = {
-            "sequence": "S01_D2_A",
+            "sequence": "flight",
             "drones": [{"drone": 0, "size_m": [0.5, 0.5, 0.2]}],
             "settings": {"swarm": {"particles": 77}},
             "versions": {"psotrack": "0.2"},
             "real_time_factor": 1.5,
         }
         (folder / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
+        pt.report(folder / "tracks.csv", folder / "report.html", recording=world / "flight")
 
-    return make_once(tmp_path_factory, "reported_flight", make)
-
-
-@pytest.fixture(scope="module")
-def sequence(flight):
-    return flight / "Simulated_Data" / "S01_D2_A"
-
-
-@pytest.fixture(scope="module")
-def page(flight, sequence, tmp_path_factory):
-    """The report of the flight."""
-
-    def make(folder):
-        pt.report(flight / "tracks.csv", folder / "report.html", recording=sequence)
-
-    return make_once(tmp_path_factory, "report_page", make) / "report.html"
+    return make_once(tmp_path_factory, "reported", make)
 
 
 @pytest.fixture
-def report(run_psotrack):
-    """Runs `psotrack report`, which must succeed: what it prints."""
-
-    def report(*words):
-        done = run_psotrack("report", *words)
-        assert done.code == 0, done
-        return done.out
-
-    return report
+def page(reported):
+    return reported / "report.html"
 
 
-@pytest.fixture
-def chromium():
-    with browser.open_browser() as opened:
-        yield opened
+def text_of(path):
+    return path.read_text(encoding="utf-8")
 
 
-def pictures_in(page, caption=""):
-    """Pictures of the events whose caption contains a text, BGR."""
-    found = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)"([^>]*)', page.read_text(encoding="utf-8"))
-    coded = [np.frombuffer(base64.b64decode(data), np.uint8) for data, words in found if caption in words]
-    return [cv2.imdecode(one, cv2.IMREAD_COLOR) for one in coded]
+def pictures_in(page):
+    """Caption and picture of each event, BGR."""
+    found = re.findall(r'<img src="data:image/jpeg;base64,([^"]*)"[^>]* alt="([^"]*)"', text_of(page))
+    return [
+        (caption, cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR))
+        for data, caption in found
+    ]
 
 
 def decoded(text):
     return np.frombuffer(base64.b64decode(text), "<f4")
 
 
-class TestFlight:
-    def test_the_page_has_all_parts_and_needs_no_other_file(self, page):
-        text = page.read_text(encoding="utf-8")
-        headings = (
-            "Errors against the reference",
-            "Drones",
-            "Cameras",
-            "Over time",
-            "Events",
-            "How it was made",
-        )
-        for heading in headings:
-            assert f"<h2>{heading}</h2>" in text
-        for words in (
-            "drone &lt;b&gt;1&lt;/b&gt; is lost",
-            "drone &lt;b&gt;1&lt;/b&gt; is found again",
-            "&#34;swarm.particles&#34;: 77",
-            "fraction of the frames in which the ellipsoid that the run states holds",
-            # The tables are those of a notebook: of an evaluation, with the figures of all drones, and of tracks.
-            "<td>all</td>",
-            "<td>50 50 20</td>",
-            "<b>1.5 times</b><span>faster than the video</span>",
-        ):
-            assert words in text
-        assert "<b>1</b>" not in text
-        assert re.findall(r"(?:src|href)=\"(?!data:|#)([^\"]*)\"", text) == []
-        assert len(text) < MOST_BYTES / 4
-
-    def test_the_same_tracks_again_is_a_script_that_processes_may_import(self, page):
-        """Processes that make silhouettes import the script again, under another name: it must not track again."""
-        (script,) = re.findall(
-            r"<pre>(import psotrack.*?)</pre>", page.read_text(encoding="utf-8"), re.DOTALL
-        )
-        ran = {"__name__": "__mp_main__"}
-        exec(html.unescape(script), ran)
-        assert "tracked" not in ran
-        assert "particles" in script
-
-    @pytest.mark.parametrize("shown", ["a recording without tracks", "a reference of another time"])
-    def test_what_the_viewer_shows_has_a_report(self, flight, sequence, tmp_path, shown):
-        if shown == "a recording without tracks":
-            read = read_flight([], sequence)
-        else:
-            read = read_flight([flight / "tracks.csv"], sequence)
-            late = replace(read.truth, frame=read.truth.frame + 1000, time_s=read.truth.time_s + 100)
-            read = replace(read, recording=replace(read.recording, reference=Reference(late)))
-        write_flight_report(tmp_path / "page.html", read, pictures=False)
-        text = (tmp_path / "page.html").read_text(encoding="utf-8")
-        assert "psotrackScene(document" in text
-        assert "Errors against the reference" not in text
-
-    def test_pictures_show_the_place_of_the_event(self, page):
-        """The box of the drone, in the drone's colour, is in the picture of the event in which the drone is found."""
-        (picture,) = pictures_in(page, "is found again")
-        assert picture.shape == (240, 360, 3)
-        # The colour of drone 1, lighter.
-        off = np.abs(picture.astype(int) - [51, 126, 221]).sum(axis=-1)
-        rows, columns = np.nonzero(off < 90)
-        # The whole box, with its name, a quarter as high as the picture. JPEG blurs colours of thin lines.
-        assert len(rows) > 20
-        assert 0 < rows.min() < rows.max() < 239
-        assert 0 < columns.min() < columns.max() < 359
-        assert np.ptp(columns) < 120
-
-    def test_pictures_of_large_objects_stay_inside_the_frame(self, report, flight, sequence, tmp_path):
-        """People fill the frame: their pictures show the whole height, and little grey around a frame of 4:3."""
-        shutil.copy(flight / "tracks.csv", tmp_path / "tracks.csv")
-        record = {"drones": [{"drone": drone, "size_m": [0.6, 0.6, 1.8]} for drone in range(2)]}
-        (tmp_path / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
-        report(tmp_path / "tracks.csv", sequence, "--out", tmp_path / "people.html")
-        pictures = pictures_in(tmp_path / "people.html")
-        assert pictures
-        for picture in pictures:
-            grey = (np.abs(picture.astype(int) - 90) < 3).all(axis=-1)
-            # Of 240 rows, the frame has all; of 360 columns, a frame of 16:9 has all too.
-            assert grey.mean() < 0.02
-
-    def test_without_a_recording_and_with_two_files_of_tracks(self, report, flight, sequence, tmp_path):
-        out = report(flight / "tracks.csv", "--out", tmp_path / "alone.html")
-        again = pt.report(flight / "tracks.csv", tmp_path / "alone.html", force=True)
-        assert f"{again}\n" == out
-        assert re.fullmatch(r".*alone\.html: 0\.\d MB\n", out)
-        text = (tmp_path / "alone.html").read_text(encoding="utf-8")
-        assert "<h2>Cameras</h2>" not in text
-        assert "<img" not in text
-        other, out = shutil.copy(flight / "tracks.csv", tmp_path / "other.csv"), tmp_path / "two.html"
-        report(flight / "tracks.csv", sequence, "--compare", other, "--no-pictures", "--out", out)
-        text = out.read_text(encoding="utf-8")
-        assert text.count("<h2>Drones</h2>") == 2
-        assert "There is no record of a run beside other." in text
-
-    def test_pages_are_small_and_html(self, run_psotrack, flight, tmp_path):
-        words = ("report", flight / "tracks.csv", "--out", tmp_path / "report.pdf")
-        assert_refused(lambda: run_psotrack(*words), "ends in .html", unchanged=tmp_path)
-        assert_refused(
-            lambda: write_page(tmp_path / "large.html", "x" * 9_000_000),
-            "expected a page of at most 8 MB, found 9.0 MB",
-            unchanged=tmp_path,
-        )
+def test_the_page_has_all_parts_and_needs_no_other_file(page):
+    text = text_of(page)
+    headings = re.findall("<h2>(.*?)</h2>", text)
+    assert headings == [
+        "Errors against the reference",
+        "Drones",
+        "Cameras",
+        "Over time",
+        "Events",
+        "How it was made",
+    ]
+    for words in (
+        "drone &lt;b&gt;1&lt;/b&gt; is lost",
+        "drone &lt;b&gt;1&lt;/b&gt; is found again",
+        "&#34;swarm.particles&#34;: 77",
+        "fraction of the frames in which the ellipsoid that the run states holds",
+        # The tables are those of a notebook: of an evaluation, with the figures of all drones, and of tracks.
+        "<td>all</td>",
+        "<td>50 50 20</td>",
+        "<b>1.5 times</b><span>faster than the video</span>",
+    ):
+        assert words in text
+    assert "<b>1</b>" not in text
+    assert re.findall(r"(?:src|href)=\"(?!data:|#)([^\"]*)\"", text) == []
+    assert len(text) < MOST_BYTES / 4
 
 
-class TestScene:
-    def test_positions_are_those_of_the_tracks(self):
-        (first, second) = scene_data(flight_of(on_x_axis([0, 1, None, 3], [5, 6, 7, 8])))["drones"]
-        np.testing.assert_array_equal(decoded(first["position_m"])[::3], [0, 1, np.nan, 3])
-        np.testing.assert_array_equal(decoded(second["position_m"])[::3], [5, 6, 7, 8])
-        np.testing.assert_array_equal(decoded(first["status"]), [0, 0, 2, 0])
+def test_the_same_tracks_again_is_a_script_that_processes_may_import(page):
+    """Processes that make silhouettes import the script again, under another name: it must not track again."""
+    (script,) = re.findall(r"<pre>(import psotrack.*?)</pre>", text_of(page), re.DOTALL)
+    ran = {"__name__": "__mp_main__"}
+    exec(html.unescape(script), ran)
+    assert "tracked" not in ran
+    assert "particles" in script
 
-    def test_a_world_far_from_its_origin_loses_nothing(self):
-        """In float32, 500 km are known to 3 cm."""
-        tracks = on_x_axis([0, 0.001, 0.002])
-        far = replace(tracks, position_m=tracks.position_m + np.array([500_000.0, 5_000_000.0, 120.0]))
-        data = scene_data(flight_of(far))
-        shown = decoded(data["drones"][0]["position_m"])[::3].astype(float) + data["origin_m"][0]
-        np.testing.assert_allclose(shown - 500_000, [0, 0.001, 0.002], atol=1e-4)
 
-    def test_pyramids_of_cameras_open_along_their_view(self, sequence):
-        read = read_flight([], sequence)
-        rig = read.recording.rig
-        for index, camera in enumerate(scene_data(read)["cameras"]):
-            centre_m, corners_m = np.array(camera["centre_m"]), np.array(camera["corners_m"])
-            forward = np.asarray(rig.cameras.T_cam_world[index])[2, :3]
-            np.testing.assert_allclose(centre_m, rig.cameras.centre_world[index], atol=1e-12)
-            depth_m = (corners_m - centre_m) @ forward
-            np.testing.assert_allclose(depth_m, depth_m[0], rtol=1e-9)
-            assert depth_m[0] > 0
-            # The corners are those of the image, without its distortion.
-            width, height = np.asarray(rig.cameras[index].image_size_wh)
-            seen = (corners_m - centre_m) @ np.asarray(rig.cameras.T_cam_world[index])[:3, :3].T
-            seen_px = seen @ np.asarray(rig.cameras[index].K).T / seen[:, 2:]
-            np.testing.assert_allclose(seen_px[2, :2], [width - 0.5, height - 0.5])
+def test_a_picture_shows_the_place_of_the_event(page, reported, world):
+    """In the picture of the event in which a drone is found, the drone and its box are where the camera shows them."""
+    ((caption, picture),) = [each for each in pictures_in(page) if "is found again" in each[0]]
+    assert picture.shape == (240, 360, 3)
+    flight = read_flight([reported / "tracks.csv"], world / "flight")
+    tracks, camera = flight.tracks[0], int(caption[1])
+    views = view_in_images(flight.recording, tracks.trajectories, tracks.size_m)
+    box_px = views.boxes_px[FOUND_AGAIN, 1, camera]
+    # The picture is four lengths of the largest drone high, and its middle is the drone's.
+    rig = flight.recording.rig.cameras[camera]
+    depth_m = (rig.T_cam_world @ [*tracks.trajectories.position_m[FOUND_AGAIN, 1], 1])[2]
+    scale = 240 / (4 * 0.5 * rig.K[0, 0] / depth_m)
+    middle_px = views.middle_px[FOUND_AGAIN, 1, camera] + 0.5
+    left, top, right, bottom = (box_px - np.tile(middle_px, 2)) * scale + [180, 120, 180, 120]
+    # The colour of drone 1, lighter; JPEG blurs colours of thin lines. The drone's name is above its box.
+    rows, columns = np.nonzero(np.abs(picture.astype(int) - [51, 126, 221]).sum(axis=-1) < 90)
+    below = rows > top + 3
+    found = [columns[below].min(), columns[below].max() + 1, rows.max() + 1]
+    # The line is two pixels wide.
+    np.testing.assert_allclose(found, [left, right, bottom], atol=2.5)
+    # The drone itself is a dark rectangle of 17 by 9 pixels of the camera.
+    assert picture[117:126, 172:189].mean() < 60
 
-    def test_long_flights_show_every_nth_row(self):
-        data = scene_data(flight_of(on_x_axis(list(range(3 * MOST_ROWS)))))
-        assert len(decoded(data["time_s"])) == MOST_ROWS
 
-    def test_names_cannot_leave_the_script(self):
-        tracks = replace(on_x_axis([0, 1]), drones=("</script><script>alert(1)</script>",))
-        assert "</script><script>alert" not in view_3d(tracks)._repr_html_()
+def test_pictures_of_large_objects_show_the_whole_height(run_psotrack, reported, world, tmp_path):
+    """People fill the frame: their pictures show a frame of 4:3 between two grey columns."""
+    shutil.copy(reported / "tracks.csv", tmp_path / "tracks.csv")
+    record = {"drones": [{"drone": 0, "size_m": [0.6, 0.6, 1.8]}]}
+    (tmp_path / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
+    words = (tmp_path / "tracks.csv", world / "flight", "--out", tmp_path / "people.html")
+    assert run_psotrack("report", *words).code == 0
+    pictures = [picture for _, picture in pictures_in(tmp_path / "people.html")]
+    assert pictures
+    for picture in pictures:
+        # The noise of the film is brighter.
+        is_grey = (np.abs(picture.astype(int) - 90) < 12).all(axis=(0, 2))
+        np.testing.assert_allclose(np.flatnonzero(~is_grey)[[0, -1]], [20, 339], atol=2)
+
+
+@pytest.mark.parametrize("shown", ["a recording without tracks", "a reference of another time"])
+def test_what_the_viewer_shows_has_a_report(flight, tmp_path, shown):
+    if shown == "a recording without tracks":
+        flight = replace(flight, tracks=())
+    else:
+        late = replace(flight.truth, frame=flight.truth.frame + 1000, time_s=flight.truth.time_s + 100)
+        flight = replace(flight, recording=replace(flight.recording, reference=Reference(late)))
+    write_flight_report(tmp_path / "page.html", flight, pictures=False)
+    text = text_of(tmp_path / "page.html")
+    assert "psotrackScene(document" in text
+    assert "Errors against the reference" not in text
+
+
+def test_without_a_recording_and_with_two_files_of_tracks(run_psotrack, reported, world, tmp_path):
+    alone, two = tmp_path / "alone.html", tmp_path / "two.html"
+    out = run_psotrack("report", reported / "tracks.csv", "--out", alone).out
+    assert f"{pt.report(reported / 'tracks.csv', alone, force=True)}\n" == out
+    assert re.fullmatch(r".*alone\.html: 0\.\d MB\n", out)
+    assert "<h2>Cameras</h2>" not in text_of(alone)
+    assert "<img" not in text_of(alone)
+    other = shutil.copy(reported / "tracks.csv", tmp_path / "other.csv")
+    words = (reported / "tracks.csv", world / "flight", "--compare", other, "--no-pictures", "--out", two)
+    assert run_psotrack("report", *words).code == 0
+    assert text_of(two).count("<h2>Drones</h2>") == 2
+    assert "There is no record of a run beside other." in text_of(two)
+
+
+def test_pages_are_small(tmp_path):
+    assert_refused(
+        lambda: write_page(tmp_path / "large.html", "x" * 9_000_000),
+        "expected a page of at most 8 MB, found 9.0 MB",
+        unchanged=tmp_path,
+    )
+
+
+# --- the 3D view
+
+
+def test_positions_are_those_of_the_tracks():
+    (first, second) = scene_data(flight_of(on_x_axis([0, 1, None, 3], [5, 6, 7, 8])))["drones"]
+    np.testing.assert_array_equal(decoded(first["position_m"])[::3], [0, 1, np.nan, 3])
+    np.testing.assert_array_equal(decoded(second["position_m"])[::3], [5, 6, 7, 8])
+    np.testing.assert_array_equal(decoded(first["status"]), [0, 0, 2, 0])
+    # A world far from its origin loses nothing; in float32, 500 km are known to 3 cm.
+    tracks = on_x_axis([0, 0.001, 0.002])
+    far = replace(tracks, position_m=tracks.position_m + np.array([500_000.0, 5_000_000.0, 120.0]))
+    data = scene_data(flight_of(far))
+    shown = decoded(data["drones"][0]["position_m"])[::3].astype(float) + data["origin_m"][0]
+    np.testing.assert_allclose(shown - 500_000, [0, 0.001, 0.002], atol=1e-4)
+    # Long flights show every n-th row.
+    data = scene_data(flight_of(on_x_axis(list(range(3 * MOST_ROWS)))))
+    np.testing.assert_allclose(
+        decoded(data["drones"][0]["position_m"])[::3] + data["origin_m"][0], np.arange(MOST_ROWS) * 3
+    )
+
+
+def test_pyramids_of_cameras_open_along_their_view(flight):
+    cameras = flight.recording.rig.cameras
+    for index, camera in enumerate(scene_data(replace(flight, tracks=()))["cameras"]):
+        centre_m, corners_m = np.array(camera["centre_m"]), np.array(camera["corners_m"])
+        np.testing.assert_allclose(centre_m, cameras.centre_world[index], atol=1e-12)
+        seen = (corners_m - centre_m) @ np.asarray(cameras.T_cam_world[index])[:3, :3].T
+        np.testing.assert_allclose(seen[:, 2], seen[0, 2], rtol=1e-9)
+        assert seen[0, 2] > 0
+        # The corners are those of the image, without its distortion.
+        seen_px = (seen @ np.asarray(cameras.K[index]).T / seen[:, 2:])[:, :2]
+        corners_px = np.array([[0, 0], [320, 0], [320, 240], [0, 240]]) - 0.5
+        np.testing.assert_allclose(seen_px, corners_px, atol=1e-9)
+
+
+def test_names_cannot_leave_the_script():
+    tracks = replace(on_x_axis([0, 1]), drones=("</script><script>alert(1)</script>",))
+    assert "</script><script>alert" not in view_3d(tracks)._repr_html_()
+
+
+# --- in a browser
+
+#: Names of Chromium on the machines of Linux distributions, and of Chrome: test runs download nothing.
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+#: WebGL by software: machines that test have no graphics card. Containers run as root, without a sandbox.
+SOFTWARE = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--no-sandbox",
+)
+
+
+@contextlib.contextmanager
+def open_page(path, *, width=1600, dark=False, arguments=SOFTWARE):
+    """A page of a file in Chromium, without a network; the page must not report any error.
+
+    Without Chromium the test fails, or is skipped if PSOTRACK_NO_BROWSER is 1.
+    """
+    program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if program is None and os.environ.get("PSOTRACK_NO_BROWSER") == "1":
+        pytest.skip("PSOTRACK_NO_BROWSER is 1")
+    assert program, (
+        f"none of {', '.join(BROWSERS)} is installed; PSOTRACK_NO_BROWSER=1 leaves these tests out"
+    )
+    from playwright.sync_api import sync_playwright
+
+    errors = []
+    with sync_playwright() as programs:
+        browser = programs.chromium.launch(executable_path=program, args=list(arguments))
+        scheme, viewport = "dark" if dark else "light", {"width": width, "height": 900}
+        page = browser.new_page(viewport=viewport, color_scheme=scheme, offline=True)
+        page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: errors.append(f"{error}"))
+        page.on("request", lambda asked: errors.append(asked.url) if asked.url.startswith("http") else None)
+        page.goto(path.as_uri())
+        try:
+            yield page
+        finally:
+            browser.close()
+    # A page that cannot draw in 3D says so.
+    assert [error for error in errors if "WebGL" not in error] == []
+
+
+def screenshot(locator):
+    """(height, width, 3), what an element of a page shows, BGR."""
+    return cv2.imdecode(np.frombuffer(locator.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(int)
 
 
 #: One page in `.ci/run`, the others by `make nightly`.
-WIDTHS = [
-    pytest.param(400, True, marks=pytest.mark.slow),
-    pytest.param(1600, False, marks=pytest.mark.nightly),
-]
+@pytest.mark.parametrize(
+    ("width", "dark"),
+    [
+        pytest.param(400, True, marks=pytest.mark.slow),
+        pytest.param(1600, False, marks=pytest.mark.nightly),
+    ],
+)
+def test_the_page_of_a_flight(page, width, dark):
+    with open_page(page, width=width, dark=dark) as shown:
+        shown.wait_for_selector(".scene canvas")
+        paper = shown.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert paper == ("rgb(20, 24, 29)" if dark else "rgb(252, 252, 251)")
+        # Nothing is wider than the window: a table that is wider scrolls by itself.
+        assert shown.evaluate("document.documentElement.scrollWidth") <= width
+        shown.evaluate("document.querySelector('.scene').scene.show(3)")
+        blue, green, red = screenshot(shown.locator(".scene-view")).reshape(-1, 3).T
+        # Both drones' bodies are drawn in their colours, lit: the hue stays.
+        assert ((blue > red + 60) & (blue > green + 20)).sum() > 20
+        assert ((red > blue + 60) & (red > green + 40)).sum() > 20
 
 
-class TestInABrowser:
-    @pytest.mark.parametrize(("width", "dark"), WIDTHS)
-    def test_the_page_of_a_flight(self, chromium, page, width, dark):
-        with browser.open_page(chromium, page, width=width, dark=dark) as shown:
-            shown.wait_for_selector(".scene canvas")
-            paper = shown.evaluate("getComputedStyle(document.body).backgroundColor")
-            assert paper == ("rgb(20, 24, 29)" if dark else "rgb(252, 252, 251)")
-            # Nothing is wider than the window: a table that is wider scrolls by itself.
-            assert shown.evaluate("document.documentElement.scrollWidth") <= width
-            shown.evaluate("document.querySelector('.scene').scene.show(3)")
-            picture = browser.screenshot(shown.locator(".scene-view")).reshape(-1, 3)
-            # Both drones' bodies are drawn in their colours, lit: the hue stays.
-            blue, green, red = picture.astype(int).T
-            assert ((blue > red + 60) & (blue > green + 20)).sum() > 20
-            assert ((red > blue + 60) & (red > green + 40)).sum() > 20
+@pytest.mark.nightly
+def test_play_step_jump_and_sort(page):
+    row = "document.querySelector('.scene').scene.row()"
+    labels = "[...document.querySelectorAll('.scene-drone')]"
+    visible = f"{labels}.filter((label) => label.style.display !== 'none').length"
+    with open_page(page) as shown:
+        shown.wait_for_selector(".scene canvas")
+        assert shown.evaluate(row) == 0
+        before = screenshot(shown.locator(".scene-view"))
+        shown.click(".scene-play")
+        shown.wait_for_function(f"{row} === {NUM_FRAMES - 1}")
+        assert shown.get_attribute(".scene-play", "aria-label") == "play"
+        assert np.abs(screenshot(shown.locator(".scene-view")) - before).max() > 50
+        shown.focus(".scene-view")
+        shown.keyboard.press("ArrowLeft")
+        assert shown.evaluate(row) == NUM_FRAMES - 2
+        shown.locator(".jump").first.click()
+        assert shown.evaluate(row) < NUM_FRAMES - 2
+        # A lost drone is not drawn.
+        for instant, count in ((2, 2), (8, 1)):
+            shown.evaluate(f"document.querySelector('.scene').scene.show({instant})")
+            assert shown.evaluate(visible) == count
+        errors = shown.locator("table:has(thead)").first
+        heading = errors.locator("th button").nth(2)
+        heading.click()
+        shown_mm = [float(text) for text in errors.locator("tbody td:nth-child(3)").all_inner_texts()]
+        assert shown_mm == sorted(shown_mm)
+        heading.click()
+        assert errors.locator("th").nth(2).get_attribute("aria-sort") == "descending"
 
-    @pytest.mark.nightly
-    def test_play_step_jump_and_sort(self, chromium, page):
-        with browser.open_page(chromium, page) as shown:
-            shown.wait_for_selector(".scene canvas")
-            row = "document.querySelector('.scene').scene.row()"
-            assert shown.evaluate(row) == 0
-            before = browser.screenshot(shown.locator(".scene-view"))
-            shown.click(".scene-play")
-            shown.wait_for_function(f"{row} > 5")
-            shown.wait_for_function(f"{row} === {FRAMES - 1}")
-            assert shown.get_attribute(".scene-play", "aria-label") == "play"
-            assert np.abs(browser.screenshot(shown.locator(".scene-view")).astype(int) - before).max() > 50
-            shown.focus(".scene-view")
-            shown.keyboard.press("ArrowLeft")
-            assert shown.evaluate(row) == FRAMES - 2
-            shown.locator(".jump").first.click()
-            assert shown.evaluate(row) < FRAMES - 2
-            errors = shown.locator("table:has(thead)").first
-            heading = errors.locator("th button").nth(2)
-            heading.click()
-            shown_mm = [float(text) for text in errors.locator("tbody td:nth-child(3)").all_inner_texts()]
-            assert shown_mm == sorted(shown_mm)
-            heading.click()
-            assert errors.locator("th").nth(2).get_attribute("aria-sort") == "descending"
 
-    @pytest.mark.nightly
-    def test_a_lost_drone_is_not_drawn(self, chromium, page):
-        with browser.open_page(chromium, page) as shown:
-            shown.wait_for_selector(".scene canvas")
-            labels = "[...document.querySelectorAll('.scene-drone')]"
-            visible = f"{labels}.filter((label) => label.style.display !== 'none').length"
-            shown.evaluate("document.querySelector('.scene').scene.show(2)")
-            assert shown.evaluate(visible) == 2
-            shown.evaluate("document.querySelector('.scene').scene.show(9)")
-            assert shown.evaluate(visible) == 1
+@pytest.mark.nightly
+def test_a_view_of_a_notebook(tmp_path):
+    cell = view_3d(on_x_axis([0, 1, 2, 3]))._repr_html_()
+    (tmp_path / "cell.html").write_text(f"<!doctype html><title>cell</title>{cell}", encoding="utf-8")
+    with open_page(tmp_path / "cell.html") as shown:
+        frame = shown.frame_locator("iframe")
+        frame.locator(".scene canvas").wait_for()
+        assert frame.locator(".scene-clock").inner_text() == "0.00 s"
 
-    @pytest.mark.nightly
-    def test_a_view_of_a_notebook(self, chromium, tmp_path):
-        path = tmp_path / "cell.html"
-        cell = view_3d(on_x_axis([0, 1, 2, 3]))._repr_html_()
-        path.write_text(f"<!doctype html><title>cell</title>{cell}", encoding="utf-8")
-        with browser.open_page(chromium, path) as shown:
-            cell = shown.frame_locator("iframe")
-            cell.locator(".scene canvas").wait_for()
-            assert cell.locator(".scene-clock").inner_text() == "0.00 s"
 
-    @pytest.mark.nightly
-    def test_without_webgl_the_rest_of_the_page_works(self, page):
-        with browser.open_browser(["--disable-gpu", "--disable-3d-apis", "--no-sandbox"]) as blind:
-            context = blind.new_context()
-            shown = context.new_page()
-            shown.goto(page.as_uri())
-            shown.wait_for_selector(".scene-none")
-            assert "no 3D graphics" in shown.inner_text(".scene-none")
-            shown.locator(".jump").first.click()
-            assert shown.locator("table:has(thead)").count() == 3
+@pytest.mark.nightly
+def test_without_webgl_the_rest_of_the_page_works(page):
+    with open_page(page, arguments=("--disable-gpu", "--disable-3d-apis", "--no-sandbox")) as shown:
+        shown.wait_for_selector(".scene-none")
+        assert "no 3D graphics" in shown.inner_text(".scene-none")
+        shown.locator(".jump").first.click()
+        assert shown.locator("table:has(thead)").count() == 3
