@@ -86,43 +86,29 @@ class TestMog2:
         assert np.abs(error_px.mean(axis=0)).max() < 0.1
         assert error_px.std(axis=0).max() < 0.5
 
-    @pytest.mark.parametrize("hovering_frames", [range(0, 18), range(22, 40)])
-    def test_a_hovering_drone_is_foreground_and_leaves_no_ghost(self, hovering_frames: range) -> None:
-        rng = np.random.default_rng(7)
-        background = _texture(rng)
-        centres = [(40.0, 60.0) if i in hovering_frames else (60.0 + 2 * i, 40.0) for i in range(40)]
-        frames = [_with_discs(background, rng, centre) for centre in centres]
-        masks = Mog2(ForegroundSettings(working_reduction=1)).foreground(frames, frames)
-        for centre, mask in zip(centres, masks, strict=True):
-            area_px = np.pi * RADIUS_PX**2
-            assert np.abs(_centroid_px(mask, 1) - centre).max() < 0.5
-            assert 0.9 * area_px < np.count_nonzero(mask) < 1.4 * area_px
-
-    @given(seed=st.integers(0, 99), num_frames=st.integers(1, 12), threshold=st.sampled_from([8.0, 16.0]))
-    @settings(max_examples=20)
+    @given(
+        seed=st.integers(0, 99),
+        num_frames=st.integers(1, 12),
+        threshold=st.sampled_from([8.0, 16.0]),
+        rate=st.sampled_from([0.0, 0.1]),
+    )
+    @settings(max_examples=30)
     def test_foreground_is_that_of_opencv_which_learned_the_mean(
-        self, seed: int, num_frames: int, threshold: float
+        self, seed: int, num_frames: int, threshold: float, rate: float
     ) -> None:
+        """At rate 0, the background is constant: what hovers stays foreground, and leaves no ghost."""
         frames = np.random.default_rng(seed).integers(90, 130, (num_frames, 24, 32, 3), dtype=np.uint8)
         model = cv2.createBackgroundSubtractorMOG2(varThreshold=threshold)
         model.setBackgroundRatio(0.5)
         for number, frame in enumerate(frames, 1):
             model.apply(frame, learningRate=1 / number)
-        shown = [np.clip(frames[0].astype(int) + 25, 0, 255).astype(np.uint8), frames[-1]]
+        shown = [np.clip(frames[0].astype(int) + 25, 0, 255).astype(np.uint8), frames[-1]] * 2
         # OpenCV's shadows are foreground.
-        expected = [255 * (model.apply(frame, learningRate=0) > 0) for frame in shown]
-        fg_settings = ForegroundSettings(working_reduction=1, min_blob_px=0, var_threshold=threshold)
+        expected = [255 * (model.apply(frame, learningRate=rate) > 0) for frame in shown]
+        fg_settings = ForegroundSettings(
+            working_reduction=1, min_blob_px=0, var_threshold=threshold, learning_rate=rate
+        )
         np.testing.assert_array_equal(list(Mog2(fg_settings).foreground(frames, shown)), expected)
-
-    def test_the_background_is_constant_at_learning_rate_zero(self) -> None:
-        rng = np.random.default_rng(9)
-        background = _texture(rng)
-        frames = [_with_discs(background, rng, (20.0 + 3 * i, 60.0)) for i in range(40)]
-        first, *_, last = Mog2(ForegroundSettings()).foreground(frames, 60 * frames[3:4])
-        np.testing.assert_array_equal(first, last)
-        *_, absorbed = Mog2(ForegroundSettings(learning_rate=0.05)).foreground(frames, 60 * frames[3:4])
-        assert first.any()
-        assert not absorbed.any()
 
     @pytest.mark.parametrize(("shadows", "level"), [("keep", 255), ("drop", 0), ("weight", 64)])
     def test_shadow_label_is_kept_dropped_or_weighted(self, shadows: str, level: int) -> None:
@@ -229,10 +215,6 @@ def _f1(mask: np.ndarray, truth: np.ndarray) -> float:
     return 2 * np.count_nonzero(seen & truth) / (np.count_nonzero(seen) + np.count_nonzero(truth))
 
 
-def _still(room: np.ndarray, index: int) -> np.ndarray:
-    return room
-
-
 def _gain(room: np.ndarray, index: int) -> np.ndarray:
     return room * (1 + 0.15 * np.sin(2 * np.pi * index / 175 + 1))
 
@@ -244,24 +226,20 @@ def _lamp(room: np.ndarray, index: int) -> np.ndarray:
     return lit
 
 
-def _screen(room: np.ndarray, index: int) -> np.ndarray:
+def _screen_and_leaves(room: np.ndarray, index: int) -> np.ndarray:
+    """A screen that plays a film, and leaves that sway before a window."""
     shown = room.copy()
     colours = np.random.default_rng(index // 10).uniform(0, 255, (3, 4, 3))
     shown[10:40, 110:150] = cv2.resize(colours, (40, 30), interpolation=cv2.INTER_CUBIC)
     shown[10:40, 110:150] = np.roll(shown[10:40, 110:150], 3 * index, axis=1)
+    leaves = _smooth(np.random.default_rng(4), 70, 70, cells=20)
+    window = np.roll(leaves, round(4 * np.sin(index / 4)), axis=1)[:50, 10:60, None]
+    shown[60:110, 5:55] = np.where(window > 0.5, 40 + 120 * window, shown[60:110, 5:55])
     return shown
 
 
-def _leaves(room: np.ndarray, index: int) -> np.ndarray:
-    swaying = room.copy()
-    leaves = _smooth(np.random.default_rng(4), 70, 70, cells=20)
-    window = np.roll(leaves, round(4 * np.sin(index / 4)), axis=1)[:50, 10:60, None]
-    swaying[60:110, 5:55] = np.where(window > 0.5, 40 + 120 * window, swaying[60:110, 5:55])
-    return swaying
-
-
 class TestLiving:
-    @pytest.mark.parametrize("change", [_still, _gain, _lamp, _screen, _leaves])
+    @pytest.mark.parametrize("change", [_gain, _lamp, _screen_and_leaves])
     def test_the_drone_is_the_foreground_whatever_changes(
         self, change: Callable[[np.ndarray, int], np.ndarray]
     ) -> None:
@@ -346,6 +324,7 @@ class TestLiving:
         # Before such changes were limited, the drone was not found at all.
         assert _f1(background.step(_exposed(pale, rng)), drone) > 0.9
 
+    @pytest.mark.slow
     def test_flashes_that_were_learned_long_ago_leave_no_invalid_numbers(self) -> None:
         """OpenCV's blur gave numbers below 0 after some minutes, and their roots were no numbers."""
         rng = np.random.default_rng(0)

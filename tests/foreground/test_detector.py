@@ -34,11 +34,6 @@ def models(tmp_path_factory):
     return folder
 
 
-def black(size: int):
-    """Black image with twice the width of the network's input and an aspect ratio of 4 to 3."""
-    return np.zeros((SCALE * size * 3 // 4, SCALE * size, 3), np.uint8)
-
-
 def square(size: int, column: int, row: int):
     """xyxy of one of the network's squares in the image; the grey border above the image is an eighth of the input."""
     x0, y0 = SCALE * STRIDE * column, SCALE * (STRIDE * row - size // 8)
@@ -46,8 +41,8 @@ def square(size: int, column: int, row: int):
 
 
 def painted(size, *squares, value=255):
-    """A black image with squares."""
-    bgr = black(size)
+    """A black image of twice the width of the network's input and an aspect ratio of 4 to 3, with squares."""
+    bgr = np.zeros((SCALE * size * 3 // 4, SCALE * size, 3), np.uint8)
     for x0, y0, x1, y1 in squares:
         bgr[max(0, y0) : y1, max(0, x0) : x1] = value
     return bgr
@@ -62,7 +57,7 @@ def detector(models, layout, **settings):
 def test_squares_are_found_the_brightest_first(models, layout):
     size = SIZES[layout]
     dim, bright = square(size, 2, 3), square(size, 9, 7)
-    xyxy, confidence = detector(models, layout).boxes(black(size))
+    xyxy, confidence = detector(models, layout).boxes(painted(size))
     assert (xyxy.shape, confidence.shape) == ((0, 4), (0,))
     bgr = np.maximum(painted(size, dim, value=200), painted(size, bright))
     xyxy, confidence = detector(models, layout).boxes(bgr)
@@ -88,10 +83,9 @@ def test_boxes_at_the_border_and_in_an_upright_image(models):
     x0, y0, x1, y1 = there = square(128, 4, 1)
     assert y0 == -SCALE * STRIDE
     bgr = painted(128, there)
-    xyxy, _ = detector(models, "v5").boxes(bgr)
-    np.testing.assert_allclose(xyxy, [[x0, 0, x1, y1]], atol=1e-4)
-    xyxy, _ = detector(models, "v5").boxes(np.ascontiguousarray(bgr.transpose(1, 0, 2)))
-    np.testing.assert_allclose(xyxy, [[0, x0, y1, x1]], atol=1e-4)
+    for image, box in ((bgr, [x0, 0, x1, y1]), (bgr.transpose(1, 0, 2), [0, x0, y1, x1])):
+        xyxy, _ = detector(models, "v5").boxes(np.ascontiguousarray(image))
+        np.testing.assert_allclose(xyxy, [box], atol=1e-4)
 
 
 def test_the_network_gets_rgb(tmp_path, models):
@@ -177,17 +171,8 @@ def test_detect_writes_a_file_per_camera(models, flight_folder, run_psotrack, tm
 
 def test_track_makes_detections_and_keeps_them(models, flight_folder, run_psotrack, tmp_path, monkeypatch):
     folder, _ = flight_folder
-    words = (
-        "track",
-        folder,
-        "--cache",
-        tmp_path / "cache",
-        "--detector",
-        models / "v8.onnx",
-        "--detector-size",
-        128,
-    )
-    track = functools.partial(run_psotrack, *words, "--json", "-", "--out")
+    of_detector = ("--detector", models / "v8.onnx", "--detector-size", 128, "--cache", tmp_path / "cache")
+    track = functools.partial(run_psotrack, "track", folder, *of_detector, "--json", "-", "--out")
     lines = ("--method", "projection-lines")
     found = track(tmp_path / "a.csv", *lines)
     tracks = read_trajectories(tmp_path / "a.csv")
