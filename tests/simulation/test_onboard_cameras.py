@@ -124,44 +124,28 @@ def test_written_poses_are_the_poses_of_the_rendered_frames(scene, tmp_path):
 # --- the room
 
 
-def differences(surfaces, cam, painted):
-    """Largest difference of the light of each pixel from a depth buffer with full textures."""
-    expected = backdrop.render_light(surfaces, cam, antialiasing=False)
-    return np.abs(painted[..., :3] / LIGHT_UNIT - expected).max(axis=-1)
-
-
-@pytest.mark.parametrize(("drone", "frame"), [(0, 0), (1, 90), (2, 170), (3, 90)])
-def test_the_painted_room_agrees_with_a_depth_buffer(scene, drone, frame):
-    """The painter draws surfaces from far to near without depth."""
-    surfaces = scene.room.surfaces
-    cam = OnboardRenderer(scene, drone).cam_at(scene.time_s(frame))
-    painted = np.empty((cam.height, cam.width, 4), np.uint16)
-    RoomPainter(surfaces).paint(raster.full_view(cam), painted)
-    difference = differences(surfaces, cam, painted)
-    # Pixels on an edge may differ because the depth buffer is float32 (measured at most 3.4e-4 of the pixels). The
-    # painter's reduced textures also differ in fine structure and at the edges of markers.
-    assert (difference > 0.2).mean() < 1e-3
-    assert difference.mean() < 2e-3
-    number, _ = backdrop.numbers_and_depth(surfaces, raster.full_view(cam))
-    floor = painted[..., 3] > LIGHT_UNIT // 2
-    assert (floor != (number == 0)).mean() < 2e-4
-
-
 @pytest.mark.parametrize("hall", HALLS)
 def test_a_hall_is_painted_from_far_to_near_wherever_the_eye_is(hall):
+    """The painter draws surfaces without depth; the oracle is a depth buffer with full textures."""
     surfaces = room(hall, True, 0.1).surfaces
     painter, rng = RoomPainter(surfaces), np.random.default_rng(0)
     ahead = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    for _ in range(6):
+    for _ in range(5):
         eye_m = rng.uniform([-0.4, -0.4, 0.3], [0.4, 0.4, 0.9]) * HALLS[hall].size_m
         turn = Rotation.from_euler("zyx", rng.uniform([0, -0.5, -0.5], [2 * np.pi, 0.5, 0.5]))
         R = ahead @ turn.as_matrix()
         cam = raster.Pinhole(R, -R @ eye_m, np.array([[92.0, 0, 95.5], [0, 92, 53.5], [0, 0, 1]]), 192, 108)
         painted = np.empty((cam.height, cam.width, 4), np.uint16)
         painter.paint(raster.full_view(cam), painted)
-        wrong = (differences(surfaces, cam, painted) > 0.2).astype(np.uint8)
+        expected = backdrop.render_light(surfaces, cam, antialiasing=False)
+        difference = np.abs(painted[..., :3] / LIGHT_UNIT - expected).max(axis=-1)
+        wrong = (difference > 0.2).astype(np.uint8)
         # Without single pixels on edges, where the reduced textures differ; measured at most 3.9e-4.
         assert cv2.morphologyEx(wrong, cv2.MORPH_OPEN, np.ones((2, 2))).mean() < 1e-3
+        number, _ = backdrop.numbers_and_depth(surfaces, raster.full_view(cam))
+        floor = painted[..., 3] > LIGHT_UNIT // 2
+        # Pixels on an edge may differ because the depth buffer is float32.
+        assert (floor != (number == 0)).mean() < 2e-4
 
 
 def test_colours_agree_with_a_fixed_camera_at_the_same_pose(scene):
@@ -173,31 +157,6 @@ def test_colours_agree_with_a_fixed_camera_at_the_same_pose(scene):
     # The two renderers sample edges differently; colours agree to one grey level.
     assert np.abs(difference.mean(axis=(0, 1))).max() < 0.5
     assert np.median(np.abs(difference)) <= 1.0
-
-
-@pytest.mark.slow
-def test_markers_are_detected_at_their_projection(tmp_path):
-    """Frames have full size, optics, motion blur and noise; the pose is read from its file, and OpenCV projects."""
-    scene = laboratory(1.0)
-    write_poses(tmp_path / onboard_pose_file(4), *onboard_poses(scene, 3, 101))
-    position_m, orientation_wxyz = read_poses(tmp_path / onboard_pose_file(4))
-    R = Rotation.from_quat(orientation_wxyz[100], scalar_first=True).as_matrix().T
-    K, (width, height) = intrinsics(scene)
-    cam = raster.Pinhole(R, -R @ position_m[100], K, width, height)
-    found = find_markers(OnboardRenderer(scene, 3).frame(100))
-    assert len(found) >= 4
-    corners_m = scene.room.marker_corners_m
-    errors = np.stack([pixels - opencv_pixels(cam, corners_m[marker]) for marker, pixels in found.items()])
-    distance = np.linalg.norm(errors, axis=-1)
-    # OpenCV finds the corners of a black square 0.2 px inside the square even in linear light without blur. Gamma
-    # spreads white over black and adds another 0.2 px (measured mean 0.41 px).
-    assert distance.mean() < 0.5
-    # A common shift of all corners would be an error of the simulator; the mean of at least 16 corners has a standard
-    # error of 0.1 px (measured shift 0.03 px).
-    assert np.abs(errors.mean(axis=(0, 1))).max() < 0.12
-    # Partly hidden corners, and corners where OpenCV's refinement fails, have larger errors (measured 1 in 80 above
-    # 1.2 px).
-    assert np.mean(distance < 1.2) > 0.9
 
 
 # --- other drones
@@ -270,10 +229,9 @@ def test_drones_cast_shadows_on_the_visible_floor(scene):
 # --- time: motion blur, rolling shutter, exposure, noise
 
 
-@pytest.mark.parametrize("speed_rad_s", [1.5, -3.0])
-def test_a_turning_camera_blurs_along_rows_by_its_rotation(speed_rad_s):
+def test_a_turning_camera_blurs_along_rows_by_its_rotation():
     """A box blur of length L adds L^2 / 12 to the variance of the silhouette, along the blur only."""
-    shutter_s, target = 1 / 50, tilted_cube(0.2, (1.0, 0.3, 1.5))
+    shutter_s, speed_rad_s, target = 1 / 50, -3.0, tilted_cube(0.2, (1.0, 0.3, 1.5))
     still, turning = (
         mean_and_variance(
             hidden(turning_flight(MIDDLE, speed), target, shutter_s=shutter_s, position_m=(0.0, 0.0, 0.0))
@@ -288,57 +246,31 @@ def test_a_turning_camera_blurs_along_rows_by_its_rotation(speed_rad_s):
     assert abs(across) < 0.4
 
 
-def test_a_long_exposure_is_the_mean_of_short_exposures(scene):
-    """The comparison is in linear light without lens blur, where an exposure is an integral over time."""
-    shutter_s, parts, flight = 1 / 40, 64, turning_flight(MIDDLE, 1.2)
-    imaging = msgspec.structs.replace(S02.imaging, lens_blur_px=0.0)
-    long, short = (seen_by(flight, imaging=imaging, shutter_s=time_s) for time_s in (shutter_s, 1e-9))
-    painter = RoomPainter(scene.room.surfaces)
-    total, light = np.zeros((long.height, long.width)), np.empty((long.height, long.width, 4), np.uint16)
-    for part in range(parts):
-        painter.paint(raster.full_view(short.cam_at(((part + 0.5) / parts - 0.5) * shutter_s)), light)
-        total += light[..., 1].clip(0, 4 * LIGHT_UNIT) / LIGHT_UNIT
-    expected = total / parts
-    dull = expected < 0.95  # light above full scale is clipped
-    away, sharp = (
-        np.abs(sensor.undevelop(each.clean_frame(0))[..., 1] - expected)[dull].mean()
-        for each in (long, short)
-    )
-    # 5 samples for 7 px of blur leave steps at strong edges; a sharp frame differs much more.
-    assert away < 0.006
-    assert away < 0.5 * sharp
-
-
-def test_frames_do_not_depend_on_the_order_of_rendering(scene):
+def test_frames_do_not_depend_on_the_order_and_each_camera_has_its_own_noise(scene):
     renderer, again = OnboardRenderer(scene, 1), OnboardRenderer(scene, 1)
     first, second = renderer.frame(3), renderer.frame(40)
     np.testing.assert_array_equal(again.frame(40), second)
     np.testing.assert_array_equal(again.frame(3), first)
     assert first.dtype == np.uint8
     assert (first != second).mean() > 0.5
-
-
-def test_each_camera_has_its_own_noise(scene):
-    noise = []
-    for drone in (0, 1):
-        renderer = OnboardRenderer(scene, drone)
-        grey = np.full((renderer.height, renderer.width, 3), 120, np.uint8)
-        noise.append(renderer.sensor.expose(grey, 5, 0.2).astype(float))
-        noise[-1] -= noise[-1].mean()
+    grey = np.full((renderer.height, renderer.width, 3), 120, np.uint8)
+    shown = (each.sensor.expose(grey, 5, 0.2) for each in (renderer, OnboardRenderer(scene, 0)))
+    a, b = (each - each.mean() for each in shown)
     # With half a million partly correlated numbers, independent noise has a correlation below 0.01.
-    assert abs((noise[0] * noise[1]).mean() / (noise[0].std() * noise[1].std())) < 0.02
+    assert abs((a * b).mean() / (a.std() * b.std())) < 0.02
 
 
 SIZE_WH = (640, 360)
 FOV_DEG = (92.45, 60.83)
 
 
-def made(**onboard):
+def made(scale=0.5, **onboard):
     """A scene without shadows and noise whose drones carry cameras of 640 x 360 pixels."""
+    size_wh = tuple(round(side / scale) for side in SIZE_WH)
     quiet = {"shadows": False, "read_noise": 0.0, "shot_noise": 0.0, "antialiasing": False}
-    fields = {"image_size_wh": SIZE_WH, "fov_deg": FOV_DEG, "shutter_s": 1 / 10_000, "pitch_deg": 10.0}
+    fields = {"image_size_wh": size_wh, "fov_deg": FOV_DEG, "shutter_s": 1 / 10_000, "pitch_deg": 10.0}
     imaging, camera = msgspec.structs.replace(S02.imaging, **quiet), OnboardCamera(**{**fields, **onboard})
-    return build(msgspec.structs.replace(S02, imaging=imaging, onboard=camera), seed=1)
+    return build(msgspec.structs.replace(S02, imaging=imaging, onboard=camera), scale=scale, seed=1)
 
 
 @pytest.mark.parametrize(("height", "motion_px"), [(360, 0.01), (361, 0.3), (17, 5.0), (360, 0.0)])
@@ -356,7 +288,6 @@ def test_strips_cover_each_row_once_and_its_time_on_average(height, motion_px):
         assert np.abs(times - rows).max() <= 0.5 + max(0.5 / motion_px, 4) / 16
 
 
-@pytest.mark.slow
 def test_each_row_is_what_a_global_shutter_shows_at_its_time():
     line_time_s, frame = 0.03 / SIZE_WH[1], 40
     fixed = made()
@@ -364,7 +295,8 @@ def test_each_row_is_what_a_global_shutter_shows_at_its_time():
     def shown(scene):
         return OnboardRenderer(scene, 0).clean_frame(frame).astype(float)
 
-    rolled, still = shown(made(line_time_s=line_time_s)), shown(fixed)
+    # At half the size, a row of the image stands for two rows of the camera.
+    rolled, still = shown(made(line_time_s=line_time_s / 2)), shown(fixed)
     for row in (0, 359):
         moment = shown(replace(fixed, start_s=line_time_s * (row - (SIZE_WH[1] - 1) / 2)))
         # Motion within a strip is at most half a pixel; at edges of markers a grey level may differ.
@@ -378,21 +310,27 @@ def test_each_row_is_what_a_global_shutter_shows_at_its_time():
 def test_markers_of_a_distorting_lens_are_detected_at_their_projection():
     """OpenCV detects and OpenCV projects."""
     distortion = np.array([-0.1, 0.03, 0.0005, -0.0004])
-    scene = made(distortion=tuple(distortion), image_size_wh=(1280, 720))
+    scene = made(1.0, distortion=tuple(distortion), image_size_wh=(1280, 720))
     renderer = OnboardRenderer(scene, 0)
     found = find_markers(cv2.cvtColor(renderer.frame(40), cv2.COLOR_BGR2GRAY))
     assert len(found) >= 4
     cam = renderer.cam_at(scene.time_s(40))
     off_px, straight_px = (
-        [
-            np.linalg.norm(corners - opencv_pixels(cam, scene.room.marker_corners_m[marker], dist), axis=1)
-            for marker, corners in found.items()
-        ]
+        np.array(
+            [
+                corners - opencv_pixels(cam, scene.room.marker_corners_m[marker], dist)
+                for marker, corners in found.items()
+            ]
+        )
         for dist in (distortion, None)
     )
-    # Measured 0.3 px, by OpenCV's refinement of corners; without the distortion tens of pixels.
-    assert np.median(off_px) < 0.7
-    assert np.max(straight_px) > 20
+    # Measured 0.3 px, by OpenCV's refinement of corners, which moves each corner inwards; without the distortion tens
+    # of pixels.
+    assert np.median(np.linalg.norm(off_px, axis=-1)) < 0.7
+    assert np.abs(straight_px).max() > 20
+    # A common shift of all corners would be an error of the simulator (measured 0.08 px): the mean of at least 16
+    # corners has a standard error of 0.1 px.
+    assert np.abs(off_px.mean(axis=(0, 1))).max() < 0.15
     # The lens of the package is the same.
     points_m = scene.room.marker_corners_m[next(iter(found))]
     own = project(lens(scene), points_m @ cam.R.T + cam.t_m)[0]
@@ -415,15 +353,13 @@ def test_the_exposure_swings_between_its_limits():
     assert OnboardRenderer(made(), 0).sensor.exposure(0.7) == 1.0
 
 
-@pytest.mark.slow
 def test_a_simulated_sequence_with_distortion_has_the_lens_of_each_drone(tmp_path):
     camera = {"image_size_wh": list(SIZE_WH), "fov_deg": list(FOV_DEG), "distortion": [-0.1, 0.03, 0.0, 0.0]}
-    recipe = change_scenario(
-        S02, {"onboard": camera, "image_size_wh": [64, 64], "cameras": "laboratory_corners"}
-    )
-    folder = simulate(recipe, tmp_path, SimulationSettings(num_frames=2, scale=0.5), jobs=1)
+    changes = {"onboard": camera, "image_size_wh": [320, 320], "cameras": "laboratory_corners"}
+    settings = SimulationSettings(num_frames=2, scale=0.1)
+    folder = simulate(change_scenario(S02, changes), tmp_path, settings, jobs=1)
     lenses = folder / "drone_cameras.toml"
-    found = choose_lens((320, 180), path=lenses, fov_deg=None, name="dron1", scale=False)
+    found = choose_lens((64, 36), path=lenses, fov_deg=None, name="dron1", scale=False)
     np.testing.assert_allclose(found.dist[:4], camera["distortion"])
     # The table without distortion is absent, so that no command takes the lens for ideal.
     assert not (folder / "drone_cameras_calibration.csv").exists()
