@@ -2,21 +2,27 @@
 
 import json
 import re
+import shutil
 
 import cv2
 import numpy as np
 import pytest
-from helpers import make_once
-from real_form import SERIALS, write_as_real
+from helpers import make_once, read_mocap_markers
+from msgspec.structs import replace
+from placed_drones import S02
+from scipy.interpolate import CubicSpline
 
-from psotrack.geometry import look_at, make_camera, project
-from psotrack.geometry.rig_files import read_rig
+from psotrack.geometry import Rig, look_at, make_camera, project
+from psotrack.geometry.rig_files import read_rig, write_calibration
 from psotrack.recordings import probe
-from psotrack.simulation import OWN_CAMERAS, SimulationSettings, change_scenario, scenario, simulate
+from psotrack.recordings.datasets import CALIBRATION, DETECTIONS, read_sequence
+from psotrack.recordings.mocap import Markers, write_c3d
+from psotrack.simulation import OWN_CAMERAS, SimulationSettings, simulate
 from psotrack.simulation.imaging.lens_image import lens_image
 from psotrack.simulation.imaging.posed_board import PosedBoard, board_poses, draw_board, own_board
 from psotrack.simulation.imaging.raster import pinhole
 from psotrack.simulation.own_cameras import own_rig
+from psotrack.simulation.world.halls import RIGS
 
 
 def lens():
@@ -114,12 +120,45 @@ def test_the_folder_of_a_laboratory(tmp_path, run_psotrack):
 # --- the real half
 
 
+#: Serial numbers of the dataset's cameras, without the fifth camera, which was a spare.
+SERIALS = ("55260362", "56339527", "60881257", "61016180")
+#: Focal length of the real half's calibration at the full image size, pixels.
+FOCAL_LENGTH_PX = 1158.7
+#: A weak barrel distortion, usual for this field of view. The distortion of the dataset's lenses is not known.
+LENS = (-0.08, 0.02, 0.0004, -0.0003)
 #: The reference's clock is ahead of the videos by this time, seconds: 9.4 frames of 25 Hz.
 OFFSET_S = 0.377
-
-
 #: Largest error of the offset that is estimated from the drones' motion, seconds: a tenth of a frame.
 OFFSET_TOLERANCE_S = 0.004
+
+
+def write_real_half(folder):
+    """A sequence in the form of the real half of DPJAIT, which a Vicon system recorded, in Real_Data/R02_D4.
+
+    Four cameras of one type with lens distortion are named by serial number, with a calibration in millimetres. The
+    reference is one C3D file of marker crosses at 100 Hz, whose clock began earlier, with noise and a reflection on the
+    floor. The middle of a cross is not the drone's body origin: evaluation finds the lever arm.
+    """
+    lens = {"focal_length_px": FOCAL_LENGTH_PX, "distortion": LENS}
+    cameras = tuple(replace(place, **lens) for place in RIGS["laboratory_corners"])
+    size = SimulationSettings(num_frames=80, scale=0.25, masks=False, onboard=False)
+    simulated = read_sequence(simulate(replace(S02, cameras=cameras, markers=False), folder, size, jobs=1))
+    real = folder / "Real_Data" / "R02_D4"
+    (real / DETECTIONS).mkdir(parents=True)
+    write_calibration(real / CALIBRATION, Rig(SERIALS, simulated.rig.cameras), unit="mm")
+    for name, serial in zip(simulated.rig.names, SERIALS, strict=True):
+        shutil.copy(simulated.videos[name].path, real / f"{serial}.avi")
+        shutil.copy(simulated.detections[name], real / DETECTIONS / f"{serial}.csv")
+    paths = sorted(simulated.folder.glob("dron*_markers_*.csv"))
+    crosses_m = np.concatenate([read_mocap_markers(path) for path in paths], axis=1)
+    # Before frame 0 the drones stand still.
+    time_s = np.arange(0, 79 / 25 + OFFSET_S, 0.01) - OFFSET_S
+    shown_m = CubicSpline(np.arange(80) / 25, crosses_m)(np.maximum(time_s, 0.0))
+    shown_m += np.random.default_rng(0).normal(0.0, 0.0002, shown_m.shape)
+    labels = [f"Dron{drone}:Dron{drone}{marker}" for drone in range(1, 5) for marker in range(1, 5)]
+    reflection_m = np.tile((1.3, -1.1, 0.02), (len(time_s), 1, 1))
+    markers = Markers((*labels, "*1"), np.concatenate([shown_m, reflection_m], axis=1), 100.0)
+    write_c3d(real / "R02_D4.c3d", markers)
 
 
 @pytest.mark.slow
@@ -128,21 +167,16 @@ def test_a_sequence_in_the_layout_of_the_real_half_through_every_command(
 ):
     """The reference's clock is ahead of the videos; `doctor` finds by how much, and `evaluate` removes it."""
 
-    def make(folder):
-        recipe = change_scenario(scenario("S02_D4_A"), {"cameras": "laboratory_corners", "markers": False})
-        size = SimulationSettings(num_frames=120, scale=0.25, masks=False, onboard=False)
-        write_as_real(simulate(recipe, folder, size, jobs=1), folder, offset_s=OFFSET_S)
-
     def run(*words):
         result = run_psotrack(*words, "--json", "-")
         # `doctor` ends with 1 where it finds something.
         assert result.code in ((0, 1) if words[0] == "doctor" else (0,)), result.err
         return json.loads(result.out)
 
-    sequence = make_once(tmp_path_factory, "real_half", make) / "Real_Data" / "R02_D4"
+    sequence = make_once(tmp_path_factory, "real_half", write_real_half) / "Real_Data" / "R02_D4"
     content = run("init", "--show", sequence)
     assert list(content["cameras"]) == list(SERIALS)
-    assert content["cameras"][SERIALS[0]]["focal_length_px"] == pytest.approx(0.25 * 1158.7)
+    assert content["cameras"][SERIALS[0]]["focal_length_px"] == pytest.approx(0.25 * FOCAL_LENGTH_PX)
     (finding,) = run("doctor", sequence)["findings"]
     assert finding["kind"] == "reference"
     assert "`psotrack doctor --tracks`" in finding["remedy"]
@@ -170,5 +204,4 @@ def test_a_sequence_in_the_layout_of_the_real_half_through_every_command(
         # The reference is the marker cross above the body; the tracked point is the centre of the whole drone's box.
         assert all(drone["offset_m"][2] < -0.03 for drone in errors["per_drone"])
     refused = run_psotrack("evaluate", tracks, sequence, "--offset", "soon")
-    assert (refused.code, refused.out) == (2, "")
     assert "expected a number of seconds, or auto, found 'soon'" in refused.err
