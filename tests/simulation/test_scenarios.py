@@ -1,6 +1,5 @@
 """Scenarios: the thirteen presets of the dataset, scenario files, and changed fields."""
 
-import tomllib
 from pathlib import Path
 
 import msgspec
@@ -9,9 +8,7 @@ import pytest
 from placed_drones import S02
 
 from psotrack.simulation import build, catalogue, change_scenario, load, preset_names, preset_text, scenario
-from psotrack.simulation.flights.planning import frame_times_s, plan
 from psotrack.simulation.scenarios import FlightFromFile, Mesh, NearPass
-from psotrack.simulation.world.halls import RIGS
 
 #: Name -> drones (the published S05 ships ten pose files), cameras, frames.
 DATASET = {
@@ -31,42 +28,38 @@ DATASET = {
 }
 
 
-def test_the_presets_are_the_sequences_of_the_dataset():
+def test_the_presets_are_the_sequences_of_the_dataset(run_psotrack):
     """The paper states 20 min 3 s in total, and 91 min 25 s when each sequence is counted once per drone."""
-    assert preset_names() == tuple(DATASET)
-    recipes = [scenario(name) for name in preset_names()]
-    assert sum(recipe.num_frames for recipe in recipes) / 25 == 20 * 60 + 3
-    assert sum(recipe.num_frames * len(recipe.drones) for recipe in recipes) / 25 == 91 * 60 + 25
-    models = set()
-    for recipe, (name, (num_drones, cameras, frames)) in zip(recipes, DATASET.items(), strict=True):
-        drones = recipe.drones
-        assert (recipe.name, len(drones), recipe.num_frames) == (name, num_drones, frames)
-        assert len(RIGS[recipe.cameras]) == cameras
-        assert (recipe.fps, recipe.image_size_wh) == (25.0, (1920, 1080))
-        assert recipe.markers == (recipe.onboard is not None) == name.endswith("_A")
-        assert recipe.hall == ("large_hall" if 3 <= int(name[1:3]) <= 10 else "laboratory")
-        assert recipe.description
-        assert len({(drone.model, drone.paint_bgr) for drone in drones}) == len(drones)
-        models |= {drone.model for drone in drones}
+    rows, models = catalogue(), set()
+    assert preset_names() == tuple(DATASET) == tuple(row["name"] for row in rows)
+    assert sum(row["frames"] for row in rows) / 25 == 20 * 60 + 3
+    assert sum(row["frames"] * row["drones"] for row in rows) / 25 == 91 * 60 + 25
+    shown = run_psotrack("simulate", "--list").out
+    # Speeds measured on the dataset: the fast sequences, the sequences flown by hand, and all others.
+    fast = dict.fromkeys(("S08_D8", "S09_D6", "S10_D6"), (3.4, 4.0))
+    by_hand = dict.fromkeys(("S11_D4", "S12_D3", "S13_D3"), (0.25, 0.43))
+    for row in rows:
+        name, recipe = row["name"], scenario(row["name"])
+        drones, cameras, frames = DATASET[name]
+        assert (row["drones"], row["cameras"], row["frames"]) == (drones, cameras, frames)
+        assert (recipe.name, recipe.fps, recipe.image_size_wh) == (name, 25.0, (1920, 1080))
+        assert row["markers"] == row["onboard"] == name.endswith("_A")
+        assert row["hall"] == ("large_hall" if 3 <= int(name[1:3]) <= 10 else "laboratory")
+        assert f"{name}: {drones} drones, {cameras} cameras, {frames} frames, {row['hall']}" in shown
+        assert row["description"] in shown
+        least, most = (fast | by_hand).get(name, (0.5, 3.0))
+        assert least <= row["mean_speed_m_s"] <= most
+        assert len({(drone.model, drone.paint_bgr) for drone in recipe.drones}) == drones
+        models |= {drone.model for drone in recipe.drones}
         assert recipe.limits.min_distance_m >= 0.8
-        near = any(isinstance(drone.flight, NearPass) for drone in drones)
-        assert near == (name in {"S01_D2_A", "S04_D10", "S06_D6"})
+        near_m = [drone.flight.distance_m for drone in recipe.drones if isinstance(drone.flight, NearPass)]
+        assert bool(near_m) == (name in {"S01_D2_A", "S04_D10", "S06_D6"})
+        if name == "S01_D2_A":
+            assert near_m == [0.3], "its two drones pass each other at 30 cm"
     assert models == {"x_frame", "x_frame_racer", "camera_drone", "hexacopter", "tall_cross"}
 
 
-def test_the_two_drones_of_s01_pass_each_other_at_30_cm():
-    recipe = scenario("S01_D2_A")
-    time_s = frame_times_s(recipe, recipe.num_frames)
-    for seed in (0, 1, 2):
-        first, second = (flight.position_m(time_s) for flight in plan(recipe, seed))
-        gap_m = np.linalg.norm(first - second, axis=-1)
-        meetings = (gap_m[1:-1] < gap_m[:-2]) & (gap_m[1:-1] < gap_m[2:])
-        assert np.count_nonzero(meetings) >= 5
-        # At up to 1.1 m/s, a frame is at most half a frame time from the closest approach: sqrt(0.3^2 + 0.022^2) m.
-        np.testing.assert_allclose(gap_m[1:-1][meetings], 0.3, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["S01_D2_A", "S06_D6", "S13_D3"])
+@pytest.mark.parametrize("name", DATASET)
 def test_all_cameras_see_the_drones_of_every_preset_most_of_the_time(name):
     scene = build(scenario(name), scale=0.1)
     position_m = scene.positions_m(scene.scenario.num_frames)[::25].reshape(-1, 3)
@@ -77,12 +70,13 @@ def test_all_cameras_see_the_drones_of_every_preset_most_of_the_time(name):
         assert seen.mean() > 0.5
 
 
-def test_a_file_is_read_and_its_paths_are_relative_to_its_folder(tmp_path, monkeypatch):
+def test_a_file_is_read_and_its_paths_are_relative_to_its_folder(tmp_path, monkeypatch, run_psotrack):
     path = tmp_path / "mine" / "mine.toml"
     path.parent.mkdir()
-    for name in ("S02_D4_A", "S06_D6", "S13_D3"):
+    for name in DATASET:
         path.write_text(preset_text(name), encoding="utf-8")
         assert load(path) == scenario(name)
+    assert run_psotrack("simulate", "S01_D2_A", "--show").out == preset_text("S01_D2_A")
     head, _, _, third = preset_text("S12_D3").split("[[drones]]")
     path.write_text(
         head
@@ -130,23 +124,3 @@ def test_change_scenario_changes_only_the_given_fields():
         change_scenario(S02, {"onboard.fov_deg": [90.0, 90.0], "onboard.image_size_wh": [800, 800]}),
         scale=0.1,
     )
-
-
-def test_the_catalogue_and_the_text_are_those_of_the_presets(run_psotrack):
-    rows = catalogue()
-    assert [row["name"] for row in rows] == list(DATASET)
-    shown = run_psotrack("simulate", "--list").out
-    for row in rows:
-        drones, cameras, frames = DATASET[row["name"]]
-        assert (row["drones"], row["cameras"], row["frames"]) == (drones, cameras, frames)
-        assert row["markers"] == row["onboard"] == row["name"].endswith("_A")
-        assert f"{row['name']}: {drones} drones, {cameras} cameras, {frames} frames, {row['hall']}" in shown
-        assert row["description"] in shown
-    # Speeds measured on the dataset: the fast sequences, the sequences flown by hand, and all others.
-    fast = dict.fromkeys(("S08_D8", "S09_D6", "S10_D6"), (3.4, 4.0))
-    by_hand = dict.fromkeys(("S11_D4", "S12_D3", "S13_D3"), (0.25, 0.43))
-    for row in rows:
-        least, most = (fast | by_hand).get(row["name"], (0.5, 3.0))
-        assert least <= row["mean_speed_m_s"] <= most
-    assert run_psotrack("simulate", "S01_D2_A", "--show").out == preset_text("S01_D2_A")
-    assert tomllib.loads(preset_text("S01_D2_A"))["name"] == "S01_D2_A"
