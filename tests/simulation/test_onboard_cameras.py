@@ -343,13 +343,6 @@ def test_the_exposure_swings_between_its_limits():
     factors = np.array([renderer.sensor.exposure(time_s) for time_s in times_s])
     assert factors.min() == pytest.approx(0.3, rel=1e-3)
     assert factors.max() == pytest.approx(2.0, rel=1e-3)
-    image = np.full((SIZE_WH[1], SIZE_WH[0], 3), 100, np.uint8)
-    dark, bright = (
-        renderer.sensor.expose(image, 0, times_s[index]).mean()
-        for index in (factors.argmin(), factors.argmax())
-    )
-    # A factor of light is its power 1 / 2.2 of grey levels; flicker and drift change the light by up to 10 %.
-    assert bright / dark == pytest.approx((2.0 / 0.3) ** (1 / 2.2), rel=0.06)
     assert OnboardRenderer(made(), 0).sensor.exposure(0.7) == 1.0
 
 

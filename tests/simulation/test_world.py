@@ -11,7 +11,7 @@ from placed_drones import BLACK, S02, around
 from psotrack.geometry import project
 from psotrack.simulation import CameraRenderer, build
 from psotrack.simulation.scenarios import Mesh, Rotor
-from psotrack.simulation.world import drones, lighting, models, rooms
+from psotrack.simulation.world import drones, lighting, rooms
 from psotrack.simulation.world.halls import HALLS
 
 MODELS = {name: drones.model(name) for name in drones.MODELS}
@@ -73,22 +73,6 @@ def test_rotors_turn_above_their_motors_without_touching_each_other(name):
         assert np.linalg.norm(a - b) > r + s or abs(a[2] - b[2]) > 0.01
 
 
-def test_each_rotor_disc_has_the_radius_of_its_rotor():
-    model = drones.DroneModel(
-        models.box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
-        np.ones(12),
-        np.array([[0.2, 0.0, 0.1], [-0.3, 0.1, 0.2]]),
-        np.array([0.05, 0.4]),
-    )
-    fans = drones.disc_fans(model).reshape(2, -1, 3, 3)
-    np.testing.assert_array_equal(
-        fans[:, :, 0], np.repeat(model.rotor_centres_m[:, None], fans.shape[1], axis=1)
-    )
-    rims = np.linalg.norm(fans[:, :, 1:] - fans[:, :, :1], axis=-1)
-    np.testing.assert_allclose(rims, np.broadcast_to(model.rotor_radii_m[:, None, None], rims.shape))
-    assert model.radius_m == pytest.approx(np.hypot(0.3, np.hypot(0.1, 0.2)) + 0.4)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_marker_crosses_stand_on_top_are_asymmetric_and_differ_between_ten_drones(name):
     model = MODELS[name]
@@ -121,21 +105,7 @@ MESH_FORMATS = {
 
 
 @pytest.mark.parametrize("mesh_format", MESH_FORMATS)
-def test_an_exported_mesh_is_read_with_the_same_triangles(mesh_format, tmp_path):
-    suffix, options = MESH_FORMATS[mesh_format]
-    written = as_trimesh(MODELS["hexacopter"].triangles_m)
-    written.export(tmp_path / f"drone{suffix}", **options)
-    model = drones.model(Mesh(file=str(tmp_path / f"drone{suffix}")))
-    # PLY holds float32 and OBJ eight decimals, so coordinates are exact to about 1e-8 m.
-    np.testing.assert_allclose(model.triangles_m, written.triangles, atol=4e-8)
-    np.testing.assert_array_equal(model.paint, 1.0)
-    assert model.rotor_centres_m.shape == (0, 3)
-    assert drones.disc_fans(model).shape == (0, 3, 3)
-    assert model.radius_m == pytest.approx(np.linalg.norm(written.vertices, axis=-1).max(), abs=1e-7)
-
-
-@pytest.mark.parametrize("mesh_format", MESH_FORMATS)
-def test_scale_origin_and_rotors_are_exact(mesh_format, tmp_path):
+def test_a_mesh_is_read_exactly_with_its_scale_origin_and_rotors(mesh_format, tmp_path):
     suffix, options = MESH_FORMATS[mesh_format]
     shape = trimesh.creation.box((256, 256, 256))  # exact in every format
     shape.export(tmp_path / f"cube{suffix}", **options)
@@ -150,6 +120,12 @@ def test_scale_origin_and_rotors_are_exact(mesh_format, tmp_path):
     np.testing.assert_array_equal(model.triangles_m, shape.triangles / 1024 - [0.125, 0.0, -0.0625])
     np.testing.assert_array_equal(model.rotor_centres_m, [(0.1, 0.2, 0.3), (-0.1, 0.2, 0.3)])
     np.testing.assert_array_equal(model.rotor_radii_m, [0.05, 0.07])
+    np.testing.assert_array_equal(model.paint, 1.0)
+    # The rim of each rotor's disc has the rotor's radius, and the farther rotor's rim is the farthest point.
+    fans = drones.disc_fans(model).reshape(2, -1, 3, 3)
+    rims = np.linalg.norm(fans[:, :, 1:] - model.rotor_centres_m[:, None, None], axis=-1)
+    np.testing.assert_allclose(rims, np.broadcast_to([[[0.05]], [[0.07]]], rims.shape))
+    assert model.radius_m == pytest.approx(np.sqrt(0.14) + 0.07)
 
 
 def test_polygons_materials_parts_and_latin_1_are_read(tmp_path, capfd):
