@@ -1,10 +1,12 @@
-"""The table of formats: sound files, the public functions that read them, and a command that does."""
+"""The table of formats: sound files, the public functions that read them, and a command that does.
+
+Small files lie in tests/data/formats, and are copied; the others are written here.
+"""
 
 from __future__ import annotations
 
 import shutil
-import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,36 +16,29 @@ import cv2
 import dpjait_folders
 import numpy as np
 import onnx_models
-import pandas as pd
-import rig_texts as rigs
 import worlds
-from helpers import ring_rig
 
 from fuzz.mutations import Change, columns, members
 from psotrack import calibration, inside_out, recordings, simulation
 from psotrack.errors import errors_name
 from psotrack.foreground.detection import DetectorSettings, OnnxDetector
 from psotrack.foreground.silhouettes import compute
-from psotrack.geometry.rig_files import read_lenses, read_rig, write_rig
+from psotrack.geometry.rig_files import read_lenses, read_rig
 from psotrack.pipeline import archives
 from psotrack.recordings import datasets, exchange, mocap
-from psotrack.recordings.datasets import (
-    read_marker_centres,
-    read_masks,
-    write_marker_corners,
-)
 from psotrack.show import flights
-from psotrack.simulation import build, change_scenario, read_recorded_flight, read_sticks, scenario
 from psotrack.sweeps import Store, read_grid
 from psotrack.trajectories import read_trajectories
 
 Read = Callable[[Path], object]
 
+SOUND = Path(__file__).parents[1] / "data" / "formats"
 #: An image size for the calibrations that have none.
 SIZE_WH = (1280, 720)
 _CONVERT = "calibrate convert {file} {out}/rig.toml --size 1280,720"
 _EXPORT = "export {file} --to json --out {out}/tracks.json"
 _INFO = "init --show {folder}"
+_MAP = "onboard map {file} --out {out}/corners.csv"
 
 
 @dataclass(frozen=True)
@@ -69,6 +64,16 @@ class Format:
     is_slow: bool = False
 
 
+def _copied(name: str) -> Callable[[Path], object]:
+    return lambda folder: shutil.copytree(SOUND / name, folder, dirs_exist_ok=True)
+
+
+def _stored(path: str, *reads: Read, command: str = "", inside: Change | None = None) -> Format:
+    """A format whose sound files are copied; the path is the name of their folder, and the file."""
+    name, _, file = path.partition("/")
+    return Format(_copied(name), file, reads, command, inside)
+
+
 # --- calibrations
 
 
@@ -80,58 +85,30 @@ def _lenses(path: Path) -> object:
     return read_lenses(path, SIZE_WH)
 
 
-def _calibration(make: Callable[[Path], object], file: str, units: str = "") -> Format:
-    return Format(make, file, (_rig, _lenses), f"{_CONVERT}{units and f' --units {units}'}")
+def _calibration(path: str, words: str = "") -> Format:
+    return _stored(path, _rig, _lenses, command=f"{_CONVERT} {words}")
 
 
-def _only_lenses(file: str, text: str) -> Format:
-    return Format(_text(file, text), file, (_lenses,), f"{_CONVERT} --lenses")
-
-
-def _written(file: str, file_format: str | None = None) -> Format:
-    def make(folder: Path) -> None:
-        write_rig(folder / file, ring_rig(2, coefficients=5), file_format=file_format)
-
-    return _calibration(make, file)
-
-
-def _text(file: str, text: str) -> Callable[[Path], object]:
-    return lambda folder: (folder / file).write_text(text, encoding="utf-8")
-
-
-_VICON = 'VICON_RADIAL2="ViconRadial2 650.5 350.25 0.06 -0.01"'
 _CALIBRATIONS = {
-    "rig.toml": _written("rig.toml"),
-    "opencv-yaml": _written("rig.yml"),
-    "caliscope": _written("camera_array.toml"),
-    "anipose": _written("calibration.toml", "anipose"),
-    "dpjait-cameras": _calibration(
-        _text(
-            "cameras.csv",
-            f"{dpjait_folders.REAL_HEADER}\n55260362;-100;250.5;6000;1.9;0.1;0;1158.7;640;360;-0.1;0.02;0.001;-0.002\n"
-            "56339527;100;250.5;6000;1.9;-0.1;0;1158.7;640;360;-0.1;0.02;0.001;-0.002\n",
-        ),
-        "cameras.csv",
-    ),
-    "opencv-json": _calibration(rigs.json_file, "rig.json", "m"),
-    "opencv-stereo-yaml": _calibration(rigs.storage_files, "extrinsics.yml", "m"),
-    "opencv-stereo-xml": _calibration(rigs.storage_files, "intrinsics.xml", "m"),
-    "ros": _only_lenses("head.yaml", rigs.ros_text()),
-    "pose2sim": _calibration(lambda folder: rigs.pose2sim_file(folder / "calib.toml"), "calib.toml"),
-    "qualisys": _calibration(lambda folder: rigs.qualisys_file(folder / "a.qca.txt"), "a.qca.txt"),
-    "vicon": _calibration(lambda folder: rigs.vicon_file(folder / "a.xcp", _VICON), "a.xcp"),
-    "easymocap-lenses": _calibration(rigs.easymocap_files, "intri.yml"),
-    "easymocap-poses": _calibration(rigs.easymocap_files, "extri.yml"),
-    "kalibr": _calibration(lambda folder: rigs.kalibr_file(folder / "camchain.yaml"), "camchain.yaml"),
-    "dlt": _calibration(
-        lambda folder: rigs.dlt_file(folder / "dlt.csv", rigs.dlt_columns(upwards=True)), "dlt.csv", "m"
-    ),
-    "handpose-lenses": _calibration(rigs.handpose_files, "c0.dat", "m"),
-    "handpose-poses": _calibration(rigs.handpose_files, "rot_trans_c1.dat", "m"),
-    "argus": _only_lenses(
-        "profile.txt",
-        "1 1165.5 1920 1080 960 540 1 -0.2 0.05 0.001 0.002 0.01\n2 800 1280 720 640 360 1 0 0 0 0 0\n",
-    ),
+    "rig.toml": _calibration("rig.toml/rig.toml"),
+    "opencv-yaml": _calibration("opencv-yaml/rig.yml"),
+    "caliscope": _calibration("caliscope/camera_array.toml"),
+    "anipose": _calibration("anipose/calibration.toml"),
+    "dpjait-cameras": _calibration("dpjait-cameras/cameras.csv"),
+    "opencv-json": _calibration("opencv-json/rig.json", "--units m"),
+    "opencv-stereo-yaml": _calibration("opencv-stereo/extrinsics.yml", "--units m"),
+    "opencv-stereo-xml": _calibration("opencv-stereo/intrinsics.xml", "--units m"),
+    "pose2sim": _calibration("pose2sim/calib.toml"),
+    "qualisys": _calibration("qualisys/a.qca.txt"),
+    "vicon": _calibration("vicon/a.xcp"),
+    "easymocap-lenses": _calibration("easymocap/intri.yml"),
+    "easymocap-poses": _calibration("easymocap/extri.yml"),
+    "kalibr": _calibration("kalibr/camchain.yaml"),
+    "dlt": _calibration("dlt/dlt.csv", "--units m"),
+    "handpose-lenses": _calibration("handpose/c0.dat", "--units m"),
+    "handpose-poses": _calibration("handpose/rot_trans_c1.dat", "--units m"),
+    "ros": _stored("ros/head.yaml", _lenses, command=f"{_CONVERT} --lenses"),
+    "argus": _stored("argus/profile.txt", _lenses, command=f"{_CONVERT} --lenses"),
 }
 
 
@@ -143,8 +120,6 @@ def _exported(to: str, out: str, file: str | None = None, inside: Change | None 
 
     def make(folder: Path) -> None:
         exchange.export_tracks(worlds.make_tracks(), to, folder / out)
-        if to == "mot":
-            (folder / "seqinfo.ini").write_text("[Sequence]\nname=a\nframeRate=25\nseqLength=14\n")
 
     def read(path: Path) -> object:
         whole = path.parents[len(Path(file).parts) - 1] if file else path
@@ -154,36 +129,37 @@ def _exported(to: str, out: str, file: str | None = None, inside: Change | None 
     return Format(make, f"{out}/{file}" if file else out, (read,), command, inside)
 
 
-def _mot_info(folder: Path) -> None:
-    _exported("mot", "tracks.txt").make(folder)
+def _of_run(path: Path) -> object:
+    return flights.read_tracks_file(path.with_suffix(".csv"), "a")
 
 
 _TRACKS = {
-    "tracks-csv": Format(
-        lambda folder: worlds.make_tracks_file(folder / "tracks.csv"),
-        "tracks.csv",
-        (partial(read_trajectories, fps=25.0), exchange.read_tracks),
-        _EXPORT,
+    "tracks-csv": _stored(
+        "tracks/tracks.csv", partial(read_trajectories, fps=25.0), exchange.read_tracks, command=_EXPORT
     ),
     "tracks-parquet": _exported("parquet", "tracks.parquet", inside=columns),
     "tracks-json": _exported("json", "tracks.json"),
     "tum": _exported("tum", "tum", "1.tum"),
     "kitti": _exported("kitti", "kitti", "poses/1.txt"),
     "kitti-times": _exported("kitti", "kitti", "sequences/1/times.txt"),
-    "mot": _exported("mot", "tracks.txt"),
-    "mot-rate": Format(
-        _mot_info,
-        "seqinfo.ini",
-        (lambda path: exchange.read_tracks(path.parent / "tracks.txt"),),
-        "export {folder}/tracks.txt --to json --out {out}/tracks.json",
+    "mot": _stored("mot/tracks.txt", exchange.read_tracks, command=_EXPORT),
+    "mot-rate": _stored(
+        "mot/seqinfo.ini",
+        lambda path: exchange.read_tracks(path.parent / "tracks.txt"),
+        command="export {folder}/tracks.txt --to json --out {out}/tracks.json",
     ),
     "tracks-c3d": _exported("c3d", "tracks.c3d"),
     "mcap": _exported("mcap", "tracks.mcap"),
-    "run-record": Format(
-        lambda folder: worlds.make_tracks_file(folder / "tracks.csv"),
-        "tracks.json",
-        (flights.read_run_record, lambda path: flights.read_tracks_file(path.with_suffix(".csv"), "a")),
-        "export {folder}/tracks.csv --to mcap --out {out}/tracks.mcap",
+    "run-record": _stored(
+        "tracks/tracks.json",
+        flights.read_run_record,
+        _of_run,
+        command="export {folder}/tracks.csv --to mcap --out {out}/tracks.mcap",
+    ),
+    "camera-path": _stored(
+        "tracks/inside.csv",
+        inside_out.read_camera_path,
+        command="onboard fuse {file} {folder}/tracks.csv --out {out}/fused.csv",
     ),
 }
 
@@ -194,66 +170,35 @@ _TRACKS = {
 def _recording(folder: Path) -> None:
     """A recording with all kinds of files; the videos have few frames, so that a try is quick."""
     worlds.make_sequence(folder)
-    rows = "".join(f"{frame},{10 + frame},20,12,10,16,25,0.9\n" for frame in range(worlds.NUM_FRAMES))
-    (folder / "boxes.csv").write_text(rows)
-    times = "".join(f"{frame},{frame / worlds.RATE_HZ}\n" for frame in range(worlds.NUM_FRAMES))
-    (folder / "times.csv").write_text(f"frame,time_s\n{times}")
-    labels = tuple(f"{body}:{body}{i}" for body in ("dronA", "dronB") for i in range(4))
-    cross_m = np.array([[0.1, 0, 0], [0, 0.12, 0], [-0.15, 0, 0], [0, -0.1, 0.05]])
-    position_m = np.concatenate([cross_m + np.array([x, 0, 1.2]) for x in (-0.6, 0.6)])
-    moved_m = position_m + 0.01 * np.arange(20)[:, None, None]
-    mocap.write_c3d(folder / "mocap.c3d", mocap.Markers(labels, moved_m, 50.0))
-    write_marker_corners(folder / "corners.csv", _corners())
-    text = (folder / "recording.toml").read_text()
-    text = text.replace('video = "c1.avi"', 'video = "c1.avi"\ntimestamps = "times.csv"')
-    text = text.replace('video = "c2.avi"', 'video = "c2.avi"\nline_time_s = 1e-5\ndetections = "boxes.csv"')
-    files = ", ".join(f'"{name}.csv"' for name in worlds.REFERENCE)
-    text = text.replace(f"files = [{files}]", 'files = ["mocap.c3d"]\ntime_offset_s = 0.01')
-    text += '[markers]\ncorners = "corners.csv"\n[world]\nbounds_m = [[-3, -3, 0], [3, 3, 3]]\n'
-    (folder / "recording.toml").write_text(text)
-
-
-def _corners() -> Mapping[int, np.ndarray]:
-    square = np.array([[0, 2, 1.2], [0.2, 2, 1.2], [0.2, 2, 1.0], [0, 2, 1.0]])
-    return {marker: square + np.array([marker, 0, 0]) for marker in (0, 1, 7)}
-
-
-def _csv_recording(folder: Path) -> None:
-    worlds.make_sequence(folder)
+    _copied("recording")(folder)
 
 
 def _open(path: Path) -> object:
     return datasets.open_recording(path.parent).usable()
 
 
-def _part(file: str, *reads: Read) -> Format:
-    return Format(_recording, file, (_open, *reads), _INFO, is_slow=True)
+def _part(file: str, *reads: Read, make: Callable[[Path], object] = _recording) -> Format:
+    return Format(make, file, (_open, *reads), _INFO, is_slow=True)
 
 
 def _dpjait(folder: Path) -> None:
     """A small sequence of the dataset with all kinds of files."""
     dpjait_folders.make_simulated(folder)
-    write_marker_corners(folder / "aruco_corners.csv", _corners())
-    mask = cv2.imencode(".png", np.eye(8, dtype=np.uint8) * 255)[1].tobytes()
-    with zipfile.ZipFile(folder / "drone_masks.zip", "w") as archive:
-        for frame in range(3):
-            archive.writestr(f"cam1i/dron1/{frame:06d}.png", mask)
+    _copied("dpjait")(folder)
 
 
 def _all_masks(path: Path) -> None:
-    with read_masks(path) as masks:
+    with datasets.read_masks(path) as masks:
         for frame in masks.frames:
             masks.mask("cam1i", 1, frame)
 
 
 def _published(file: str, *reads: Read, inside: Change | None = None) -> Format:
-    opened = (_open_root,) if "/" not in file else (lambda path: _open_root(path.parent),)
-    return Format(_dpjait, file, (*opened, *reads), _INFO, inside, is_slow=True)
+    def opened(path: Path) -> object:
+        recording = datasets.open_recording(path.parents[file.count("/")])
+        return recording.onboard, recording.truth, recording.detections
 
-
-def _open_root(path: Path) -> object:
-    recording = datasets.open_recording(path.parent)
-    return recording.onboard, recording.truth, recording.detections
+    return Format(_dpjait, file, (opened, *reads), _INFO, inside, is_slow=True)
 
 
 _RECORDINGS = {
@@ -263,14 +208,14 @@ _RECORDINGS = {
     "recording-times": _part("times.csv", recordings.read_timestamps),
     "recording-c3d": _part("mocap.c3d", mocap.read_c3d),
     "recording-video": _part("c0.avi"),
-    "recording-reference": Format(_csv_recording, "dron1.csv", (_open,), _INFO, is_slow=True),
+    "recording-reference": _part("dron1.csv", make=worlds.make_sequence),
     "dpjait-calibration": _published("cameras_calibration.csv"),
     "dpjait-poses": _published("dron1_pos_25.csv"),
     "dpjait-boxes": _published("dl_data/cam2i_s.csv", recordings.read_detections),
     "dpjait-onboard-poses": _published("dron1_cam_25.csv"),
     "dpjait-onboard-lenses": _published("drone_cameras_calibration.csv"),
     "dpjait-corners": _published("aruco_corners.csv", inside_out.read_marker_map),
-    "dpjait-masks": _published("drone_masks.zip", _all_masks, inside=members()),
+    "dpjait-masks": _published("drone_masks.zip", _all_masks, inside=members),
 }
 
 
@@ -308,121 +253,37 @@ def _image(file: str) -> Format:
 _PICTURES = {
     "avi": _video("a.avi"),
     "mp4": _video("a.mp4"),
-    "png": _image("a.png"),
-    "jpg": _image("a.jpg"),
-    "tif": _image("a.tif"),
-    "bmp": _image("a.bmp"),
+    **{suffix: _image(f"a.{suffix}") for suffix in ("png", "jpg", "tif", "bmp")},
 }
 
 
 # --- tables of points and markers
 
-
-def _path_of_camera(folder: Path) -> None:
-    count, time_s = 12, np.arange(12) / 25
-    position_m = np.column_stack([np.cos(time_s), np.sin(time_s), 1 + time_s])
-    inside_out.write_camera_path(
-        folder / "inside.csv",
-        inside_out.CameraPath(
-            frame=np.arange(count),
-            time_s=time_s,
-            position_m=position_m,
-            orientation_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
-            covariance=np.tile(1e-4 * np.eye(6), (count, 1, 1)),
-            num_markers=np.full(count, 3),
-            reprojection_px=np.full(count, 0.4),
-            ambiguity=np.zeros(count),
-            status=np.zeros(count, int),
-            flags=np.zeros(count, int),
-        ),
-        "dron1",
-    )
-    worlds.make_tracks_file(folder / "tracks.csv")
-
-
-def _table(file: str, text: str, *reads: Read, command: str = "") -> Format:
-    return Format(_text(file, text), file, reads, command)
-
-
-#: A tetrahedron of 0.2 m as a drone, in both formats of meshes.
-_OBJ = "v 0 0 0\nv 0.2 0 0\nv 0 0.2 0\nv 0 0 0.2\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-_PLY = (
-    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-    "element face 4\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n0.2 0 0\n0 0.2 0\n0 0 0.2\n"
-    "3 0 2 1\n3 0 1 3\n3 1 2 3\n3 2 0 3\n"
-)
-
-
-def _drone(path: Path) -> object:
-    """The scene in which a mesh is a drone."""
-    recipe = change_scenario(scenario("S01_D2_A"), {"drones[0].model": {"file": f"{path}"}})
-    return build(recipe, scale=0.1)
-
-
-def _marks() -> str:
-    """Points marked in the images of two cameras."""
-    rng = np.random.default_rng(0)
-    points_m = rng.uniform((-1, -1, 0), (1, 1, 2), (9, 3))
-    rows = ["camera,point,x_px,y_px,x_m,y_m,z_m"]
-    for name, (R, t) in zip(("left", "right"), rigs.poses(), strict=True):
-        seen = points_m @ R.T + t
-        pixels = seen[:, :2] / seen[:, 2:] * 620 + (639.5, 359.5)
-        rows += [
-            f"{name},p{i},{x},{y},{m[0]},{m[1]},{m[2]}"
-            for i, ((x, y), m) in enumerate(zip(pixels, points_m, strict=True))
-        ]
-    return "\n".join(rows)
-
-
-_VIEWS = "camera,frame,x_px,y_px,point\n" + "".join(
-    f"{camera},{frame},{100 + frame},{50.5 + frame},{end}\n"
-    for camera in ("left", "right")
-    for frame in range(4)
-    for end in "ab"
-)
-_CENTRES = "id,x_m,y_m,z_m\n1,0,2,1\n2,0.5,2,1\n7,1,2,1.2\n"
 _TABLES = {
-    "camera-path": Format(
-        _path_of_camera,
-        "inside.csv",
-        (inside_out.read_camera_path,),
-        "onboard fuse {file} {folder}/tracks.csv --out {out}/fused.csv",
+    "marker-centres": _stored(
+        "marker-centres/centres.csv", inside_out.read_marker_table, datasets.read_marker_centres
     ),
-    "marker-centres": _table("centres.csv", _CENTRES, inside_out.read_marker_table, read_marker_centres),
-    "measured-corners": Format(
-        lambda folder: write_marker_corners(folder / "corners.csv", _corners()),
-        "corners.csv",
-        (inside_out.read_measured_corners, inside_out.read_marker_table),
-        "onboard map {file} --out {out}/corners.csv",
+    "measured-corners": _stored(
+        "measured-corners/corners.csv",
+        inside_out.read_measured_corners,
+        inside_out.read_marker_table,
+        command=_MAP,
     ),
-    "measured-c3d": Format(
-        lambda folder: mocap.write_c3d(
-            folder / "room.c3d",
-            mocap.Markers(
-                tuple(f"Marker{marker}:{corner + 1}" for marker in _corners() for corner in range(4)),
-                np.tile(np.concatenate(list(_corners().values())), (3, 1, 1)),
-                100.0,
-            ),
-        ),
-        "room.c3d",
-        (inside_out.read_measured_corners, mocap.read_c3d),
-        "onboard map {file} --out {out}/corners.csv",
+    "measured-c3d": _stored(
+        "measured-c3d/room.c3d", inside_out.read_measured_corners, mocap.read_c3d, command=_MAP
     ),
-    "image-points": _table(
-        "pairs.csv",
-        _marks(),
+    "image-points": _stored(
+        "image-points/pairs.csv",
         calibration.read_image_points,
         calibration.read_world,
         command="calibrate rig --pairs {file} --fov 92.4,60.8 --size 1280,720 --out {out}/rig.toml",
     ),
-    "point-views": _table("views.csv", _VIEWS, calibration.read_point_views),
-    "world": _table(
-        "world.csv", "point,x_m,y_m,z_m\na,0,0,1\nb,1,0,1\nc,0,1,1\nd,1,1,2\n", calibration.read_world
-    ),
+    "point-views": _stored("point-views/views.csv", calibration.read_point_views),
+    "world": _stored("world/world.csv", calibration.read_world),
 }
 
 
-# --- settings, records, archives, networks
+# --- settings, records, archives, networks, the simulator's files
 
 
 def _loaded(path: Path) -> object:
@@ -431,67 +292,10 @@ def _loaded(path: Path) -> object:
         return simulation.build(simulation.load(path), scale=0.05)
 
 
-_OBJ = "".join(f"v {x} {y} {z}\n" for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.1, 0.1)) + (
-    "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
-)
-
-
-def _mesh(folder: Path) -> None:
-    text = simulation.preset_text("S01_D2_A")
-    (folder / "mesh.obj").write_text(_OBJ)
-    (folder / "scenario.toml").write_text(text)
-
-
-def _mesh_of(path: Path) -> object:
-    recipe = simulation.load(path.parent / "scenario.toml")
-    model = {"file": str(path), "scale": 1.0}
-    with errors_name(path):
-        return simulation.build(simulation.change_scenario(recipe, {"drones[0].model": model}), scale=0.05)
-
-
-_GRID = """sequences = ["S01_D2_A", "S02_D4_A"]
-runs = 3
-first_seed = 1
-[settings]
-swarm.particles = 8
-swarm.kind = "joint"
-init = "truth"
-drones.size_m = [0.5, 0.5, 0.2]
-[methods.swarm]
-swarm.search = "pso"
-[grid]
-swarm.iterations = [10, 20]
-"""
-_CONFIG = """command = "track"
-SEQ = "nowhere"
-particles = 20
-iterations = 10
-cameras = "cam1,cam2"
-size = [0.4, 0.4, 0.2]
-swarm = "joint"
-out = "tracks.csv"
-"""
-
-
-_FIGURES = ("track_ms_per_frame", "hota", "offset_removed_mean_error_m", "p95_error_m", "missed_rate")
-
-
-def _results(folder: Path) -> None:
-    store = Store(folder)
-    for key in ("a" * 40, "b" * 40):
-        rows = pd.DataFrame(
-            {
-                "cell": key,
-                "sequence": "S01",
-                "method": "swarm",
-                "seed": [0, 1],
-                "mean_error_m": [0.01, 0.02],
-                "settings.swarm.particles": [8, 8],
-                **{figure: [0.5, 0.25] for figure in _FIGURES},
-            }
-        )
-        store.add(key, rows)
-    store.add_failure("c" * 40, "no file", {"sequence": "S03", "method": "swarm"})
+def _drone(path: Path) -> object:
+    """The scene in which a mesh is a drone."""
+    model = {"drones[0].model": {"file": f"{path}"}}
+    return simulation.build(simulation.change_scenario(simulation.scenario("S01_D2_A"), model), scale=0.1)
 
 
 def _of_results(path: Path) -> None:
@@ -501,16 +305,23 @@ def _of_results(path: Path) -> None:
     store.finished_seeds("a" * 40)
 
 
-def _stored(file: str, command: str, inside: Change | None = None) -> Format:
-    return Format(_results, file, (_of_results,), command, inside)
-
-
-def _archive(folder: Path) -> None:
-    shutil.copy(archives_made.OLD, folder / "a.psotrack")
-
-
 def _unpack(path: Path) -> None:
     archives.unpack(path, path.parents[2] / "out" / "unpacked")
+
+
+def _unpacked(file: str, read: Read, command: str) -> Format:
+    """A file of an archive that was unpacked."""
+
+    def make(folder: Path) -> None:
+        archives.unpack(archives_made.OLD, folder / "flight")
+
+    return Format(make, f"flight/{file}", (read,), command)
+
+
+def _frames_of_silhouettes(path: Path) -> object:
+    (flight,) = (each for each in path.parents if each.name == "flight")
+    recording = datasets.open_recording(flight).usable(silhouettes=True)
+    return compute(recording, cache=flight / "none").read(0, recording.num_frames)
 
 
 def _network(folder: Path) -> None:
@@ -523,26 +334,7 @@ def _detected(path: Path) -> object:
     return OnnxDetector(path, DetectorSettings(size=64)).boxes(np.zeros((48, 64, 3), np.uint8))
 
 
-def _unpacked(file: str) -> Format:
-    """Silhouettes of a camera in an archive that was unpacked."""
-    return Format(
-        lambda folder: archives.unpack(archives_made.OLD, folder / "flight"),
-        f"flight/silhouettes/cam1/{file}",
-        (_frames_of_silhouettes,),
-        "archive {folder}/flight/tracks.csv {folder}/flight --out {out}/a.psotrack",
-    )
-
-
-def _frames_of_silhouettes(path: Path) -> object:
-    (flight,) = (each for each in path.parents if each.name == "flight")
-    recording = datasets.open_recording(flight).usable(silhouettes=True)
-    return compute(recording, cache=flight / "none").read(0, recording.num_frames)
-
-
-_FLIGHT = "frame,time_s,drone,x_m,y_m,z_m\n" + "".join(
-    f"{i},{i / 25},a,{i / 50},0.5,1.25\n" for i in range(12)
-)
-_STICKS = "time_s,forward,left,up,turn\n0,0,0,0,0\n0.2,0.5,0,0.25,-0.5\n0.4,-1,1,0,0\n0.6,0,0,0,0\n"
+_ARCHIVE = "archive {folder}/flight/tracks.csv {folder}/flight --out {out}/a.psotrack"
 _OTHERS = {
     "scenario": Format(
         lambda folder: (folder / "mine.toml").write_text(simulation.preset_text("S02_D4_A")),
@@ -551,46 +343,46 @@ _OTHERS = {
         "simulate --scenario {file} --out {out} --scale 0.05 --frames 1 --jobs 1 --quiet",
         is_slow=True,
     ),
-    "mesh": Format(_mesh, "mesh.obj", (_mesh_of,), is_slow=True),
-    "grid": Format(
-        _text("grid.toml", _GRID),
-        "grid.toml",
-        (lambda path: read_grid(path).cells(),),
-        "sweep {file} --dry-run --data {folder}",
+    "mesh-obj": _stored("mesh-obj/drone.obj", _drone),
+    "mesh-ply": _stored("mesh-ply/drone.ply", _drone),
+    "recorded-flight": _stored("recorded-flight/flight.csv", simulation.read_recorded_flight),
+    "sticks": _stored(
+        "sticks/sticks.csv",
+        simulation.read_sticks,
+        command="simulate fly --out {out}/flight.csv --device {file}",
+    ),
+    "grid": _stored(
+        "grid/grid.toml",
+        lambda path: read_grid(path).cells(),
+        command="sweep {file} --dry-run --data {folder}",
     ),
     "config": Format(
-        _text("run.toml", _CONFIG),
+        _copied("config"),
         "run.toml",
         (),
         "track {folder}/nowhere --config {file} --out {out}/tracks.csv",
         is_refused=True,
     ),
-    "sweep-rows": _stored(f"cells/{'a' * 40}.parquet", "report {folder} --table", columns),
-    "sweep-failure": _stored(f"cells/_{'c' * 40}.error.json", "sweep --status {folder}"),
+    "sweep-rows": _stored(
+        f"results/cells/{'a' * 40}.parquet", _of_results, command="report {folder} --table", inside=columns
+    ),
+    "sweep-failure": _stored(
+        f"results/cells/_{'c' * 40}.error.json", _of_results, command="sweep --status {folder}"
+    ),
     "archive": Format(
-        _archive,
+        lambda folder: shutil.copy(archives_made.OLD, folder / "a.psotrack"),
         "a.psotrack",
         (_unpack,),
         "archive {file} --out {out}/unpacked",
-        members(),
+        members,
     ),
-    "stored-silhouettes": _unpacked("zarr.json"),
-    "stored-silhouettes-chunk": _unpacked("c/0/0/0"),
-    "mesh-obj": _table("drone.obj", _OBJ, _drone),
-    "mesh-ply": _table("drone.ply", _PLY, _drone),
-    "recorded-flight": Format(_text("flight.csv", _FLIGHT), "flight.csv", (read_recorded_flight,)),
-    "sticks": Format(
-        _text("sticks.csv", _STICKS),
-        "sticks.csv",
-        (read_sticks,),
-        "simulate fly --out {out}/flight.csv --device {file}",
-    ),
-    "archive-manifest": Format(
-        lambda folder: archives.unpack(archives_made.OLD, folder / "flight"),
-        f"flight/{archives.MANIFEST_FILE}",
-        (lambda path: archives.read_manifest(path.parent),),
+    "archive-manifest": _unpacked(
+        archives.MANIFEST_FILE,
+        lambda path: archives.read_manifest(path.parent),
         "init --show {folder}/flight",
     ),
+    "stored-silhouettes": _unpacked("silhouettes/cam1/zarr.json", _frames_of_silhouettes, _ARCHIVE),
+    "stored-silhouettes-chunk": _unpacked("silhouettes/cam1/c/0/0/0", _frames_of_silhouettes, _ARCHIVE),
     "onnx": Format(
         _network,
         "a.onnx",

@@ -7,63 +7,17 @@ Parquet tables. Some contents are replaced as a whole.
 from __future__ import annotations
 
 import io
+import json
 import re
 import zipfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from random import Random
 
 Change = Callable[[Random, bytes], bytes]
 
 #: Cells of tables and scalars of JSON, TOML, YAML and XML.
-WORDS = (
-    *("", "0", "-0", "1", "-1", "0.5", "nan", "inf", "-inf", "1e999", "1e308", "-1e308", "1e-320", "1e30"),
-    *(
-        "65536",
-        "2147483648",
-        "9223372036854775808",
-        "-9223372036854775809",
-        "9" * 40,
-        "0x10",
-        "1_0",
-        "1,5",
-        "٣",
-    ),
-    *(
-        "x",
-        "é",
-        "true",
-        "null",
-        "None",
-        "[]",
-        "{}",
-        "[1",
-        '"',
-        "'",
-        "\x00",
-        "\t",
-        "\u2028",
-        "\ud7ff",
-        "a b",
-        "%s",
-    ),
-    *("[[1, 2], [3]]", "[true]", '"x"', '""', "{ a = 1 }", '{"a": 1}', "1979-05-27", "07:32:00", "&a", "*a"),
-    *(
-        "..",
-        "../x",
-        "/",
-        "/nowhere",
-        ".",
-        "nowhere.csv",
-        "~",
-        "#",
-        "[nan]",
-        "[[]]",
-        '["a", "b"]',
-        "-",
-        "=",
-        ":",
-    ),
-)
+WORDS: list[str] = json.loads(Path(__file__).with_name("words.json").read_text(encoding="utf-8"))
 _TOKEN = re.compile(rb"-?\d[\d.e+-]*|\w+|\"[^\"\n]*\"|[\[\]{}:,=<>/;]")
 _VALUE = re.compile(rb"(?<=[=:])[^\n,}\]]+|\"[^\"\n]*\"|\[[^\[\]\n]*\]")
 _SEPARATORS = (b";", b",", b"\t", b" ")
@@ -92,36 +46,51 @@ def mutate(random: Random, content: bytes, others: Sequence[bytes], inside: Chan
     return content
 
 
-def members() -> Change:
+def members(random: Random, content: bytes) -> bytes:
     """Change of a ZIP archive whose members stay readable: one is changed, left out, renamed or written twice."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as before:
+            entries = [(entry.filename, before.read(entry)) for entry in before.infolist()]
+    except Exception:  # an earlier change made the archive unreadable
+        return content
+    if not entries:
+        return content
+    index = random.randrange(len(entries))
+    name, data = entries[index]
+    kind = random.random()
+    if kind < 0.6:
+        entries[index] = name, mutate(random, data, [each for _, each in entries])
+    elif kind < 0.75:
+        del entries[index]
+    elif kind < 0.9:
+        renamed = random.choice(_OF_TEXT)(random, name.encode()).decode("utf-8", "replace")
+        entries[index] = renamed.replace("\x00", "0") or "0", data
+    else:
+        entries.append((name.upper(), data))
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as after:
+        for name, data in entries:
+            after.writestr(name, data)
+    return out.getvalue()
 
-    def inside(random: Random, content: bytes) -> bytes:
-        try:
-            with zipfile.ZipFile(io.BytesIO(content)) as before:
-                entries = [(entry.filename, before.read(entry)) for entry in before.infolist()]
-        except Exception:  # an earlier change made the archive unreadable
-            return content
-        if not entries:
-            return content
-        index = random.randrange(len(entries))
-        name, data = entries[index]
-        kind = random.random()
-        if kind < 0.6:
-            entries[index] = name, mutate(random, data, [each for _, each in entries])
-        elif kind < 0.75:
-            del entries[index]
-        elif kind < 0.9:
-            renamed = random.choice(_OF_TEXT)(random, name.encode()).decode("utf-8", "replace")
-            entries[index] = renamed.replace("\x00", "0") or "0", data
-        else:
-            entries.append((name.upper(), data))
-        out = io.BytesIO()
-        with zipfile.ZipFile(out, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as after:
-            for name, data in entries:
-                after.writestr(name, data)
-        return out.getvalue()
 
-    return inside
+#: Values of cells of Parquet tables.
+_CELLS = [
+    None,
+    float("nan"),
+    float("inf"),
+    -1,
+    0,
+    1.5,
+    2**53,
+    -(2**62),
+    "x",
+    "",
+    True,
+    b"\xff",
+    [1],
+    {"a": 1},
+]
 
 
 def columns(random: Random, content: bytes) -> bytes:
@@ -135,39 +104,21 @@ def columns(random: Random, content: bytes) -> bytes:
         name, values = table.column_names[index], table.column(index).to_pylist()
     except (pa.ArrowException, OSError, ValueError):  # an earlier change made the table unreadable
         return content
-    odd = (
-        None,
-        float("nan"),
-        float("inf"),
-        -1,
-        0,
-        1.5,
-        2**53,
-        -(2**62),
-        "x",
-        "",
-        True,
-        b"\xff",
-        [1],
-        {"a": 1},
-    )
+    row = random.randrange(max(len(values), 1))
     kind = random.random()
     if kind < 0.15:
         table = table.remove_column(index)
     elif kind < 0.25:
-        table = table.rename_columns(
-            [random.choice(table.column_names) if each == name else each for each in table.column_names]
-        )
+        other = random.choice(table.column_names)
+        table = table.rename_columns([other if each == name else each for each in table.column_names])
     elif kind < 0.35:
-        table = table.slice(0, random.randrange(table.num_rows + 1))
-    elif kind < 0.45 and table.num_rows:
-        table = pa.concat_tables([table, table.slice(random.randrange(table.num_rows), 1)])
+        table = table.slice(0, row)
+    elif kind < 0.45:
+        table = pa.concat_tables([table, table.slice(row, 1)])
     else:
-        value = random.choice(odd)
-        if kind < 0.7 and values:
-            values[random.randrange(len(values))] = value
-        else:
-            values = [value] * len(values)
+        value = random.choice(_CELLS)
+        # One cell, or all of the column.
+        values = [value if kind > 0.7 or place == row else each for place, each in enumerate(values)]
         try:
             table = table.set_column(index, name, [pa.array(values)])
         except (pa.ArrowException, TypeError, OverflowError):  # no column can hold these values together
@@ -178,26 +129,16 @@ def columns(random: Random, content: bytes) -> bytes:
 
 
 def _whole(random: Random, content: bytes, others: Sequence[bytes]) -> bytes:
+    """Another content: none, zeros, noise, brackets in brackets, twice or half the content, or another file."""
     return random.choice(
         (
-            b"",
-            b"\n" * 50,
-            b"\x00" * 200,
-            b"\xef\xbb\xbf",
+            *(b"", b"\n" * 50, b"\x00" * 200, b"\xef\xbb\xbf", b"[]", b"{}", b"null", b"1"),
+            *(b"[" * 20_000, b'{"a":' * 20_000, b"a = " + b"[" * 20_000, b"<a>" * 20_000, b"- " * 2_000),
             random.randbytes(300),
-            b"[" * 20_000,
-            b'{"a":' * 20_000,
-            b"a = " + b"[" * 20_000,
-            b"<a>" * 20_000,
-            b"- " * 2_000,
-            b"[]",
-            b"{}",
-            b"null",
-            b"1",
             content + content,
             content[: len(content) // 2],
             content.decode("latin-1").encode("utf-16"),
-            random.choice(others) if others else b"",
+            random.choice(others or [b""]),
         )
     )
 
@@ -227,30 +168,21 @@ def _cut(random: Random, content: bytes) -> bytes:
     return content[: random.randrange(len(content) + 1)]
 
 
-def _remove(random: Random, content: bytes) -> bytes:
-    start = random.randrange(len(content) + 1)
-    return content[:start] + content[start + random.choice((1, 2, 16, 512)) :]
-
-
 def _insert(random: Random, content: bytes) -> bytes:
     start = random.randrange(len(content) + 1)
     new = random.choice((b"\x00", b"\xff\xfe", b"\xc3", b"\xef\xbb\xbf", b"\r", random.randbytes(9)))
     return content[:start] + new + content[start:]
 
 
-def _repeat(random: Random, content: bytes) -> bytes:
+def _piece(random: Random, content: bytes) -> bytes:
+    """A piece is left out, written twice or erased."""
     start = random.randrange(len(content) + 1)
-    stop = start + random.choice((1, 8, 100, 4000))
-    return content[:stop] + content[start:]
+    piece = content[start : start + random.choice((1, 4, 16, 100, 512, 4000))]
+    new = random.choice((b"", piece + piece, bytes(len(piece))))
+    return content[:start] + new + content[start + len(piece) :]
 
 
-def _erase(random: Random, content: bytes) -> bytes:
-    start = random.randrange(len(content) + 1)
-    piece = content[start : start + random.choice((4, 64, 1024))]
-    return content[:start] + bytes(len(piece)) + content[start + len(piece) :]
-
-
-_OF_BYTES: tuple[Change, ...] = (_flip, _flip, _integer, _integer, _cut, _remove, _insert, _repeat, _erase)
+_OF_BYTES: tuple[Change, ...] = (_flip, _flip, _integer, _integer, _cut, _insert, _piece, _piece, _piece)
 
 
 # --- texts

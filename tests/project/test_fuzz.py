@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import archives_made
 import pytest
 from fuzz.formats import FORMATS
 from fuzz.trial import Judge
@@ -14,8 +15,8 @@ from psotrack.errors import InputError
 TRIES = 5
 #: Files that a reader once treated wrongly, in folders with the names of their formats.
 FINDS = sorted(path for path in (Path(__file__).parents[1] / "data" / "fuzz").rglob("*") if path.is_file())
-#: Finds that are long and regular.
-NESTED = {
+#: Finds that are long and regular, or the most part of another file.
+MADE = {
     "tracks-json": b'{"a":' * 20_000,
     "archive-manifest": b"[" * 20_000,
     "stored-silhouettes": b'{"a":' * 20_000,
@@ -24,6 +25,7 @@ NESTED = {
     "recording.toml": b"a = " + b"[" * 20_000,
     "marker-centres": b"a = " + b"[" * 20_000,
     "dpjait-boxes": b"- " * 2_000,
+    "archive": archives_made.OLD.read_bytes()[1:],
 }
 
 
@@ -72,9 +74,9 @@ def test_what_was_found_is_mended(path, judges):
     assert [trial for trial in judged(judges(name), name, path.read_bytes()) if trial.fault] == []
 
 
-@pytest.mark.parametrize("name", NESTED)
-def test_brackets_in_brackets_are_refused_quickly(name, judges):
-    trials = judged(judges(name), name, NESTED[name])
+@pytest.mark.parametrize("name", MADE)
+def test_brackets_in_brackets_and_a_lost_beginning_are_refused(name, judges):
+    trials = judged(judges(name), name, MADE[name])
     assert [trial for trial in trials if trial.fault] == []
     assert any(trial.is_refused for trial in trials)
 

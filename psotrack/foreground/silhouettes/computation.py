@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import zarr
 
-from psotrack.errors import InputError, SettingsError
+from psotrack.errors import InputError, SettingsError, errors_name
 from psotrack.foreground.silhouettes.foreground import BackgroundModel, Mog2
 from psotrack.foreground.silhouettes.frames import FramesOfInstants, Silhouettes
 from psotrack.foreground.silhouettes.living_background import Living
@@ -84,7 +84,9 @@ def compute(
     places = _places(recording, tasks)
     for name, place in places.items():
         if name not in tasks:
-            _check_made_with(name, place, scaled, model)
+            # A long value is cut, and the path behind it.
+            with errors_name(place.path):
+                _check_made_with(name, place, scaled, model)
     opened = {name: _opened(name, place, tasks, recording.rig, scaled) for name, place in places.items()}
     missing = {name: tasks[name] for name, array in opened.items() if array is None and name in tasks}
     for path in dict.fromkeys(places[name].path for name in missing):

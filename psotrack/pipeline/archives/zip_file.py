@@ -130,6 +130,9 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipped:
             entries = zipped.infolist()
+            if any(entry.header_offset < 0 for entry in entries):
+                # `zipfile` would raise an OSError, which is taken for one of the folder's.
+                raise zipfile.BadZipFile("bytes at the beginning are missing")
             _check_names(path, [entry.filename for entry in entries])
             _check_ratio(path, sum(entry.file_size for entry in entries))
             yield zipped
