@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from camera_paths import camera_path
 from evo.core import metrics, sync
 from evo.tools import file_interface
 from helpers import assert_refused
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.evaluation import PathSettings, Statistics, compare_paths, plots
 from psotrack.evaluation.path_comparison import mean_rotation, wrap_deg
-from psotrack.inside_out import CameraPath, write_camera_path
+from psotrack.inside_out import write_camera_path
 from psotrack.recordings.exchange import export_tracks, read_tracks
 from psotrack.support import COLOURS, FAINT
 from psotrack.trajectories import Status, Trajectories, write_trajectories
@@ -373,24 +374,12 @@ def evaluated(run_psotrack):
 def files(tmp_path_factory):
     """The table of `localise` of a flight, the reference at 100 Hz and an IMU at 25 Hz by clocks of their own."""
     folder = tmp_path_factory.mktemp("paths")
-    path = noisy_path()
-    table, count = folder / "dron1.csv", path.num_frames
-    write_camera_path(
-        table,
-        CameraPath(
-            frame=path.frame,
-            time_s=path.time_s,
-            position_m=path.position_m[:, 0],
-            orientation_wxyz=path.orientation_wxyz[:, 0],
-            covariance=np.tile(1e-5 * np.eye(6), (count, 1, 1)),
-            num_markers=np.full(count, 6),
-            reprojection_px=np.full(count, 0.3),
-            ambiguity=np.zeros(count),
-            status=path.status[:, 0],
-            flags=np.zeros(count, int),
-        ),
-        "dron1",
-    )
+    path, table = noisy_path(), folder / "dron1.csv"
+    poses = Rotation.from_quat(path.orientation_wxyz[:, 0], scalar_first=True)
+    covariance = np.tile(1e-5 * np.eye(6), (path.num_frames, 1, 1))
+    first_s = path.time_s[0]
+    localised = camera_path(path.position_m[:, 0], poses, covariance, first_s=first_s)
+    write_camera_path(table, localised, "dron1")
     vicon = tum_file(folder, "vicon", *recording(clock_s=CLOCK_S))
     time_s, _, wxyz = recording(rate_hz=25, clock_s=TURN_CLOCK_S)
     imu = tum_file(folder, "imu", time_s, np.zeros((len(time_s), 3)), wxyz)
