@@ -44,19 +44,6 @@ def test_a_rig_without_a_board_is_said_also_the_second_time(run_psotrack: Run, t
     assert "expected a video of each camera" in run_psotrack("run", two_videos / "board").err
 
 
-def test_ctrl_c_in_a_step_ends_the_run(
-    run_psotrack: Run, two_videos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As in every command: the program answers, in one line, and no step follows."""
-
-    def press(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("psotrack.api.draft_recording", press)
-    with pytest.raises(KeyboardInterrupt):
-        run_psotrack("run", two_videos)
-
-
 @pytest.mark.slow
 def test_videos_and_a_rig_file_become_a_report(run_psotrack: Run, tmp_path: Path) -> None:
     lab = make_sequence(tmp_path / "lab")
