@@ -18,6 +18,7 @@ from psotrack.geometry.rig_files import write_rig
 from psotrack.recordings import probe, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
+from psotrack.trajectories import Status, Trajectories
 
 #: Few, small cameras: a machine that is busy with other tests must keep up with the replay.
 CAMERAS, NUM_FRAMES, SCALE = ("cam1", "cam2", "cam3", "cam4"), 40, 0.25
@@ -142,3 +143,17 @@ def free_port() -> int:
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         return one.getsockname()[1]
+
+
+def rows_of(frame: int, num_drones: int = 4) -> Trajectories:
+    """Rows of an instant, which differ from frame to frame."""
+    generator, shape = np.random.default_rng(frame), (1, num_drones, 3)
+    return Trajectories(
+        frame=np.array([frame]),
+        time_s=np.array([frame / 25]),
+        drones=tuple(f"{drone}" for drone in range(num_drones)),
+        position_m=generator.normal(size=shape),
+        velocity_m_s=generator.normal(size=shape),
+        status=np.full(shape[:2], int(Status.TRACKED)),
+        covariance_m2=np.tile(np.eye(3), (1, num_drones, 1, 1)),
+    )
