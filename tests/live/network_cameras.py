@@ -23,7 +23,8 @@ from psotrack.trajectories import Status, Trajectories
 #: Few, small cameras: a machine that is busy with other tests must keep up with the replay.
 CAMERAS, NUM_FRAMES, SCALE = ("cam1", "cam2", "cam3", "cam4"), 40, 0.25
 SIZE_WH = (480, 270)
-EFFORT = ["--particles", "20", "--iterations", "15"]
+#: A program is compiled for 1, 2 and 4 drones.
+EFFORT = ["--particles", "20", "--iterations", "15", "--most-drones", "4"]
 MJPEG = "multipart/x-mixed-replace; boundary=frame"
 
 

@@ -250,7 +250,7 @@ def test_without_two_cameras_that_film_the_command_ends(
 #: Name of the case -> options, and words of the line.
 BAD = {
     "no output": (["--replay"], "--out: expected --out FILE, --lines, --udp, --websocket or --view"),
-    "files": (["--lines"], "expected at least two cameras of the rig with the address of a stream"),
+    "files": (["--lines"], "the number of a device as `video`, found none; --replay plays the videos"),
     "another kind of file": (["--replay", "--out", "tracks.txt"], "ends in .csv"),
     "no address": (["--replay", "--udp", "nowhere"], "--udp: expected HOST:PORT"),
     "no port": (["--replay", "--websocket", "nowhere"], "--websocket: expected PORT or HOST:PORT"),
