@@ -118,23 +118,22 @@ def recording(folder: Path) -> Recording:
 
 
 @pytest.fixture
-def make(tmp_path: Path) -> Callable[..., Silhouettes]:
-    """Computes the silhouettes of a recording in this process, into the cache of the test."""
-    return functools.partial(compute, settings=SETTINGS, cache=tmp_path / "cache", jobs=1)
+def decoded() -> list[int]:
+    """Gets the numbers of frames that `make` decodes, in this process and in others."""
+    return []
 
 
 @pytest.fixture
-def decoded_videos(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """List that gets the name of the video of each frame that this process decodes, in order."""
-    names: list[str] = []
+def make(tmp_path: Path, decoded: list[int]) -> Callable[..., Silhouettes]:
+    """Computes the silhouettes of a recording in this process, into the cache of the test."""
 
-    def read_and_count(video, step=1, **how):  # type: ignore[no-untyped-def]
-        for frame in read_frames(video, step, **how):
-            names.append(video.path.stem)
-            yield frame
+    @contextlib.contextmanager
+    def report(description: str, total: int) -> Iterator[Advance]:
+        before = sum(decoded)
+        yield decoded.append
+        assert (description, total) == ("silhouettes", sum(decoded) - before)
 
-    monkeypatch.setattr(silhouette_store, "read_frames", read_and_count)
-    return names
+    return functools.partial(compute, settings=SETTINGS, cache=tmp_path / "cache", jobs=1, report=report)
 
 
 def _expected(recording: Recording, settings: SilhouetteSettings = SETTINGS) -> np.ndarray:
@@ -245,19 +244,10 @@ def test_every_setting_the_model_and_the_number_of_frames_are_in_the_key(video_f
 # --- the store
 
 
-def test_stored_silhouettes_equal_direct_computation(recording: Recording, make) -> None:
-    started: list[tuple[str, int]] = []
-    done: list[int] = []
-
-    @contextlib.contextmanager
-    def report(description: str, total: int) -> Iterator[Advance]:
-        started.append((description, total))
-        yield done.append
-
+def test_stored_silhouettes_equal_direct_computation(recording: Recording, make, decoded: list[int]) -> None:
     for _ in range(2):
-        silhouettes = make(recording, report=report)
-    assert started == [("silhouettes", 3 * (NUM_FRAMES + 10))], "the second call reports no progress"
-    assert sum(done) == 3 * (NUM_FRAMES + 10)
+        silhouettes = make(recording)
+    assert sum(decoded) == 3 * (NUM_FRAMES + 10), "the second call decodes nothing"
     assert silhouettes.cameras == ("cam1", "cam2", "cam3")
     assert silhouettes.shape == (30, 41)
     assert (silhouettes.num_frames, silhouettes.reduction) == (NUM_FRAMES, 4)
@@ -288,27 +278,26 @@ def test_silhouettes_of_the_living_background_equal_those_of_frames_that_are_kep
         np.testing.assert_array_equal(_read_all(silhouettes)[:, camera], masks)
 
 
-def test_only_what_is_missing_is_decoded(
-    folder: Path, tmp_path: Path, make, decoded_videos: list[str]
-) -> None:
+def test_only_what_is_missing_is_decoded(folder: Path, tmp_path: Path, make, decoded: list[int]) -> None:
     shutil.copy(folder / "cam1.avi", folder / "cam2.avi")
     first = make(_make_recording(folder))
-    assert len(decoded_videos) == 2 * (NUM_FRAMES + 10), "equal videos are decoded once"
+    assert sum(decoded) == 2 * (NUM_FRAMES + 10), "equal videos are decoded once"
     assert min(first.seconds["decode"], first.seconds["foreground"]) > 0
     before = _read_all(first)
     np.testing.assert_array_equal(before[:, 0], before[:, 1])
-    decoded_videos.clear()
+    decoded.clear()
     # Name and folder of a video are not in the key.
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
     (moved / "cam3.avi").rename(moved / "other.avi")
     second = make(_make_recording(moved))
-    assert decoded_videos == []
+    assert decoded == []
     assert second.seconds == {"decode": 0.0, "foreground": 0.0}
     np.testing.assert_array_equal(_read_all(second), before)
     # Fewer frames are made anew. What happens to the folder has no effect after reading.
     shorter = _make_recording(folder).usable(["cam3"], num_frames=12)
     np.testing.assert_array_equal(_read_all(make(shorter)), _expected(shorter))
-    assert set(decoded_videos) == {"cam3"}
+    # The background is learned from every other frame.
+    assert sum(decoded) == 12 + 6
     shutil.rmtree(tmp_path / "cache")
     np.testing.assert_array_equal(_read_all(first), before)
 
@@ -373,21 +362,26 @@ def test_damage_is_named_and_the_silhouettes_are_made_anew(
 
 
 def test_a_truncated_video_is_named_and_the_other_videos_are_kept(
-    recording: Recording, tmp_path: Path, make, decoded_videos: list[str]
+    recording: Recording, tmp_path: Path, make, decoded: list[int]
 ) -> None:
     """`--frames` counts instants at the rate of the fastest camera, not frames of the truncated video."""
     recording = with_cameras(recording, times={"cam3": FrameTimes(NUM_FRAMES, fps=12.5)})
     video = recording.videos["cam3"].path
     os.truncate(video, video.stat().st_size * 2 // 3)
-    with pytest.raises(TruncatedVideoError) as error_info:
-        make(recording, jobs=2)
-    assert str(error_info.value).startswith(f"{video}: expected {NUM_FRAMES} frames, found ")
+    found = []
+    for jobs in (2, 1):
+        with pytest.raises(TruncatedVideoError) as error_info:
+            make(recording, jobs=jobs)
+        assert str(error_info.value).startswith(f"{video}: expected {NUM_FRAMES} frames, found ")
+        found.append((error_info.value.num_readable, error_info.value.num_instants))
     assert list((tmp_path / "cache").glob(".*")) == []
+    decoded.clear()
     others = recording.usable(["cam1", "cam2"])
     np.testing.assert_array_equal(_read_all(make(others)), _expected(others))
-    assert decoded_videos == []
+    assert decoded == []
     # The commands with `--frames` advise this number.
-    readable, advised = error_info.value.num_readable, error_info.value.num_instants
+    (readable, advised), other = found
+    assert other == (readable, advised)
     # Frame i of the slow camera is nearest to instants 2i - 1 (or 2i - 1 and 2i) to 2i + 1.
     assert 2 * readable - 1 <= advised <= 2 * readable
     make(recording.usable(num_frames=advised))
