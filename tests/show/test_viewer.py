@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 import urllib.request
@@ -15,7 +14,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from helpers import assert_refused, drawn_silhouettes, files_up_to, listening_at
+from helpers import Output, assert_refused, drawn_silhouettes, listening_at
 from rerun.chunk import RrdReader
 from worlds import (
     CAMERAS,
@@ -242,16 +241,34 @@ def test_a_recording_without_tracks_and_tracks_with_positions_alone(run, world, 
         assert len(shown[6]) == 1
 
 
-def test_what_the_machine_lacks_is_one_line(run, world, flight, tmp_path, monkeypatch):
-    words = (world / "tracks.csv", "--save", tmp_path / "x.rrd")
-    with files_up_to(100_000):
-        assert_refused(lambda: write_flight(words[-1], flight), "x.rrd", "disk", unchanged=tmp_path)
+def test_what_the_machine_lacks_is_one_line(run, world, tmp_path, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":987")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     # Rerun's window cannot open.
     assert_refused(lambda: run(world / "tracks.csv", "--quiet"), "--save", unchanged=tmp_path)
     monkeypatch.setitem(sys.modules, "rerun_cli", None)
+    words = (world / "tracks.csv", "--save", tmp_path / "x.rrd")
     assert_refused(lambda: run(*words), "pip install '.[view]'", unchanged=tmp_path)
+
+
+#: The program on a disk that is full soon. It is a process of its own: Rerun may wait without end for such a disk.
+ON_A_FULL_DISK = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+from psotrack.__main__ import main
+main()
+"""
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_one_line(start_python, world, tmp_path):
+    def view():
+        words = ("view", world / "tracks.csv", "--save", tmp_path / "x.rrd")
+        process = start_python("-c", ON_A_FULL_DISK, *words)
+        out, err = process.communicate(timeout=60)
+        return Output(process.returncode, out, err)
+
+    assert_refused(view, "x.rrd", "the whole file", "disk", unchanged=tmp_path)
 
 
 #: The program with Ctrl-C as at a terminal: a shell starts programs in the background with Ctrl-C ignored.
@@ -310,7 +327,7 @@ def test_cameras_on_drones_have_paths_and_markers(flight, tmp_path):
 @pytest.mark.slow
 # The program that keeps the rows is stopped while it waits for more.
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
-def test_rows_of_a_live_session_arrive_in_the_viewer(flight, tmp_path):
+def test_rows_of_a_live_session_arrive_in_the_viewer(flight, start_python, tmp_path):
     """Another program of Rerun connects to the viewer's address and keeps what it gets."""
     tracks, saved = make_tracks(), tmp_path / "live.rrd"
     with LiveView(flight.recording, web=True) as view:
@@ -319,19 +336,11 @@ def test_rows_of_a_live_session_arrive_in_the_viewer(flight, tmp_path):
             view.write(tracks.at_frames(np.array([frame])))
             view.show_delay(0.02)
         last = tracks.at_frames(np.array([NUM_FRAMES - 1]))
-        view.write(
-            replace(
-                last, frame=last.frame + 1, time_s=last.time_s + 0.04, position_m=last.position_m * np.nan
-            )
-        )
+        gone = {"position_m": last.position_m * np.nan, "time_s": last.time_s + 0.04}
+        view.write(replace(last, frame=last.frame + 1, **gone))
         address = re.findall(r"%3A(\d+)%2Fproxy", view.page)[0]
-        program = (sys.executable, "-m", "rerun_cli", "--connect", f"rerun+http://127.0.0.1:{address}/proxy")
-        keeper = subprocess.Popen(
-            [*program, "--save", str(saved), "--bind", "127.0.0.1", "--port", "auto"],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        words = ("--connect", f"rerun+http://127.0.0.1:{address}/proxy", "--save", saved)
+        keeper = start_python("-m", "rerun_cli", *words, "--bind", "127.0.0.1", "--port", "auto")
         # The program gets all rows that there are; its file grows until then.
         sizes = [-2, -1]
         while sizes[-1] != sizes[-2] or sizes[-1] <= 0:
