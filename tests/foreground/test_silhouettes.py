@@ -180,13 +180,10 @@ def _warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
         ({}, [(640, 512), (1920, 1080)], None, (2, 4, 9)),
         ({}, [(3840, 2160)], None, (4, 8, 9)),
         ({}, [(1080, 1920)], None, (2, 4, 9)),
-        ({}, [(640, 512)], None, (1, 2, 9)),
         ({}, [(160, 120)], None, (1, 1, 9)),
         ({"background": "mog2"}, [(1920, 1080)], None, (2, 4, 64)),
-        ({"background": "mog2"}, [(160, 120)], None, (1, 1, 4)),
         ({"drone_px": 12.0}, [(3840, 2160)], None, (1, 2, 6)),
         ({"drone_px": 5.0}, [(3840, 2160)], None, (1, 1, 4)),
-        ({"drone_px": 100.0}, [(640, 512)], None, (5, 10, 400)),
         ({"reduction": 3}, [(1920, 1080)], None, (1, 3, 9)),
         ({"working_reduction": 3}, [(1920, 1080)], None, (3, 6, 9)),
         ({"min_blob_px": 0}, [(1920, 1080)], None, (2, 4, 0)),
@@ -410,16 +407,13 @@ def test_cameras_of_different_size_and_length_are_filled_up_with_background(fold
     recording.by_name["cam2"].camera.image_size_wh[:] = (202, 98)
     silhouettes = make(recording)
     assert silhouettes.shape == (30, 51)
-    frames = _read_all(silhouettes)
-    assert frames.shape == (NUM_FRAMES, 3, 30, 51)
+    expected = np.zeros((NUM_FRAMES, 3, 30, 51), np.uint8)
     for index, name in enumerate(recording.rig.names):
         alone = _expected(recording.usable([name]))[:, 0]
-        num_frames, height, width = alone.shape
-        np.testing.assert_array_equal(frames[:num_frames, index, :height, :width], alone)
         assert alone.any()
-        assert not frames[num_frames:, index].any()
-        assert not frames[:, index, height:].any()
-        assert not frames[:, index, :, width:].any()
+        num_frames, height, width = alone.shape
+        expected[:num_frames, index, :height, :width] = alone
+    np.testing.assert_array_equal(_read_all(silhouettes), expected)
 
 
 def test_what_is_ignored_is_background_and_belongs_to_the_key(
