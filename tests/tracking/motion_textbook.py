@@ -1,4 +1,4 @@
-"""Simulated flights with white jerk, and a textbook filter and smoother in float64 NumPy, as oracles for `motion`.
+"""Simulated flights with white jerk, and one joint Gaussian of all states in float64 NumPy, as oracles for `motion`.
 
 The textbook's state is position, velocity and acceleration, (9,), or with a correlated error of the measurements,
 (12,). A measurement observes position plus correlated error. The state of `psotrack.tracking.motion` contains this sum
@@ -91,32 +91,8 @@ def decay(dt_s, time_s):
     return left.item(), begun.item()
 
 
-def textbook_filter(model, time_s, measured_m, covariance_m2, was_measured):
-    """Filter one drone from frame 0; return the means, covariances and NIS of all frames.
-
-    The update uses explicit inverses and P - K H P.
-    """
-    H = model.H
-    x, P = model.start(measured_m[0], covariance_m2[0])
-    means, covariances, nis, last = [x], [P], [np.nan], covariance_m2[0]
-    for k in range(1, len(time_s)):
-        F, Q = model.transition(round(time_s[k] - time_s[k - 1], 12), last)
-        x, P = F @ x, F @ P @ F.T + Q
-        nis.append(np.nan)
-        if was_measured[k]:
-            last = covariance_m2[k]
-            innovation = measured_m[k] - H @ x
-            S_inv = np.linalg.inv(H @ P @ H.T + model.white(last))
-            K = P @ H.T @ S_inv
-            x, P = x + K @ innovation, P - K @ H @ P
-            nis[-1] = innovation @ S_inv @ innovation
-        means.append(x)
-        covariances.append(P)
-    return np.array(means), np.array(covariances), np.array(nis)
-
-
-def textbook_smoother(model, time_s, measured_m, covariance_m2, was_measured):
-    """Smooth one drone without recursion: condition one joint Gaussian of all states on all measurements.
+def textbook(model, time_s, measured_m, covariance_m2, was_measured):
+    """Means and covariances of one drone without recursion: condition a Gaussian of all states on all measurements.
 
     In the first frame, only the measurement determines the position.
     """
@@ -136,7 +112,7 @@ def textbook_smoother(model, time_s, measured_m, covariance_m2, was_measured):
         prior[k, :, k] = F @ prior[k - 1, :, k - 1] @ F.T + Q
     prior, mean = prior.reshape(size * frames, size * frames), mean.ravel()
     rows = np.flatnonzero(was_measured[1:]) + 1
-    H = np.concatenate([np.kron(np.eye(frames)[row], model.H) for row in rows])
+    H = np.kron(np.eye(frames)[rows], model.H)
     R = block_diag(*model.white(covariance_m2[rows]))
     gain = np.linalg.solve(H @ prior @ H.T + R, H @ prior).T
     mean = mean + gain @ (measured_m[rows].ravel() - H @ mean)
@@ -172,10 +148,10 @@ class SimulatedFlight:
     def params(self):
         return self.model.params(self.was_measured.shape[1])
 
-    def textbook_arguments(self, drone, first=0):
-        """Arguments of the textbook functions for one drone, from frame `first` on."""
+    def textbook(self, drone, frames=slice(None)):
+        """What the textbook says of one drone in some frames from their measurements."""
         by_drone = (self.measured_m, self.covariance_m2, self.was_measured)
-        return self.model, self.time_s[first:], *(part[first:, drone] for part in by_drone)
+        return textbook(self.model, self.time_s[frames], *(part[frames, drone] for part in by_drone))
 
 
 def simulate_flight(seed, *, frames, drones, std_m=0.01, dt_s=DT_S, steady=False, **numbers):

@@ -48,6 +48,12 @@ def flights(rng, frames, drones):
     return path + np.array([0.1, -0.1, 1.2]), np.gradient(path, 1 / FPS, axis=0)
 
 
+def world(seed, num_cameras, frames, drones=2):
+    """What is random, a rig, and flights."""
+    rng = np.random.default_rng(seed)
+    return rng, ring_rig(num_cameras, image_size_wh=(1920, 1080)), *flights(rng, frames, drones)
+
+
 def turned(rig, angle_deg, rng):
     """The rig with every camera turned about its centre by an angle, about a random axis."""
     T = rig.cameras.T_cam_world.copy()
@@ -86,17 +92,6 @@ def views_at(rig, position_m, velocity_m_s, place_px=np.nan):
     return views_of_places(
         rig.cameras, np.broadcast_to(place_px, shape), np.ones(shape), position_m, velocity_m_s
     )
-
-
-def rows_of(views):
-    """The places of all frames and drones as rows, and the derivatives of the views: turns, clocks."""
-    cameras = views.shown.shape[-1]
-    places = FittedPlaces(
-        views.residual_px.reshape(-1, cameras, 2),
-        views.jacobian.reshape(-1, cameras, 2, 3),
-        views.shown.reshape(-1, cameras),
-    )
-    return places, views.turn_px.reshape(-1, cameras, 2, 3), views.flow_px_s.reshape(-1, cameras, 2)
 
 
 def only_noise(noise_px, fading):
@@ -153,8 +148,7 @@ class TestViews:
         """Found: 1.6 GB, more than all of the tracking before, for 100,000 frames of 4 drones in 8 cameras."""
 
         def peak_bytes(frames):
-            rig, rng = ring_rig(6), np.random.default_rng(1)
-            position_m, velocity_m_s = flights(rng, frames, 2)
+            rng, rig, position_m, velocity_m_s = world(1, 6, frames)
             place_px = project(rig.cameras, position_m[:, :, None])[0] + rng.normal(size=(frames, 2, 6, 2))
             tracemalloc.start()
             views = views_at(rig, position_m, velocity_m_s, place_px)
@@ -171,8 +165,7 @@ class TestViews:
 
 class TestLearning:
     def test_variances_of_cameras_are_not_shrunk_by_the_fit(self):
-        rig, rng = ring_rig(4), np.random.default_rng(1)
-        position_m, velocity_m_s = flights(rng, 800, 1)
+        rng, rig, position_m, velocity_m_s = world(1, 4, 800, 1)
         noise_px = np.array([[1.0, 0.7], [1.5, 1.5], [2.0, 3.0], [4.0, 1.0]])
         error_px = noise_px * rng.normal(size=(800, 1, 4, 2))
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
@@ -198,8 +191,12 @@ class TestLearning:
         values = correlated(rng, (600, 3, 4, 2), fraction, frames)
         found = autocorrelation_of(values, np.ones((600, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
         assert found.white == pytest.approx(1 - fraction, abs=0.08)
-        rho = toeplitz(np.where(np.arange(600) == 0, 1.0, fraction * np.exp(-np.arange(600) / frames)))
-        assert found.inflation(1 / FPS) == pytest.approx(rho.mean() * 600, rel=0.35)
+        # The inflation is that of a long sum.
+        fading = fraction * np.exp(-np.arange(4000) / frames)
+        long = toeplitz(np.where(np.arange(4000) == 0, 1.0, fading)).sum() / 4000
+        right = Autocorrelation(1 - fraction, np.array([fraction]), np.array([frames / FPS]))
+        assert right.inflation(1 / FPS) == pytest.approx(long, rel=0.015)
+        assert found.inflation(1 / FPS) == pytest.approx(long, rel=0.35)
         # Errors that never change are bias.
         values = 0.6 * rng.normal(size=(1, 3, 4, 2)) + 0.8 * rng.normal(size=(600, 3, 4, 2))
         biased = autocorrelation_of(values, np.ones((600, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
@@ -209,59 +206,37 @@ class TestLearning:
         few = autocorrelation_of(values[:4], np.ones((4, 3, 4), bool), 1 / FPS, NOTHING_KNOWN)
         assert few is NOTHING_KNOWN
 
-    def test_inflation_is_that_of_a_long_sum(self):
-        correlation = Autocorrelation(0.4, np.array([0.6]), np.array([0.3]))
-        long = (
-            toeplitz(0.4 * (np.arange(4000) == 0) + 0.6 * np.exp(-np.arange(4000) / FPS / 0.3)).sum() / 4000
-        )
-        assert correlation.inflation(1 / FPS) == pytest.approx(long, rel=0.01)
-
-    @pytest.mark.parametrize("angle_deg", [0.1, 0.5])
-    def test_turned_cameras_are_found(self, angle_deg):
-        found = []
+    @pytest.mark.parametrize(("angle_deg", "late_s"), [(0.1, 0.0), (0.5, 0.0), (0.0, 0.02)])
+    def test_turned_cameras_and_late_clocks_are_found(self, angle_deg, late_s):
+        found, apart_s = [], late_s * np.array([0.0, 1.0, -0.5, 1.5, 0.0, -1.0])
         for seed in range(2):
-            rng = np.random.default_rng(seed)
-            rig = ring_rig(6, image_size_wh=(1920, 1080))
-            position_m, velocity_m_s = flights(rng, 100, 2)
-            error_px = rng.normal(size=(100, 2, 6, 2))
-            views, _ = fitted_views(rig, turned(rig, angle_deg, rng), position_m, velocity_m_s, error_px)
+            rng, rig, position_m, velocity_m_s = world(seed, 6, 100)
+            late_px = -views_at(rig, position_m, velocity_m_s).flow_px_s * apart_s[:, None]
+            stated, error_px = turned(rig, angle_deg, rng), rng.normal(size=(100, 2, 6, 2)) + late_px
+            views, _ = fitted_views(rig, stated, position_m, velocity_m_s, error_px)
             found.append(learn_camera_errors(views, FPS, USUAL))
         # The angle is spread over three axes.
         angles = [np.degrees(each.turn_rad) * np.sqrt(3) for each in found]
-        assert np.mean(angles) == pytest.approx(angle_deg, rel=0.25)
-        assert max(each.clock_s for each in found) < 0.004
+        assert np.mean(angles) == pytest.approx(angle_deg, rel=0.25, abs=0.03)
+        clocks_s = [each.clock_s for each in found]
+        assert np.mean(clocks_s) == pytest.approx(apart_s.std(), rel=0.3, abs=0.004)
         np.testing.assert_allclose([each.noise_px.mean() for each in found], 1.0, rtol=0.1)
 
-    def test_late_clocks_are_found(self):
-        rng = np.random.default_rng(5)
-        rig, late_s = ring_rig(6, image_size_wh=(1920, 1080)), np.array([0, 0.02, -0.01, 0.03, 0.0, -0.02])
-        position_m, velocity_m_s = flights(rng, 150, 2)
-        exact, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((150, 2, 6, 2)))
-        error_px = -exact.flow_px_s * late_s[:, None] + 0.5 * rng.normal(size=(150, 2, 6, 2))
-        views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
-        constant = fit_constant_errors(*rows_of(views), np.full((6, 2), 0.5), 1.0)
-        apart_s = constant.clock_s - late_s
-        np.testing.assert_allclose(apart_s - apart_s.mean(), 0.0, atol=0.002)
-        assert constant.clock_std_s == pytest.approx(late_s.std(), rel=0.3)
-        assert np.degrees(constant.turn_std_rad) < 0.02
-
-    @pytest.mark.parametrize("noise_px", [1e-6, 1e-10, 1e-14])
+    @pytest.mark.parametrize("noise_px", [1e-6, 1e-14])
     def test_few_frames_that_turns_explain_exactly_have_a_finite_covariance(self, noise_px):
         """Turns and clocks fit a few frames exactly: the noise that remains is that of the arithmetic."""
-        rng = np.random.default_rng(3)
-        rig = ring_rig(4, image_size_wh=(1920, 1080))
-        position_m, velocity_m_s = flights(rng, 2, 1)
+        rng, rig, position_m, velocity_m_s = world(3, 4, 2, 1)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, rng.normal(size=(2, 1, 4, 2)))
-        constant = fit_constant_errors(*rows_of(views), np.full((4, 2), noise_px), 1.0)
+        places = FittedPlaces(views.residual_px[:, 0], views.jacobian[:, 0], views.shown[:, 0])
+        derivatives = views.turn_px[:, 0], views.flow_px_s[:, 0]
+        constant = fit_constant_errors(places, *derivatives, np.full((4, 2), noise_px), 1.0)
         assert np.isfinite(constant.covariance).all()
         largest = np.abs(constant.covariance).max()
         assert np.linalg.eigvalsh(constant.covariance).min() > -1e-9 * largest
 
     @pytest.mark.parametrize("frames", [200, 2100])
     def test_a_sound_rig_has_no_systematic_errors(self, frames):
-        rng = np.random.default_rng(6)
-        rig = ring_rig(5, image_size_wh=(1920, 1080))
-        position_m, velocity_m_s = flights(rng, frames, 2)
+        rng, rig, position_m, velocity_m_s = world(6, 5, frames)
         error_px = correlated(rng, (frames, 2, 5, 2), 0.5, 8)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, error_px)
         errors = learn_camera_errors(views, FPS, USUAL)
@@ -277,8 +252,7 @@ class TestLearning:
 
 class TestCovariances:
     def test_given_errors_count_where_the_cameras_show_less(self):
-        rng, rig = np.random.default_rng(8), ring_rig(2)
-        position_m, velocity_m_s = flights(rng, 6, 2)
+        _, rig, position_m, velocity_m_s = world(8, 2, 6)
         position_m[[0, 3, 4], 1] = np.nan
         views = views_at(rig, position_m, velocity_m_s)
         none = only_noise(np.full((2, 2), np.nan), USUAL)
@@ -298,8 +272,7 @@ class TestCovariances:
 
     def test_covariances_of_a_long_recording_are_those_of_its_frames(self):
         """Covariances are computed in parts; the mean of the turns is that of all frames."""
-        rng, rig = np.random.default_rng(11), ring_rig(3)
-        position_m, velocity_m_s = flights(rng, 2300, 2)
+        rng, rig, position_m, velocity_m_s = world(11, 3, 2300)
         views, _ = fitted_views(rig, rig, position_m, velocity_m_s, np.zeros((2300, 2, 3, 2)))
         turn_rad, clock_s = 0.01, 0.02
         noise_px, bias_px = rng.uniform(1, 2, (2, 3, 2))
@@ -337,9 +310,7 @@ class TestCovariances:
         num_frames = 75 if frames > 1 else 30
         rates = []
         for seed in range(num_rigs):
-            rng = np.random.default_rng(seed)
-            rig = ring_rig(num_cameras, image_size_wh=(1920, 1080))
-            position_m, velocity_m_s = flights(rng, num_frames, 2)
+            rng, rig, position_m, velocity_m_s = world(seed, num_cameras, num_frames)
             noise = correlated(rng, (num_frames, 2, num_cameras, 2), 0.7 if frames > 1 else 0.0, frames)
             flow_px_s = views_at(rig, position_m, velocity_m_s).flow_px_s
             error_px = noise_px * noise - flow_px_s * rng.uniform(-late_s, late_s, num_cameras)[:, None]
@@ -398,20 +369,14 @@ class TestFilteredVariance:
 
 
 def test_errors_without_offset_are_compared_with_relative_covariances():
-    covariance_m2 = np.tile(np.diag([4e-4, 1e-4, 9e-4]), (3, 2, 1, 1))
-    estimate = Trajectories(
-        frame=np.arange(3),
-        time_s=np.arange(3) / FPS,
-        drones=("0", "1"),
-        position_m=np.zeros((3, 2, 3)) + np.array([[0.0, 0, 0], [1, 1, 1]]),
-        covariance_m2=covariance_m2,
-        relative_covariance_m2=covariance_m2 / 4,
-    )
+    position_m, time_s = np.zeros((3, 2, 3)) + np.array([[0.0, 0, 0], [1, 1, 1]]), np.arange(3) / FPS
+    truth = Trajectories(np.arange(3), time_s, ("0", "1"), position_m)
     # An offset of 2 sigma, and changes of 1.5 relative sigma to either side of it.
     change_m = 0.0225 * np.array([1.0, 0.0, -1.0])[:, None, None] * np.array([0.0, 0.0, 1.0])
-    moved = replace(estimate, position_m=estimate.position_m + np.array([0.0, 0.02, 0.0]) + change_m)
-    figures = evaluate(moved, estimate)
+    covariance_m2 = np.tile(np.diag([4e-4, 1e-4, 9e-4]), (3, 2, 1, 1))
+    both = {"covariance_m2": covariance_m2, "relative_covariance_m2": covariance_m2 / 4}
+    figures = evaluate(
+        replace(truth, position_m=position_m + np.array([0.0, 0.02, 0.0]) + change_m, **both), truth
+    )
     assert figures.mean_nees == pytest.approx(2.0**2 + 0.75**2 * 2 / 3)
     assert figures.offset_removed_mean_nees == pytest.approx(1.5**2 * 2 / 3)
-    alone = replace(moved, relative_covariance_m2=None)
-    assert evaluate(alone, estimate).offset_removed_mean_nees == pytest.approx(0.75**2 * 2 / 3)

@@ -70,9 +70,7 @@ DRONE = (22, 19, 42, 29)
 #: What the silhouette shows -> the silhouette, and the fitness: foreground in the box over the union of both.
 BY_HAND = {
     "the drone": (silhouette(DRONE), 1),
-    "left half": (silhouette((22, 19, 32, 29)), 1 / 2),
     "an L": (silhouette((22, 19, 42, 21), (22, 21, 24, 29)), (40 + 16) / 200),
-    "elsewhere": (silhouette((0, 0, 10, 10), (50, 30, 64, 48)), 0),
     "nothing": (silhouette(), 0),
     "a fifth covered": (silhouette(DRONE, value=51), 1 / 5),
     # Foreground beside the box, within the ring of 30 x 15 pixels, makes the union larger.

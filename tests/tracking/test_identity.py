@@ -51,11 +51,7 @@ def simulate_tracks(flown_m, std_m=0.01, seed=0, exchanges=()):
         was_measured=np.ones((frames, drones), bool),
         truth=truth,
     )
-    return order_by_tracks(by_drones, truth)
-
-
-def order_by_tracks(by_drones, truth):
-    """Move the columns of each drone to the columns of its tracks in `truth`."""
+    # The columns of each drone become those of its tracks.
     column = np.argsort(truth, axis=1)
     names = ("position_m", "covariance_m2", "was_measured")
     return replace(by_drones, **{name: relabelled(getattr(by_drones, name), column) for name in names})
@@ -110,30 +106,21 @@ def merge_positions(flown_m, merge_m=0.3):
 
 class TestTwoDrones:
     @pytest.mark.parametrize("std_m", [0.005, 0.03])
+    @pytest.mark.parametrize("frame", [None, 46, 50, 53])
     @pytest.mark.parametrize("flight", [passing, turning_back])
-    def test_correct_labels_are_kept(self, flight, std_m):
-        tracks = simulate_tracks(flight(), std_m)
+    def test_correct_labels_are_kept_and_swapped_labels_are_corrected(self, flight, frame, std_m):
+        tracks = simulate_tracks(flight(), std_m, exchanges=[(frame, (1, 0))] if frame else [])
         found = resolve_tracks(tracks)
-        np.testing.assert_array_equal(found.order, tracks.truth)
         (encounter,) = found.encounters
-        assert encounter.outcome is LabelOutcome.KEPT
+        assert encounter.outcome is (LabelOutcome.SWAPPED if frame else LabelOutcome.KEPT)
         assert encounter.drones == (0, 1)
-        assert encounter.log_odds < np.log(0.01)
+        assert (encounter.log_odds if frame else -encounter.log_odds) > np.log(99)
         # Errors of a few centimetres shift the frame of the least distance, which is 0.3 m.
         assert abs(encounter.closest_frame - 50) <= 3
         assert encounter.distance_m == pytest.approx(0.3, abs=6 * std_m)
         assert encounter.first_frame < 45 < 55 < encounter.last_frame < 75
-
-    @pytest.mark.parametrize("std_m", [0.005, 0.03])
-    @pytest.mark.parametrize("frame", [46, 50, 53])
-    @pytest.mark.parametrize("flight", [passing, turning_back])
-    def test_swapped_labels_are_corrected(self, flight, frame, std_m):
-        tracks = simulate_tracks(flight(), std_m, exchanges=[(frame, (1, 0))])
-        found = resolve_tracks(tracks)
-        assert list_outcomes(found) == [LabelOutcome.SWAPPED]
-        assert found.encounters[0].log_odds > np.log(99)
         # At distances of 0.3 m and more, labels are wrong in one frame; with errors of 0.03 m, in two frames.
-        assert (found.order != tracks.truth).any(axis=1).sum() <= 2
+        assert (found.order != tracks.truth).any(axis=1).sum() <= (2 if frame else 0)
 
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_drones_that_hover_together_are_ambiguous(self, exchanged):
@@ -143,11 +130,11 @@ class TestTwoDrones:
         )
         assert list_outcomes(found) == [LabelOutcome.UNDECIDED]
         assert (found.order == [0, 1]).all()
-        last = found.encounters[0].last_frame
+        first, last = found.encounters[0].first_frame, found.encounters[0].last_frame
         # Odds are nearly even; the course of more than a second ago has little influence. Measured 0.41 to 0.62.
         assert (np.abs(found.ambiguity[[50, 60, 70, last], 0] - 0.5) < 0.15).all()
         # Ambiguity begins with the encounter and ends with it.
-        assert (found.ambiguity[: found.encounters[0].first_frame] == 0).all()
+        assert (found.ambiguity[:first] == 0).all()
         assert (found.ambiguity[last + 1 :] == 0).all()
         np.testing.assert_array_equal(found.pairs, [[0, 1]])
 
@@ -164,11 +151,6 @@ class TestTwoDrones:
             # Labels are undefined in frames without measurements.
             assert (found.order == tracks.truth)[was_measured.all(axis=1)].all()
 
-    def test_labels_swapped_twice_in_an_encounter(self):
-        """An encounter has wrong labels for twenty frames, and ends with the correct labels."""
-        tracks = simulate_tracks(passing(0.4, 0.1), exchanges=[(40, (1, 0)), (60, (1, 0))])
-        np.testing.assert_array_equal(resolve_tracks(tracks).order, tracks.truth)
-
     @pytest.mark.parametrize("exchanged", [False, True])
     def test_merged_silhouettes_in_a_pass(self, exchanged):
         """For a few tenths of a second both drones are measured at one place; only their earlier course can decide."""
@@ -176,14 +158,6 @@ class TestTwoDrones:
         found = resolve_tracks(tracks)
         assert list_outcomes(found) == [LabelOutcome.SWAPPED if exchanged else LabelOutcome.KEPT]
         np.testing.assert_array_equal(found.order[[0, -1]], tracks.truth[[0, -1]])
-
-    def test_a_drone_that_appears_beside_another(self):
-        tracks = simulate_tracks(passing())
-        was_measured = tracks.was_measured.copy()
-        was_measured[:48, 1] = False
-        found = resolve_tracks(replace(tracks, was_measured=was_measured))
-        assert list_outcomes(found) == [LabelOutcome.KEPT]
-        assert (found.order == [0, 1]).all()
 
     def test_one_drone_or_distant_drones_have_no_encounter(self):
         distant = resolve_tracks(simulate_tracks(passing(0.8)))
@@ -193,13 +167,6 @@ class TestTwoDrones:
         alone = resolve_tracks(simulate_tracks(passing()[:, :1]))
         assert (alone.order == 0).all()
         assert (alone.pairs.shape, alone.ambiguity.shape) == ((0, 2), (100, 0))
-
-    def test_an_encounter_that_lasts_until_the_end(self):
-        tracks = simulate_tracks(passing()[:51], exchanges=[(48, (1, 0))])
-        found = resolve_tracks(tracks)
-        assert list_outcomes(found) == [LabelOutcome.OPEN]
-        assert found.encounters[0].last_frame == 50
-        np.testing.assert_array_equal(found.order, tracks.truth)
 
     def test_a_drone_that_is_lost_in_an_encounter(self):
         """Two seconds after the drones were last near, the encounter ends without a decision."""
@@ -238,17 +205,6 @@ class TestMoreDrones:
         assert list_outcomes(found).count(LabelOutcome.SWAPPED) == swaps
         assert {encounter.drones for encounter in found.encounters} == {(0, 1), (0, 2), (1, 2)}
 
-    def test_two_swaps_at_different_times(self):
-        """Three tracks are permuted in two steps, and each step is corrected in its frame."""
-        tracks = simulate_tracks(meeting_in_the_middle(3), exchanges=[(46, (1, 0, 2)), (54, (0, 2, 1))])
-        np.testing.assert_array_equal(resolve_tracks(tracks).order, tracks.truth)
-
-    def test_a_drone_far_away_takes_no_part(self):
-        flown_m = np.concatenate([meeting_in_the_middle(3), np.full((100, 1, 3), 2.0)], axis=1)
-        found = resolve_tracks(simulate_tracks(flown_m, exchanges=[(50, (2, 0, 1, 3))]))
-        assert (found.ambiguity[:, (found.pairs == 3).any(axis=1)] == 0).all()
-        assert (found.ambiguity[:, (found.pairs != 3).all(axis=1)] > 0).any(axis=0).all()
-
     def test_pairs_that_meet_while_their_labels_are_uncertain(self):
         one = passing(0.3, 0.3)
         flown_m = np.concatenate([one, one + np.array([0.0, 1.6, 0.0])], axis=1)
@@ -260,12 +216,6 @@ class TestMoreDrones:
         found = resolve_tracks(tracks)
         np.testing.assert_array_equal(found.order, tracks.truth)
         assert {encounter.first_frame for encounter in found.encounters} != {0}
-
-    def test_five_drones_that_meet_at_once(self):
-        """Correct labels are kept, and the reported ambiguity is a probability."""
-        found = resolve_tracks(simulate_tracks(meeting_in_the_middle(5)))
-        assert (found.order == np.arange(5)).all()
-        assert ((found.ambiguity >= 0) & (found.ambiguity <= 1)).all()
 
     def test_a_drone_that_passes_two_others_is_decided_while_they_stay(self):
         """Two drones stay side by side, and a third drone passes them."""
@@ -297,6 +247,7 @@ class TestMoreDrones:
         columns = [column[tuple(pair)] for pair in found.pairs]
         # The tolerance is for sums in another order, over a hundred frames.
         np.testing.assert_allclose(renamed.ambiguity[:, columns], found.ambiguity, rtol=0, atol=1e-9)
+        assert ((found.ambiguity >= 0) & (found.ambiguity <= 1)).all()
 
     def test_the_first_frames_alone_give_the_same_result(self):
         """The first frames alone give the same result as all frames, up to the first frame that is still uncertain."""

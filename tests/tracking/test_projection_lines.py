@@ -1,21 +1,34 @@
-"""Tracking drones by the lines of sight of their detections: exact boxes, and boxes with the errors of detectors."""
+"""Tracking drones by the lines of sight of their detections, and the volume in which they are searched."""
+
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOM_M, ring_rig
+from helpers import make_unnamed_rig, ring_rig
+from seen_boxes import FPS, boxes_of, joined, see, track, true_boxes
 
+from psotrack.errors import InputError
 from psotrack.evaluation import evaluate
-from psotrack.geometry import make_rig, project
-from psotrack.recordings import Detections
-from psotrack.settings import DroneSettings, StatusSettings, TrackSettings
-from psotrack.tracking.births import state_at_first_frame
-from psotrack.tracking.lines import track_detections
+from psotrack.geometry import look_at, make_camera, project
+from psotrack.geometry.rig_files import write_rig
+from psotrack.pipeline import track_recording
+from psotrack.recordings import Detections, write_detections
+from psotrack.recordings.datasets import open_recording
+from psotrack.settings import DroneSettings, MotionSettings, StatusSettings, TrackSettings
+from psotrack.tracking.births import (
+    find_cut_off,
+    find_outside,
+    flight_volume,
+    moving_points,
+    room_bounds,
+    state_at_first_frame,
+)
 from psotrack.tracking.lines.merged_boxes import PART_SHARE, split_merged_boxes
 from psotrack.tracking.lines.single_views import find_single_views
-from psotrack.tracking.matching import Expected, Sightings, from_detections
+from psotrack.tracking.matching import Expected, Sightings, from_detections, match
 from psotrack.trajectories import Status, Trajectories
 
-FPS = 25.0
 FRAMES = 75
 RIG = ring_rig(8, coefficients=4, image_size_wh=(1920, 1080))
 SPAN_M = np.array([0.5, 0.2])
@@ -31,48 +44,18 @@ def circles(num_drones, frames=FRAMES, speed_m_s=1.0):
     return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), height_m], axis=-1)
 
 
-def simulate_detections(truth_m, *, jitter=0.0, missed=0.0, false_alarms=0.0, seed=0, hidden=()):
-    """Boxes around the projected positions in every camera, but for drones in `hidden`: (drone, first, last frame)."""
-    rng = np.random.default_rng(seed)
-    width_height = RIG.cameras.image_size_wh[0]
-    found = {}
-    for index, name in enumerate(RIG.names):
-        frame, boxes = [], []
-        for number, drones_m in enumerate(truth_m):
-            pixels, depth = project(RIG.cameras[index], drones_m)
-            for drone, (pixel, z) in enumerate(zip(pixels, depth, strict=True)):
-                size = RIG.cameras.K[index, 0, 0] * SPAN_M / z
-                # The middle of the pixel at (0, 0) is half a pixel from the image's corner.
-                middle = pixel + 0.5 + jitter * size * rng.standard_normal(2)
-                is_hidden = any(drone == lost and first <= number < last for lost, first, last in hidden)
-                inside = (middle > 0).all() and (middle < width_height).all()
-                if inside and not is_hidden and rng.random() >= missed:
-                    frame.append(number)
-                    boxes.append([*(middle - size / 2), *(middle + size / 2)])
-            for _ in range(rng.poisson(false_alarms)):
-                corner = rng.random(2) * (width_height - 100)
-                frame.append(number)
-                boxes.append([*corner, *(corner + rng.uniform(30, 100, 2))])
-        found[name] = Detections(
-            np.array(frame, int), np.array(boxes, float).reshape(-1, 4), np.ones(len(frame))
-        )
-    return found
-
-
 def line_settings(count=None, **status):
     return TrackSettings(drones=DroneSettings(count=count), status=StatusSettings(**status))
 
 
-def track_boxes(detections, num_frames, *, rig=RIG, settings=None, known=None):
-    sightings = from_detections(detections, rig, num_frames)
-    return track_detections(
-        rig.cameras, sightings, settings or line_settings(), fps=FPS, bounds_m=ROOM_M, known=known
-    )[0]
+def seen_and_tracked(truth_m, *, settings=None, known=None, **how):
+    """The tracks of drones at (frames, drones, 3)."""
+    return track(RIG, see(RIG, truth_m, SPAN_M, **how), settings, known=known)
 
 
-def track(truth_m, count=None, known=None, **noise):
-    boxes = simulate_detections(truth_m, **noise)
-    return track_boxes(boxes, len(truth_m), settings=line_settings(count), known=known)
+def moving(truth_m):
+    """Places and velocities in the first frame. On a circle, the mean over the first step is 0.03 m/s off."""
+    return truth_m[0], (truth_m[1] - truth_m[0]) * FPS
 
 
 def evaluate_tracks(tracked, truth_m):
@@ -93,8 +76,7 @@ def evaluate_tracks(tracked, truth_m):
 def test_perfect_boxes_give_the_drones_to_a_millimetre():
     """Six of the eight cameras have boxes: fitness is the share of the cameras that agree."""
     truth_m = circles(2)
-    boxes = simulate_detections(truth_m)
-    tracked = track_boxes({name: boxes[name] for name in RIG.names[:6]}, FRAMES)
+    tracked = seen_and_tracked(truth_m, unseen=[np.s_[:, 6:]])
     errors = evaluate_tracks(tracked, truth_m)
     assert tracked.num_drones == 2
     assert (errors["missed_rate"], errors["id_switches"], errors["mota"]) == (0, 0, 1)
@@ -111,16 +93,16 @@ def test_a_drone_that_accelerates_hard_after_a_rest_keeps_its_track():
     time_s = np.arange(FRAMES) / FPS - 1.0
     x_m = np.where(time_s > 0, 0.5 * (1 - np.cos(2 * np.pi * time_s)), 0.0)
     truth_m = np.stack([x_m, 0 * x_m, 0 * x_m + 1.2], axis=-1)[:, None]
-    tracked = track(truth_m, jitter=0.02)
+    tracked = seen_and_tracked(truth_m, jitter=0.02)
     assert tracked.arrivals == ()
     assert (tracked.status == Status.TRACKED).all()
     # The error of single frames: about 16 mm for jitter of 5 %, so 6 mm here.
     assert np.linalg.norm(tracked.measured_m - truth_m, axis=-1).max() < 0.04
 
 
-def test_a_lost_drone_coasts_with_growing_uncertainty_and_is_found_again():
+def test_a_lost_drone_coasts_and_is_found_again_and_a_drone_that_appears_later_is_new():
     truth_m = circles(3)
-    tracked = track(truth_m, jitter=0.03, hidden=[(1, 25, 50)])
+    tracked = seen_and_tracked(truth_m, jitter=0.03, unseen=[np.s_[25:50, :, 1], np.s_[:10, :, 2]])
     assert tracked.status.shape[1] == 3
     which = int(np.nanargmin(np.linalg.norm(tracked.position_m[20] - truth_m[20, 1], axis=-1)))
     status = tracked.status[:, which]
@@ -132,49 +114,38 @@ def test_a_lost_drone_coasts_with_growing_uncertainty_and_is_found_again():
     assert (np.diff(variance) > 0).all()
     assert (status[40:50] == Status.LOST).all()
     assert (status[50:] == Status.TRACKED).all()
-    (again,) = tracked.arrivals
+    new, again = tracked.arrivals
+    assert (new.frame, new.drone, new.again) == (10, 2, False)
+    assert (tracked.status[:10, 2] == Status.LOST).all()
+    assert np.isnan(tracked.position_m[:10, 2]).all()
     assert (again.frame, again.drone, again.again) == (50, which, True)
     assert np.linalg.norm(tracked.position_m[60, which] - truth_m[60, 1]) < 0.03
 
 
-def test_a_drone_that_appears_later_is_a_new_drone():
-    truth_m = circles(3)
-    tracked = track(truth_m, jitter=0.03, hidden=[(2, 0, 30)])
-    (new,) = tracked.arrivals
-    assert (new.frame, new.drone, new.again) == (30, 2, False)
-    assert (tracked.status[:30, 2] == Status.LOST).all()
-    assert np.isnan(tracked.position_m[:30, 2]).all()
-
-
 def test_without_drones_there_are_no_tracks():
     """Three false alarms in every image: lines that meet once do not meet in five of eight frames."""
-    tracked = track(np.empty((25, 0, 3)), false_alarms=3.0)
+    tracked = seen_and_tracked(np.empty((25, 0, 3)), clutter=3)
     assert tracked.status.shape == (25, 0)
     assert len(state_at_first_frame(tracked).position_m) == 0
 
 
 def test_known_drones_come_first_in_the_given_order_and_others_beside_them_from_the_first_frame():
     truth_m = circles(3, frames=30)
-    velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
-    given = [2, 0]
-    tracked = track(truth_m, known=(truth_m[0, given], velocity_m_s[given]))
+    tracked = seen_and_tracked(truth_m, known=moving(truth_m[:, [2, 0]]))
     assert tracked.arrivals == ()
     assert (tracked.status == Status.TRACKED).all()
-    # The initial velocity is the mean over the first step, which on a circle is 0.03 m/s off.
     np.testing.assert_allclose(tracked.position_m[0], truth_m[0, [2, 0, 1]], atol=2e-3)
     np.testing.assert_allclose(state_at_first_frame(tracked).position_m, tracked.position_m[0])
     # The number of drones is limited to the given count.
-    assert track(truth_m, count=2).num_drones == 2
+    assert seen_and_tracked(truth_m, settings=line_settings(2)).num_drones == 2
 
 
 @pytest.mark.parametrize("max_coasting_std_m", [0.5, 0.01])
 def test_a_given_drone_that_is_seen_late_keeps_its_number(max_coasting_std_m):
     """No camera shows the first drone until its track is lost at its given place."""
     truth_m = circles(3)
-    velocity_m_s = (truth_m[1] - truth_m[0]) * FPS
-    boxes = simulate_detections(truth_m, jitter=0.03, hidden=[(0, 0, 30)])
-    settings = line_settings(3, max_coasting_std_m=max_coasting_std_m)
-    tracked = track_boxes(boxes, FRAMES, settings=settings, known=(truth_m[0], velocity_m_s))
+    settings, hidden = line_settings(3, max_coasting_std_m=max_coasting_std_m), [np.s_[:30, :, 0]]
+    tracked = seen_and_tracked(truth_m, settings=settings, known=moving(truth_m), jitter=0.03, unseen=hidden)
     (again,) = tracked.arrivals
     assert (again.frame, again.drone, again.again) == (30, 0, True)
     assert (tracked.status[20:30, 0] == Status.LOST).all()
@@ -182,22 +153,12 @@ def test_a_given_drone_that_is_seen_late_keeps_its_number(max_coasting_std_m):
     assert np.linalg.norm(tracked.position_m[40:] - truth_m[40:], axis=-1).max() < 0.06
 
 
-def seen_by_two_then_one(last=55):
-    """A drone on a circle: cameras 0 and 2 see it until frame 30, then camera 2 alone until `last`."""
-    truth_m = circles(1, frames=FRAMES)
-    detections = simulate_detections(truth_m, jitter=0.02, seed=3)
-    pair = make_rig({RIG.names[index]: RIG.cameras[index] for index in (0, 2)})
-    two = {}
-    for name, stop in ((RIG.names[0], 30), (RIG.names[2], last)):
-        kept = detections[name].frame < stop
-        two[name] = Detections(detections[name].frame[kept], detections[name].xyxy[kept], np.ones(kept.sum()))
-    return pair, truth_m, two
-
-
 @pytest.mark.slow
 def test_one_camera_keeps_a_track_on_its_line_of_sight():
-    pair, truth_m, detections = seen_by_two_then_one()
-    tracks = track_boxes(detections, FRAMES, rig=pair)
+    """Two cameras see a drone on a circle until frame 30, then one of them alone until frame 55."""
+    truth_m, pair = circles(1), RIG.select([RIG.names[0], RIG.names[2]])
+    seen = see(pair, truth_m, SPAN_M, jitter=0.02, seed=2, unseen=[np.s_[30:, 0], np.s_[55:]])
+    tracks = track(pair, seen)
     assert tracks.num_drones == 1
     alone = slice(30, 55)
     assert (tracks.status[alone, 0] != Status.TRACKED).all()
@@ -205,11 +166,11 @@ def test_one_camera_keeps_a_track_on_its_line_of_sight():
     stated = np.isfinite(tracks.position_m[alone, 0]).all(axis=-1)
     assert stated.all()
     camera = RIG.cameras[2]
-    seen, _ = project(camera, tracks.position_m[alone, 0][stated])
+    drawn, _ = project(camera, tracks.position_m[alone, 0][stated])
     true, _ = project(camera, truth_m[alone, 0][stated])
     # Boxes err by 2 % of their sides, which is 1 to 4 pixels; without the camera, the prediction errs by 45 pixels
     # after half a second.
-    assert np.linalg.norm(seen - true, axis=-1).max() < 15.0
+    assert np.linalg.norm(drawn - true, axis=-1).max() < 15.0
     # No position is stated that is vaguer than half a metre, and each is right within its covariance.
     off_m = truth_m[alone, 0][stated] - tracks.position_m[alone, 0][stated]
     covariance_m2 = tracks.covariance_m2[alone, 0][stated]
@@ -217,7 +178,7 @@ def test_one_camera_keeps_a_track_on_its_line_of_sight():
     # 0.1 % of a chi-squared distribution of three degrees of freedom is above 16.3; the rows share one error.
     assert (np.einsum("fi,fij,fj->f", off_m, np.linalg.inv(covariance_m2), off_m) < 16.3).all()
     # A smaller limit states the first of these rows only.
-    sure = track_boxes(detections, FRAMES, rig=pair, settings=line_settings(max_coasting_std_m=0.1))
+    sure = track(pair, seen, line_settings(max_coasting_std_m=0.1))
     stated = np.isfinite(sure.position_m[alone, 0]).all(axis=-1)
     assert stated[0]
     assert not stated[-1]
@@ -254,28 +215,23 @@ def test_a_part_of_a_drone_that_two_cameras_see_once_is_no_second_drone(seed, be
     Two tracks at one place would share the drone for ever, if each box of the drone were split between them. The boxes
     are up to some tens of percent too large, as those of blobs with shadows.
     """
-    rng = np.random.default_rng(seed)
     truth_m = circles(1, frames=40)
-    whole = simulate_detections(truth_m, jitter=0.05, seed=seed)
-    part = simulate_detections(truth_m[:1] + np.array([beside_m, 0.0, 0.0]), jitter=0.05, seed=seed + 100)
-    for camera, name in enumerate(RIG.names):
-        one = whole[name]
-        middle, half = (one.xyxy[:, :2] + one.xyxy[:, 2:]) / 2, (one.xyxy[:, 2:] - one.xyxy[:, :2]) / 2
-        half *= 1 + 0.2 * np.abs(rng.standard_normal((len(half), 1)))
-        boxes = [(one.frame, np.concatenate([middle - half, middle + half], axis=1), one.confidence)]
-        if camera >= 6:
-            boxes.insert(0, (part[name].frame, part[name].xyxy, part[name].confidence))
-        whole[name] = Detections(*(np.concatenate(values) for values in zip(*boxes, strict=True)))
-    tracked = track_boxes(whole, len(truth_m))
+    whole = see(RIG, truth_m, SPAN_M, jitter=0.05, seed=seed)
+    larger = 1 + 0.2 * np.abs(np.random.default_rng(seed).standard_normal(whole.size_px.shape[:3]))
+    beside = truth_m + np.array([beside_m, 0.0, 0.0])
+    part = see(RIG, beside, SPAN_M, jitter=0.05, seed=seed + 100, unseen=[np.s_[1:], np.s_[:, :6]])
+    seen = joined(boxes_of(whole.centre_px, whole.size_px * larger[..., None]), part, axis=2)
+    tracked = track(RIG, seen)
     assert tracked.num_drones == 1
     assert (tracked.status == Status.TRACKED).all()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [2, 4])
 def test_chance_crossings_of_two_cameras_take_no_detection_from_a_drone(seed):
     """Each camera misses a fifth of the drones and has three false alarms: lines of two cameras cross everywhere."""
     truth_m = circles(6, frames=25)
-    tracked = track(truth_m, jitter=0.05, missed=0.2, false_alarms=3.0, seed=seed)
+    missed = np.random.default_rng(seed).random((25, len(RIG), 6)) < 0.2
+    tracked = seen_and_tracked(truth_m, jitter=0.05, clutter=3, seed=seed, unseen=[missed])
     assert tracked.num_drones == 6
     # Of 150; found in 138 to 141 if all crossings compete for the detections.
     assert (tracked.status == Status.TRACKED).sum() >= 148
@@ -295,12 +251,10 @@ BOX_RIG = ring_rig(5, coefficients=4, image_size_wh=(1920, 1080))
 SPANS_M = np.array([[0.5, 0.2], [0.3, 0.3]])
 
 
-def true_boxes(drones_m, span_m=SPANS_M, rig=BOX_RIG):
-    """Boxes in which the cameras see the drones: (drones, cameras, 4). Pixel centres are at whole numbers."""
-    pixels, depth = project(rig.cameras, drones_m[:, None])
-    focal_px = np.diagonal(rig.cameras.K, axis1=-2, axis2=-1)[:, :2]
-    half_px = span_m[:, None] * focal_px / depth[..., None] / 2
-    return np.concatenate([pixels - half_px, pixels + half_px], axis=-1)
+def corners(drones_m, span_m=SPANS_M, rig=BOX_RIG):
+    """Boxes in which the cameras see the drones, as corners: (drones, cameras, 4)."""
+    centre_px, size_px = (each.swapaxes(0, 1) for each in true_boxes(rig, drones_m, span_m))
+    return np.concatenate([centre_px - size_px / 2, centre_px + size_px / 2], axis=-1)
 
 
 def enclosing_box(boxes):
@@ -317,9 +271,8 @@ def sightings_of(*boxes, noise_px=3.0):
 
 def split(view, expected_m, span_m):
     """The frame's boxes after merged boxes are split, with drones expected at these places."""
-    corners = true_boxes(expected_m, span_m)
-    middle_px, half_px = (corners[..., :2] + corners[..., 2:]) / 2, (corners[..., 2:] - corners[..., :2]) / 2
-    return split_merged_boxes(view, np.concatenate([middle_px, half_px], axis=-1))
+    centre_px, size_px = (each.swapaxes(0, 1) for each in true_boxes(BOX_RIG, expected_m, span_m))
+    return split_merged_boxes(view, np.concatenate([centre_px, size_px / 2], axis=-1))
 
 
 def boxes_in_camera(view, camera):
@@ -339,7 +292,7 @@ def two_drones():
 
 def test_a_drone_in_a_merged_box_gets_its_own_box_if_edges_of_the_merged_box_are_its_own():
     drones_m = two_drones()
-    own = true_boxes(drones_m)
+    own = corners(drones_m)
     whole = enclosing_box(own)
     seen = split(sightings_of(whole), drones_m, SPANS_M)
     num_placed = []
@@ -358,7 +311,7 @@ def test_the_expected_positions_hardly_change_the_boxes():
     """The edges come from the image; only the sizes depend on the expected distances of the drones."""
     right, down, _ = BOX_RIG.cameras.T_cam_world[0, :3, :3]
     drones_m = np.array([0.0, 0.0, 1.2]) + np.array([np.zeros(3), 0.35 * right + 0.25 * down])
-    own = true_boxes(drones_m)
+    own = corners(drones_m)
     expected_m = drones_m + 0.03 * np.array([[1.0, -1.0, 0.5], [-1.0, 0.5, 1.0]])
     seen = split(sightings_of(enclosing_box(own)), expected_m, SPANS_M)
     # An error of 5 cm at about 4 m is 1.3 % of 150 px, and half of the size goes into the centre.
@@ -366,10 +319,11 @@ def test_the_expected_positions_hardly_change_the_boxes():
     np.testing.assert_allclose(seen.centre_px[0, 1:], middle_px, atol=1.0)
 
 
-def test_overlapping_boxes_of_one_drone_each_do_not_change():
-    own = true_boxes(two_drones())
-    view = sightings_of(*own)
-    seen = split(view, two_drones(), SPANS_M)
+@pytest.mark.parametrize("case", ["a box for each drone", "drones of unknown size"])
+def test_boxes_that_do_not_change(case):
+    own, alone = corners(two_drones()), case == "a box for each drone"
+    view = sightings_of(*own) if alone else sightings_of(enclosing_box(own))
+    seen = split(view, two_drones(), SPANS_M if alone else np.full((2, 2), np.nan))
     np.testing.assert_array_equal(seen.centre_px, view.centre_px)
     np.testing.assert_array_equal(seen.noise_px, view.noise_px)
 
@@ -378,19 +332,12 @@ def test_a_drone_in_the_middle_of_a_merged_box_is_hidden():
     """Three drones in a column: no edge of the box gives the height of the middle drone."""
     drones_m = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 1.1], [0.0, 0.0, 1.3]])
     span_m = np.tile(SPANS_M[0], (3, 1))
-    own = true_boxes(drones_m, span_m)
+    own = corners(drones_m, span_m)
     seen = split(sightings_of(enclosing_box(own)), drones_m, span_m)
     for camera in range(len(BOX_RIG)):
         high = boxes_in_camera(seen, camera)[:, 1]
         assert own[1, camera, 1] not in high
         assert len(high) <= 2
-
-
-def test_drones_of_unknown_size_split_no_box():
-    own = true_boxes(two_drones())
-    view = sightings_of(enclosing_box(own))
-    seen = split(view, two_drones(), np.full((2, 2), np.nan))
-    np.testing.assert_array_equal(seen.centre_px, view.centre_px)
 
 
 def merge_touching_boxes(boxes):
@@ -418,21 +365,221 @@ def test_drones_whose_boxes_merge_keep_their_tracks():
     )
     span_m = np.array([[0.45, 0.18], [0.35, 0.25], [0.45, 0.18]])
     rng = np.random.default_rng(0)
-    images = {name: ([], []) for name in RIG.names}
-    for number, drones_m in enumerate(truth_m):
-        for index, name in enumerate(RIG.names):
-            own = true_boxes(drones_m, span_m, RIG)[:, index] + 0.5 + rng.normal(0.0, 1.0, (3, 4))
-            for box in merge_touching_boxes(own):
-                images[name][0].append(number)
-                images[name][1].append(box)
-    detections = {
-        name: Detections(np.array(frame), np.array(boxes), np.ones(len(frame)))
-        for name, (frame, boxes) in images.items()
-    }
-    known = truth_m[0], (truth_m[1] - truth_m[0]) * FPS
-    errors = evaluate_tracks(track_boxes(detections, len(truth_m), known=known), truth_m)
+    centre_px, size_px = np.full((2, len(truth_m), len(RIG), 3, 2), np.nan)
+    for frame, drones_m in enumerate(truth_m):
+        for camera, own in enumerate(corners(drones_m, span_m, RIG).swapaxes(0, 1)):
+            boxes = np.array(merge_touching_boxes(own + rng.normal(0.0, 1.0, (3, 4))))
+            centre_px[frame, camera, : len(boxes)] = (boxes[:, :2] + boxes[:, 2:]) / 2
+            size_px[frame, camera, : len(boxes)] = boxes[:, 2:] - boxes[:, :2]
+    tracked = track(RIG, boxes_of(centre_px, size_px), known=moving(truth_m))
+    errors = evaluate_tracks(tracked, truth_m)
     assert errors["id_switches"] == 0
     # The middle drone has no edge of its own for two frames. Measured 1.1 % and 1.8 mm; 3.3 % and 3.6 mm if the centres
     # of merged boxes were used as centres of drones.
     assert errors["missed_rate"] < 0.02
     assert errors["mean_error_m"] < 0.0025
+
+
+# --- the volume in which drones are searched: bounds and a speed limit from what moves, few cameras, tracks cut off
+
+FORMULA = runpy.run_path(str(Path(__file__).parents[2] / "experiments" / "accuracy" / "formula_flights.py"))
+SCENES, make_flight = FORMULA["SCENES"], FORMULA["make_flight"]
+
+K = np.array([[1000.0, 0, 960], [0, 1000.0, 540], [0, 0, 1]])
+SKY_M = (0.0, 0.0, 15.0)
+
+
+def ground_rig(num_cameras, target_m=SKY_M, height_m=1.5):
+    """Cameras on the ground on a circle of 25 m, which all look at one place."""
+    cameras = []
+    for angle in 2 * np.pi * np.arange(num_cameras) / num_cameras + 0.3:
+        R, t_m = look_at([25 * np.cos(angle), 25 * np.sin(angle), height_m], target_m)
+        cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080)))
+    return make_unnamed_rig(*cameras)
+
+
+def flights(num_frames, speeds_m_s, centre_m=SKY_M):
+    """Positions (frames, drones, 3) of drones on horizontal circles of 8 m, one above the other."""
+    time_s = np.arange(num_frames)[:, None] / FPS
+    angle = np.array(speeds_m_s) / 8.0 * time_s + 2.0 * np.arange(len(speeds_m_s))
+    height_m = np.broadcast_to(centre_m[2] + 1.5 * np.arange(len(speeds_m_s)), angle.shape)
+    return np.stack([8 * np.cos(angle), 8 * np.sin(angle), height_m], axis=-1) + np.array(
+        [*centre_m[:2], 0.0]
+    )
+
+
+def see_all(rig, truth_m, *, clutter=1, **how):
+    """Boxes with errors of 1 px, and false alarms."""
+    return see(rig, truth_m, (0.35, 0.35), jitter=0.07, clutter=clutter, **how)
+
+
+def track_in(rig, seen, volume, size_m=None, **status):
+    motion = MotionSettings(max_speed_m_s=volume.max_speed_m_s)
+    settings = TrackSettings(motion=motion, status=StatusSettings(**status))
+    return track(rig, seen, settings.changed({"drones.size_m": size_m}), bounds_m=volume.bounds_m)
+
+
+def test_the_volume_holds_drones_far_above_the_cameras_and_their_speed():
+    rig, truth_m = ground_rig(4), flights(60, (4.0, 11.0))
+    points = moving_points(rig, see_all(rig, truth_m), FPS)
+    volume = flight_volume(rig, points)
+    assert volume.bounds_from == "cameras and moving points"
+    assert volume.speed_from == "moving points"
+    assert ((truth_m >= volume.bounds_m[0]) & (truth_m <= volume.bounds_m[1])).all()
+    # The margin beyond the highest drone is a metre; false alarms do not widen the volume.
+    assert 16.5 < volume.bounds_m[1, 2] < 20
+    assert 11.0 < volume.max_speed_m_s < 2 * 11.0
+    # A recording may be shorter than the time that is searched at once.
+    assert len(moving_points(rig, see_all(rig, truth_m)[:16], FPS))
+
+
+@pytest.mark.slow
+def test_things_smaller_than_usual_drones_are_found_where_their_size_is_given():
+    """Balls of 5 cm: 2 px wide in the cameras, 28 m away."""
+    rig, truth_m, size_m = ground_rig(4), flights(60, (4.0, 11.0)), (0.05, 0.05, 0.05)
+    drones = see_all(rig, truth_m)
+    balls = boxes_of(drones.centre_px, drones.size_px / 6.5)
+    assert not len(moving_points(rig, balls, FPS))
+    volume = flight_volume(rig, moving_points(rig, balls, FPS, size_m))
+    assert volume.bounds_from == "cameras and moving points"
+    assert track_in(rig, balls, volume).num_drones == 0
+    assert track_in(rig, balls, volume, size_m).num_drones == 2
+    # A given size that is wrong hides no usual drone.
+    assert track_in(rig, drones, volume, list(size_m)).num_drones == 2
+
+
+def test_given_values_win():
+    rig, truth_m = ground_rig(4), flights(30, (11.0,))
+    points = moving_points(rig, see_all(rig, truth_m), FPS)
+    volume = flight_volume(rig, points, bounds_m=(-1.0, 1.0, -2.0, 2.0, 0.0, 3.0), max_speed_m_s=5.0)
+    np.testing.assert_array_equal(volume.bounds_m, [[-1, -2, 0], [1, 2, 3]])
+    assert (volume.bounds_from, volume.max_speed_m_s, volume.speed_from) == ("given", 5.0, "given")
+    assert volume.record["bounds_m"] == [[-1.0, -2.0, 0.0], [1.0, 2.0, 3.0]]
+    assert "outside of the given bounds" in find_outside(volume)
+    assert "--max-speed" in find_outside(flight_volume(rig, points, max_speed_m_s=5.0))
+    assert find_outside(flight_volume(rig, points)) is None
+
+
+def test_false_alarms_and_what_moves_below_a_floor_leave_the_room_of_the_cameras():
+    rig = ground_rig(4)
+    points = moving_points(rig, see_all(rig, flights(60, ()), clutter=3), FPS)
+    volume = flight_volume(rig, points)
+    np.testing.assert_array_equal(volume.bounds_m, room_bounds(rig))
+    assert (volume.bounds_from, volume.max_speed_m_s) == ("cameras", 6.0)
+    # Reflections in the floor of a room agree in all cameras, and move with the drones.
+    rig = ground_rig(4, target_m=(0.0, 0.0, 1.0), height_m=9.0)
+    real_m = flights(30, (2.0,), centre_m=(0.0, 0.0, 2.0))
+    both_m = np.concatenate([real_m, real_m * (1, 1, -1)], axis=1)
+    volume = flight_volume(rig, moving_points(rig, see_all(rig, both_m), FPS))
+    np.testing.assert_array_equal(volume.bounds_m, room_bounds(rig))
+
+
+@pytest.mark.slow
+def test_two_cameras_begin_a_track_where_there_is_no_third():
+    rig = ground_rig(5)
+    pair = make_unnamed_rig(rig.cameras[0], rig.cameras[1])
+    truth_m = flights(40, (4.0, 3.0))
+    volume = flight_volume(pair, None, bounds_m=(-20.0, 20.0, -20.0, 20.0, 0.0, 30.0))
+    sightings = see_all(pair, truth_m)
+    tracks = track_in(pair, sightings, volume)
+    assert tracks.num_drones == 2
+    assert (tracks.status == Status.TRACKED).mean() > 0.95
+    # The covariance says that two lines of sight determine the place worse than five.
+    five = track_in(rig, see_all(rig, truth_m), volume)
+    spread = [np.trace(each.covariance_m2[20, 0]) for each in (tracks, five)]
+    assert spread[0] > 1.5 * spread[1]
+    assert track_in(pair, sightings, volume, min_cameras_to_begin=3).num_drones == 0
+
+
+def test_two_cameras_keep_a_track_that_three_began_and_begin_one_late_that_a_third_should_see():
+    rig, truth_m = ground_rig(3), flights(50, (4.0,))
+    volume = flight_volume(rig, None, bounds_m=(-20.0, 20.0, -20.0, 20.0, 0.0, 30.0))
+    three, two = (see_all(rig, truth_m, seed=1, unseen=hidden) for hidden in ((), [np.s_[:, 2]]))
+    kept = track_in(rig, joined(three[:12], two[12:], axis=0), volume)
+    assert kept.num_drones == 1
+    assert (kept.status[:, 0] == Status.TRACKED).all()
+    assert track_in(rig, see_all(rig, truth_m[:25], unseen=[np.s_[:, 2]]), volume).num_drones == 0
+    assert track_in(rig, two, volume, min_cameras_to_begin=2).num_drones == 1
+    # A post before the third camera hides the drone: after 30 frames the track counts, from its begin on.
+    hidden = track_in(rig, two, volume)
+    assert hidden.num_drones == 1
+    assert (hidden.status[:, 0] == Status.TRACKED).mean() > 0.9
+    assert track_in(rig, two, volume, min_cameras_to_begin=3).num_drones == 0
+
+
+def test_the_volume_holds_a_drone_that_something_hides_from_the_third_camera():
+    rig = ground_rig(3)
+    truth_m = np.concatenate([flights(60, (4.0,)), flights(60, (1.0,), centre_m=(0.0, 0.0, 22.0))], axis=1)
+    low, high = see_all(rig, truth_m[:, :1]), see_all(rig, truth_m[:, 1:], unseen=[np.s_[:, 1]], clutter=0)
+    both = joined(low, high, axis=2)
+    volume = flight_volume(rig, moving_points(rig, both, FPS))
+    assert 22.0 < volume.bounds_m[1, 2] < 27.0
+    assert track_in(rig, both, volume).num_drones == 2
+
+
+@pytest.mark.slow
+def test_a_fast_drone_far_away_is_not_two():
+    """A sharp turn brings a drone out of its gate; three cameras that agree beside the place keep its track."""
+    flight = make_flight(SCENES["outdoors, 4 cameras, 3 drones on 100 m"], 250, 54)
+    sightings = from_detections(flight.detections, flight.rig, flight.num_frames)
+    volume = flight_volume(flight.rig, moving_points(flight.rig, sightings, FPS))
+    tracks = track_in(flight.rig, sightings, volume)
+    assert tracks.num_drones == 3
+
+
+@pytest.mark.parametrize(
+    ("largest_y_m", "max_speed_m_s", "expected"),
+    [
+        (20.0, 12.0, None),
+        (5.0, 12.0, "was lost at the bound y = 5.0 m; if it flies on, pass wider --bounds"),
+        (20.0, 4.0, "flies at the speed limit of 4 m/s; if it is faster, pass a higher --max-sp"),
+    ],
+)
+def test_a_track_that_is_cut_off_is_named_with_the_option(largest_y_m, max_speed_m_s, expected):
+    rig, truth_m = ground_rig(4), flights(60, (5.0,))
+    bounds_m = (-20.0, 20.0, -20.0, largest_y_m, 0.0, 30.0)
+    volume = flight_volume(rig, None, bounds_m=bounds_m, max_speed_m_s=max_speed_m_s)
+    line = find_cut_off(track_in(rig, see_all(rig, truth_m, clutter=0), volume), volume, FPS)
+    if expected is None:
+        assert line is None
+    else:
+        assert expected in line
+        assert line.startswith("frame ")
+
+
+def test_two_views_match_wherever_the_middle_of_the_searched_room_is():
+    """The room's middle is between the cameras, where a ray has no depth yet; the drone is 100 m away."""
+    cameras = []
+    for x_m in (-7.0, 7.0):
+        R, t_m = look_at([x_m, 0.0, 1.5], [0.0, 80.0, 60.0])
+        cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(1920, 1080)))
+    pair = make_unnamed_rig(*cameras).cameras
+    place_m = np.array([[3.0, 80.0, 60.0]])
+    pixels = np.asarray(project(pair, place_m[:, None])[0])[0]
+    room_m = np.array([[-300.0, -300.0, -300.0], [300.0, 300.0, 303.0]])
+    found = match(pair, pixels[:, None], np.ones((2, 1)), bounds_m=room_m, min_views=None)
+    np.testing.assert_allclose(found.position_m, place_m, atol=0.1)
+
+
+def test_a_recording_of_detections_is_tracked_within_the_volume_that_is_found(tmp_path, caplog):
+    rig, truth_m = ground_rig(3), flights(30, (9.0,))
+    sightings = see_all(rig, truth_m)
+    write_rig(tmp_path / "rig.toml", rig)
+    lines = ["version = 1", 'calibration = "rig.toml"']
+    for camera, name in enumerate(rig.names):
+        frame, box = np.nonzero(np.isfinite(sightings.noise_px[:, camera]))
+        centre = sightings.centre_px[frame, camera, box] + 0.5
+        boxes = np.concatenate([centre - 6, centre + 6], axis=1)
+        write_detections(tmp_path / f"{name}.csv", Detections(frame, boxes, np.ones(len(frame))))
+        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', "size = [1920, 1080]", f"fps = {FPS}"]
+    (tmp_path / "recording.toml").write_text("\n".join(lines) + "\n")
+    settings = TrackSettings(method="projection-lines")
+    tracked = track_recording(open_recording(tmp_path), settings, cache=tmp_path / "cache")
+    assert tracked.trajectories.num_drones == 1
+    assert tracked.record["volume"]["bounds_from"] == "cameras and moving points"
+    assert tracked.record["volume"]["speed_from"] == "moving points"
+    assert caplog.text == ""
+    told = settings.changed({"bounds_m": (-9.0, 9.0, -9.0, 9.0, 0.0, 9.0)})
+    with pytest.raises(InputError, match="found none in any frame"):
+        track_recording(open_recording(tmp_path), told, cache=tmp_path / "cache")
+    assert "100% of what moves is outside of the given bounds; pass wider --bounds" in caplog.text

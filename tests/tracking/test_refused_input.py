@@ -1,30 +1,18 @@
-"""Messages of the tracking room: settings, measurements and lenses that it cannot use."""
+"""Messages of the tracking room: settings and measurements that it cannot use."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_refused, draw_coverage, float32, ring_rig, track_settings
+from helpers import assert_refused, track_settings
 from motion_textbook import simulate_flight
-from windows import cut_at
 
-from psotrack.geometry import make_extents
 from psotrack.pipeline import causal_settings
-from psotrack.settings import SwarmSettings, TrackSettings
+from psotrack.settings import TrackSettings
 from psotrack.tracking.identity import resolve
 from psotrack.tracking.motion import estimate_jerk_density, smooth
-from psotrack.tracking.swarm import (
-    DroneFitness,
-    ScoreInputs,
-    SearchRegion,
-    SoftIoU,
-    find_search,
-    tracker_settings,
-)
+from psotrack.tracking.swarm import tracker_settings
 
 
 def causal(name: str, value: object) -> Callable[[], object]:
@@ -46,19 +34,6 @@ def relabel(measurements: object, params: object) -> object:
     return resolve(measurements, params, 0.6)
 
 
-def search_through_a_fisheye() -> object:
-    rig = ring_rig(3, coefficients=5)
-    size_m, place_m = np.array([[0.5, 0.5, 0.3]]), np.array([[0.3, 0.0, 1.4]])
-    patches = cut_at(rig, draw_coverage(rig, place_m, size_m, 2), place_m, size_m, reduction=2)
-    cameras = replace(rig.cameras, fisheye=np.array([True, False, False]))
-    inputs = ScoreInputs(
-        make_extents(*float32((cameras, size_m))), jax.tree.map(jnp.asarray, patches), SoftIoU()
-    )
-    search = find_search(SwarmSettings(search="pso-kernel", particles=6, iterations=5))
-    region = SearchRegion(*float32((place_m - 0.3, place_m + 0.3, np.full(3, 0.1))))
-    return search(jax.random.key(3), DroneFitness(inputs), jnp.zeros((6, 1, 3)), region, jnp.int32(5))
-
-
 def kernel(**options: object) -> Callable[[], object]:
     return lambda: tracker_settings(track_settings(search="pso-kernel", **options))
 
@@ -75,7 +50,6 @@ BAD = {
     "causal background": (causal("silhouettes.background", "mog2"), "first_look: expected"),
     "kernel, joint swarm": (kernel(swarm="joint"), KERNEL + "swarm.kind joint"),
     "kernel, hard score": (kernel(score="hard"), KERNEL + "another score"),
-    "kernel, fisheye": (search_through_a_fisheye, KERNEL + "a fisheye lens"),
     "time that steps back": (measured(smooth, "time_s", 3, 0.01), TIMES),
     "endless time": (measured(estimate_jerk_density, "time_s", 29, np.inf), TIMES),
     "no position": (measured(smooth, "measured_m", (4, 1, 2), np.nan), "row 4, drone 1: " + POSITION),

@@ -64,6 +64,7 @@ AWAY = ((0.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
 BESIDE = ((-0.6, 0.5, 1.0), (1.0, 0.0, 0.0), 0.5)
 FAR = ((-4.5, 0.0, 1.0), (1.0, 0.0, 0.0), 0.5)
 LONG_AGO = ((2.0, 2.0, 1.0), (0.0, 1.0, 0.0), 20.0)
+LARGE = (*LONG_AGO, {"span_m": 0.9})
 #: Two drones that left through the ceiling two metres apart; three seconds after the first, one is back near its place.
 LEFT = ((-1.5, -2.0, 3.0), (0.0, 0.0, 2.0), 3.5)
 LEFT_TOO = ((-1.5, 0.5, 3.0), (0.0, 0.0, 2.0), 5.5)
@@ -73,10 +74,15 @@ NARROW, WIDE = {"span_m": 0.46}, {"span_m": 0.62}
 STOOD = ((0.0, 0.0, 1.0), STILL_M_S, 20.0)
 GHOST = candidate(velocity_m_s=STILL_M_S, moves=False)
 SEEMING = candidate((0.0, 0.0, 1.05), (0.0, -0.02, 0.13))
-DEPARTING, RISING = candidate((0.5, 0.0, 1.0), frame=5), candidate((0.1, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)
+DEPARTING = candidate((0.5, 0.0, 1.0), frame=5)
+RISING, ELSEWHERE = (candidate((x_m, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9) for x_m in (0.1, 1.0))
 #: The same, and another drone that comes in at two metres per second, three metres away.
 COMING = candidate((0.0, -2.7, 2.7), (0.0, 0.0, -2.0))
 STAYED, FLEW = (((0.0, 0.3, 1.5), velocity, 2.6) for velocity in (STILL_M_S, (0.0, 0.0, 2.0)))
+#: A drone takes off where one was lost as it landed; another was lost in the air a moment ago, and is as large.
+TAKING_OFF = candidate((0.0, 0.1, 0.12), (0.0, 0.0, 0.3), is_sure=False)
+LANDED = ((0.0, 0.0, 0.13), (0.0, 0.5, -0.5), 9.5)
+IN_THE_AIR = ((-1.3, -1.8, 3.0), (0.5, 0.5, -1.0), 2.6)
 #: A drone that was found again at the place of its loss, so that it may be a ghost.
 HELD = (*STOOD, {"doubtful": True})
 NO_NEW = {"max_births": 0}
@@ -93,12 +99,7 @@ CASES = {
     "out of reach until time has passed": ([HERE], [(*FAR[:2], 10.0)], {}, [0]),
     "long ago, of this size": ([candidate(span_m=0.55)], [LONG_AGO], {}, [0]),
     "long ago, of half the size": ([candidate(span_m=1.0)], [LONG_AGO], {}, [NEW]),
-    "long ago, the other is as large": (
-        [candidate(span_m=0.9)],
-        [LONG_AGO, (*LONG_AGO, {"span_m": 0.9})],
-        {},
-        [1],
-    ),
+    "long ago, the other is as large": ([candidate(span_m=0.9)], [LONG_AGO, LARGE], {}, [1]),
     # Walls reflect drones, so the drones are nearer than they would be without walls.
     "the drone that left here is back": ([BACK], [LEFT, (*LEFT_TOO, NARROW)], {}, [0]),
     "sizes that differ by a third decide": ([BACK], [(*LEFT, WIDE), (*LEFT_TOO, NARROW)], {}, [1]),
@@ -112,22 +113,11 @@ CASES = {
     "a ghost that seems to move": ([SEEMING, RISING], [STOOD], {}, [NO_DRONE, 0]),
     "a ghost of nobody that seems to move": ([SEEMING, RISING], [], {}, [NO_DRONE, NEW]),
     # A slow and a fast drone at different places are two drones.
-    "a slow and a fast drone": (
-        [SEEMING, candidate((1.0, 0.0, 1.3), (0.1, 0.0, 1.5), frame=9)],
-        [STOOD],
-        {},
-        [0, NEW],
-    ),
+    "a slow and a fast drone": ([SEEMING, ELSEWHERE], [STOOD], {}, [0, NEW]),
     "who stood still has stayed": ([COMING], [STAYED], {}, [NEW]),
     "who flew out of sight may be back": ([COMING], [FLEW], {}, [0]),
     "of two, the one that flew": ([COMING], [STAYED, FLEW], {}, [1]),
-    # The other drone was lost in the air a moment ago, and is as large.
-    "who was lost as it landed takes off": (
-        [candidate((0.0, 0.1, 0.12), (0.0, 0.0, 0.3), is_sure=False)],
-        [((-1.3, -1.8, 3.0), (0.5, 0.5, -1.0), 2.6), ((0.0, 0.0, 0.13), (0.0, 0.5, -0.5), 9.5)],
-        {},
-        [1],
-    ),
+    "who was lost as it landed takes off": ([TAKING_OFF], [IN_THE_AIR, LANDED], {}, [1]),
     # A candidate that departs from the place where the drone was found again is the drone.
     "a ghost keeps no track": ([candidate((0.6, 0.0, 1.0))], [HELD], {}, [0]),
     "who passes by a doubtful track": ([candidate((0.6, 0.0, 1.0), (0.0, 1.0, 0.0))], [HELD], {}, [NEW]),
@@ -201,19 +191,13 @@ def test_the_assignment_has_the_largest_likelihood(seed):
     ]
     gone = lost_tracks(*((place[k], velocity[k], gap[k] + 0.5, {"span_m": span[k]}) for k in range(3)))
     sigma = 6.0 / 3
-    score = np.array(
-        [
-            [
-                max(
-                    oracle_log_density(one, place[k], velocity[k], gap[k] + 0.5, sigma),
-                    norm.logpdf(one.velocity_m_s, 0, sigma).sum() - np.log(ROOM_M3),
-                )
-                + norm.logpdf(np.log(0.5 / span[k]), 0, 0.2)
-                for k in range(3)
-            ]
-            for one in found
-        ]
-    )
+
+    def log_likelihood(one, k):
+        moved = oracle_log_density(one, place[k], velocity[k], gap[k] + 0.5, sigma)
+        anywhere = norm.logpdf(one.velocity_m_s, 0, sigma).sum() - np.log(ROOM_M3)
+        return max(moved, anywhere) + norm.logpdf(np.log(0.5 / span[k]), 0, 0.2)
+
+    score = np.array([[log_likelihood(one, k) for k in range(3)] for one in found])
     best = max(permutations(range(3)), key=lambda columns: score[range(3), columns].sum())
     assert assigned_drones(found, gone, max_births=0) == list(best)
 

@@ -1,4 +1,4 @@
-"""Tracks of the swarm: in one block of frames, and drones that enter, leave and return in a whole recording."""
+"""Tracks of the swarm: in one block of frames, in a whole recording, in batches, and without the future."""
 
 from dataclasses import fields, replace
 
@@ -7,8 +7,10 @@ import pytest
 from drawn_flights import (
     AWAY,
     CELL_M,
+    EFFORT,
     ENTERS,
     FPS,
+    NUM_FRAMES,
     REDUCTION,
     RIG,
     SIZE_M,
@@ -19,14 +21,14 @@ from drawn_flights import (
     run_inputs,
     track,
 )
-from helpers import ROOM_M, cameras_of, ring_rig, silhouettes_in_memory, track_settings
+from helpers import ROOM_M, ring_rig, silhouettes_in_memory, track_settings
 
-from psotrack.pipeline import track_runs
-from psotrack.recordings import FrameTimes, Recording, Reference
+from psotrack.foreground.silhouettes import Exposures
 from psotrack.tracking.births import InitialState
 from psotrack.tracking.identity import postprocess
-from psotrack.tracking.swarm import track_silhouettes
-from psotrack.trajectories import ARRAYS, Status, Trajectories
+from psotrack.tracking.swarm import StepwiseTracker, block, stepwise, track_silhouettes, tracker_settings
+from psotrack.tracking.swarm.run import SwarmRun
+from psotrack.trajectories import ARRAYS, Status
 
 SETTINGS = track_settings()
 
@@ -108,18 +110,6 @@ def test_same_seed_same_result(curves):
     # Each frame has new random numbers: a drone that hovers is not found at the same place again.
     hovering = track_two(np.repeat(curves[:1], BLOCK_FRAMES, axis=0), velocity_m_s=STILL_M_S)
     assert len(np.unique(hovering.measured_m[:, 0], axis=0)) == BLOCK_FRAMES
-
-
-@pytest.mark.slow
-def test_drones_of_their_own_swarms_interact_by_occlusion_alone(curves):
-    """Without occlusion, another initial position of the second drone changes no bit of the first drone's track."""
-    elsewhere_m = CURVE_M[0] + [[0, 0, 0], [0.1, 0, 0]]
-    one, other = (
-        track_two(curves, position_m, **{"score.occlusion": False})
-        for position_m in (CURVE_M[0], elsewhere_m)
-    )
-    np.testing.assert_array_equal(other.position_m[:, 0], one.position_m[:, 0])
-    assert (other.position_m[0, 1] != one.position_m[0, 1]).any()
 
 
 @pytest.mark.slow
@@ -361,20 +351,16 @@ RUNS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def silhouettes():
-    return silhouettes_in_memory(RIG, comings_and_goings()[:60], REDUCTION)
-
-
-def track_batch(silhouettes, runs, *, side_by_side=False):
+def track_batch(runs, *, side_by_side=False):
+    silhouettes = silhouettes_in_memory(RIG, comings_and_goings()[:60], REDUCTION)
     return track_silhouettes(RIG, silhouettes, runs, fps=FPS, side_by_side=side_by_side)
 
 
 @pytest.mark.slow
-def test_runs_of_a_batch_are_the_runs_alone(silhouettes):
-    one_after_another = track_batch(silhouettes, RUNS)
+def test_runs_of_a_batch_are_the_runs_alone():
+    one_after_another = track_batch(RUNS)
     for run, (tracks, places) in zip(RUNS, one_after_another, strict=True):
-        ((alone, alone_places),) = track_batch(silhouettes, [run])
+        ((alone, alone_places),) = track_batch([run])
         for name in (*ARRAYS, "size_m", "size_frames"):
             assert getattr(tracks, name).tobytes() == getattr(alone, name).tobytes(), name
         for each in fields(places):
@@ -384,11 +370,19 @@ def test_runs_of_a_batch_are_the_runs_alone(silhouettes):
 
 
 @pytest.mark.nightly
-def test_runs_side_by_side_are_the_runs_one_after_another(silhouettes):
-    one_after_another = track_batch(silhouettes, RUNS)
-    side_by_side = track_batch(silhouettes, RUNS, side_by_side=True)
+def test_runs_side_by_side_are_the_runs_one_after_another():
+    one_after_another = track_batch(RUNS)
+    side_by_side = track_batch(RUNS, side_by_side=True)
     for (one, one_places), (other, other_places) in zip(side_by_side, one_after_another, strict=True):
-        assert_same_tracks(one, other)
+        assert one.arrivals == other.arrivals
+        np.testing.assert_array_equal(one.status, other.status)
+        distance_m = np.linalg.norm(one.position_m - other.position_m, axis=-1)
+        seen = one.status == Status.TRACKED
+        assert seen.sum() > 0.6 * len(seen)
+        assert np.median(distance_m[seen]) <= MEDIAN_M
+        # The drones are metres apart: a drone with another number would be no nearer than that in a single frame.
+        assert distance_m[seen].max() < SIZE_M.min()
+        np.testing.assert_allclose(one.size_m, other.size_m, atol=2 * MEDIAN_M)
         # A place follows its drone, by at most 90 px / m.
         off_px = np.abs(one_places.middle_px - other_places.middle_px)
         assert np.nanmedian(off_px) < 90 * MEDIAN_M
@@ -396,44 +390,166 @@ def test_runs_side_by_side_are_the_runs_one_after_another(silhouettes):
     assert (side_by_side[0][0].position_m != one_after_another[0][0].position_m).any()
 
 
-def assert_same_tracks(one, other):
-    """The same drones with the same numbers and statuses, at the same places."""
-    assert one.arrivals == other.arrivals
-    np.testing.assert_array_equal(one.status, other.status)
-    settled, expected = trajectories_of(one), trajectories_of(other)
-    np.testing.assert_array_equal(settled.status, expected.status)
-    distance_m = np.linalg.norm(settled.position_m - expected.position_m, axis=-1)
-    seen = settled.status == Status.TRACKED
-    assert seen.sum() > 0.6 * len(seen)
-    for drone in range(settled.num_drones):
-        assert np.median(distance_m[seen[:, drone], drone]) <= MEDIAN_M
-    # The drones are metres apart: a drone with another number would be no nearer than that in a single frame.
-    assert distance_m[seen].max() < SIZE_M.min()
-    np.testing.assert_allclose(one.size_m, other.size_m, atol=2 * MEDIAN_M)
+# --- without the future: drones are found while frames come, and no row depends on a later frame
+
+SHAPE = (120, 160)
+#: A drone has a track in the frame after the eighth in which it is found.
+SOON = 8
+
+
+def exposures(missing=(), rig=RIG):
+    zero = np.zeros(len(rig), np.float32)
+    return Exposures(zero, ~np.isin(np.arange(len(rig)), missing), zero + 1, zero)
+
+
+def new_tracker(rig=RIG, shape=SHAPE, most_drones=16, **settings):
+    of_tracker = tracker_settings(track_settings(**(EFFORT | settings)))
+    images = {"fps": FPS, "reduction": REDUCTION, "shape": shape}
+    return StepwiseTracker(rig, of_tracker, bounds_m=ROOM_M, most_drones=most_drones, **images)
+
+
+def step_by_step(images, tracker=None, *, missing=None, kept=None):
+    """The rows of all frames, or of those that are kept; `missing` has the cameras that do not show a frame."""
+    rows, tracker = [], tracker or new_tracker()
+    for frame in range(len(images)) if kept is None else kept:
+        shown = exposures((missing or {}).get(frame, ()))
+        rows.append(tracker.step(frame, frame / FPS, images[frame], shown))
+        tracker.look_ahead()
+    return rows
+
+
+def error_m(rows, drone, truth_m):
+    return float(np.linalg.norm(rows.position_m[0, rows.drones.index(f"{drone}")] - truth_m))
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    return step_by_step(comings_and_goings())
 
 
 @pytest.mark.slow
-def test_runs_together_have_the_covariances_and_camera_errors_of_each_run_alone(silhouettes, tmp_path):
-    """The errors of the cameras are learned from each run's middles."""
-    num_frames = silhouettes.num_frames
-    frame = np.arange(num_frames)
-    truth = Trajectories(frame, frame / FPS, ("first", "second"), TRUTH_M[:num_frames])
-    times = {name: FrameTimes(num_frames, FPS) for name in RIG.names}
-    bounds_m = tuple(ROOM_M.T.ravel().tolist())
-    recording = Recording(
-        "drawn", tmp_path, cameras_of(RIG, times=times), Reference(truth), bounds_m=bounds_m
-    )
-    size_m = {"drones.size_m": tuple(SIZE_M[0].tolist())}
-    settings = [
-        track_settings(particles=20, iterations=15, seed=seed, init="truth", **size_m) for seed in (0, 5)
-    ]
-    together = track_runs(recording, silhouettes, settings)
-    for one, of_run in zip(settings, together, strict=True):
-        (alone,) = track_runs(recording, silhouettes, [one])
-        for name in ("position_m", "covariance_m2", "relative_covariance_m2"):
-            np.testing.assert_array_equal(
-                getattr(of_run.trajectories, name), getattr(alone.trajectories, name)
-            )
-        assert of_run.record["camera_errors"] == alone.record["camera_errors"]
-    # Each run has its own errors: other seeds place the drones by other roundings.
-    assert together[0].record["camera_errors"] != together[1].record["camera_errors"]
+def test_drones_that_come_leave_and_return_keep_their_numbers(tracked):
+    numbers = [rows.drones for rows in tracked]
+    assert not any(numbers[:SOON])
+    assert set(numbers[SOON : ENTERS + SOON]) == {("0",)}
+    assert set(numbers[ENTERS + SOON :]) == {("0", "1")}
+    for frame in [*range(SOON, AWAY.start), *range(AWAY.stop + SOON, NUM_FRAMES)]:
+        assert error_m(tracked[frame], 0, TRUTH_M[frame, 0]) < CELL_M
+    for frame in range(ENTERS + SOON, NUM_FRAMES):
+        assert error_m(tracked[frame], 1, TRUTH_M[frame, 1]) < CELL_M
+    assert tracked[AWAY.stop - 1].status.tolist() == [[Status.LOST, Status.TRACKED]]
+
+
+@pytest.mark.slow
+def test_rows_do_not_depend_on_later_frames(tracked):
+    other = comings_and_goings()[:70].copy()
+    other[60:] = 0
+    again = step_by_step(other)
+    for rows, same in zip(tracked[:60], again[:60], strict=True):
+        assert rows.drones == same.drones
+        for name in ("position_m", "velocity_m_s", "covariance_m2", "fitness", "num_cameras", "status"):
+            assert getattr(rows, name).tobytes() == getattr(same, name).tobytes(), name
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_missing_or_sees_foreground_everywhere_loses_no_drone(tracked):
+    dazzled = comings_and_goings().copy()
+    dazzled[85:95, 2] = 255
+    rows = step_by_step(dazzled, missing=dict.fromkeys(range(80, 100), (0,)))
+    for frame in range(88, NUM_FRAMES):
+        assert rows[frame].drones == tracked[frame].drones
+        for drone in (0, 1):
+            assert error_m(rows[frame], drone, TRUTH_M[frame, drone]) < CELL_M
+
+
+@pytest.mark.slow
+def test_frames_that_are_left_out_count_as_time():
+    """A drone of 1 m/s is found while frames are left out, and its track begins with its velocity.
+
+    The velocity was that between frames, and the first prediction was off by the distance of the frames left out.
+    """
+    number, frames = np.arange(60), [*range(0, 60, 3)]
+    velocity_m_s = np.array([0.8, 0.6, 0.0])
+    truth_m = np.array([-1.0, -0.6, 1.2]) + number[:, None] / FPS * velocity_m_s
+    images = np.zeros((len(number), len(RIG), *SHAPE), np.uint8)
+    images[frames] = draw(truth_m[frames, None], np.array([[0.5, 0.5, 0.3]]))
+    rows = step_by_step(images, kept=frames)
+    assert [found.num_drones for found in rows] == [0] * SOON + [1] * (len(frames) - SOON)
+    for frame, found in zip(frames[SOON:], rows[SOON:], strict=True):
+        assert found.status == Status.TRACKED
+        assert error_m(found, 0, truth_m[frame]) < CELL_M / 2
+        # Measured 0.06 m/s in the first frame, and 0.4 to 0.6 m/s before.
+        assert np.linalg.norm(found.velocity_m_s - velocity_m_s) < 0.15
+
+
+@pytest.mark.slow
+def test_a_drone_that_was_lost_for_long_leaves_its_place(monkeypatch):
+    monkeypatch.setattr(stepwise, "FORGOTTEN_S", 0.8)
+    drones = comings_and_goings()[:25]
+    nothing = np.zeros_like(comings_and_goings()[:40])
+    rows = step_by_step(np.concatenate([drones, nothing, drones]), new_tracker(drones=1))
+    # The drone comes back under a new number; there is one place, which is used again.
+    assert [rows[frame].drones for frame in (24, 64, 89)] == [("0",), (), ("1",)]
+    # More drones than allowed are left out.
+    limited = step_by_step(comings_and_goings()[ENTERS : ENTERS + 20], new_tracker(drones=1))
+    assert {found.num_drones for found in limited} == {0, 1}
+
+
+def test_a_track_may_wait_for_a_slot_that_the_next_frame_adds():
+    """Three drones are found together, where there are two slots: to forget drones then raised an IndexError."""
+    setting = block.Setting(RIG, REDUCTION, np.array([SHAPE[::-1]] * len(RIG)), FPS)
+    run = SwarmRun(setting, run_inputs())
+    places_m, size_m = np.arange(9.0).reshape(3, 3), np.full((3, 3), 0.5)
+    waiting = run.given_starts(InitialState(places_m, np.zeros((3, 3)), size_m, np.full(3, 5.0)), 7)
+    assert len(run.slots) == 2
+    run.forget(oldest=-100)
+    assert run.known == [start.slot for start in waiting] == [0, 1, 2]
+
+
+# --- compilations: one per capacity of the slots and shape of the images, for all values of the inputs
+
+SMALL = ring_rig(3, image_size_wh=(80, 60))
+SMALL_SHAPE = (30, 40)
+
+
+def track_noise(num_drones, *, seed=0, **settings):
+    """Track given drones in random silhouettes of 30 frames."""
+    rng = np.random.default_rng(seed)
+    images = rng.integers(0, 256, (30, len(SMALL), *SMALL_SHAPE)).astype(np.uint8)
+    places_m = rng.uniform([-1, -1, 0.5], [1, 1, 2.5], (num_drones, 3))
+    size_m = np.full((num_drones, 3), 0.4 + 0.1 * seed)
+    given = InitialState(places_m, np.zeros((num_drones, 3)), size_m, np.full(num_drones, 3.0))
+    effort = {"particles": 7, "iterations": 3, "seed": seed, "drones": num_drones}
+    tracks = track(images, given, rig=SMALL, **(effort | settings))
+    assert tracks.num_drones == num_drones
+
+
+def compiled():
+    """Number of programs of the tracker that this process has compiled so far."""
+    return block._one_run._cache_size()
+
+
+@pytest.mark.slow
+def test_a_new_number_of_drones_within_a_capacity_and_other_values_compile_nothing():
+    before = compiled()
+    track_noise(3)
+    # One block of 25 frames, and one that is filled up to 25: the same program.
+    assert compiled() == before + 1
+    track_noise(4, seed=1, max_speed_m_s=3.0, inertia=0.4, min_fitness=0.3)
+    track_noise(4, seed=2, iterations=0, cognitive=2.0, social=0.1, spread_m=0.2, max_coasting_s=2.0)
+    assert compiled() == before + 1
+    # The test can see a compilation: five drones need more slots.
+    track_noise(5)
+    assert compiled() == before + 2
+
+
+@pytest.mark.slow
+def test_no_frame_waits_for_a_compilation():
+    tracker = new_tracker(rig=SMALL, shape=SMALL_SHAPE, most_drones=4, particles=7, iterations=3)
+    tracker.compile()
+    before = compiled()
+    for frame in range(3):
+        images = np.full((len(SMALL), *SMALL_SHAPE), 40 * frame, np.uint8)
+        tracker.step(2 * frame, 0.08 * frame, images, exposures((frame,), SMALL))
+        tracker.look_ahead()
+    assert compiled() == before

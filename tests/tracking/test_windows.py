@@ -90,12 +90,8 @@ def _means(image, row, column, cell):
     height, width = image.shape
     values = image[np.clip(y, 0, height - 1)[:, None], np.clip(x, 0, width - 1)].astype(int)
     inside, padded = within(height, width), within(height + -height % 8, width + -width % 8)
-    mean = _rounded_mean(cells(values * inside), cell)
-    return mean, cells(inside) == cell**2, cells(padded) == 0
-
-
-def _rounded_mean(sums, cell):
-    return (2 * sums + cell**2) // (2 * cell**2)
+    rounded = (2 * cells(values * inside) + cell**2) // (2 * cell**2)
+    return rounded, cells(inside) == cell**2, cells(padded) == 0
 
 
 def test_at_the_image_border_a_divided_pixel_counts_in_full():
@@ -296,22 +292,6 @@ def test_only_the_nearest_neighbours_occlude():
     # Without the nearer drones, the fourth occludes: it is close enough.
     alone = cut_at(far_rig(1), NOISE, expected_m, SIZES_M, occluding=np.arange(5) == 4)
     assert (alone.clear[0] < 1).all()
-
-
-def test_drones_smaller_than_a_pixel_are_occluded_too():
-    """A drone behind a neighbour has no unoccluded share and no score, even if no pixel's centre is in its ellipse."""
-    size_m = np.array([[0.02, 0.02, 0.01], [1.0, 1.0, 0.5]])
-    expected_m = np.array([[0.013, 0, 0.012], [0.1, 0, 0]])
-    patches = cut_at(far_rig(1), NOISE, expected_m, size_m)
-    x, _ = middle_px(expected_m[0], PIXELS_PER_M[0])
-    assert abs(x % 1 - 0.5) > PIXELS_PER_M[0] * 0.01
-    np.testing.assert_array_equal(patches.clear[0], 0)
-    assert (patches.clear[1] > 0.8).all()
-    fitness = evaluate(drone_fitness, far_rig(1), patches, expected_m, size_m)
-    assert np.isnan(fitness[0])
-    assert fitness[1] > 0
-    apart_m = np.array([[-2.0, 0, 0], [0.1, 0, 0]])
-    np.testing.assert_array_equal(cut_at(far_rig(1), NOISE, apart_m, size_m).clear, 1)
 
 
 def test_a_drone_has_no_score_on_another_drones_silhouette():
