@@ -185,6 +185,23 @@ class TestFloat32:
             # Rounding of 6e-8 of the largest variance is 1,000 times larger for the smallest. Measured 5e-3 at worst.
             np.testing.assert_allclose(variance, expected, rtol=1e-2)
 
+    @pytest.mark.parametrize("std_m", [1e-4, 1e-2])
+    def test_a_precise_measurement_after_a_long_gap(self, std_m):
+        """After an uncertainty of ten metres, P - K S Kᵀ of a precise measurement would be rounding or negative."""
+        results = []
+        for dtype in (jnp.float32, jnp.float64):
+            with jax.enable_x64(dtype == jnp.float64):
+                params = as_arrays(motion_params(300.0, 1, error_share=0.5), dtype)
+                known = jnp.eye(3, dtype=dtype)[None] * std_m**2
+                state = init(jnp.zeros((1, 3), dtype), jnp.zeros((1, 3), dtype), known, params)
+                state = predict(state, jnp.asarray(2.5, dtype), params)
+                assert state.covariance[0, 0, 0] > 10.0**2
+                after, _ = update(state, jnp.ones((1, 3), dtype), known, jnp.array([True]), params)
+                results.append((np.asarray(after.covariance), np.asarray(after.position_covariance_m2)))
+        for rounded, expected in zip(*results, strict=True):
+            np.testing.assert_allclose(np.diagonal(rounded[0]), np.diagonal(expected[0]), rtol=1e-4)
+            assert least_correlation(rounded).min() > 0
+
     def test_a_precise_position_with_a_vague_lasting_error(self):
         """The position's variance is a difference that rounding makes 0 or negative; the result must be positive."""
         rng = np.random.default_rng(9)
