@@ -186,6 +186,11 @@ BY_HAND = {
     ),
     # A second is two frames: only the pair of frames 1 and 3 remains.
     "a missed frame": (on_x_axis([0, 0, None, 0.3, 0.9]), STILL, {"rpe_1s_rmse_m": 0.3}),
+    "two frames": (
+        on_x_axis([0, 0.3], frame=[0, 2]),
+        on_x_axis([0, 0], frame=[0, 2]),
+        {"rpe_1s_rmse_m": 0.3},
+    ),
     "less than a second": (on_x_axis([0, 0.1]), on_x_axis([0, 0]), {"rpe_1s_rmse_m": None}),
     # The inverse of [[2, 1], [1, 2]] is [[2, -1], [-1, 2]] / 3, so an error of (1, 0, 0) has a NEES of 2/3.
     "correlated errors": (

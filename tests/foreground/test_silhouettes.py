@@ -523,6 +523,12 @@ def test_entries_are_listed_and_pruned_the_oldest_first_and_what_is_no_entry_sta
 ) -> None:
     cache = tmp_path / "cache"
     made = make(recording.usable(["cam1", "cam2"]))
+    for seal in cache.glob(f"*/{SEAL_FILE}"):
+        os.utime(seal, (0, 0))
+    make(recording.usable(["cam2"]))
+    assert [entry["video"] for entry in _listed(run_psotrack, cache) if entry["days_unused"] < 1] == [
+        "cam2.avi"
+    ]
     # The program was used last.
     for name, age_s in (("cam1", 40 * DAY_S), ("cam2", 9 * DAY_S)):
         os.utime(cache / made.keys[name] / SEAL_FILE, (time.time() - age_s,) * 2)
