@@ -60,19 +60,16 @@ class Curves:
         return replace(self, params=self.params + step.shared)
 
 
-def measured_curves(seed, count=None):
-    """True params, and values with noise, of one curve or of `count` curves."""
-    rng = np.random.default_rng(seed)
-    shape = () if count is None else (count,)
-    params = np.stack(
-        [rng.uniform(2, 5, shape), rng.uniform(0.5, 2, shape), rng.uniform(-1, 1, shape)], axis=-1
-    )
-    return params, curve(params)[0] + rng.normal(0, 0.1, (*shape, len(TIME_S)))
+def measured_curves(count):
+    """Values with noise of some curves."""
+    rng = np.random.default_rng(1)
+    params = rng.uniform((2, 0.5, -1), (5, 2, 1), (count, 3))
+    return curve(params)[0] + rng.normal(0, 0.1, (count, len(TIME_S)))
 
 
 @pytest.mark.parametrize("robust", [False, True])
 def test_a_fit_equals_scipys(robust):
-    _, values = measured_curves(1)
+    (values,) = measured_curves(1)
     if robust:
         values[[3, 11]] += [20.0, -30.0]
     start = Curves(np.array([1.0, 0.1, 0.0]), values, robust)
@@ -92,47 +89,35 @@ def test_a_fit_equals_scipys(robust):
 
 
 def test_no_step_raises_a_cost():
-    _, values = measured_curves(3, count=20)
-    rng = np.random.default_rng(3)
-    for params, of_one in zip(rng.normal(0, 1, (20, 3)), values, strict=True):
-        state = Curves(params, of_one)
+    starts = np.random.default_rng(3).uniform((0, 0.1, -1), (5, 2, 1), (20, 3))
+    for params, values in zip(starts, measured_curves(20), strict=True):
+        state = Curves(params, values)
         for steps in (1, 2, 3, 5, 8):
             after = levenberg_marquardt(state, max_steps=steps)
             assert after.cost <= state.cost
             state = after
 
 
-def coupled_equations(seed, blocks=5, m=3, n=4):
+def coupled_equations(blocks=5, m=3, n=4):
     """Normal equations with blocks, and the same equations as a dense matrix and its right side."""
-    rng = np.random.default_rng(seed)
-    jacobian = np.zeros((blocks, 10, blocks * m + n))
-    for k in range(blocks):
-        jacobian[k, :, k * m : k * m + m] = rng.normal(size=(10, m))
-        jacobian[k, :, blocks * m :] = rng.normal(size=(10, n))
-    J, r = jacobian.reshape(-1, blocks * m + n), rng.normal(size=10 * blocks)
-    A, b = J.T @ J, J.T @ r
-    cut = blocks * m
+    rng, cut = np.random.default_rng(5), blocks * m
+    J = np.zeros((blocks, 10, cut + n))
     diagonal = [slice(k * m, k * m + m) for k in range(blocks)]
-    equations = NormalEquations(
-        A[cut:, cut:],
-        b[cut:],
-        np.stack([A[rows, rows] for rows in diagonal]),
-        b[:cut].reshape(blocks, m),
-        A[:cut, cut:].reshape(blocks, m, n),
-    )
-    return equations, A, b
+    for rows, columns in zip(J, diagonal, strict=True):
+        rows[:, columns], rows[:, cut:] = rng.normal(size=(10, m)), rng.normal(size=(10, n))
+    J = J.reshape(10 * blocks, cut + n)
+    A, b = J.T @ J, J.T @ rng.normal(size=10 * blocks)
+    own = np.stack([A[rows, rows] for rows in diagonal])
+    between = A[:cut, cut:].reshape(blocks, m, n)
+    return NormalEquations(A[cut:, cut:], b[cut:], own, b[:cut].reshape(blocks, m), between), A, b
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_elimination_of_blocks_gives_the_dense_solution(damping):
-    equations, A, b = coupled_equations(5)
-    step = equations.damped(damping).solved()
-    expected = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
-    np.testing.assert_allclose(np.concatenate([step.blocks.ravel(), step.shared]), expected, atol=1e-10)
-
-
-def test_the_covariance_of_shared_unknowns_equals_the_dense_inverse():
-    equations, A, _ = coupled_equations(6)
+def test_elimination_of_blocks_gives_the_dense_solution_and_covariance():
+    equations, A, b = coupled_equations()
+    for damping in (0.0, 0.3):
+        step = equations.damped(damping).solved()
+        expected = np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
+        np.testing.assert_allclose(np.append(step.blocks, step.shared), expected, atol=1e-10)
     found = covariance_from_information(equations.reduced().information)
     np.testing.assert_allclose(found, np.linalg.inv(A)[15:, 15:], rtol=1e-9, atol=1e-12)
 
