@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from psotrack.calibration import Board, BoardViews
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
-from psotrack.recordings import VideoWriter
+from psotrack.geometry.rig_files import write_rig
+from psotrack.recordings import VideoWriter, write_detections
 
 BOARD = Board((8, 6), 0.1, 0.075)
 SIZE_WH = (1280, 720)
@@ -122,12 +123,13 @@ def random_poses(count=14):
         yield T
 
 
-def film_board(path, poses=None):
-    """Write a video of the board in the hand."""
+def film_board(path, poses=None, frames=1):
+    """Write a video of the board in the hand, with as many frames of each pose."""
     with VideoWriter(path, 25.0, (640, 480)) as writer:
         for T in random_poses() if poses is None else poses:
             image = draw_board(HELD, HELD_K, T, (640, 480))
-            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+            for _ in range(frames):
+                writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     return path
 
 
@@ -147,6 +149,20 @@ def write_pairs(path, rig, *, noise_px=0.5, wrong=None):
             lines.append(f"{name},p{number},{x},{y},{place}")
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def record_detections(folder, seen, rig=None):
+    """Write a recording of detections by camera, which have no place without a rig."""
+    folder.mkdir(exist_ok=True)
+    lines = ["version = 1"]
+    if rig is not None:
+        write_rig(folder / "rig.toml", rig)
+        lines.append('calibration = "rig.toml"')
+    for name, boxes in seen.items():
+        write_detections(folder / f"{name}.csv", boxes)
+        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', "size = [1920, 1080]", "fps = 25.0"]
+    (folder / "recording.toml").write_text("\n".join(lines) + "\n")
+    return folder
 
 
 def fly_point(instants=60):

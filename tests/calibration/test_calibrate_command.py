@@ -6,13 +6,22 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from board_rigs import WORLD_M, draw_board, film_board, fly_point, gaps_of, row_of_cameras, write_pairs
+from board_rigs import (
+    HELD,
+    HELD_K,
+    WORLD_M,
+    draw_board,
+    film_board,
+    fly_point,
+    gaps_of,
+    random_poses,
+    row_of_cameras,
+    write_pairs,
+)
 from helpers import ring_rig
 from marker_worlds import draw_markers, marker_at
-from scipy.spatial.transform import Rotation
 
 import psotrack as pt
-from psotrack.calibration import Board
 from psotrack.geometry import Rig, look_at, make_camera, make_rig, project
 from psotrack.geometry.rig_files import read_lenses, read_rig, write_calibration, write_rig
 from psotrack.recordings import Detections, VideoWriter, write_detections
@@ -121,74 +130,54 @@ def test_a_rig_from_markers_on_the_walls(calibrate, tmp_path):
 
 # Boards.
 
-SIZE_WH = (640, 480)
-HELD_K = np.array([[620.0, 0, 322.0], [0, 620.0, 236.0], [0, 0, 1]])
-BOARD = Board((4, 6), 0.04, 0.03)
-STATED = ("--squares", "4x6", "--square", "0.04", "--marker", "0.03", "--dictionary", "4x4_50")
+STATED = ("--squares", "7x5", "--square", "0.04", "--marker", "0.03", "--dictionary", "4x4_50")
 
 
-def pose(seed, x_m=0.0):
-    rng = np.random.default_rng(seed)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
-    T[:3, 3] = np.array([-0.08 - x_m, -0.12, 0.45]) + rng.uniform(-0.02, 0.02, 3)
-    return T
-
-
-def film_pair(folder, seeds):
-    """Videos by two cameras, 0.1 m apart, of a board at poses of these seeds."""
-    shown = {}
-    for name, x_m in (("left", 0.0), ("right", 0.1)):
-        with VideoWriter(folder / f"{name}.avi", 25.0, SIZE_WH) as writer:
-            for seed in seeds:
-                if (x_m, seed) not in shown:
-                    image = draw_board(BOARD, HELD_K, pose(seed, x_m), SIZE_WH)
-                    shown[x_m, seed] = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-                writer.write(shown[x_m, seed])
-    return folder / "left.avi", folder / "right.avi"
+def poses_by_two_cameras(count=8):
+    """Pairs of poses of the board in the hand, before a left camera and one that is 0.1 m to its right."""
+    for T in random_poses(count):
+        right = T.copy()
+        right[0, 3] -= 0.1
+        yield T, right
 
 
 @pytest.mark.slow
 def test_any_frame_of_a_long_video_may_be_the_floor(calibrate, tmp_path):
     """More than 300 frames are not all searched, which a line says; the frame of --floor always is."""
-    videos = film_pair(tmp_path, [number // 20 % 8 for number in range(306)])
-    out = tmp_path / "rig.toml"
+    pairs, out = list(poses_by_two_cameras(18)), tmp_path / "rig.toml"
+    videos = [film_board(tmp_path / f"{i}.avi", (pair[i] for pair in pairs), 17) for i in range(2)]
     said = calibrate("rig", *videos, *STATED, "--lens", "0", "--floor", "45", "--out", out)
-    assert "left 154 of 306, right 154 of 306" in said
-    np.testing.assert_allclose(read_rig(out).cameras.T_cam_world[0, :3, 3], pose(45 // 20)[:3, 3], atol=0.01)
+    # Every second frame, and that of the floor.
+    assert "0 154 of 306, 1 154 of 306" in said
+    np.testing.assert_allclose(read_rig(out).cameras.T_cam_world[0, :3, 3], pairs[2][0][:3, 3], atol=0.01)
 
 
 def test_a_rig_from_folders_of_images_of_a_board(calibrate, tmp_path, caplog):
     """Printed white on black; the function of the package gives the same."""
-    for name, x_m in (("left", 0.0), ("right", 0.1)):
-        (tmp_path / name).mkdir()
-        for number in range(8):
-            image = draw_board(BOARD, HELD_K, pose(number, x_m), SIZE_WH)
-            cv2.imwrite(str(tmp_path / name / f"{number}.png"), 255 - image)
-    paths, out = (str(tmp_path / "left"), str(tmp_path / "right")), tmp_path / "rig.toml"
+    names = ("left", "right")
+    for number, pair in enumerate(poses_by_two_cameras()):
+        for name, T in zip(names, pair, strict=True):
+            (tmp_path / name).mkdir(exist_ok=True)
+            image = 255 - draw_board(HELD, HELD_K, T, (640, 480))
+            cv2.imwrite(str(tmp_path / name / f"{number}.png"), image)
+    paths, out = [str(tmp_path / name) for name in names], tmp_path / "rig.toml"
     content = calibrate("rig", *paths, *STATED, "--lens", "0", "--out", out, "--json", "-")
     assert content["print"] == []
-    known = {"squares": (4, 6), "square_m": 0.04, "marker_m": 0.03, "dictionary": "4x4_50", "lens": "0"}
+    known = {"squares": (7, 5), "square_m": 0.04, "marker_m": 0.03, "dictionary": "4x4_50", "lens": "0"}
     found = pt.calibrate_rig(paths, **known, out=out, force=True)
     assert json.loads(json.dumps(found.to_dict())) == content
     assert "the world is camera left" in str(found)
     rig = read_rig(out)
-    assert rig.names == ("left", "right")
+    assert rig.names == names
     np.testing.assert_allclose(rig.cameras.centre_world, [[0, 0, 0], [0.1, 0, 0]], atol=0.005)
-    calibrate("rig", *paths, *STATED, "--lens", "auto", "--out", tmp_path / "other.toml")
-    words = "camera left: lens models are compared by at least 9 views, found 8: it gets the usual"
+    # Of one camera only the lens is found; test_boards has the exact bounds.
+    one = ("rig", paths[0], *STATED, "--names", "60881257", "--out", tmp_path / "lens.toml")
+    content = calibrate(*one, "--lens", "auto", "--json", "-")["cameras"]["60881257"]
+    words = "camera 60881257: lens models are compared by at least 9 views, found 8: it gets the usual"
     assert words in caplog.text
-
-
-def test_the_lens_of_one_camera_from_a_board(calibrate, tmp_path):
-    out, size = tmp_path / "lens.toml", ("--squares", "7x5", "--square", "0.04", "--marker", "0.03")
-    film_board(tmp_path / "board.avi")
-    words = ("rig", tmp_path / "board.avi", *size, "--lens", "4", "--names", "60881257", "--out", out)
-    content = calibrate(*words, "--json", "-")["cameras"]["60881257"]
-    lens = read_lenses(out)
+    lens = read_lenses(tmp_path / "lens.toml")
     assert lens.names == ("60881257",)
     assert content["focal_px"] == np.diag(lens.cameras.K[0])[:2].tolist()
-    # test_boards has the exact bounds.
     assert abs(lens.cameras.K[0, 0, 0] - 620) < 12
 
 

@@ -14,6 +14,7 @@ from board_rigs import (
     film_board,
     fly_point,
     random_poses,
+    record_detections,
     row_of_cameras,
     write_pairs,
 )
@@ -44,7 +45,7 @@ from psotrack.calibration.rig.moving_point import adjust
 from psotrack.evaluation import find_offset
 from psotrack.geometry import look_at, make_camera, project
 from psotrack.geometry.rig_files import write_rig
-from psotrack.recordings import Detections, write_detections
+from psotrack.recordings import Detections
 
 RIG, FOUR = row_of_cameras(3), row_of_cameras(4)
 HELD = Board((7, 5), 0.04, 0.03)
@@ -120,18 +121,6 @@ def blind_camera(folder, run):
             cv2.imwrite(str(folder / name / f"{number}.png"), image)
     cameras = open_images([folder / "a", folder / "b"])
     return lambda: find_views(HELD, cameras, instants_of_numbers(cameras))
-
-
-STATED = "--squares 7x5 --square 0.04 --marker 0.03"
-
-
-def short_video(folder, run):
-    """The second of two videos ends early."""
-    for name in ("left", "right"):
-        film_board(folder / f"{name}.avi", random_poses(12))
-    path = folder / "right.avi"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    return lambda: run("calibrate rig --out {new} {tmp}/left.avi {tmp}/right.avi " + STATED)
 
 
 def flat_poses(count, step_m, distance_m, turn_deg=3.0):
@@ -256,7 +245,6 @@ BAD = {
     "apart": (board_views(apart), "no instant at which one of c0, c1 and one of c2 see the board together"),
     "blind camera": (blind_camera, "camera b: expected views of the board", "found none in 2 frames"),
     "no floor": (calls(calibrate_rig, BOARD, Scene(RIG).views(RNG), floor=70), "floor: ", "found frame 70"),
-    "short video": (short_video, "right.avi: expected 12 frames, ", "`ffmpeg -i right.avi -frames:v "),
     "camera twice": (calls(open_images, ["a/board", "a/board"]), "each camera once, found board again"),
     "no images": (calls(open_images, ["top*.png"]), "images of this pattern, found none"),
     "one name": (calls(open_images, ["a/board", "b/board"], ["a"]), "2 names, found 1"),
@@ -312,12 +300,8 @@ def make_files(folder):
     film_board(folder / "board.avi")
     rows = [{"camera": name, "frame": k, "x_px": 1, "y_px": 1} for name in RIG.names for k in range(20)]
     pd.DataFrame(rows).to_csv(folder / "light.csv", index=False)
-    lines, one = ["version = 1"], Detections(np.arange(5), np.tile([0, 0, 9, 9.0], (5, 1)), np.ones(5))
-    (folder / "unplaced").mkdir()
-    for name in ("left", "right"):
-        write_detections(folder / "unplaced" / f"{name}.csv", one)
-        lines += [f"[cameras.{name}]", f'detections = "{name}.csv"', "size = [1920, 1080]", "fps = 25.0"]
-    (folder / "unplaced" / "recording.toml").write_text("\n".join(lines) + "\n")
+    one = Detections(np.arange(5), np.tile([0, 0, 9, 9.0], (5, 1)), np.ones(5))
+    record_detections(folder / "unplaced", {"left": one, "right": one})
 
 
 @pytest.mark.parametrize(("prepare", "words"), [(one, words) for one, *words in BAD.values()], ids=BAD)
