@@ -17,29 +17,6 @@ ARM_M = np.array([0.01, 0.03, -0.12])
 INSIDE_M, OUTSIDE_M = np.array([0.001, 0.001, 0.003]), np.array([0.004, 0.004, 0.004])
 
 
-def example_path(with_velocity: bool = True) -> CameraPath:
-    """Path of six frames with random poses and all kinds of status and flags; frame 5 has no pose."""
-    rng = np.random.default_rng(3)
-    root = rng.normal(size=(6, 6, 6))
-    covariance = root @ root.swapaxes(-1, -2)
-    path = CameraPath(
-        frame=np.array([0, 1, 2, 4, 5, 6]),
-        time_s=np.array([0.0, 0.04, 0.08, 0.16, 0.2, 0.24]),
-        position_m=rng.normal(size=(6, 3)),
-        orientation_wxyz=Rotation.random(6, rng=rng).as_quat(scalar_first=True),
-        covariance=(covariance + covariance.swapaxes(-1, -2)) / 2,
-        num_markers=np.array([4, 5, 1, 0, 0, 7]),
-        reprojection_px=np.array([0.1, 0.2, 0.3, np.nan, np.nan, 0.4]),
-        ambiguity=np.array([0.0, 0.0, 0.3, np.nan, np.nan, 0.0]),
-        status=np.array([Status.TRACKED] * 3 + [Status.COASTING, Status.LOST, Status.TRACKED]),
-        flags=np.array([0, 0, Flag.FEW_MARKERS | Flag.AMBIGUOUS, Flag.GATED, 0, 0]),
-        velocity_m_s=rng.normal(size=(6, 3)) if with_velocity else None,
-    )
-    for values in (path.position_m, path.orientation_wxyz, path.covariance):
-        values[4] = np.nan
-    return path
-
-
 def camera_path(position_m, rotation, covariance, *, first_s=0.0, num_markers=8) -> CameraPath:
     """A path at 25 Hz with a pose in each frame."""
     count = len(position_m)
@@ -65,6 +42,24 @@ def remove_poses(path: CameraPath, rows) -> CameraPath:
         values[name][rows] = np.nan
     values["status"][rows], values["num_markers"][rows] = Status.LOST, 0
     return replace(path, **values)
+
+
+def example_path(with_velocity: bool = True) -> CameraPath:
+    """Path of six frames with random poses and all kinds of status and flags; frame 5 has no pose."""
+    rng, frame = np.random.default_rng(3), np.array([0, 1, 2, 4, 5, 6])
+    root = rng.normal(size=(6, 6, 6))
+    covariance = root @ root.mT
+    path = camera_path(rng.normal(size=(6, 3)), Rotation.random(6, rng=rng), (covariance + covariance.mT) / 2)
+    path = replace(
+        path,
+        frame=frame,
+        time_s=np.round(frame / FPS, 2),
+        ambiguity=np.array([0.0, 0.0, 0.3, np.nan, np.nan, 0.0]),
+        status=np.array([Status.TRACKED] * 3 + [Status.COASTING, Status.LOST, Status.TRACKED]),
+        flags=np.array([0, 0, Flag.FEW_MARKERS | Flag.AMBIGUOUS, Flag.GATED, 0, 0]),
+        velocity_m_s=rng.normal(size=(6, 3)) if with_velocity else None,
+    )
+    return remove_poses(path, [4])
 
 
 def outside_tracks(middle_m, covariance_m2, first=0) -> Trajectories:

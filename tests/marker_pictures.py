@@ -11,6 +11,8 @@ from psotrack.geometry import undistort
 BLACK, WHITE, GAMMA = 35.0, 215.0, 2.2
 #: Samples per pixel along each side.
 FINE = 3
+#: Error of a sample's place on a sheet, pixels.
+CONVERGED_PX = 1e-4
 #: Distance of the camera from a sheet, in sides of the marker.
 FAR = 5.0
 
@@ -59,8 +61,12 @@ def _places(sheet, x, y):
     small = 1e-4
     for _ in range(5):
         at = sheet.pixels(u, v)
-        by_u, by_v = (sheet.pixels(u + small, v) - at) / small, (sheet.pixels(u, v + small) - at) / small
+        # Far beyond the sheet a steep one has no place for a pixel, and none is needed.
+        near = np.maximum(np.abs(u), np.abs(v)) < 1
         left_x, left_y = x - at[..., 0], y - at[..., 1]
+        if np.hypot(left_x, left_y)[near].max(initial=0.0) < CONVERGED_PX:
+            break
+        by_u, by_v = (sheet.pixels(u + small, v) - at) / small, (sheet.pixels(u, v + small) - at) / small
         area = by_u[..., 0] * by_v[..., 1] - by_u[..., 1] * by_v[..., 0]
         u = np.clip(u + (left_x * by_v[..., 1] - left_y * by_v[..., 0]) / area, -2, 2)
         v = np.clip(v + (left_y * by_u[..., 0] - left_x * by_u[..., 1]) / area, -2, 2)

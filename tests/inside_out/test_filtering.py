@@ -112,18 +112,6 @@ turns = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 AGILITY = pose_motion.Agility(4.0, 0.7)
 
 
-@given(turns)
-@pytest.mark.parametrize("scale", [1.0, 0.02, 0.0])
-def test_the_jacobian_is_the_numerical_derivative(scale, turn) -> None:
-    turn, small = scale * turn, 1e-6
-    right = np.zeros((3, 3))
-    for axis, step_rad in enumerate(small * np.eye(3)):
-        ahead, behind = (Rotation.from_rotvec(turn + sign * step_rad) for sign in (1, -1))
-        right[:, axis] = (behind.inv() * ahead).as_rotvec() / (2 * small)
-    # Central differences have errors of the squared step, and rounding errors divided by the step, 1e-10.
-    np.testing.assert_allclose(pose_motion.right_jacobian(turn), right, atol=2e-9)
-
-
 def test_translation_of_a_camera_without_turns_equals_a_textbook_filter() -> None:
     """Kalman's equations in textbook form, for position, velocity, acceleration and the correlated error.
 
@@ -253,7 +241,7 @@ def test_hovering_and_racing_cameras_are_followed_as_well_as_stated() -> None:
             for part, own, axes in zip(found, by_raw, (slice(0, 3), slice(3, 6)), strict=True):
                 # Most of the error is correlated and cannot be separated from motion, so the gain is small; 60 frames
                 # determine a ratio of medians to some percent.
-                assert lengths(part) < 1.06 * lengths(own)
+                assert lengths(part) < 1.03 * lengths(own)
                 covariance = path.covariance[path.seen][:, axes, axes]
                 assert 0.7 < (squares(part, covariance) < NINETY).mean() < 1.0
             speeds.append(lengths((path.velocity_m_s - speed_m_s)[10:-2]))
@@ -268,6 +256,7 @@ def test_hovering_and_racing_cameras_are_followed_as_well_as_stated() -> None:
     assert violent.rate_change_std_rad_s > 8 * calm.rate_change_std_rad_s
 
 
+@pytest.mark.slow
 def test_good_poses_are_gated_as_seldom_as_stated() -> None:
     raw, _, _ = flight(80, acceleration=0.5, shake=0.3, seed=6)
     few, many = (
@@ -279,14 +268,11 @@ def test_good_poses_are_gated_as_seldom_as_stated() -> None:
     assert 1 <= many <= 40
 
 
-@pytest.mark.parametrize(
-    ("shift_m", "turn"), [([0.0, 0.15, 0.0], [0.0, 0.0, 0.03]), ([0.4, -2.0, 0.3], [0.0, 0.5, 0.0])]
-)
-def test_outliers_are_bridged_with_growing_uncertainty(shift_m, turn) -> None:
+def test_outliers_are_bridged_with_growing_uncertainty() -> None:
     """Single wrong poses, a run of them, and some at both ends."""
     raw, position_m, truth = flight(80, seed=33)
     bad = np.r_[0, 15, 40:46, 78:80]
-    raw = move_poses(raw, bad, shift_m, turn)
+    raw = move_poses(raw, bad, [0.0, 0.15, 0.0], [0.0, 0.0, 0.03])
     path, smoothed = filter_path(raw), smooth(raw)
     by_filter = errors(path, position_m, truth)
     # In 6 frames, 0.24 s, the error is 0.06 m and 4 degrees at 2 m/s2 and 2 rad/s2, and more at larger accelerations.
@@ -315,21 +301,20 @@ def test_a_wrong_first_state_is_replaced_when_more_poses_contradict_it() -> None
     assert off_m(path, position_m)[8:].max() < 0.03
 
 
-@pytest.mark.parametrize("restart_after", [4, 10])
-def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses(restart_after) -> None:
-    raw, position_m, _ = flight(60, seed=12)
-    moved = np.array([0.0, 0.0, 5.0]) * (np.arange(60) >= 30)[:, None]
+def test_a_camera_that_stays_elsewhere_is_found_after_restart_after_poses() -> None:
+    raw, position_m, _ = flight(45, seed=12)
+    moved = np.array([0.0, 0.0, 5.0]) * (np.arange(45) >= 25)[:, None]
     raw, position_m = replace(raw, position_m=raw.position_m + moved), position_m + moved
-    params = PoseFilterParams(restart_after=restart_after)
-    path, believed = filter_path(raw, params), 30 + restart_after - 1
-    assert (path.status[30:believed] == Status.COASTING).all()
+    params = PoseFilterParams(restart_after=4)
+    path, believed = filter_path(raw, params), 25 + 4 - 1
+    assert (path.status[25:believed] == Status.COASTING).all()
     assert (path.status[believed : believed + 10] == Status.TRACKED).all()
     assert off_m(path, position_m)[believed:].max() < 0.03
     # Some poses beside the jump may be gated and bridged. A path drawn across the jump would be off by metres.
     assert off_m(smooth(raw, params), position_m).max() < 0.1
 
 
-@pytest.mark.parametrize("calm", [50, pytest.param(280, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("calm", [40, pytest.param(280, marks=pytest.mark.slow)])
 def test_a_late_turn_of_a_hovering_camera_is_followed(calm) -> None:
     """The agility of 280 calm frames says nothing about the last 20, in which the camera flies off with 40 m/s2."""
     count = calm + 20
@@ -375,7 +360,7 @@ def test_gaps_are_bridged_for_the_longest_gap() -> None:
     assert both_m2[40] < 0.3 * variance_m2[40]
 
 
-def flight_with_false_poses(acceleration, before, *, markers=2):
+def flight_with_false_poses(acceleration, before, markers):
     """A flight with a gap of a second, after which five poses agree with each other but are 2.3 m off."""
     raw, position_m, _ = flight(before + 55, acceleration=acceleration, shake=0.5, seed=40)
     raw = replace(raw, num_markers=np.full(before + 55, markers))
@@ -383,22 +368,19 @@ def flight_with_false_poses(acceleration, before, *, markers=2):
     return move_poses(raw, slice(before + 25, before + 30), [2.3, 0.0, 0.0]), position_m
 
 
-@pytest.mark.parametrize("acceleration", [0.5, 2.0])
-def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration) -> None:
-    raw, position_m = flight_with_false_poses(acceleration, 30)
-    path = filter_path(raw)
-    assert (path.status[55:60] == Status.LOST).all()
+@pytest.mark.parametrize(
+    ("acceleration", "before", "markers"),
+    # Agreeing markers do not outweigh the motion of a hovering camera.
+    [(0.5, 30, 2), (2.0, 30, 2), (0.05, 60, 8)],
+)
+def test_wrong_poses_that_agree_after_a_gap_are_not_accepted(acceleration, before, markers) -> None:
+    raw, position_m = flight_with_false_poses(acceleration, before, markers)
+    path, begun = filter_path(raw), before + 25
+    assert (path.status[begun : begun + 5] == Status.LOST).all()
     # The right poses are accepted when they are one more than the wrong poses and enough to contradict a state.
-    assert (path.status[70:] == Status.TRACKED).all()
+    assert (path.status[begun + 15 :] == Status.TRACKED).all()
     for one in (path, smooth(raw)):
-        assert np.nanmax(off_m(one, position_m)[55:]) < 0.05
-
-
-def test_after_a_gap_agreeing_markers_do_not_outweigh_the_motion_of_a_hovering_camera() -> None:
-    raw, position_m = flight_with_false_poses(0.05, 60, markers=8)
-    path = filter_path(raw)
-    assert (path.status[85:90] == Status.LOST).all()
-    assert np.nanmax(off_m(path, position_m)[85:]) < 0.05
+        assert np.nanmax(off_m(one, position_m)[begun:]) < 0.05
 
 
 def test_after_a_gap_markers_that_agree_beyond_chance_are_accepted_at_once() -> None:
@@ -446,18 +428,17 @@ def test_paths_of_few_poses(frames) -> None:
         assert found.tolist() == [Status.LOST] * (frames - 1) + [Status.TRACKED]
 
 
-def test_paths_without_poses_at_the_beginning_and_raw_paths_that_stay_as_they_are() -> None:
-    raw, _, _ = flight(30, seed=16)
-    raw = remove_poses(move_poses(raw, slice(20, 21), [1.0, 0.0, 0.0]), slice(0, 10))
+def test_paths_without_poses_at_the_beginning_or_at_all_and_raw_paths_that_stay_as_they_are() -> None:
+    raw, _, _ = flight(20, seed=16)
+    raw = remove_poses(raw, slice(0, 10))
     before = {name: np.copy(value) for name, value in vars(raw).items() if value is not None}
     path, _ = filter_path(raw), smooth(raw)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(raw, name), value)
     assert (path.status[:12] == Status.LOST).all()
-    assert (np.delete(path.status, 20)[12:] == Status.TRACKED).all()
-    nothing = remove_poses(raw, slice(None))
+    assert (path.status[12:] == Status.TRACKED).all()
     for find in (filter_path, smooth):
-        assert (find(nothing).status == Status.LOST).all()
+        assert (find(remove_poses(raw, slice(None))).status == Status.LOST).all()
 
 
 # Errors that are the same in all frames.

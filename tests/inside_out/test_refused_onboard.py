@@ -349,18 +349,3 @@ def test_bad_input_is_refused_in_one_line(prepare, words, files, run_psotrack, t
         return run_psotrack("onboard", *(word.format(**paths) for word in line.split()))
 
     assert_refused(prepare(tmp_path, run), *words, unchanged=tmp_path)
-
-
-def test_a_video_that_ends_early_is_used_as_its_message_says(files, run_psotrack, tmp_path):
-    content, short = files["flight"].read_bytes(), tmp_path / "short.avi"
-    short.write_bytes(content[: len(content) * 6 // 10])
-    words = ("onboard", "localise", short, "--markers", files["corners"], "--camera", files["lens"], "--out")
-    refused = run_psotrack(*words, tmp_path / "track.csv")
-    there = int(refused.err.partition("--frames ")[2].split()[0])
-    assert_refused(
-        lambda: run_psotrack(*words, tmp_path / "track.csv"),
-        f"short.avi: expected 14 frames, found that only {there} can be decoded",
-        unchanged=tmp_path,
-    )
-    assert run_psotrack(*words, tmp_path / "track.csv", "--frames", there).code == 0
-    assert read_camera_path(tmp_path / "track.csv")[0].num_frames == there

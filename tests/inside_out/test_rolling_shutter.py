@@ -135,8 +135,7 @@ def test_corners_are_moved_to_where_the_middle_row_sees_them():
         (0, 12),
         # The last of 40 frames was 12 mm off and 26 to 30 of six degrees of freedom, because the motion was learned
         # from poses by a global shutter, whose covariances do not contain the motion.
-        (3, 40),
-        *(pytest.param(seed, 40, marks=pytest.mark.slow) for seed in (1, 7)),
+        *(pytest.param(seed, 40, marks=pytest.mark.slow) for seed in (3, 1, 7)),
         *(pytest.param(seed, 120, marks=pytest.mark.nightly) for seed in (1, 2, 3)),
     ],
 )
@@ -155,12 +154,13 @@ def test_poses_of_a_rolling_shutter_are_as_good_as_stated(seed, num_frames):
         assert squares_of(path, hand, 6)[[0, -1]].max() < chi2.ppf(0.9999, 6)
         if num_frames >= 40:
             # Measured 0.80 to 0.98. Without the acceleration during a frame, the poses had 0.67 to 0.9.
-            assert inside_90(path, hand, 3) > 0.75
-            assert inside_90(path, hand, 6) > 0.75
+            assert inside_90(path, hand, 3) >= 0.8
+            assert inside_90(path, hand, 6) >= 0.8
             # Measured 0.63 to 1.17; a recording of 40 frames has few independent errors.
             assert 0.6 < np.mean(squares_of(path, hand, 6)) / 6 < 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_a_line_time_that_is_left_out_widens_the_covariances_where_the_video_shows_it(seed):
     hand = Hand(seed)
@@ -185,14 +185,14 @@ def test_a_stream_follows_a_shutter_whose_line_time_is_given():
 
 def test_a_still_camera_has_the_poses_of_a_global_shutter():
     """A pose does not depend on the line time where nothing moves, up to the uncertainty of the motion."""
-    detected = filmed(Hand(0, size=0.0), 16, LINE_TIME_S)
+    detected = filmed(Hand(0, size=0.0), 10, LINE_TIME_S)
     plain, rolling = (followed(detected, RollingShutter(one)).path for one in (0.0, LINE_TIME_S))
-    assert np.linalg.norm(plain.position_m - rolling.position_m, axis=1)[8:].max() < 1e-3
+    assert np.linalg.norm(plain.position_m - rolling.position_m, axis=1)[6:].max() < 1e-3
 
 
 def test_without_a_filter_each_frame_has_its_own_pose():
     hand = Hand(1)
-    path = followed(filmed(hand, 20, LINE_TIME_S), RollingShutter(LINE_TIME_S), filter=None).path
+    path = followed(filmed(hand, 12, LINE_TIME_S), RollingShutter(LINE_TIME_S), filter=None).path
     assert path.velocity_m_s is None
     # Measured 1.7 mm; the first frame knows nothing of the motion, and says so.
     assert np.median(off_m(path, hand)) < 0.003
