@@ -17,7 +17,6 @@ from placed_drones import S02, number_image
 from scipy.spatial.transform import Rotation
 
 from psotrack import __version__
-from psotrack.errors import OutputError
 from psotrack.geometry import project
 from psotrack.recordings import probe, read_detections, read_frames
 from psotrack.recordings.datasets import (
@@ -312,17 +311,12 @@ def test_a_second_simulation_of_the_same_sequence_is_refused(tmp_path):
     assert [path.name for path in folder.parent.iterdir()] == [NAME]
 
 
-@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EIO])
-def test_a_file_system_without_locks_is_accepted_and_a_broken_one_is_an_error(tmp_path, monkeypatch, code):
+def test_a_file_system_without_locks_is_accepted(tmp_path, monkeypatch):
     def fail(descriptor, operation):
-        raise OSError(code, os.strerror(code))
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr("fcntl.flock", fail)
-    refused = pytest.raises(
-        OutputError, match=r"S02_D4_A: expected a path that can be written, found Input/output error"
-    )
-    allowed = contextlib.nullcontext() if code == errno.ENOLCK else refused
-    with allowed, unfinished(tmp_path / NAME, b"record") as parts:
+    with unfinished(tmp_path / NAME, b"record") as parts:
         assert parts.is_relative_to(tmp_path)
 
 
