@@ -127,17 +127,12 @@ def around(pixel, reach):
     return np.s_[y - reach : y + reach + 1, x - reach : x + reach + 1], np.array([x - reach, y - reach])
 
 
-def drone_masks(scene, cam, backdrop_depth_m, frame):
-    """(height, width), number of the visible drone per pixel, from 1 on, at the middle of the exposure; 0 for none."""
-    numbers = np.zeros((cam.height, cam.width), np.uint8)
-    for silhouette in silhouettes(scene, cam, backdrop_depth_m, frame):
+def number_image(renderer, frame=0):
+    """(height, width), number of the visible drone per pixel at the middle of a frame's exposure, from 1 on; else 0."""
+    cam, numbers = renderer.cam, np.zeros((renderer.cam.height, renderer.cam.width), np.uint8)
+    for silhouette in silhouettes(renderer.scene, cam, renderer.backdrop.depth_m, frame):
         numbers[silhouette.window.slices][silhouette.seen] = silhouette.number
     return numbers
-
-
-def number_image(renderer, frame=0):
-    """(height, width), number of the visible drone per pixel of a camera's frame; 0 for none."""
-    return drone_masks(renderer.scene, renderer.cam, renderer.backdrop.depth_m, frame)
 
 
 def find_markers(image):

@@ -230,19 +230,16 @@ def test_a_flight_ends_at_the_maximum_duration():
 SCRIPT = (Sample(0.0, Sticks(1.0, -0.5, 0.1, 0.0)), Sample(1 / 3, Sticks(turn=-1.0)), Sample(2.5, Sticks()))
 
 
-@pytest.mark.parametrize(
-    ("keys", "sticks"),
-    [
-        ("", Sticks()),
-        ("W", Sticks(forward=1.0)),
-        ("S D", Sticks(forward=-1.0, left=-1.0)),
-        ("A UP LEFT", Sticks(left=1.0, up=1.0, turn=1.0)),
-        ("DOWN RIGHT", Sticks(up=-1.0, turn=-1.0)),
-        ("W S A D UP DOWN LEFT RIGHT", Sticks()),
-    ],
-)
-def test_keys_act_as_full_sticks_and_opposite_keys_cancel(keys, sticks):
-    assert key_sticks(lambda name: name in keys.split()) == sticks
+def test_keys_act_as_full_sticks_and_opposite_keys_cancel():
+    for keys, sticks in {
+        "": Sticks(),
+        "W": Sticks(forward=1.0),
+        "S D": Sticks(forward=-1.0, left=-1.0),
+        "A UP LEFT": Sticks(left=1.0, up=1.0, turn=1.0),
+        "DOWN RIGHT": Sticks(up=-1.0, turn=-1.0),
+        "W S A D UP DOWN LEFT RIGHT": Sticks(),
+    }.items():
+        assert key_sticks(lambda name, keys=keys: name in keys.split()) == sticks
 
 
 def controlled(end):

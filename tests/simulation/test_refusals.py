@@ -51,16 +51,11 @@ SCRIPT = (Sample(0.0, Sticks(1.0, -0.5, 0.1, 0.0)), Sample(1 / 3, Sticks(turn=-1
 # runs commands, which writes the files that are needed and gives the call that must be refused.
 
 
-def edited(old, new):
-    """The file of a preset with one change."""
-
-    def make(folder, run):
-        path, preset = folder / "mine.toml", preset_text("S02_D4_A")
-        assert old in preset
-        path.write_text(preset.replace(old, new, 1))
-        return lambda: load(path)
-
-    return make
+def bad_file(folder, run):
+    """The file of a preset with a negative period."""
+    path = folder / "mine.toml"
+    path.write_text(preset_text("S02_D4_A").replace("period_s = 7.4", "period_s = -7.4", 1))
+    return lambda: load(path)
 
 
 def scene(**changes):
@@ -180,7 +175,7 @@ _HALF_TURNED[5] = np.nan
 #: Name of the case -> how the bad input is made, and words of the line.
 BAD = {
     # Scenario files.
-    "a negative period": (edited("period_s = 7.4", "period_s = -7.4"),
+    "a negative period": (bad_file,
         "mine.toml: drones[0].flight.terms[0].period_s: expected a number of at least 0.001, found -7.4"),
     "more frames than a disk holds": (scene(num_frames=2500000000),
         "num_frames: expected a whole number of at most 1000000, found 2500000000"),

@@ -280,23 +280,20 @@ def test_frames_of_cameras_with_rates_and_starts_of_their_own(tmp_path):
     K = np.array([[100.0, 0, 99.5], [0, 100, 49.5], [0, 0, 1]])
     camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=(200, 100))
     starts_s, rates_hz = {"slow": 0.03, "quick": 0.0}, {"slow": 25.0, "quick": 50.0}
-    flights = tmp_path / "a", tmp_path / "b"
-    for folder in flights:
-        folder.mkdir()
-        write_rig(folder / "rig.toml", make_rig(dict.fromkeys(starts_s, camera)))
-        tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.csv"]']
-        for name, start_s in starts_s.items():
-            with VideoWriter(folder / f"{name}.avi", rates_hz[name], (200, 100)) as video:
-                for _ in range(int(rates_hz[name] // 5)):
-                    video.write(np.zeros((100, 200, 3), np.uint8))
-            tables.append(f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {start_s}')
-        (folder / "recording.toml").write_text("\n".join(tables))
-        time_s = 0.05 + np.arange(60) / 100
-        position_m = np.stack([time_s, np.full(60, 5.0), np.zeros(60)], axis=-1)[:, None]
-        truth = Trajectories(np.arange(60), time_s, ("drone",), position_m)
-        write_trajectories(folder / "drone.csv", truth)
+    time_s = 0.05 + np.arange(60) / 100
+    position_m = np.stack([time_s, np.full(60, 5.0), np.zeros(60)], axis=-1)[:, None]
+    write_rig(tmp_path / "rig.toml", make_rig(dict.fromkeys(starts_s, camera)))
+    write_trajectories(tmp_path / "drone.csv", Trajectories(np.arange(60), time_s, ("drone",), position_m))
+    tables = ["version = 1", 'calibration = "rig.toml"', '[reference]\nfiles = ["drone.csv"]']
+    for name, start_s in starts_s.items():
+        with VideoWriter(tmp_path / f"{name}.avi", rates_hz[name], (200, 100)) as video:
+            for _ in range(int(rates_hz[name] // 5)):
+                video.write(np.zeros((100, 200, 3), np.uint8))
+        tables.append(f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {start_s}')
+    (tmp_path / "recording.toml").write_text("\n".join(tables))
+    recording = open_recording(tmp_path)
     small = LabelSettings(drone_size_m=(0.1, 0.1, 0.1))
-    write_data_set([open_recording(folder) for folder in flights], tmp_path / "set", small, jobs=1)
+    write_data_set([recording, replace(recording, name="again")], tmp_path / "set", small, jobs=1)
     for name, start_s in starts_s.items():
         files = sorted((tmp_path / "set" / "labels").glob(f"*/*_{name}_*.txt"))
         known = [k for k in range(int(rates_hz[name] // 5)) if start_s + k / rates_hz[name] > 0.05]
