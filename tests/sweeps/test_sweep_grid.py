@@ -63,25 +63,19 @@ def cells(tmp_path_factory):
 
 def test_every_combination_is_a_cell_with_a_key_of_its_own(cells):
     # Three draws where the cameras are a number, and one draw otherwise.
-    cameras = [(None, 0), (4, 0), (4, 1), (4, 2), (("cam1i", "cam2i"), 0)]
+    kept = [("all", 0), ("4", 0), ("4", 1), ("4", 2), ("cam1i+cam2i", 0)]
+    sequences, methods = ["S01_D2_A", "S04_D10"], ["paper", "ours"]
     expected = [
-        (sequence, method, particles, threshold, *kept)
-        for sequence, method, particles, threshold, kept in itertools.product(
-            ["S01_D2_A", "S04_D10"], ["paper", "ours"], [20, 50, 100], [8.0, 9.5], cameras
-        )
+        (*one, *cameras)
+        for *one, cameras in itertools.product(sequences, methods, [20, 50, 100], [8.0, 9.5], kept)
     ]
-    found = [
-        (
-            cell.sequence,
-            cell.method,
-            cell.settings.swarm.particles,
-            cell.settings.silhouettes.var_threshold,
-            cell.cameras,
-            cell.perturbation.draw,
-        )
-        for cell in cells
-    ]
-    assert found == expected
+    assert [(cell.sequence, cell.method, *cell.axes.values()) for cell in cells] == expected
+    assert list(cells[0].axes) == ["swarm.particles", "silhouettes.var_threshold", "cameras", "draw"]
+    assert [cell.cameras for cell in cells[:5]] == [None, 4, 4, 4, ("cam1i", "cam2i")]
+    for cell in cells:
+        assert cell.settings.swarm.particles == cell.axes["swarm.particles"]
+        assert cell.settings.silhouettes.var_threshold == cell.axes["silhouettes.var_threshold"]
+        assert cell.perturbation == Perturbation(draw=cell.axes["draw"])
     assert len({cell_key(cell, INPUT) for cell in cells}) == len(cells)
     assert pickle.loads(pickle.dumps(cells)) == cells
     # Names lead to inner tables, or are dotted; lists may be tuples.
@@ -89,7 +83,7 @@ def test_every_combination_is_a_cell_with_a_key_of_its_own(cells):
     assert grid(nested).cells() == grid(SMALL).cells()
 
 
-def test_a_cell_has_the_settings_of_the_file_and_axes_as_numbers_and_words(cells):
+def test_a_cell_has_the_settings_of_the_file(cells):
     paper = cells[0]
     assert paper.settings == TrackSettings(
         silhouettes=SilhouetteSettings(background="mog2", reduction=8, var_threshold=8.0),
@@ -97,14 +91,8 @@ def test_a_cell_has_the_settings_of_the_file_and_axes_as_numbers_and_words(cells
         score=ScoreSettings(kind="hard"),
     )
     assert (paper.runs, paper.seeds, paper.frames) == (10, range(10), None)
-    assert paper.perturbation == Perturbation()
     ours = next(cell for cell in cells if cell.method == "ours")
     assert (ours.settings.swarm.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
-    kept = [("all", 0), ("4", 0), ("4", 1), ("4", 2), ("cam1i+cam2i", 0)]
-    assert [dict(cell.axes) for cell in cells[:5]] == [
-        {"swarm.particles": 20, "silhouettes.var_threshold": 8.0, "cameras": cameras, "draw": draw}
-        for cameras, draw in kept
-    ]
     # A whole number becomes a float where the setting is a float.
     assert isinstance(paper.axes["silhouettes.var_threshold"], float)
 
