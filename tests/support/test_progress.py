@@ -11,26 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nbclient import NotebookClient
 
+from psotrack.pipeline import speed_in_words
 from psotrack.support import joined, no_progress, progress_bar, progress_lines, terminal_bar
-
-
-class Clock:
-    """A clock that a test moves."""
-
-    def __init__(self) -> None:
-        self.now_s = 0.0
-
-    def __call__(self) -> float:
-        return self.now_s
 
 
 def lines_of(steps: list[tuple[float, int]], total: int, long_s: float = 0.0) -> list[str]:
     """Lines about a stage whose steps take some seconds each."""
     written: list[str] = []
-    clock = Clock()
-    with progress_lines(written.append, long_s=long_s, clock=clock)("track", total) as advance:
+    now_s = 0.0
+    with progress_lines(written.append, long_s=long_s, clock=lambda: now_s)("track", total) as advance:
         for seconds, count in steps:
-            clock.now_s += seconds
+            now_s += seconds
             advance(count)
     return written
 
@@ -81,17 +72,19 @@ def test_few_lines_and_none_about_short_stages(seconds: list[float], long_s: flo
         assert lines[-1].startswith(f"track: {len(seconds)} of {len(seconds)} in ")
 
 
-def test_a_stage_that_an_error_ends_says_so() -> None:
-    written: list[str] = []
+def test_a_stage_that_an_error_ends_says_so_and_joined_reports_count_the_same_steps() -> None:
+    written: tuple[list[str], list[str]] = [], []
+    report = joined(*(progress_lines(each.append, clock=lambda: 0.0) for each in written), no_progress)
 
     def work() -> None:
-        with progress_lines(written.append, clock=Clock())("track", 10) as advance:
-            advance(4)
+        with report("track", 10) as advance:
+            advance(1)
+            advance(3)
             raise ValueError("broken")
 
     with pytest.raises(ValueError, match="broken"):
         work()
-    assert written == ["track: 4 of 10, stopped after 0.0 s"]
+    assert written == (["track: 4 of 10, stopped after 0.0 s"],) * 2
 
 
 def test_lines_go_to_stderr_and_short_work_is_quiet(
@@ -112,14 +105,13 @@ def test_lines_go_to_stderr_and_short_work_is_quiet(
     assert "7/7" in stream.getvalue()
 
 
-def test_joined_reports_count_the_same_steps() -> None:
-    first: list[str] = []
-    second: list[str] = []
-    report = joined(*(progress_lines(each.append, clock=Clock()) for each in (first, second)), no_progress)
-    with report("track", 5) as advance:
-        advance(2)
-        advance(3)
-    assert first == second == ["track: 5 of 5 in 0.0 s"]
+def test_a_speed_in_words() -> None:
+    assert [speed_in_words(factor) for factor in (0.061, 0.0077, 2.0, 0.99)] == [
+        "16 times slower than the video",
+        "130 times slower than the video",
+        "2 times faster than the video",
+        "as fast as the video",
+    ]
 
 
 @pytest.mark.nightly
