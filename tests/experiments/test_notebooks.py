@@ -36,21 +36,28 @@ def has_picture(cell):
     return any(kind.startswith("image/") for kind in kinds)
 
 
-@each_script
-def test_script_and_notebook_have_the_same_cells(script):
-    assert cells(jupytext.read(script)) == cells(committed_notebook(script))
-
-
 def test_every_notebook_has_a_script():
-    assert [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))] == [
-        path.stem for path in SCRIPTS
-    ]
+    assert sorted((ROOT / "notebooks").glob("*.ipynb")) == [path.with_suffix(".ipynb") for path in SCRIPTS]
 
 
 @each_script
-def test_committed_notebook_has_been_run_from_top_to_bottom(script):
-    counts = [cell.execution_count for cell in committed_notebook(script).cells if cell.cell_type == "code"]
+def test_the_committed_notebook_is_small_and_was_run_from_top_to_bottom_on_no_particular_machine(script):
+    notebook = committed_notebook(script)
+    assert cells(jupytext.read(script)) == cells(notebook)
+    counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == "code"]
     assert counts == list(range(1, len(counts) + 1))
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert [each for each in outputs if each.output_type == "error" or each.get("name") == "stderr"] == []
+    data = [part for output in outputs for part in output.get("data", {}).items()]
+    texts = [
+        *(each.get("text", "") for each in outputs),
+        *(text for kind, text in data if "image" not in kind),
+    ]
+    assert [text for text in texts if MACHINE_PATH.search(text)] == []
+    assert script.with_suffix(".ipynb").stat().st_size < MAX_BYTES
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert "version" not in notebook.metadata.get("language_info", {})
+    assert [cell for cell in notebook.cells if "execution" in cell.metadata] == []
 
 
 @each_script
@@ -65,30 +72,6 @@ def test_every_picture_is_followed_by_a_what_to_see_cell(script):
     # This includes photographs of the hall at the beginning.
     assert all(cell.cell_type == "markdown" and cell.source.startswith("*What to see") for cell in after)
     assert not has_picture(notebook.cells[-1])
-
-
-@each_script
-def test_committed_notebook_shows_no_errors_and_no_paths_of_a_machine(script):
-    notebook = committed_notebook(script)
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
-    assert not [
-        output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"
-    ]
-    texts = [output.get("text", "") for output in outputs]
-    texts += [
-        text for output in outputs for kind, text in output.get("data", {}).items() if "image" not in kind
-    ]
-    assert not [text for text in texts if MACHINE_PATH.search(text)]
-
-
-@each_script
-def test_committed_notebook_is_small_and_its_metadata_are_stable(script):
-    path = script.with_suffix(".ipynb")
-    assert path.stat().st_size < MAX_BYTES
-    notebook = committed_notebook(script)
-    assert notebook.metadata.kernelspec.name == "python3"
-    assert "version" not in notebook.metadata.get("language_info", {})
-    assert not [cell for cell in notebook.cells if "execution" in cell.metadata]
 
 
 @each_script
@@ -116,18 +99,9 @@ def copies(tmp_path_factory):
 @each_script
 def test_notebook_runs_at_tiny_size(script, copies):
     """Run by nbmake in another pytest process, because this one turns warnings of Jupyter's machinery into errors."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "--nbmake",
-        # The default, five minutes for a cell, is not enough for the compiler on slow machines.
-        "--nbmake-timeout=7200",
-        f"{script.stem}.ipynb",
-    ]
+    # The default, five minutes for a cell, is not enough for the compiler on slow machines.
+    words = ["-q", "-p", "no:cacheprovider", "--nbmake", "--nbmake-timeout=7200", f"{script.stem}.ipynb"]
+    command = [sys.executable, "-m", "pytest", *words]
     environment = os.environ | {"PSOTRACK_NOTEBOOKS": "tiny"}
     ran = subprocess.run(command, cwd=copies, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr

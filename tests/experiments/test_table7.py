@@ -1,4 +1,4 @@
-"""The program that makes Tables 6 to 8, on a short simulated sequence, and on the same in the form of a real one."""
+"""The program that makes Tables 6 to 8, on a short simulated sequence."""
 
 import subprocess
 import sys
@@ -9,12 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from helpers import make_once
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from psotrack.inside_out import MarkerMap
-from psotrack.recordings.datasets import onboard_pose_file, open_recording, pose_file
-from psotrack.recordings.mocap import Markers, write_c3d
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
 
 EXPERIMENT = Path(__file__).parents[2] / "experiments" / "table7"
@@ -71,37 +67,6 @@ def test_tables_rows_and_a_second_run(data: Path, tmp_path: Path) -> None:
     before = kept.stat().st_mtime_ns
     assert table7("--data", data, "--out", tmp_path).returncode == 0
     assert kept.stat().st_mtime_ns == before
-
-
-@pytest.mark.nightly
-def test_a_recording_in_the_form_of_a_real_one(data: Path, tmp_path: Path) -> None:
-    """A cross of markers in a C3D file at 100 Hz that began two seconds before the video, and no poses."""
-    source, folder = data / "Simulated_Data" / "S01_D2_A", tmp_path / "Real_Data" / "R99_D1_A"
-    folder.mkdir(parents=True)
-    left_out = {name(drone, FPS) for name in (pose_file, onboard_pose_file) for drone in (1, 2)}
-    for path in source.iterdir():
-        if path.is_file() and path.name not in {*left_out, "dron2_cam_s.avi", "simulation.json"}:
-            (folder / path.name).symlink_to(path)
-    truth = open_recording(source).truth
-    known = truth.seen[:, 0]
-    time_s, wxyz = truth.time_s[known], truth.orientation_wxyz[known, 0]
-    samples_s = np.clip(np.arange(-200, 600) / 100, time_s[0], time_s[-1])
-    there_m = CubicSpline(time_s, truth.position_m[known, 0])(samples_s)
-    turns = RotationSpline(time_s, Rotation.from_quat(wxyz, scalar_first=True))(samples_s)
-    cross_m = np.array(
-        [[0.15, 0, 0.02], [-0.1, 0, 0.02], [0, 0.12, 0.03], [0, -0.07, 0.02], [0.03, 0.03, 0.06]]
-    )
-    markers_m = np.stack([there_m + turns.apply(marker_m) for marker_m in cross_m], axis=1)
-    write_c3d(
-        folder / "R99_D1_A.c3d", Markers(tuple(f"Dron1:Dron1{n}" for n in range(1, 6)), markers_m, 100.0)
-    )
-    done = table7("--data", tmp_path, "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    rows = pd.read_csv(tmp_path / "out" / "results.csv").query("drone == 'dron1'")
-    assert (rows["offset_s"] - 2.0).abs().max() * FPS < 0.2
-    assert (rows[rows["method"] != "paper"]["position_median_m"] < 0.03).all()
-    # The true clock offsets of a real recording are not known.
-    assert "found minus planted" not in done.stdout
 
 
 @pytest.mark.slow
