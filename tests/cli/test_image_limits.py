@@ -206,22 +206,11 @@ def little_video(path: Path, codec: str) -> bytes:
     return path.read_bytes()
 
 
-def avi(path: Path, width: int, height: int, codec: str = "XVID") -> None:
-    """A video of which the header, and the header of its stream, claim a size."""
-    data = little_video(path, codec)
+def raw_avi(path: Path, width: int, height: int) -> None:
+    """A video of raw images, of which the header, and the header of its stream, claim a size."""
+    data = little_video(path, "I420")
     data = with_bytes(data, data.index(b"avih") + 8 + 32, struct.pack("<II", width, height))
     path.write_bytes(with_bytes(data, data.index(b"strf") + 8 + 4, struct.pack("<ii", width, height)))
-
-
-def raw_avi(path: Path, width: int, height: int) -> None:
-    avi(path, width, height, "I420")
-
-
-def mp4(path: Path, width: int, height: int) -> None:
-    data = little_video(path, "mp4v")
-    # The sizes of the track (16.16) and of its description (16 bits).
-    data = with_bytes(data, data.index(b"tkhd") + 4 + 76, struct.pack(">HHHH", width, 0, height, 0))
-    path.write_bytes(with_bytes(data, data.index(b"mp4v") + 4 + 24, struct.pack(">HH", width, height)))
 
 
 def avi_of_jpegs(path: Path, width: int, height: int) -> None:
@@ -233,16 +222,11 @@ def avi_of_jpegs(path: Path, width: int, height: int) -> None:
 
 
 @pytest.mark.parametrize("size_wh", [(30_000, 30_000), (60_000, 60_000)])
-def test_a_video_of_huge_images(size_wh, tmp_path):
+@pytest.mark.parametrize("make", [raw_avi, avi_of_jpegs])
+def test_a_video_of_huge_images(make, size_wh, tmp_path):
     path = tmp_path / "a.avi"
-    for make in (raw_avi, avi_of_jpegs):
-        make(path, *size_wh)
-        assert_refused(lambda: list(read_frames(probe(path))), f"{path}: expected", unchanged=tmp_path)
-    # Where only the container claims the size, the codec knows that of its images.
-    for make in (avi, mp4):
-        path = tmp_path / f"{make.__name__}.{make.__name__}"
-        make(path, *size_wh)
-        assert {frame.shape for frame in read_frames(probe(path))} == {(48, 64, 3)}
+    make(path, *size_wh)
+    assert_refused(lambda: list(read_frames(probe(path))), f"{path}: expected", unchanged=tmp_path)
 
 
 def test_a_video_that_claims_to_last_for_days(tmp_path):

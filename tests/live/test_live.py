@@ -126,8 +126,12 @@ def test_a_replay_gives_the_tracks_of_its_offline_twin_to_all_outputs(
     common = ["--cache", cache, *EFFORT]
     port, received = free_port(), list[str]()
 
+    def answers() -> bool:
+        with socket.socket() as one:
+            return one.connect_ex(("127.0.0.1", port)) == 0
+
     def listen() -> None:
-        wait_until(lambda: listening_at(os.getpid()), "nobody listens")
+        wait_until(answers, f"nobody answers at port {port}")
         assert listening_at(os.getpid()) == {"127.0.0.1"}
         with client.connect(f"ws://127.0.0.1:{port}") as connection:
             received.extend(connection)
