@@ -152,6 +152,7 @@ def test_any_frame_of_a_long_video_may_be_the_floor(calibrate, tmp_path):
     np.testing.assert_allclose(read_rig(out).cameras.T_cam_world[0, :3, 3], pairs[2][0][:3, 3], atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_rig_from_folders_of_images_of_a_board(calibrate, tmp_path, caplog):
     """Printed white on black; the function of the package gives the same."""
     names = ("left", "right")

@@ -120,16 +120,6 @@ def test_a_lever_arm_along_the_flight_is_not_taken_for_an_offset():
     assert (without.lever_arm_m == 0).all()
 
 
-def test_circles_determine_the_offset_within_one_turn():
-    estimate = simulate_estimate(circle, offset_s=0.2, noise_m=0.02)
-    assert find(estimate, circle, max_offset_s=0.35).offset_s == pytest.approx(0.2, abs=2e-3)
-
-
-def circle(time_s):
-    angle = 2 * np.pi * np.asarray(time_s) / 0.8
-    return np.stack([np.cos(angle), np.sin(angle), 1 + 0 * angle], axis=-1)
-
-
 def test_drones_in_another_order_with_a_false_track_and_a_missing_drone():
     paths = [random_motion(number) for number in range(3)]
     false = [lambda t: random_motion(7)(t) - [0, 9, 0]]

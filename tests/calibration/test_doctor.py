@@ -380,6 +380,7 @@ def test_sightings_that_agree_by_chance_do_not_go_on_from_frame_to_frame(monkeyp
 # The command.
 
 
+@pytest.mark.slow
 def test_the_command(run_psotrack, tmp_path):
     folder = record_detections(tmp_path / "correct", INDOORS.seen, RIG)
     done = run_psotrack("doctor", folder)

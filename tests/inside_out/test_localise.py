@@ -367,6 +367,7 @@ def test_markers_may_be_turned_any_way():
     assert off_m(path, centres_m).max() < 0.05
 
 
+@pytest.mark.slow
 def test_exchanged_markers_of_a_map_are_named(localise, tmp_path):
     """Found: `numpy.linalg.LinAlgError: Singular matrix`. One pair has its corners counted from another one."""
     corners_m = wall_markers()
