@@ -11,7 +11,7 @@ from helpers import assert_refused, cameras_of, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
-from worlds import NUM_FRAMES, RATE_HZ, make_sequence, make_tracks, make_tracks_file
+from worlds import CAMERAS, NUM_FRAMES, RATE_HZ, make_sequence, make_tracks, make_tracks_file
 
 from psotrack.recordings import FrameTimes, Recording, view_in_images
 from psotrack.recordings.exchange import export_tracks
@@ -25,7 +25,6 @@ from psotrack.show.flights import (
     flight_of,
     read_flight,
     recording_beside,
-    split_sequence,
 )
 from psotrack.show.flights.run_record import as_run_record
 from psotrack.trajectories import Status, write_trajectories
@@ -188,32 +187,23 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path):
     assert len({*flight.tracks[0].colours, *flight.tracks[1].colours}) == 2
 
 
-def test_the_recording_is_named_last(world):
-    path, lab = world / "tracks.csv", world / "flight"
-    assert split_sequence([path, lab]) == ((path,), lab)
-    assert split_sequence([path]) == ((path,), None)
-
-
-@pytest.mark.parametrize("name", ["flight", "flight/recording.toml"])
-def test_tracks_in_the_folder_of_their_recording_know_it_where_it_moves(world, name):
-    assert recording_beside(world / name, world / "flight" / "results" / "tracks.csv").startswith("..")
-
-
-@pytest.mark.parametrize("folder", ["flight", "../elsewhere/flight"])
-def test_tracks_know_their_recording(tmp_path, caplog, folder):
-    """A recording in the folder of the tracks is moved with it; another one stays where it is."""
-    sequence = make_sequence(tmp_path / "home" / folder)
-    tracks = make_tracks_file(tmp_path / "home" / "tracks.csv")
-    record = json.loads(tracks.with_suffix(".json").read_text(encoding="utf-8"))
-    record["recording"] = recording_beside(sequence, tracks)
+@pytest.mark.parametrize(
+    ("sequence", "folder"), [("home/flight", "home"), ("elsewhere/flight", "home"), ("home", "home/results")]
+)
+def test_tracks_know_their_recording(tmp_path, caplog, sequence, folder):
+    """A recording is moved with tracks in its folder, and with those beside it; another one stays where it is."""
+    recording = make_sequence(tmp_path / sequence)
+    (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    tracks = make_tracks_file(tmp_path / folder / "tracks.csv")
+    record = {"recording": recording_beside(recording / "recording.toml", tracks)}
     tracks.with_suffix(".json").write_text(json.dumps(record), encoding="utf-8")
-    tracks = (tmp_path / "home").rename(tmp_path / "moved") / "tracks.csv"
-    if folder == "../elsewhere/flight":
-        (tmp_path / "home").mkdir()
-    assert read_flight([tracks]).recording.name == "flight"
+    (tmp_path / "home").rename(tmp_path / "moved")
+    (tmp_path / "home").mkdir()
+    tracks = tmp_path / folder.replace("home", "moved") / "tracks.csv"
+    assert read_flight([tracks]).recording.rig.names == CAMERAS
     find_recording(tracks).rename(tmp_path / "gone")
     assert read_flight([tracks]).recording is None
-    assert "flight is not there; name the recording" in caplog.text
+    assert "recording.toml is not there; name the recording" in caplog.text
 
 
 def test_exported_tracks_beside_a_file_are_no_record(tmp_path):
