@@ -442,7 +442,7 @@ USUAL = ["--particles", "15", "--iterations", "10", "--quiet"]
 @pytest.mark.parametrize(
     "name",
     [
-        "lines",
+        pytest.param("lines", marks=pytest.mark.slow),
         pytest.param("fused", marks=pytest.mark.slow),
         # What the two runs above share, without detections: 30 s, most of which is compiling.
         pytest.param("swarm", marks=pytest.mark.nightly),

@@ -34,30 +34,21 @@ def test_a_file_is_read(tmp_path):
     assert len(read_detections(write_file(tmp_path, ""))) == 0
 
 
-@pytest.mark.parametrize(
-    ("text", "frames"),
-    [
-        (f"\ufeff{LINE}\n", [4]),
-        (f"{LINE}\r\n\r\n", [4]),
-        (f"\n\n{LINE},\n\n", [4]),
-        (LINE.replace(",", " , "), [4]),
-        (f"{LINE}\n2.0,{LINE[2:]}", [2, 4]),
-        (f"{LINE},,,,\n2,{LINE[2:]}{7 * ','}\n3,,,,\n,,,,", [2, 4]),
-        (f"{LINE},,,,,,,,{LINE[2:]}", [4, 4]),
-        # Some exports of YOLO have the middle of the box as x and y.
-        ("0,25,40,30,40,25,40,0.9", [0]),
-    ],
-    ids=[
-        "byte order mark",
-        "Windows",
-        "blank lines and last comma",
-        "spaces",
-        "out of order, frame as 2.0",
-        "padded with empty fields",
-        "an empty detection between two",
-        "middles",
-    ],
-)
+#: Name of the case -> text of a file, the frames of its detections, which are all equal.
+VARIANTS = {
+    "byte order mark": (f"\ufeff{LINE}\n", [4]),
+    "Windows": (f"{LINE}\r\n\r\n", [4]),
+    "blank lines and last comma": (f"\n\n{LINE},\n\n", [4]),
+    "spaces": (LINE.replace(",", " , "), [4]),
+    "out of order, frame as 2.0": (f"{LINE}\n2.0,{LINE[2:]}", [2, 4]),
+    "padded with empty fields": (f"{LINE},,,,\n2,{LINE[2:]}{7 * ','}\n3,,,,\n,,,,", [2, 4]),
+    "an empty detection between two": (f"{LINE},,,,,,,,{LINE[2:]}", [4, 4]),
+    # Some exports of YOLO have the middle of the box as x and y.
+    "middles": ("0,25,40,30,40,25,40,0.9", [0]),
+}
+
+
+@pytest.mark.parametrize(("text", "frames"), VARIANTS.values(), ids=VARIANTS)
 def test_variants_of_the_format_are_read(tmp_path, text, frames):
     detections = read_detections(write_file(tmp_path, text))
     assert detections.frame.tolist() == frames

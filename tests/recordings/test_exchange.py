@@ -6,7 +6,6 @@ installed without their dependencies (see the Makefile), so that their tests are
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,20 +15,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import LENSES, assert_refused, cameras_of, make_once, ring_rig, sphere_points
+from helpers import LENSES, assert_refused, cameras_of, ring_rig, sphere_points
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
+from worlds import IMAGE_SIZE_WH, NUM_FRAMES, RATE_HZ, make_tracks, make_tracks_file, two_flights
 
 from psotrack.evaluation import evaluate
 from psotrack.geometry import look_at, make_camera, project
-from psotrack.geometry.rig_files import write_rig
-from psotrack.recordings import FrameTimes, Recording, VideoWriter
+from psotrack.recordings import FrameTimes, Recording, Reference, probe, read_frames
 from psotrack.recordings.datasets import open_recording
 from psotrack.recordings.exchange import FORMATS, Footage, export_tracks, read_tracks
 from psotrack.recordings.exchange.ros_messages import DEFINITIONS, camera_message
-from psotrack.trajectories import Status, Trajectories, write_trajectories
+from psotrack.trajectories import Status, Trajectories
 
 #: Names of outputs that hold all of the small tracks, per format.
 OUTPUTS = {
@@ -46,7 +45,6 @@ SIZE_M = (0.5, 0.5, 0.2)
 LASTS_S = 1.0
 #: Rate, time of frame 0 and time per row of each camera. The instants are those of the fastest camera.
 CLOCKS = {"c0": (25.0, 0.0, 0.0), "c1": (50.0, 0.0, 0.0), "c2": (25.0, 0.013, 2e-5)}
-WH = (320, 240)
 
 
 def path_m(drone, time_s):
@@ -55,71 +53,51 @@ def path_m(drone, time_s):
     return np.stack([np.cos(angle), np.sin(angle), 1.2 + 0.2 * time_s + 0.3 * drone], axis=-1)
 
 
-def small_tracks(num_frames=50, fps=50.0):
-    """Two drones with gaps, lost rows, covariances, velocities and orientations, near the paths of the reference."""
-    frame = np.arange(num_frames)
-    time_s = frame / fps
-    rng = np.random.default_rng(4)
-    position_m = np.stack([path_m(0, time_s), path_m(1, time_s)], axis=1)
-    position_m += rng.normal(0, 0.02, position_m.shape)
-    status = np.full((num_frames, 2), int(Status.TRACKED))
-    status[10:13, 0], status[13, 0], status[30:, 1] = Status.LOST, Status.COASTING, Status.LOST
-    position_m[35:, 1] = np.nan
-    return Trajectories(
-        frame=frame,
-        time_s=time_s,
-        drones=("0", "1"),
-        position_m=position_m,
-        velocity_m_s=rng.normal(0, 1, position_m.shape),
-        orientation_wxyz=Rotation.random(2 * num_frames, rng=rng)
-        .as_quat(scalar_first=True, canonical=True)
-        .reshape(num_frames, 2, 4),
-        status=status,
-        covariance_m2=np.broadcast_to(np.diag([1e-4, 2e-4, 4e-4]), (num_frames, 2, 3, 3)).copy(),
+def small_tracks(rate_hz=RATE_HZ):
+    """The small world's tracks beside their places, with a gap and with orientations."""
+    tracks, rng = make_tracks(), np.random.default_rng(4)
+    tracks.status[2:4, 0] = Status.LOST
+    turn = Rotation.random(2 * tracks.num_frames, rng=rng).as_quat(scalar_first=True, canonical=True)
+    return replace(
+        tracks,
+        time_s=tracks.frame / rate_hz,
+        position_m=tracks.position_m + rng.normal(0, 0.02, tracks.position_m.shape),
+        velocity_m_s=rng.normal(0, 1, tracks.position_m.shape),
+        orientation_wxyz=turn.reshape(tracks.num_frames, 2, 4),
     )
-
-
-def make_flight(folder):
-    """A recording of three cameras that differ in rate and start, the last with a rolling shutter, with a reference."""
-    write_rig(folder / "rig.toml", ring_rig(3, coefficients=5, image_size_wh=WH))
-    tables = ['version = 1\ncalibration = "rig.toml"\n[reference]\nfiles = ["truth.csv"]']
-    for name, (fps, begins_s, line_time_s) in CLOCKS.items():
-        with VideoWriter(folder / f"{name}.avi", fps, WH) as writer:
-            for index in range(int((LASTS_S - begins_s) * fps)):
-                writer.write(np.full((WH[1], WH[0], 3), 2 * index, np.uint8))
-        tables.append(
-            f'[cameras.{name}]\nvideo = "{name}.avi"\ntime_offset_s = {begins_s}\nline_time_s = {line_time_s}\n'
-        )
-    time_s = np.arange(0, 1.2, 0.01)
-    position_m = np.stack([path_m(0, time_s), path_m(1, time_s)], axis=1)
-    reference = Trajectories(np.arange(len(time_s)), time_s, ("a", "b"), position_m)
-    write_trajectories(folder / "truth.csv", reference)
-    (folder / "recording.toml").write_text("\n".join(tables), encoding="utf-8")
-    write_trajectories(folder / "tracks.csv", small_tracks())
-    record = {"drones": [{"drone": drone, "size_m": list(SIZE_M)} for drone in range(2)]}
-    (folder / "tracks.json").write_text(json.dumps(record), encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory):
-    """The folder of `make_flight`, which no test changes."""
-    return make_once(tmp_path_factory, "flight_of_three_clocks", make_flight)
+    """A recording of three equal cameras, which no test changes."""
+    return two_flights(tmp_path_factory) / "flight"
+
+
+@pytest.fixture
+def tracks_file(tmp_path):
+    """Tracks of the recording, with a record of the run."""
+    return make_tracks_file(tmp_path / "tracks.csv")
 
 
 @pytest.fixture(scope="module")
-def recording(flight):
-    return open_recording(flight)
-
-
-@pytest.fixture(scope="module")
-def footage(recording):
-    return Footage(recording, np.array([SIZE_M, SIZE_M]))
-
-
-@pytest.fixture(scope="module")
-def perfect(recording):
-    """The reference as tracks."""
-    return replace(recording.truth, drones=("0", "1"))
+def footage():
+    """Three cameras that differ in rate and start, the last with a rolling shutter, and where the drones are."""
+    recording = Recording(
+        "clocks",
+        Path("clocks"),
+        cameras_of(
+            ring_rig(3, coefficients=5, image_size_wh=IMAGE_SIZE_WH),
+            times={
+                name: FrameTimes(int((LASTS_S - begins_s) * fps), fps, begins_s)
+                for name, (fps, begins_s, _) in CLOCKS.items()
+            },
+            line_time_s={name: line_time_s for name, (_, _, line_time_s) in CLOCKS.items()},
+        ),
+    )
+    time_s = recording.timeline().time_s
+    position_m = np.stack([path_m(0, time_s), path_m(1, time_s)], axis=1)
+    truth = Trajectories(np.arange(len(time_s)), time_s, ("0", "1"), position_m)
+    return Footage(replace(recording, reference=Reference(truth)), np.array([SIZE_M, SIZE_M]))
 
 
 def instants(num_frames, fps=25.0):
@@ -171,7 +149,7 @@ def test_what_each_format_keeps(tmp_path):
     read = {}
     for to, name in OUTPUTS.items():
         export_tracks(tracks, to, tmp_path / name)
-        read[to] = read_tracks(tmp_path / name, recording=instants(50, 50.0))
+        read[to] = read_tracks(tmp_path / name, recording=instants(NUM_FRAMES))
     assert set(OUTPUTS) == set(FORMATS)
     seen, unknown = tracks.seen, replace(tracks, orientation_wxyz=None)
     for to in ("tum", "kitti", "mcap", "csv", "parquet", "json"):
@@ -180,7 +158,7 @@ def test_what_each_format_keeps(tmp_path):
             read[to].at_frames(tracks.frame).orientation_wxyz[seen], tracks.orientation_wxyz[seen], atol=1e-14
         )
         export_tracks(unknown, to, tmp_path / OUTPUTS[to], force=True)
-        assert read_tracks(tmp_path / OUTPUTS[to], recording=instants(50, 50.0)).orientation_wxyz is None
+        assert read_tracks(tmp_path / OUTPUTS[to], recording=instants(NUM_FRAMES)).orientation_wxyz is None
     for to in ("mcap", "csv", "parquet", "json"):
         np.testing.assert_array_equal(read[to].covariance_m2[seen], tracks.covariance_m2[seen])
     for to in ("csv", "parquet", "json"):
@@ -189,7 +167,7 @@ def test_what_each_format_keeps(tmp_path):
     # The folder of a bag is read, too.
     (tmp_path / "metadata.yaml").touch()
     (tmp_path / "tracks.mcap").rename(tmp_path / "bag_0.mcap")
-    np.testing.assert_array_equal(read_tracks(tmp_path, recording=instants(50, 50.0)).seen, seen)
+    np.testing.assert_array_equal(read_tracks(tmp_path, recording=instants(NUM_FRAMES)).seen, seen)
 
 
 def figures(run_psotrack, tracks, flight):
@@ -197,11 +175,11 @@ def figures(run_psotrack, tracks, flight):
 
 
 @pytest.mark.parametrize("to", ["mot", "mcap"])
-def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tmp_path, to):
+def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tracks_file, tmp_path, to):
     """The same figures, except those of covariances that the format does not hold."""
-    tracks, out = flight / "tracks.csv", tmp_path / ("mot" if to == "mot" else "tracks.mcap")
-    assert run_psotrack("export", tracks, flight, "--to", to, "--out", out).code == 0
-    expected, found = (figures(run_psotrack, path, flight) for path in (tracks, out))
+    out = tmp_path / ("mot" if to == "mot" else "tracks.mcap")
+    assert run_psotrack("export", tracks_file, flight, "--to", to, "--out", out).code == 0
+    expected, found = (figures(run_psotrack, path, flight) for path in (tracks_file, out))
     assert expected["missed_rate"] > 0.1, "the gaps count"
     del expected["per_drone"]
     for key, value in expected.items():
@@ -213,11 +191,11 @@ def test_evaluate_takes_back_what_export_wrote(run_psotrack, flight, tmp_path, t
 
 
 @pytest.mark.parametrize("to", ["tum", "kitti", "mcap", "json", "c3d"])
-def test_the_times_say_another_rate_than_the_recordings(recording, tmp_path, to):
+def test_the_times_say_another_rate_than_the_recordings(footage, tmp_path, to):
     """20 Hz, as from `track --rate 20`, where the recording has 50 Hz."""
-    slow = small_tracks(20, 20.0)
+    slow = small_tracks(20.0)
     export_tracks(slow, to, tmp_path / OUTPUTS[to])
-    read = read_tracks(tmp_path / OUTPUTS[to], recording=recording)
+    read = read_tracks(tmp_path / OUTPUTS[to], recording=footage.recording)
     np.testing.assert_array_equal(read.at_frames(slow.frame).seen, slow.seen)
     np.testing.assert_allclose(read.time_s, read.frame / 20.0, rtol=0, atol=1e-12)
 
@@ -264,8 +242,8 @@ print(json.dumps({"rmse": ape.get_statistic(metrics.StatisticsType.rmse), "poses
 
 
 @pytest.mark.skipif(find_spec("evo") is None, reason="evo is not installed; see the Makefile")
-def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path, perfect):
-    tracks = small_tracks()
+def test_evo_reads_tum_and_kitti_and_finds_the_same_error(tmp_path):
+    tracks, perfect = small_tracks(), replace(make_tracks(), status=None)
     for to in ("tum", "kitti"):
         export_tracks(tracks, to, tmp_path / to)
     export_tracks(perfect, "tum", tmp_path / "truth")
@@ -308,8 +286,9 @@ def trackeval_clear(folder):
 
 
 @pytest.mark.skipif(find_spec("trackeval") is None, reason="trackeval is not installed; see the Makefile")
-def test_trackeval_reads_the_boxes_of_every_camera(tmp_path, recording, footage, perfect):
-    export_tracks(perfect, "mot", tmp_path / "perfect", footage=footage)
+def test_trackeval_reads_the_boxes_of_every_camera(tmp_path, footage):
+    recording = footage.recording
+    export_tracks(recording.truth, "mot", tmp_path / "perfect", footage=footage)
     results = trackeval_clear(tmp_path / "perfect")
     assert set(results) == {f"{recording.name}-{name}" for name in CLOCKS}
     for name, result in results.items():
@@ -320,9 +299,10 @@ def test_trackeval_reads_the_boxes_of_every_camera(tmp_path, recording, footage,
         assert frames < result["CLR_TP"] <= 2 * frames
 
 
-def test_boxes_are_around_the_drones_at_the_exposure(tmp_path, recording, footage, perfect):
+def test_boxes_are_around_the_drones_at_the_exposure(tmp_path, footage):
     """The oracle projects points of the ellipsoids' surface, at the time of the frame or of the drone's row."""
-    export_tracks(perfect, "mot", tmp_path / "mot", footage=footage)
+    recording = footage.recording
+    export_tracks(recording.truth, "mot", tmp_path / "mot", footage=footage)
     boxes = tmp_path / "mot" / "trackers" / "MOT15-train" / "psotrack" / "data"
     surface_m = sphere_points(4000) * np.array(SIZE_M) / 2
     for index, (name, (fps, begins_s, line_time_s)) in enumerate(CLOCKS.items()):
@@ -338,20 +318,21 @@ def test_boxes_are_around_the_drones_at_the_exposure(tmp_path, recording, footag
             np.testing.assert_allclose([left - 1, top - 1], low, atol=0.1)
             np.testing.assert_allclose([left - 1 + width, top - 1 + height], high, atol=0.1)
     # A drone that is lost has no box; the second camera has a frame at each instant.
-    export_tracks(small_tracks(), "mot", tmp_path / "mot", footage=footage, force=True)
+    tracks = small_tracks(recording.fps)
+    export_tracks(tracks, "mot", tmp_path / "mot", footage=footage, force=True)
     table = np.loadtxt(boxes / f"{recording.name}-c1.txt", delimiter=",")
-    assert sorted(table[:, :2].tolist()) == (np.argwhere(small_tracks().seen) + 1).tolist()
+    assert sorted(table[:, :2].tolist()) == (np.argwhere(tracks.seen) + 1).tolist()
 
 
 @pytest.fixture(scope="module")
-def messages(tmp_path_factory, footage):
+def messages(tmp_path_factory, flight):
     """Topic, time and content of the messages in a bag of the small tracks without orientations, read by rosbags."""
     from rosbags.highlevel import AnyReader
 
     path = tmp_path_factory.mktemp("bag") / "bag.mcap"
     tracks = replace(small_tracks(), orientation_wxyz=None)
-    lost = export_tracks(tracks, "mcap", path, footage=replace(footage, images=True))
-    assert lost == ("velocities", "status", "8 positions of lost drones")
+    lost = export_tracks(tracks, "mcap", path, footage=Footage(open_recording(flight), images=True))
+    assert lost == ("velocities", "fitness", "numbers of cameras", "status", "5 positions of lost drones")
     with AnyReader([path]) as bag:
         return [
             (each.topic, time_ns, bag.deserialize(raw, each.msgtype)) for each, time_ns, raw in bag.messages()
@@ -362,11 +343,11 @@ def transforms_in(messages):
     return [each for topic, _, content in messages if topic == "/tf" for each in content.transforms]
 
 
-def test_rosbags_reads_the_messages(messages):
+def test_rosbags_reads_the_messages(messages, flight):
     tracks = small_tracks()
     poses = [(time_ns, content) for topic, time_ns, content in messages if topic == "/drone_0/pose"]
     seen = tracks.seen[:, 0]
-    assert [time_ns for time_ns, _ in poses] == [20_000_000 * frame for frame in tracks.frame[seen]]
+    assert [time_ns for time_ns, _ in poses] == [40_000_000 * frame for frame in tracks.frame[seen]]
     for row, (time_ns, content) in zip(np.flatnonzero(seen), poses, strict=True):
         place = content.pose.pose.position
         assert [place.x, place.y, place.z] == tracks.position_m[row, 0].tolist()
@@ -377,29 +358,29 @@ def test_rosbags_reads_the_messages(messages):
         assert np.diag(covariance)[3:].tolist() == [1e9] * 3, "the orientation is not known"
     children = [each.child_frame_id for each in transforms_in(messages)]
     assert [children.count(name) for name in ("drone_0", "drone_1")] == tracks.seen.sum(axis=0).tolist()
-    # Cameras at 0 s and at the end, 0.98 s.
+    # Cameras at 0 s and at the end, 0.52 s.
     assert [children.count(name) for name in CLOCKS] == [2, 2, 2]
     images = [content for topic, _, content in messages if topic == "/c1/image/compressed"]
-    assert len(images) == 50
-    picture = cv2.imdecode(np.frombuffer(bytes(images[20].data), np.uint8), cv2.IMREAD_COLOR)
-    # JPEG of a grey image is exact within a few levels.
-    assert picture.shape == (WH[1], WH[0], 3)
-    assert abs(picture.mean() - 40) < 3
+    assert len(images) == NUM_FRAMES
+    picture = cv2.imdecode(np.frombuffer(bytes(images[9].data), np.uint8), cv2.IMREAD_COLOR).astype(int)
+    # JPEG of a noisy image is near it, and nearer than to the images in which the drones are elsewhere.
+    off = [np.abs(picture - frame).mean() for frame in read_frames(probe(flight / "c1.avi"))]
+    assert np.argmin(off) == 9
     # At 0 and with every later image.
-    assert sum(topic == "/c1/camera_info" for topic, *_ in messages) == 50
+    assert sum(topic == "/c1/camera_info" for topic, *_ in messages) == NUM_FRAMES
 
 
-def test_a_camera_info_and_its_transform_project_as_the_camera_does(messages, footage):
+def test_a_camera_info_and_its_transform_project_as_the_camera_does(messages, flight):
     """The oracle is OpenCV, with the numbers that ROS programs get."""
     info = next(content for topic, _, content in messages if topic == "/c2/camera_info")
-    assert (info.distortion_model, len(info.d), info.width, info.height) == ("plumb_bob", 5, *WH)
+    assert (info.distortion_model, len(info.d), info.width, info.height) == ("plumb_bob", 5, *IMAGE_SIZE_WH)
     pose = next(each for each in transforms_in(messages) if each.child_frame_id == "c2")
     turn, place = pose.transform.rotation, pose.transform.translation
     R = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix().T
     t = -R @ [place.x, place.y, place.z]
     point_m, K = np.array([[0.3, 0.2, 1.0]]), np.array(info.k).reshape(3, 3)
     expected, _ = cv2.projectPoints(point_m, cv2.Rodrigues(R)[0], t, K, np.array(info.d))
-    camera = footage.recording.rig.cameras[2]
+    camera = open_recording(flight).rig.cameras[2]
     np.testing.assert_allclose(project(camera, point_m)[0], expected[0], atol=1e-9)
 
 
@@ -417,7 +398,7 @@ def test_a_camera_info_and_its_transform_project_as_the_camera_does(messages, fo
 def test_the_lens_models_of_ros(dist, fisheye, model):
     R, t_m = look_at((3.0, 0.0, 2.0), (0.0, 0.0, 1.0))
     K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=WH, dist=dist, fisheye=fisheye)
+    camera = make_camera(R=R, t_m=t_m, K=K, image_size_wh=IMAGE_SIZE_WH, dist=dist, fisheye=fisheye)
     message = camera_message({}, camera)
     assert (None if message is None else message["distortion_model"]) == model
     if message is not None:
@@ -437,29 +418,27 @@ def test_the_definitions_of_the_messages_are_those_of_ros():
 # What is said, and what is refused
 
 
-def test_export_says_what_is_lost(run_psotrack, flight, tmp_path):
-    result = run_psotrack("export", flight / "tracks.csv", "--to", "kitti", "--out", tmp_path / "kitti")
+def test_export_says_what_is_lost(run_psotrack, tracks_file, tmp_path):
+    result = run_psotrack("export", tracks_file, "--to", "kitti", "--out", tmp_path / "kitti")
     assert result.out == (
-        f"{tmp_path / 'kitti'}: kitti, 2 drones, 50 frames; not in this format: covariances, velocities, status, "
-        "8 positions of lost drones\n"
+        f"{tmp_path / 'kitti'}: kitti, 2 drones, 14 frames; not in this format: covariances, velocities, fitness, "
+        "numbers of cameras, status, 3 positions of lost drones\n"
     )
-    result = run_psotrack("export", flight / "tracks.csv", "--to", "json", "--out", tmp_path / "again.json")
-    assert result.out == f"{tmp_path / 'again.json'}: json, 2 drones, 50 frames\n"
+    result = run_psotrack("export", tracks_file, "--to", "json", "--out", tmp_path / "again.json")
+    assert result.out == f"{tmp_path / 'again.json'}: json, 2 drones, 14 frames\n"
     late = replace(small_tracks(), time_s=small_tracks().time_s + 0.013)
     assert "times" in export_tracks(late, "c3d", tmp_path / "late.c3d")
     assert "times" not in export_tracks(late, "tum", tmp_path / "late")
 
 
-def test_inputs_are_not_replaced_even_with_force_and_images_need_mcap(run_psotrack, flight, tmp_path):
-    tracks, record = shutil.copy(flight / "tracks.csv", tmp_path), tmp_path / "tracks.json"
-    record.write_text("{}", encoding="utf-8")
+def test_inputs_are_not_replaced_even_with_force_and_images_need_mcap(run_psotrack, tracks_file, tmp_path):
     for words, line in (
-        (["csv", "--out", tracks], ["found TRACKS", "another path"]),
-        (["json", "--out", record], ["record of TRACKS"]),
+        (["csv", "--out", tracks_file], ["found TRACKS", "another path"]),
+        (["json", "--out", tmp_path / "tracks.json"], ["record of TRACKS"]),
         (["mcap", "--images"], ["--images", "no SEQ"]),
         (["tum", "--images"], ["--images", "--to tum"]),
     ):
-        command = ("export", tracks, "--to", *words, "--force")
+        command = ("export", tracks_file, "--to", *words, "--force")
         assert_refused(lambda command=command: run_psotrack(*command), *line, unchanged=tmp_path)
 
 

@@ -10,6 +10,7 @@ from helpers import assert_refused, make_once
 from psotrack.foreground.silhouettes import SilhouetteSettings, compute, find_blobs
 from psotrack.recordings import (
     VideoWriter,
+    check_end,
     open_video,
     probe,
     read_detections,
@@ -47,12 +48,13 @@ def overlap(mask: np.ndarray, index: int) -> float:
 
 @pytest.fixture
 def pictures(tmp_path_factory, tmp_path):
-    """A folder of numbered pictures, beside a file that is none."""
+    """A folder of numbered pictures, beside files that are none."""
 
     def make(folder):
         for index in range(FRAMES):
             cv2.imwrite(str(folder / f"frame{index}.png"), picture(index))
         (folder / "notes.txt").write_text("none of the pictures")
+        (folder / "._frame0.png").write_bytes(b"Mac OS X")
 
     return shutil.copytree(make_once(tmp_path_factory, "pictures_of_a_square", make), tmp_path / "left")
 
@@ -84,10 +86,12 @@ def test_pictures_are_the_video_of_a_camera_with_a_rate_or_times(run_psotrack, p
     video = open_recording(folder).videos["left"]
     assert (video.num_frames, video.fps, video.image_size_wh) == (FRAMES, 20.0, (WIDTH, HEIGHT))
     np.testing.assert_array_equal([*read_frames(video, 5)], [picture(index) for index in (0, 5, 10)])
+    check_end(video)
     assert "left" in run_psotrack("init", "--show", folder).out
     (pictures / "frame4.png").unlink()
     write_recording(folder, 'images = "left/*.png"', "fps = 20")
-    open_recording(folder)
+    frames = read_frames(open_recording(folder).videos["left"], 5)
+    np.testing.assert_array_equal([*frames], [picture(index) for index in (0, 6, 11)])
     assert [message.split("left: ")[1] for message in caplog.messages] == [
         "no pictures with the numbers 4: the pictures count as frames without a gap"
     ]

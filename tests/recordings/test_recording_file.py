@@ -123,17 +123,6 @@ def test_the_first_instants_are_as_many_as_asked_for_at_any_rate(folder):
     assert first.at_rate(25.0).num_frames == 2
 
 
-def test_images_are_frames_in_natural_order(folder):
-    (folder / "shots").mkdir()
-    for index in range(12):
-        cv2.imwrite(str(folder / "shots" / f"shot{index}.png"), np.full((48, 64), 20 * index, np.uint8))
-    path = write(folder, camera("left", 'images = "shots/*.png"', "fps = 30", PLACE), RIGHT)
-    video = open_recording(path).videos["left"]
-    assert (video.num_frames, video.fps, video.image_size_wh) == (12, 30.0, (64, 48))
-    assert [int(frame[0, 0, 0]) for frame in read_frames(video)] == [20 * index for index in range(12)]
-    assert [int(frame[0, 0, 0]) for frame in read_frames(video, 5)] == [0, 100, 200]
-
-
 def write_times(folder, times):
     (folder / "times.csv").write_text("frame,time_s\n" + "".join(f"{i},{t}\n" for i, t in enumerate(times)))
 

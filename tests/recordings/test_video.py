@@ -166,33 +166,6 @@ def test_opening_restores_log_levels(tmp_path, monkeypatch):
 # --- folders of pictures
 
 
-@pytest.fixture
-def pictures(tmp_path):
-    """A folder of twelve numbered pictures, beside files that are none."""
-    folder = tmp_path / "left"
-    folder.mkdir()
-    for index, picture in enumerate(noise(12)):
-        cv2.imwrite(str(folder / f"frame{index}.png"), picture)
-    (folder / "Thumbs.db").write_bytes(b"\0\1")
-    (folder / "notes.txt").write_text("none of the pictures")
-    (folder / "._frame0.png").write_bytes(b"Mac OS X")
-    return folder
-
-
-def test_pictures_are_a_video_in_the_order_of_their_numbers(pictures, caplog):
-    video = open_video(pictures, 25.0)
-    assert (video.num_frames, video.fps, video.image_size_wh) == (12, 25.0, (WIDTH, HEIGHT))
-    np.testing.assert_array_equal(list(read_frames(video)), noise(12))
-    np.testing.assert_array_equal(list(read_frames(video, 5)), noise(12)[::5])
-    check_end(video)
-    assert not caplog.records
-    (pictures / "frame4.png").unlink()
-    (pictures / "frame7.png").unlink()
-    assert open_video(pictures, 25.0).num_frames == 10
-    line = "left: no pictures with the numbers 4, 7: the pictures count as frames without a gap"
-    assert line in caplog.text
-
-
 def test_grey_pictures_and_pictures_of_16_bits(tmp_path):
     """10 to 16 bits of a camera become 8; a folder has one depth, whatever the single picture shows."""
     values = noise(1)[0, ..., 0]
