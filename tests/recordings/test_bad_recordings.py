@@ -128,7 +128,6 @@ def five_coefficients(folder):
 
 #: Name of the case -> what happens to the simulated sequence, words of the line; the first ones say where.
 SEQUENCES = {
-    "no such folder": (lambda folder: shutil.rmtree(folder / S), f"{CAMERAS}: expected", "found no such file"),
     "no videos": (remove(f"{S}/*.avi"), "S99_D9: expected videos named like the cameras, cam1i.avi ...", "no .avi"),
     "two videos": (copy(f"{S}/cam1i_s.avi", f"{S}/cam1i.avi"),
                    "cam1i_s.avi: expected one such file per camera, found cam1i.avi as well"),
@@ -526,17 +525,13 @@ OTHERS = {
 }  # fmt: skip
 
 
-def simulated(folder):
-    return read_sequence(folder / S)
-
-
 def real(bodies):
     return lambda folder: read_sequence(folder / R, bodies=bodies)
 
 
 #: Name of the case, what happens to the folder, what is called, words of the line.
 BAD = [
-    *((name, change, simulated, words) for name, (change, *words) in SEQUENCES.items()),
+    *((name, change, opened(S), words) for name, (change, *words) in SEQUENCES.items()),
     *((name, change, real(bodies), words) for name, (change, bodies, *words) in MOTION_CAPTURE.items()),
     *(
         (name, change, lambda folder: read_onboard(folder / S), words)
