@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from helpers import assert_refused, cameras_of, ring_rig, silhouettes_in_memory
+from helpers import assert_refused, cameras_of, ring_rig, silhouettes_in_memory, with_cameras
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -273,6 +273,9 @@ def test_cameras_are_kept_by_name_or_chosen_at_random(tmp_path):
     sequence, silhouettes = perturb(*flown(), Perturbation(), ("c4", "c2"))
     assert sequence.rig.names == silhouettes.cameras == tuple(silhouettes.keys) == ("c4", "c2")
     assert tuple(sequence.videos) == ("c4", "c2")
+    # Not every method needs videos and silhouettes.
+    without = with_cameras(sequence, video=dict.fromkeys(sequence.rig.names))
+    assert perturb(without, None, Perturbation(), ("c2",))[0].rig.names == ("c2",)
     np.testing.assert_array_equal(frames_of(silhouettes), frames_of(flown()[1])[:, [4, 2]])
     for cameras, words in (
         (("c0", "c9"), ("cameras: expected some of c0, ", "found c9")),

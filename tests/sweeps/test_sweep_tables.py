@@ -73,6 +73,8 @@ def test_failed_runs_do_not_count_and_a_single_run_has_no_spread():
     assert table.loc["paper", (20, "runs")] == 2
     assert math.isnan(table.loc["paper", (100, "mean")])
     assert render_table(table).splitlines()[-1].split() == ["paper", "72.0", "±", "2.8", "-"]
+    rows = results({("paper", 20): [0.07], ("ours", 100): [0.04]}).assign(sequence=["S01", "S02"])
+    assert in_mm(rows, ("sequence",), ("method", "particles")).loc["S02", ("paper", 20, "runs")] == 0
     table = in_mm(results({("paper", 20): [0.0712], ("paper", 100): [0.0412]}))
     assert render_table(table) == ("mean_error_mm\n\nparticles    20   100\nmethod\npaper      71.2  41.2\n")
 
