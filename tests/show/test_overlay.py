@@ -118,6 +118,12 @@ def test_the_map_shows_cameras_and_drones_from_above(flight, tmp_path):
         moved_m = (position_m[frame, drone] - position_m[0, 0]) * [1, -1]
         # Centres of discs of eight pixels are known to half a pixel.
         np.testing.assert_allclose(place_px, shown[0, 0] + px_per_m * moved_m, atol=1)
+    # Trails are as long as the flight, and the words about the grid are in the lower left corner.
+    for drone in range(2):
+        column, row = ((shown[0, drone] + shown[LOST_FROM - 1, drone]) / 2).round().astype(int)
+        near = maps[LOST_FROM - 1][row, column - 2 : column + 3] - colour_bgr(drone, Status.TRACKED)
+        assert np.abs(near).mean(axis=1).min() < 60
+    assert maps[0][-40:, :150].max() > 150
     # All cameras are on the map, in its middle, which is known to a pixel, five times the drones' distance away.
     centres_m = np.asarray(flight.recording.rig.cameras.centre_world)[:, :2]
     tips_px = shown[0, 0] + px_per_m * (centres_m - position_m[0, 0]) * [1, -1]
