@@ -157,26 +157,26 @@ def test_a_given_drone_that_is_seen_late_keeps_its_number(max_coasting_std_m):
 def test_one_camera_keeps_a_track_on_its_line_of_sight():
     """Two cameras see a drone on a circle until frame 30, then one of them alone until frame 55."""
     truth_m, pair = circles(1), RIG.select([RIG.names[0], RIG.names[2]])
-    seen = see(pair, truth_m, SPAN_M, jitter=0.02, seed=2, unseen=[np.s_[30:, 0], np.s_[55:]])
-    tracks = track(pair, seen)
-    assert tracks.num_drones == 1
-    alone = slice(30, 55)
-    assert (tracks.status[alone, 0] != Status.TRACKED).all()
-    # The drone flies over a radian of the circle meanwhile.
-    stated = np.isfinite(tracks.position_m[alone, 0]).all(axis=-1)
-    assert stated.all()
-    camera = RIG.cameras[2]
-    drawn, _ = project(camera, tracks.position_m[alone, 0][stated])
-    true, _ = project(camera, truth_m[alone, 0][stated])
-    # Boxes err by 2 % of their sides, which is 1 to 4 pixels; without the camera, the prediction errs by 45 pixels
-    # after half a second.
-    assert np.linalg.norm(drawn - true, axis=-1).max() < 15.0
-    # No position is stated that is vaguer than half a metre, and each is right within its covariance.
-    off_m = truth_m[alone, 0][stated] - tracks.position_m[alone, 0][stated]
-    covariance_m2 = tracks.covariance_m2[alone, 0][stated]
-    assert np.linalg.eigvalsh(covariance_m2)[:, -1].max() <= 0.5**2
-    # 0.1 % of a chi-squared distribution of three degrees of freedom is above 16.3; the rows share one error.
-    assert (np.einsum("fi,fij,fj->f", off_m, np.linalg.inv(covariance_m2), off_m) < 16.3).all()
+    alone, camera = slice(30, 55), RIG.cameras[2]
+    squared = []
+    for seed in range(4):
+        seen = see(pair, truth_m, SPAN_M, jitter=0.02, seed=seed, unseen=[np.s_[30:, 0], np.s_[55:]])
+        tracks = track(pair, seen)
+        assert tracks.num_drones == 1
+        assert (tracks.status[alone, 0] != Status.TRACKED).all()
+        # The drone flies over a radian of the circle meanwhile. Boxes err by 2 % of their sides, which is 1 to 4
+        # pixels; without the camera, the prediction errs by 45 pixels after half a second.
+        drawn, _ = project(camera, tracks.position_m[alone, 0])
+        true, _ = project(camera, truth_m[alone, 0])
+        assert np.linalg.norm(drawn - true, axis=-1).max() < 15.0
+        # No position is stated that is vaguer than half a metre.
+        covariance_m2 = tracks.covariance_m2[alone, 0]
+        assert np.linalg.eigvalsh(covariance_m2)[:, -1].max() <= 0.5**2
+        off_m = truth_m[alone, 0] - tracks.position_m[alone, 0]
+        squared.append(np.einsum("fi,fij,fj->f", off_m, np.linalg.inv(covariance_m2), off_m).mean())
+    # 0.1 % of the means of four chi-squared variables of three degrees of freedom are above 8.2; the rows of one
+    # flight share one error.
+    assert np.mean(squared) < 8.2
     # A smaller limit states the first of these rows only.
     sure = track(pair, seen, line_settings(max_coasting_std_m=0.1))
     stated = np.isfinite(sure.position_m[alone, 0]).all(axis=-1)
@@ -226,22 +226,24 @@ def test_a_part_of_a_drone_that_two_cameras_see_once_is_no_second_drone(seed, be
     assert (tracked.status == Status.TRACKED).all()
 
 
-@pytest.mark.parametrize("seed", [2, 4])
-def test_chance_crossings_of_two_cameras_take_no_detection_from_a_drone(seed):
+def test_chance_crossings_of_two_cameras_take_no_detection_from_a_drone():
     """Each camera misses a fifth of the drones and has three false alarms: lines of two cameras cross everywhere."""
     truth_m = circles(6, frames=25)
-    missed = np.random.default_rng(seed).random((25, len(RIG), 6)) < 0.2
-    tracked = seen_and_tracked(truth_m, jitter=0.05, clutter=3, seed=seed, unseen=[missed])
-    assert tracked.num_drones == 6
-    # Of 150; found in 138 to 141 if all crossings compete for the detections.
-    assert (tracked.status == Status.TRACKED).sum() >= 148
-    # Box centres are off by 25 mm across and 10 mm up. From seven views that gives 13 mm along x and y and 4 mm along
-    # z, 17 mm in total on average; 19 and 43 mm if all crossings compete.
-    errors = evaluate_tracks(tracked, truth_m)
-    assert errors["mean_error_m"] < 0.017
-    assert errors["id_switches"] == 0
+    inside = []
+    for seed in range(3):
+        missed = np.random.default_rng(seed).random((25, len(RIG), 6)) < 0.2
+        tracked = seen_and_tracked(truth_m, jitter=0.05, clutter=3, seed=seed, unseen=[missed])
+        assert tracked.num_drones == 6
+        # Of 150; found in 138 to 141 if all crossings compete for the detections.
+        assert (tracked.status == Status.TRACKED).sum() >= 148
+        # Box centres are off by 25 mm across and 10 mm up. From seven views that gives 13 mm along x and y and 4 mm
+        # along z, 17 mm in total on average; 19 and 43 mm if all crossings compete.
+        errors = evaluate_tracks(tracked, truth_m)
+        assert errors["mean_error_m"] < 0.017
+        assert errors["id_switches"] == 0
+        inside.append(errors["inside_90_rate"])
     # The covariances assume lasting errors, but the errors of this detector are independent.
-    assert 0.85 < errors["inside_90_rate"] <= 1.0
+    assert 0.85 < np.mean(inside) <= 1.0
 
 
 # --- boxes of several drones that are split
@@ -494,7 +496,7 @@ def test_two_cameras_begin_a_track_where_there_is_no_third():
 def test_two_cameras_keep_a_track_that_three_began_and_begin_one_late_that_a_third_should_see():
     rig, truth_m = ground_rig(3), flights(50, (4.0,))
     volume = flight_volume(rig, None, bounds_m=(-20.0, 20.0, -20.0, 20.0, 0.0, 30.0))
-    three, two = (see_all(rig, truth_m, seed=1, unseen=hidden) for hidden in ((), [np.s_[:, 2]]))
+    three, two = (see_all(rig, truth_m, unseen=hidden) for hidden in ((), [np.s_[:, 2]]))
     kept = track_in(rig, joined(three[:12], two[12:], axis=0), volume)
     assert kept.num_drones == 1
     assert (kept.status[:, 0] == Status.TRACKED).all()
