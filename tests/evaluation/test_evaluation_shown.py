@@ -1,5 +1,6 @@
 """Offsets of tracked points, and tables and plots of an evaluation: they show its numbers, and fit in a terminal."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,8 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from clock_worlds import FPS, LATE_S, make_late_videos
 from evaluation_flights import NUM_FRAMES, ROUNDING, on_x_axis
 from evaluation_flights import circling_flights as flights
+from helpers import make_once
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
@@ -225,6 +228,24 @@ class TestPictures:
             colour = np.round(np.array(to_rgb(drone_colour(drone))) * 255)
             # Lines are a few hundred pixels long; a line behind the line of its reference still has visible edges.
             assert (np.abs(rgb - colour).max(axis=1) <= 2).sum() > 100
+
+
+def test_the_clock_of_the_reference_is_searched_or_given(run_psotrack, tmp_path_factory):
+    root = make_once(tmp_path_factory, "late_videos", make_late_videos)
+    words = ("evaluate", root / "tracks.csv", root / "Real_Data" / "R12_D2", "--json", "-", "--offset")
+    late, auto, given = (
+        json.loads(run_psotrack(*each).out) for each in (words[:-1], (*words, "auto"), (*words, LATE_S))
+    )
+    assert "reference_offset_s" not in late
+    assert given["reference_offset_s"] == LATE_S
+    assert auto["reference_offset_s"] == pytest.approx(LATE_S, abs=0.1 / FPS)
+    # Drones at about 1 m/s fly 0.4 m in this time. The tracks have a noise of 1 cm along each axis.
+    assert late["offset_removed_mean_error_m"] > 0.2
+    for errors in (auto, given):
+        assert (errors["id_switches"], errors["missed_rate"]) == (0, 0.0)
+        assert errors["offset_removed_mean_error_m"] < 0.02
+    refused = run_psotrack(*words, "soon")
+    assert "expected a number of seconds, or auto, found 'soon'" in refused.err
 
 
 def test_importing_loads_neither_pandas_nor_matplotlib_and_drawing_no_pyplot(tmp_path):

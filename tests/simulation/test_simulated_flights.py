@@ -248,9 +248,10 @@ def test_drones_of_one_group_keep_their_spacing_on_an_orbit(seed, frames):
 def test_a_group_shares_its_variation_but_no_headings():
     alone = circling(0.0, 120.0, num_frames=9000)
     assert np.ptp(pairwise_distances_m(positions(alone, 0, stride=10))) > 0.5
-    first, other = plan(circling(0.0, 120.0, group="ring"), 0)
-    assert first.heading.yaw_rad != other.heading.yaw_rad
-    assert first.heading.phase_rad != other.heading.phase_rad
+    headings = [flight.heading for flight in plan(circling(*range(0, 360, 45), group="ring"), 0)]
+    yaws_rad = [heading.yaw_rad for heading in headings]
+    assert min(yaws_rad) < 0 < max(yaws_rad)
+    assert len(set(yaws_rad)) == len({heading.phase_rad for heading in headings}) == 8
     # Kinds of flights may differ within a group.
     line = Crossing(start_m=(-1.0, 0.0, 1.0), end_m=(1.0, 0.0, 1.0), period_s=6.3)
     orbit, crossing = plan(make_scenario(ORBIT, line, groups=("a", "a"), variation=Variation()), 1)
