@@ -1,8 +1,9 @@
 """Files of rigs, ours and those of other programs: each is projected by a formula of its own; and what is refused."""
 
 import contextlib
-import re
+import shutil
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,30 +11,6 @@ import pytest
 from helpers import assert_refused, assert_same, ring_rig
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from rig_texts import (
-    ANIPOSE,
-    CALISCOPE,
-    OLDER_CALISCOPE,
-    RADTAN,
-    RIG_TOML,
-    SIZE_WH,
-    K,
-    dlt_columns,
-    dlt_file,
-    easymocap_files,
-    handpose_files,
-    json_file,
-    kalibr_file,
-    matrix,
-    pose2sim_file,
-    poses,
-    qualisys_file,
-    ros_text,
-    sample_text,
-    storage_files,
-    vicon_file,
-    with_skew,
-)
 from scipy.spatial.transform import Rotation
 
 from psotrack.errors import InputError
@@ -42,19 +19,47 @@ from psotrack.geometry.rig_files import KEYS, RIG_FORMATS, read_lenses, read_rig
 from psotrack.geometry.rig_files.vicon import fit_distortion
 from psotrack.recordings import CameraTable
 
+#: Files of other programs, which have the cameras of `poses`, and those that each program reads with it.
+SOUND = Path(__file__).parents[1] / "data" / "formats"
+CENTRES_M = ((4.0, 0.5, 2.0), (-3.5, 1.0, 2.4))
+K = np.array([[900.0, 0.0, 650.5], [0.0, 905.0, 350.25], [0.0, 0.0, 1.0]])
+SIZE_WH = (1280, 720)
+RADTAN = (-0.12, 0.03, 0.0008, -0.0005)
 #: Points in front of all cameras of `poses`, metres.
 POINTS_M = np.array([[0.3, -0.2, 0.9], [-0.4, 0.5, 1.4], [0.0, 0.1, 0.2], [1.1, 0.8, 1.9]])
+#: File as a user writes it by hand.
+RIG_TOML = """[cameras.left]
+size = [1920, 1080]
+K = [[1160.2, 0, 961.0], [0, 1160.9, 541.2], [0, 0, 1]]
+distortion = [-0.28, 0.09, 0, 0, 0.01]
+rvec = [1.2, -0.4, 0.3]
+tvec = [0.1, 0.2, 5.0]
+"""
 UNIT = {"metres_per_unit": 1.0}
+SIZE = {"image_size_wh": SIZE_WH}
 
 
-def writes(text):
-    """A function that writes this text to a path."""
-    return lambda path: path.write_text(text, encoding="utf-8")
+def poses():
+    """Rotation and translation of each camera, world to camera, metres."""
+    return [look_at(centre, (0.0, 0.0, 1.0)) for centre in CENTRES_M]
 
 
-def fills(write, **options):
-    """A function that writes the files of a program beside a path."""
-    return lambda path: write(path.parent, **options)
+def with_skew(skew):
+    skewed = K.copy()
+    skewed[0, 1] = skew
+    return skewed
+
+
+def copied(folder, file, *changes):
+    """Path of a copy of a file of `SOUND`, and those beside it, with other texts in it, pairs of before and after."""
+    shutil.copytree((SOUND / file).parent, folder, dirs_exist_ok=True)
+    path = folder / Path(file).name
+    text = path.read_text(encoding="utf-8")
+    for before, after in changes:
+        assert before in text, before
+        text = text.replace(before, after)
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def by_opencv(R, t_m, K, dist, *, fisheye=False):
@@ -108,17 +113,6 @@ def test_a_rig_is_read_as_it_was_written(tmp_path, file):
         np.testing.assert_array_equal(stored, rig.cameras.dist)
 
 
-def test_a_rig_in_the_datasets_layout_is_read_as_it_was_written(tmp_path):
-    one_focal = K * [[1.0, 1.0, 1.0], [1.0, 900.0 / 905.0, 1.0], [1.0, 1.0, 1.0]]
-    R, t_m = poses()[0]
-    rig = make_rig({"cam1i": make_camera(R=R, t_m=t_m, K=one_focal, image_size_wh=SIZE_WH, dist=RADTAN)})
-    write_rig(tmp_path / "rig.csv", rig)
-    back = read_rig(tmp_path / "rig.csv", SIZE_WH)
-    assert back.names == rig.names
-    # Rotations are stored as Rodrigues vectors.
-    assert_same(back.cameras, rig.cameras, atol=2e-15)
-
-
 def test_opencv_reads_a_written_rig(tmp_path):
     rig = ring_rig(3, coefficients=5)
     write_rig(tmp_path / "rig.yml", rig)
@@ -140,38 +134,30 @@ def test_the_cameras_of_a_recording_are_a_rig(tmp_path):
 
 # Files of other programs.
 
-#: File to read, what writes it, arguments of the reader, names of the cameras.
+EQUIDISTANT = ("radtan", "equidistant")
+#: File to read, a change of it, arguments of the reader, names of the cameras.
 FORMATS = [
-    ("calibration.toml", writes(ANIPOSE), UNIT, ("c0", "c1")),
-    ("camera_array.toml", writes(CALISCOPE), {}, ("0", "1")),
-    ("config.toml", writes(OLDER_CALISCOPE), {}, ("0", "1")),
-    ("Calib_board.toml", pose2sim_file, {}, ("cam01", "int_cam02_img")),
-    *(
-        (name, fills(storage_files), {"image_size_wh": SIZE_WH} | UNIT, ("cam1", "cam2"))
-        for name in ("intrinsics.yml", "extrinsics.yml", "extrinsics.xml")
-    ),
-    ("rig.json", fills(json_file), UNIT, ("6-0", "left")),
-    ("session.qca.txt", qualisys_file, {}, ("26578", "26579")),
-    ("intri.yml", fills(easymocap_files), {}, ("1", "07")),
-    (
-        "extri.yml",
-        fills(easymocap_files, rodrigues=False, size=False),
-        {"image_size_wh": SIZE_WH},
-        ("1", "07"),
-    ),
-    ("camchain.yaml", kalibr_file, {}, ("cam0", "cam1")),
-    ("fisheye.yaml", partial(kalibr_file, distortion_model="equidistant"), {}, ("cam0", "cam1")),
-    *(
-        (name, fills(handpose_files), {"image_size_wh": SIZE_WH} | UNIT, ("cam0", "cam1"))
-        for name in ("c0.dat", "rot_trans_c1.dat")
-    ),
+    ("rigs/calibration.toml", (), UNIT, ("c0", "c1")),
+    ("rigs/camera_array.toml", (), {}, ("0", "1")),
+    ("rigs/config.toml", (), {}, ("0", "1")),
+    ("pose2sim/calib.toml", (), {}, ("cam01", "int_cam02_img")),
+    ("opencv-stereo/intrinsics.yml", (), SIZE | UNIT, ("cam1", "cam2")),
+    ("opencv-stereo/extrinsics.yml", (), SIZE | UNIT, ("cam1", "cam2")),
+    ("opencv-stereo/extrinsics.xml", (), SIZE | UNIT, ("cam1", "cam2")),
+    ("opencv-json/rig.json", (), UNIT, ("6-0", "left")),
+    ("qualisys/a.qca.txt", (), {}, ("26578", "26579")),
+    ("easymocap/intri.yml", (), {}, ("1", "07")),
+    ("easymocap-matrices/extri.yml", (), SIZE, ("1", "07")),
+    ("kalibr/camchain.yaml", (), {}, ("cam0", "cam1")),
+    ("kalibr/camchain.yaml", (EQUIDISTANT,), {}, ("cam0", "cam1")),
+    ("handpose/c0.dat", (), SIZE | UNIT, ("cam0", "cam1")),
+    ("handpose/rot_trans_c1.dat", (), SIZE | UNIT, ("cam0", "cam1")),
 ]
 
 
-@pytest.mark.parametrize(("file", "write", "options", "names"), FORMATS)
-def test_cameras_project_as_opencv_does(tmp_path, file, write, options, names):
-    write(tmp_path / file)
-    rig = read_rig(tmp_path / file, **options)
+@pytest.mark.parametrize(("file", "changes", "options", "names"), FORMATS)
+def test_cameras_project_as_opencv_does(tmp_path, file, changes, options, names):
+    rig = read_rig(copied(tmp_path, file, *changes), **options)
     assert rig.names == names
     assert rig.cameras.image_size_wh.tolist() == [[1280, 720]] * 2
     R1, t1 = poses()[0]
@@ -179,36 +165,25 @@ def test_cameras_project_as_opencv_does(tmp_path, file, write, options, names):
     is_first = names in (("cam1", "cam2"), ("cam0", "cam1")) and not file.endswith(".dat")
     points_m = POINTS_M @ R1.T + t1 if is_first else POINTS_M
     for index, (R, t) in enumerate(poses()):
-        expected = by_opencv(R, t, K, RADTAN, fisheye=file == "fisheye.yaml")
+        expected = by_opencv(R, t, K, RADTAN, fisheye=bool(changes))
         np.testing.assert_allclose(project(rig.cameras[index], points_m)[0], expected, rtol=0, atol=1e-6)
 
 
-def write_unplaced(path):
-    R, t_m = np.eye(3), np.zeros(3)
-    lens = make_camera(R=R, t_m=t_m, K=K, image_size_wh=SIZE_WH, dist=RADTAN)
-    write_rig(path, make_rig({"a": lens, "b": lens}), placed=False)
-
-
-def write_stereo_lenses(path):
-    storage_files(path.parent)
-    (path.parent / "extrinsics.yml").unlink()
-
-
 ARGUS = f"900 1280 720 650.5 350.25 {905 / 900!r} -0.12 0.03 0.0008 -0.0005 0\n"
-#: File of lenses alone, what writes it, and the names of the cameras.
+ROS = (SOUND / "ros/head.yaml").read_text()
+#: File of lenses alone, its text, and the names of the cameras.
 LENSES = [
-    ("lenses.toml", write_unplaced, ("a", "b")),
-    ("left.yml", writes(sample_text()), ("left",)),
-    ("head.yaml", writes(ros_text()), ("head_camera",)),
-    ("wide.yaml", writes(ros_text("equidistant")), ("head_camera",)),
-    ("cameras-profile.txt", writes(f"1 {ARGUS}2 {ARGUS}"), ("cam1", "cam2")),
-    ("intrinsics.yml", write_stereo_lenses, ("cam1", "cam2")),
+    ("left.yml", (SOUND / "rigs/left.yml").read_text(), ("left",)),
+    ("head.yaml", ROS, ("head_camera",)),
+    ("wide.yaml", ROS.replace("plumb_bob", "equidistant"), ("head_camera",)),
+    ("cameras-profile.txt", f"1 {ARGUS}2 {ARGUS}", ("cam1", "cam2")),
+    ("intrinsics.yml", (SOUND / "opencv-stereo/intrinsics.yml").read_text(), ("cam1", "cam2")),
 ]
 
 
-@pytest.mark.parametrize(("file", "write", "names"), LENSES)
-def test_files_of_lenses_without_poses(tmp_path, file, write, names):
-    write(tmp_path / file)
+@pytest.mark.parametrize(("file", "text", "names"), LENSES)
+def test_files_of_lenses_without_poses(tmp_path, file, text, names):
+    (tmp_path / file).write_text(text)
     size_wh = SIZE_WH if file == "intrinsics.yml" else None
     lenses = read_lenses(tmp_path / file, size_wh)
     assert lenses.names == names
@@ -224,8 +199,6 @@ def test_files_of_lenses_without_poses(tmp_path, file, write, names):
         read_rig(tmp_path / file, size_wh)
 
 
-VIDEO = 'TYPE="VideoInputDevice:Blackfly"'
-LONE = '<Camera DEVICEID="9" SENSOR_SIZE="1280 720"/></Cameras>'
 UNPLACED = RIG_TOML.replace("left", "right").partition("rvec")[0]
 IGNORED = "[cameras.2]\nport = 2\nignore = true\nsize = [640, 480]\n"
 NULL_POSE = """[cameras.3]
@@ -238,42 +211,38 @@ rotation = "null"
 """
 
 
-def without_video(path, *, first, second=VIDEO, more="</Cameras>"):
-    """Vicon's file, with other types of its two cameras, and more cameras."""
-    vicon_file(path, 'VICON_RADIAL="0 0"')
-    types = iter((first, second))
-    text = re.sub(VIDEO, lambda _: next(types), path.read_text())
-    path.write_text(text.replace("</Cameras>", more))
-
-
-UNCALIBRATED = {"change": ('serial="26578"', 'calibrated="false" serial="26578"')}
-VANTAGE = partial(without_video, first='TYPE="VantageV5"')
-UNTYPED = partial(without_video, first='TYPE=""', second='TYPE=""', more=LONE)
-#: File, what writes it, the cameras of the rig, those with a lens but no pose, and words of the warning.
+LONE = ("</Cameras>", '<Camera DEVICEID="9" SENSOR_SIZE="1280 720"/></Cameras>')
+UNTYPED = ('TYPE="VideoInputDevice:Blackfly"', 'TYPE=""')
+VANTAGE = ("</Cameras>", '<Camera DEVICEID="9" TYPE="VantageV5" SENSOR_SIZE="1280 720"/></Cameras>')
+UNCALIBRATED = ('serial="26578"', 'calibrated="false" serial="26578"')
+NO_CHAIN = ("T_cn_cnm1", "T_other")
+MORE = ("[cameras.1]", IGNORED + NULL_POSE + "[cameras.1]")
+BESIDE = ("[cameras.c0]", UNPLACED + "[cameras.c0]")
+#: File, changes of it, the cameras of the rig, those with a lens but no pose, and words of the warning.
 LEFT_OUT = [
-    ("rig.toml", writes(RIG_TOML + UNPLACED), {"left"}, {"right"}, "no pose: camera right"),
-    ("camera_array.toml", writes(CALISCOPE + IGNORED + NULL_POSE), {"0", "1"}, {"3"}, "no pose: camera 3"),
-    ("a.qca.txt", partial(qualisys_file, **UNCALIBRATED), {"26579"}, {"26578"}, "no pose: camera 26578"),
-    ("extri.yml", fills(easymocap_files), {"1", "07"}, {"9"}, "no pose: camera 9"),
-    ("camchain.yaml", partial(kalibr_file, chain=False), {"cam0"}, {"cam1"}, "no pose: camera cam1"),
-    ("session.xcp", VANTAGE, {"2122"}, set(), "1 cameras that record no video are left out"),
-    ("session.xcp", UNTYPED, {"2121", "2122"}, set(), "no lens: camera 9"),
+    ("rig.toml/rig.toml", [BESIDE], {"c0", "c1"}, {"right"}, "no pose: camera right"),
+    ("rigs/camera_array.toml", [MORE], {"0", "1"}, {"3"}, "no pose: camera 3"),
+    ("qualisys/a.qca.txt", [UNCALIBRATED], {"26579"}, {"26578"}, "no pose: camera 26578"),
+    ("easymocap/extri.yml", [], {"1", "07"}, {"9"}, "no pose: camera 9"),
+    ("kalibr/camchain.yaml", [NO_CHAIN], {"cam0"}, {"cam1"}, "no pose: camera cam1"),
+    ("vicon/a.xcp", [VANTAGE], {"2121", "2122"}, set(), "1 cameras that record no video are left out"),
+    ("vicon/a.xcp", [UNTYPED, LONE], {"2121", "2122"}, set(), "no lens: camera 9"),
 ]
 
 
-@pytest.mark.parametrize(("file", "write", "placed", "others", "words"), LEFT_OUT)
-def test_cameras_without_a_pose_or_a_lens_are_left_out(tmp_path, caplog, file, write, placed, others, words):
-    write(tmp_path / file)
+@pytest.mark.parametrize(("file", "changes", "placed", "others", "words"), LEFT_OUT)
+def test_cameras_without_a_pose_or_a_lens_are_left_out(
+    tmp_path, caplog, file, changes, placed, others, words
+):
+    path = copied(tmp_path, file, *changes)
     with caplog.at_level("WARNING"):
-        assert set(read_rig(tmp_path / file).names) == placed
+        assert set(read_rig(path).names) == placed
     assert words in caplog.text
-    assert set(read_lenses(tmp_path / file).names) == placed | others
+    assert set(read_lenses(path).names) == placed | others
 
 
 def test_a_file_of_pose2sim_is_no_file_of_another_program(tmp_path):
-    path = tmp_path / "Calib_board.toml"
-    pose2sim_file(path)
-    readable = set()
+    path, readable = SOUND / "pose2sim/calib.toml", set()
     for entry in RIG_FORMATS:
         with contextlib.suppress(InputError):
             read_rig(path, SIZE_WH, metres_per_unit=1.0, file_format=entry)
@@ -282,13 +251,16 @@ def test_a_file_of_pose2sim_is_no_file_of_another_program(tmp_path):
 
 
 def test_a_unit_that_a_format_leaves_open_may_be_in_the_file(tmp_path, caplog):
-    path = tmp_path / "calibration.toml"
-    path.write_text(ANIPOSE.replace("adjusted", 'unit = "cm"\nadjusted'))
+    path = copied(tmp_path, "rigs/calibration.toml", ("adjusted", 'unit = "cm"\nadjusted'))
     stated = read_rig(path).cameras.T_cam_world[:, :3, 3]
     np.testing.assert_allclose(stated, [0.01 * t for _, t in poses()], atol=1e-15)
     other = read_rig(path, metres_per_unit=1e-3).cameras.T_cam_world[:, :3, 3]
     np.testing.assert_allclose(other, 0.1 * stated, atol=1e-15)
     assert "in units of 0.01 m by the file, and are read in units of 0.001 m" in caplog.text
+
+
+VICON_RADIAL = 'VICON_RADIAL2="ViconRadial2 650.5 350.25 0.06 -0.01"'
+VICON_TURN = "0.5212659870236002 0.5904808412286389 -0.46189797946789407 0.4077553230525724"
 
 
 @pytest.mark.parametrize(
@@ -301,9 +273,7 @@ def test_a_unit_that_a_format_leaves_open_may_be_in_the_file(tmp_path, caplog):
     ],
 )
 def test_a_calibration_of_vicon(tmp_path, radial, centre_px, per_focal):
-    path = tmp_path / "session.xcp"
-    vicon_file(path, radial)
-    rig = read_rig(path)
+    rig = read_rig(copied(tmp_path, "vicon/a.xcp", (VICON_RADIAL, radial)))
     assert rig.names == ("2121", "2122")
     for index, (R, t) in enumerate(poses()):
         pixels = project(rig.cameras[index], POINTS_M)[0]
@@ -317,20 +287,12 @@ def test_a_calibration_of_vicon(tmp_path, radial, centre_px, per_focal):
         np.testing.assert_allclose(centre_px + arm * gain * scale, straight, rtol=0, atol=0.1)
 
 
-def with_quaternion(path, turn):
-    """Vicon's file, in which both cameras have this quaternion."""
-    vicon_file(path, 'VICON_RADIAL="0 0"')
-    stated = f'ORIENTATION="{" ".join(map(str, turn))}"'
-    path.write_text(re.sub('ORIENTATION="[^"]*"', stated, path.read_text()))
-
-
 def test_a_quaternion_that_was_rounded_is_one(tmp_path):
     """One tolerance for all files: two decimals change the length by up to 1 %."""
     # The length is 0.9983.
-    turn = [0.34, 0.35, 0.72, 0.49]
-    with_quaternion(tmp_path / "session.xcp", turn)
-    expected = Rotation.from_quat(turn).as_matrix()
-    found = read_rig(tmp_path / "session.xcp").cameras.T_cam_world[0, :3, :3]
+    path = copied(tmp_path, "vicon/a.xcp", (VICON_TURN, "0.34 0.35 0.72 0.49"))
+    expected = Rotation.from_quat([0.34, 0.35, 0.72, 0.49]).as_matrix()
+    found = read_rig(path).cameras.T_cam_world[0, :3, :3]
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -355,10 +317,10 @@ def test_the_fit_to_vicons_lens_reaches_the_error_that_it_states(k1, k2, shift):
 
 
 def test_easymocaps_rodrigues_vectors_count_and_sizes_of_zero_are_not_known(tmp_path):
-    easymocap_files(tmp_path)
-    inside, outside = tmp_path / "intri.yml", tmp_path / "extri.yml"
-    wrong = "".join(matrix(f"Rot_{name}", np.eye(3)) for name in ("1", "07"))
-    outside.write_text(outside.read_text() + wrong)
+    outside = copied(tmp_path, "easymocap/extri.yml")
+    inside, eye = tmp_path / "intri.yml", "[1.0, 0, 0, 0, 1, 0, 0, 0, 1]"
+    wrong = f"Rot_1: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: {eye}\n"
+    outside.write_text(outside.read_text() + wrong + wrong.replace("Rot_1", "Rot_07"))
     expected = read_rig(outside).cameras
     np.testing.assert_allclose(expected.T_cam_world[1, :3, :3], poses()[1][0], rtol=0, atol=1e-12)
     inside.write_text(inside.read_text().replace(": 720", ": -1").replace(": 1280", ": -1"))
@@ -370,9 +332,11 @@ def test_easymocaps_rodrigues_vectors_count_and_sizes_of_zero_are_not_known(tmp_
 def test_dlt_coefficients(tmp_path, upwards, separator):
     """The third camera has the world's origin behind it, and is turned round; a table may have a header."""
     behind = look_at((1.0, 0.0, 0.5), (3.0, 0.2, 0.7))
-    columns = dlt_columns([*poses(), behind], upwards=upwards, skew=0.5)
+    flip = np.array([[1.0, 0, 0], [0, -1, SIZE_WH[1]], [0, 0, 1]]) if upwards else np.eye(3)
+    rows = np.array([flip @ with_skew(0.5) @ np.column_stack(pose) for pose in (*poses(), behind)])
+    columns = (rows / rows[:, 2:, 3:]).reshape(3, 12)[:, :11]
     path = tmp_path / "dltcoefs.csv"
-    dlt_file(path, columns, separator)
+    path.write_text("\n".join(separator.join(map(repr, row)) for row in columns.T.tolist()))
     rig = read_rig(path, SIZE_WH, metres_per_unit=1.0)
     assert rig.names == ("cam1", "cam2", "cam3")
     np.testing.assert_allclose(rig.cameras.K, [with_skew(0.5)] * 3, rtol=0, atol=1e-7)
@@ -391,31 +355,27 @@ def test_dlt_coefficients(tmp_path, upwards, separator):
 # What is refused.
 
 
-def reads(file, write, size_wh=None, **options):
-    """A file, of this text or of a function that writes it, is read."""
+def reads(file, text, size_wh=None, **options):
+    """A file of this text is read."""
 
     def prepare(folder):
-        (writes(write) if isinstance(write, str) else write)(folder / file)
+        (folder / file).write_text(text)
         return partial(read_rig, folder / file, size_wh, **options)
 
     return prepare
 
 
-def changed(text, before, after):
-    return reads("x.toml", text.replace(before, after, 1))
+def changed(file, before="", after="", **options):
+    """A sound file, with another text in it or as it is, is read."""
+    return lambda folder: partial(read_rig, copied(folder, file, (before, after)), **options)
 
 
-def qualisys(before, after):
-    return reads("session.qca.txt", partial(qualisys_file, change=(before, after)))
-
-
-def kalibr(**models):
-    return reads("camchain.yaml", partial(kalibr_file, **models))
-
-
-def dlt(rows=None, size_wh=SIZE_WH, unit_m=None):
-    text = "\n".join(rows) if rows else partial(dlt_file, columns=dlt_columns())
-    return reads("dlt.csv", text, size_wh, metres_per_unit=unit_m)
+own = partial(changed, "rig.toml/rig.toml")
+anipose = partial(changed, "rigs/calibration.toml")
+qualisys = partial(changed, "qualisys/a.qca.txt")
+kalibr = partial(changed, "kalibr/camchain.yaml")
+vicon = partial(changed, "vicon/a.xcp")
+dlt = partial(changed, "dlt/dlt.csv")
 
 
 def makes(**fields):
@@ -432,66 +392,64 @@ def writes_rig(file, **options):
     return lambda folder: partial(write_rig, folder / file, RIG, **options)
 
 
-def reads_without_lenses(folder):
-    easymocap_files(folder)
-    (folder / "intri.yml").unlink()
-    return partial(read_rig, folder / "extri.yml")
-
-
 RIG, PIXELS = ring_rig(3), np.full((2, 3, 2), 100.0)
-FISHEYE = ANIPOSE.replace('"c0"', '"c0"\nfisheye = true')
-BENT = partial(vicon_file, radial='VICON_RADIAL2="ViconRadial2 650.5 350.25 -1.5 0"')
-LONG = partial(with_quaternion, turn=(0.44, 0.35, 0.72, 0.49))
 CUT_YAML = "cameras:\n   - a\n     b\n   K: {\n"
-NO_NAME, TWO_OF_K = "cameras:\n   - { K: [1, 2] }\n", "cameras:\n   - { name: c, K: [1, 2] }\n"
+NO_NAME = "cameras:\n   - { K: [1, 2] }\n"
+EXTRI = (SOUND / "easymocap/extri.yml").read_text()
+FISHEYE_OF_8 = "fisheye = true\ndistortions = [1, 1, 1, 1, -0.12, 0.03, 0.0008, -0.0005]"
+DISTORTED = "distortions = [-0.12, 0.03, 0.0008, -0.0005]"
 ENTITY = '<!DOCTYPE x [<!ENTITY a "b">]><calibration>'
 #: Name of the case -> how the bad input is made, and words of the line.
 BAD = {
     # Our own files.
-    "misspelt": (changed(RIG_TOML, "size", "szie"), "x.toml", "left.szie: expected one of", "mean size?"),
-    "version": (changed(RIG_TOML, "[cam", "version = 2\n[cam"), "version: expected 1, found 2; use a newer"),
-    "model": (changed(RIG_TOML, "rv", 'model = "omni"\nrv'), "left.model: expected opencv or", "found omni"),
-    "no tvec": (changed(RIG_TOML, "tvec = [0.1, 0.2, 5.0]", ""), "left.tvec: expected 3 numbers, as for rve"),
-    "no size": (changed(RIG_TOML, "size = [1920, 1080]", ""), "left.size or image_size: ", "pass --size"),
+    "misspelt": (own("size", "szie"), "rig.toml", "c0.szie: expected one of", "mean size?"),
+    "version": (own("version = 1", "version = 2"), "version: expected 1, found 2; use a newer"),
+    "model": (own('"opencv"', '"omni"'), "c0.model: expected opencv or", "found omni"),
+    "no tvec": (reads("x.toml", RIG_TOML.partition("tvec")[0]), "left.tvec: expected 3 numbers, as for rve"),
+    "no size": (own("size = [320, 240]", ""), "c0.size or image_size: ", "pass --size"),
     "gone": (lambda folder: partial(read_rig, folder / "no.toml"), "no.toml: expected a file to read"),
-    "csv gone": (lambda folder: partial(read_rig, folder / "no.csv", (9, 9)), "expected a file to read"),
     # Texts of other programs.
-    "no matrix": (changed(ANIPOSE, "matrix", "matrx"), "cam_0.matrix or K or camera_matrix", "found none"),
-    "two rows": (changed(ANIPOSE, ", [0.0, 0.0, 1.0]]", "]"), "expected 3 x 3 numbers, found 2 x 3"),
-    "half a pixel": (changed(ANIPOSE, "1280,", "1280.5,"), "cam_0.size: expected whole numbers"),
-    "below 0": (changed(ANIPOSE, "[[900.0", "[[-900.0"), "cam_0.matrix: expected intrinsics"),
-    "nan": (changed(ANIPOSE, "[[900.0", "[[nan"), "cam_0.matrix: expected finite numbers"),
-    "a word": (changed(ANIPOSE, "[[900.0", '[["f"'), "cam_0.matrix: expected 3 x 3 numbers"),
-    "lens of 3": (changed(ANIPOSE, "[-0.12,", "["), "distortions: expected 0, 4, 5, 8, 12, 14", "found 3"),
-    "rotation": (changed(ANIPOSE, "rotation = [", "rotation = [1.0, "), "expected 3 numbers or 3 x 3 numb"),
-    "name twice": (changed(ANIPOSE, '"c1"', '"c0"'), "cam_1: expected each camera once, found c0 again"),
-    "lens of 8": (changed(FISHEYE, "[-0.12", "[1, 1, 1, 1, -0.12"), "4 coefficients of a fisheye, found 8"),
-    "no unit": (reads("x.toml", ANIPOSE), "unit of lengths, found none", "leaves it open", "mm: --units"),
-    "unit": (changed(ANIPOSE, "adj", 'unit = "ft"\nadj'), "metadata.unit: expected one of m, cm, mm, found"),
+    "no matrix": (anipose("matrix", "matrx"), "cam_0.matrix or K or camera_matrix", "found none"),
+    "two rows": (anipose(", [0.0, 0.0, 1.0]]", "]"), "expected 3 x 3 numbers, found 2 x 3"),
+    "half a pixel": (anipose("1280,", "1280.5,"), "cam_0.size: expected whole numbers"),
+    "below 0": (anipose("[[900.0", "[[-900.0"), "cam_0.matrix: expected intrinsics"),
+    "nan": (anipose("[[900.0", "[[nan"), "cam_0.matrix: expected finite numbers"),
+    "a word": (anipose("[[900.0", '[["f"'), "cam_0.matrix: expected 3 x 3 numbers"),
+    "lens of 3": (anipose("[-0.12,", "["), "distortions: expected 0, 4, 5, 8, 12, 14", "found 3"),
+    "rotation": (anipose("rotation = [", "rotation = [1.0, "), "expected 3 numbers or 3 x 3 numb"),
+    "name twice": (anipose('"c1"', '"c0"'), "cam_1: expected each camera once, found c0 again"),
+    "lens of 8": (anipose(DISTORTED, FISHEYE_OF_8), "4 coefficients of a fisheye, found 8"),
+    "no unit": (anipose(), "unit of lengths, found none", "leaves it open", "mm: --units"),
+    "unit": (anipose("adj", 'unit = "ft"\nadj'), "metadata.unit: expected one of m, cm, mm, found"),
     "TOML": (reads("x.toml", "[cam_0\n"), "x.toml, line 1: expected valid TOML"),
     "no camera": (reads("x.toml", ""), "at least one camera, found none"),
-    "JSON": (
-        reads("x.json", "{}"),
-        "camera.matrix or K or camera_matrix: expected 3 x 3 numbers, found none",
-    ),
+    "JSON": (reads("x.json", "{}"), "camera.matrix or K or camera_matrix: expected 3 x 3 numbers, found no"),
     "YAML": (reads("x.yml", CUT_YAML), "line ", "expected valid YAML or JSON, found an error"),
     "no name": (reads("x.yml", NO_NAME), "cameras[0].name: expected a name, found none"),
-    "two of nine": (reads("x.yml", TWO_OF_K), "cameras[0].K: expected 3 x 3 numbers, found 2"),
     "unknown": (reads("x.dat", "1 2"), "x.dat: expected a rig file of a known format, found other content"),
     "CSV": (reads("x.csv", "cam_name\n", SIZE_WH), "x.csv, line 1"),
-    "size of DLT": (dlt(size_wh=None), "camera cam1", "pass --size"),
-    "unit of DLT": (dlt(), "because the file leaves it open; state m or cm or mm"),
-    "nan in DLT": (dlt(["1,2"] * 10 + ["nan,1"], unit_m=1.0), "cam1.coefficients: expected finite numbers"),
-    "no DLT": (dlt(["1,2"] * 11, unit_m=1.0), "the coefficients of a camera, found a determinant of 0"),
+    "size of DLT": (dlt(), "camera cam1", "pass --size"),
+    "unit of DLT": (
+        dlt(**SIZE),
+        "the file leaves it open; state m or cm or mm",
+    ),
+    "nan in DLT": (dlt("650.5,650.5", "nan,1", **SIZE, **UNIT), "cam1.coefficients: expected finite numbers"),
+    "no DLT": (reads("dlt.csv", "1,2\n" * 11, SIZE_WH, **UNIT), "of a camera, found a determinant of 0"),
     "r12": (qualisys(' r12="', ' r12="3" q="'), "camera 26578, transform.r11 to r33: expected a rotation"),
     "no x": (qualisys(' x="', ' q="'), "camera 26578, transform.x: expected a number, found none"),
     "XML": (qualisys("</cameras>", ""), "a.txt, line 2: expected valid XML, found an error (mismatched tag)"),
     "document type": (qualisys("<calibration>", ENTITY), "XML without document type"),
-    "omni": (kalibr(camera_model="omni"), "found omni; calibrate again with pinhole-radtan"),
-    "fov": (kalibr(distortion_model="fov"), "cam0.distortion_model: expected radtan, ", "or none, found fov"),
-    "bent": (reads("a.xcp", BENT), "Camera 2121, KeyFrame.VICON_RADIAL2: expected a correction that keeps"),
-    "quaternion": (reads("a.xcp", LONG), "ORIENTATION: expected a quaternion of length 1"),
-    "no intri.yml": (reads_without_lenses, "expected intri.yml with the lenses beside it"),
+    "omni": (kalibr("pinhole", "omni"), "found omni; calibrate again with pinhole-radtan"),
+    "fov": (kalibr("radtan", "fov"), "cam0.distortion_model: expected radtan, ", "or none, found fov"),
+    "bent": (
+        vicon("0.06 -0.01", "-1.5 0"),
+        "Camera 2121, KeyFrame.VICON_RADIAL2: expected a correction that",
+    ),
+    "quaternion": (
+        vicon(VICON_TURN, "0.44 0.35 0.72 0.49"),
+        "ORIENTATION: expected a quaternion of length 1",
+    ),
+    "no intri.yml": (reads("extri.yml", EXTRI), "expected intri.yml with the lenses beside it"),
     # Cameras and calls.
     "mirrored": (makes(R=np.diag([1.0, 1.0, -1.0])), "camera.R: expected a rotation matrix"),
     "scaled": (makes(R=1.001 * np.eye(3)), "camera.R: expected a rotation matrix"),
