@@ -96,6 +96,10 @@ class Output(NamedTuple):
     err: str
 
 
+#: What runs a command, given its words.
+Run = Callable[..., Output]
+
+
 def assert_refused(bad: Callable[[], object], *words: object, unchanged: Path) -> None:
     """Assert that bad input is refused: one short line with the words, exit code 2, and a folder as it was before.
 

@@ -1,12 +1,15 @@
 """Headline figures: their records, how they are made again, and which are of another version of tracking."""
 
 import json
+import runpy
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
+from helpers import Run
 
 ROOT = Path(__file__).parents[2]
 MODULE = ROOT / "experiments" / "_results.py"
@@ -30,17 +33,9 @@ def git(folder: Path, *words: str) -> None:
     subprocess.run(["git", *identity, *words], cwd=folder, check=True, capture_output=True)
 
 
-def run_python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *words], cwd=folder, capture_output=True, text=True, check=False)
-
-
-def results(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return run_python(folder, "experiments/_results.py", *words)
-
-
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository with one experiment, and its figure."""
+def results(run_program: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs the program of the figures in a repository with one experiment, whose figure is made."""
     experiments = tmp_path / "experiments"
     experiments.mkdir()
     shutil.copy(MODULE, experiments)
@@ -50,9 +45,10 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     git(tmp_path, "add", "-A")
     git(tmp_path, "commit", "-qm", "first")
     monkeypatch.setenv("MY_DATA", "/a/my data")
-    made = results(tmp_path, "make")
-    assert made.returncode == 0, made.stderr
-    return tmp_path
+    results = partial(run_program, experiments / "_results.py")
+    made = results("make")
+    assert made.code == 0, made.err
+    return results
 
 
 def record_of(project: Path) -> dict:
@@ -60,57 +56,58 @@ def record_of(project: Path) -> dict:
 
 
 def outdated(project: Path) -> list[str]:
-    words = "import sys; sys.path.insert(0, 'experiments'); import _results; print(*_results.outdated(), sep='\\n')"
-    return run_python(project, "-c", words).stdout.split("\n")[:-1]
+    return runpy.run_path(str(project / "experiments" / "_results.py"))["outdated"]()
 
 
-def test_a_record_says_where_its_figures_come_from(project: Path) -> None:
-    record = record_of(project)
+def test_a_record_says_where_its_figures_come_from(results: Run, tmp_path: Path) -> None:
+    record = record_of(tmp_path)
     assert record["figures"] == {"answer": 42}
     assert record["command"] == "python experiments/speed.py $MY_DATA/room"
     assert (len(record["commit"]), record["dirty"], record["tracking"]) == (40, [], 3)
     assert record["versions"]["python"] == sys.version.split()[0]
     assert record["machine"]["processors"] >= 1
-    shown = results(project, "list").stdout
+    shown = results("list").out
     assert f"made {record['date'][:10]}, commit {record['commit'][:7]}, version 3 of tracking" in shown
-    script = project / "experiments" / "speed.py"
+    script = tmp_path / "experiments" / "speed.py"
     script.write_text(script.read_text() + "\n# changed\n")
-    assert results(project, "make").returncode == 0
-    assert record_of(project)["dirty"] == ["experiments/speed.py"]
+    assert results("make").code == 0
+    assert record_of(tmp_path)["dirty"] == ["experiments/speed.py"]
 
 
-def test_a_figure_of_another_version_is_one_line(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_of_another_version_is_one_line(
+    results: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A figure whose recordings are not there stays with its date, and one without a record never does."""
-    assert outdated(project) == [""]
-    registry = project / "experiments" / "results.toml"
+    assert outdated(tmp_path) == []
+    registry = tmp_path / "experiments" / "results.toml"
     registry.write_text(REGISTRY.replace("version = 3", "version = 4"))
-    date = record_of(project)["date"][:10]
+    date = record_of(tmp_path)["date"][:10]
     expected = f"figure speed: expected version 4 of tracking, found version 3 ({date}); "
     remedy = "run `make results ONLY=speed`, about 1 minutes"
-    assert outdated(project) == [expected + remedy]
+    assert outdated(tmp_path) == [expected + remedy]
     monkeypatch.delenv("MY_DATA")
-    assert outdated(project) == [""]
-    (project / "experiments" / "results" / "speed.json").unlink()
-    assert outdated(project) == [f"figure speed: expected version 4 of tracking, found no record; {remedy}"]
+    assert outdated(tmp_path) == []
+    (tmp_path / "experiments" / "results" / "speed.json").unlink()
+    assert outdated(tmp_path) == [f"figure speed: expected version 4 of tracking, found no record; {remedy}"]
 
 
-def test_what_cannot_be_made_is_named(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    unknown = results(project, "list", "sped")
-    assert unknown.returncode == 1
-    assert "expected names of results.toml (speed), found sped" in unknown.stderr
-    (project / "experiments" / "speed.py").write_text("raise SystemExit(3)\n")
-    failed = results(project, "make")
-    assert (failed.returncode, failed.stderr) == (1, "failed: speed\n")
+def test_what_cannot_be_made_is_named(results: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unknown = results("list", "sped")
+    assert unknown.code == 1
+    assert "expected names of results.toml (speed), found sped" in unknown.err
+    (tmp_path / "experiments" / "speed.py").write_text("raise SystemExit(3)\n")
+    failed = results("make")
+    assert (failed.code, failed.err) == (1, "failed: speed\n")
     monkeypatch.delenv("MY_DATA")
-    left = results(project, "make")
+    left = results("make")
     stays = "speed: expected a value of MY_DATA in the environment, found none: the stored figure stays\n"
-    assert (left.returncode, left.stderr) == (0, stays)
-    assert results(project, "make", "speed").returncode == 1
+    assert (left.code, left.err) == (0, stays)
+    assert results("make", "speed").code == 1
 
 
-def test_the_declared_figures() -> None:
+def test_the_declared_figures(run_program: Run) -> None:
     """At most ten, in less than two hours; commands begin with Python and a script of the repository."""
-    shown = run_python(ROOT, str(MODULE), "list").stdout
+    shown = run_program(MODULE, "list").out
     scripts = [word for word in shown.split() if word.startswith("experiments/") and word.endswith(".py")]
     assert 5 < len(scripts) <= 10
     assert all((ROOT / script).is_file() for script in scripts)

@@ -2,11 +2,11 @@
 
 import runpy
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from helpers import Run
+
+PROGRAM = Path(__file__).parents[2] / "experiments" / "size.py"
 CODE = '''"""A module.
 
 Its docstring has three lines."""
@@ -18,10 +18,6 @@ TEXT = """a text
 that is no docstring
 
 """
-
-
-class Empty:
-    """A docstring."""
 
 
 def join(*parts):
@@ -42,18 +38,18 @@ LINE = f"{TEXT!r} and {join('a', f'{TEXT}')}"
 
 
 def test_docstrings_comments_and_blank_lines_are_not_counted() -> None:
-    size_of = runpy.run_path(str(ROOT / "experiments" / "size.py"))["size_of"]
-    # import 1, TEXT 4, class 1, def 1, the second text 1, return 3, async def 1, LINE 1; a line that begins with a
+    size_of = runpy.run_path(str(PROGRAM))["size_of"]
+    # import 1, TEXT 4, def 1, the second text 1, return 3, async def 1, LINE 1; a line that begins with a
     # docstring does not count.
-    assert size_of(CODE).lines == 13
-    # import os = 2, TEXT = """...""" 3, class Empty: 3, def join(*parts): 7, the text 1, return os.path.join(*parts,)
+    assert size_of(CODE).lines == 12
+    # import os = 2, TEXT = """...""" 3, def join(*parts): 7, the text 1, return os.path.join(*parts,)
     # 11, async def later(): 6, LINE = f"..." 3.
-    assert size_of(CODE).tokens == 36
+    assert size_of(CODE).tokens == 33
     assert size_of("") == (0, 0)
 
 
-def test_the_table_adds_up(tmp_path: Path) -> None:
-    """A room, a module of its own, and rooms that count for the videos; `-I -S`: no package but Python's own."""
+def test_the_table_adds_up(run_program: Run, tmp_path: Path) -> None:
+    """A room, a module of its own, and rooms that count for the videos."""
     files = {
         "psotrack/tracking/swarm.py": 5,
         "psotrack/tracking/camera_errors/model.py": 2,
@@ -66,12 +62,9 @@ def test_the_table_adds_up(tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("a = 1\n" * lines)
     (tmp_path / "experiments").mkdir()
-    script = shutil.copy(ROOT / "experiments" / "size.py", tmp_path / "experiments")
-    done = subprocess.run([sys.executable, "-I", "-S", script], capture_output=True, text=True, check=True)
-    rows = {row[:20].strip(): row[20:].replace(",", "").split() for row in done.stdout.splitlines()[1:]}
-    assert {name: int(row[0]) for name, row in rows.items() if name != "experiments"} == {
-        **{"cli": 1, "foreground": 1, "live": 1, "pipeline": 2, "tracking": 7, "api": 1, "settings": 1},
-        **{"package": 14, "video to tracks": 10, "tests": 20},
-    }
-    budgets = [int(rows[name][1]) for name in ("package", "video to tracks", "tests", "experiments")]
-    assert budgets == [36_000, 7_200, 25_000, 4_000]
+    done = run_program(Path(shutil.copy(PROGRAM, tmp_path / "experiments")))
+    rows = {row[:20].strip(): row[20:].replace(",", "").split() for row in done.out.splitlines()[1:]}
+    sizes = {"tracking": 7, "pipeline": 2, "live": 1, "api": 1}
+    sizes |= {"package": 14, "video to tracks": 10, "tests": 20}
+    assert {name: int(rows[name][0]) for name in sizes} == sizes
+    assert int(rows["tests"][1]) == 25_000

@@ -1,14 +1,12 @@
 """The program that makes Tables 6 to 8, on a short simulated sequence."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import make_once
+from helpers import Run, make_once
 
 from psotrack.inside_out import MarkerMap
 from psotrack.simulation import SimulationSettings, change_scenario, scenario, simulate
@@ -30,15 +28,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_once(tmp_path_factory, "table7", make)
 
 
-def table7(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, EXPERIMENT / "table7.py", *words]
-    return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
-
-
 @pytest.mark.nightly
-def test_tables_rows_and_a_second_run(data: Path, tmp_path: Path) -> None:
-    done = table7("--data", data, "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
+def test_tables_rows_and_a_second_run(run_program: Run, data: Path, tmp_path: Path) -> None:
+    done = run_program(EXPERIMENT / "table7.py", "--data", data, "--out", tmp_path)
+    assert done.code == 0, done.err
     every = pd.read_csv(tmp_path / "results.csv")
     assert set(every["drone"]) == {"dron1", "dron2", "all"}
     rows = every[every["drone"] == "dron1"].set_index(["wrong", "method"])
@@ -65,15 +58,15 @@ def test_tables_rows_and_a_second_run(data: Path, tmp_path: Path) -> None:
     # Markers are not detected again, and a sequence that cannot be used does not stop the others.
     kept = tmp_path / "detections" / "S01_D2_A_dron1.npz"
     before = kept.stat().st_mtime_ns
-    assert table7("--data", data, "--out", tmp_path).returncode == 0
+    assert run_program(EXPERIMENT / "table7.py", "--data", data, "--out", tmp_path).code == 0
     assert kept.stat().st_mtime_ns == before
 
 
 @pytest.mark.slow
-def test_what_cannot_be_used(tmp_path: Path) -> None:
-    done = table7("--data", tmp_path, "--out", tmp_path / "out")
+def test_what_cannot_be_used(run_program: Run, tmp_path: Path) -> None:
+    done = run_program(EXPERIMENT / "table7.py", "--data", tmp_path, "--out", tmp_path / "out")
     expected = "expected sequences with markers, *_A, in Simulated_Data or Real_Data, found none"
-    assert (done.returncode, done.stderr) == (1, f"table7: {tmp_path}: {expected}\n")
+    assert (done.code, done.err) == (1, f"table7: {tmp_path}: {expected}\n")
 
 
 def test_markers_with_wrong_ids(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,14 +1,13 @@
 """The programs that make the paper's Tables 4 and 5 and the benchmark, on one very small sequence."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import pandas as pd
 import pytest
 import small_sweeps
+from helpers import Run
 
 from psotrack.show.flights import colour_rgb
 from psotrack.simulation import build, load
@@ -39,19 +38,19 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_sweeps.small_sequence(tmp_path_factory)
 
 
-def run(data: Path, script: str, *words: object) -> subprocess.CompletedProcess[str]:
-    """Run a program of the experiments; rows and records go to the folder `results` beside the --out folder."""
-    command = [sys.executable, EXPERIMENTS / script, *words]
-    environment = small_sweeps.environment(data) | {"PYTHONPATH": str(EXPERIMENTS.parent)}
-    return subprocess.run(map(str, command), capture_output=True, text=True, env=environment, check=False)
+@pytest.fixture
+def run(run_program: Run, data: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs a program of the experiments."""
+    monkeypatch.setenv("PSOTRACK_CACHE", str(data / "cache"))
+    return lambda script, *words: run_program(EXPERIMENTS / script, *words)
 
 
-def test_table_4(data: Path, tmp_path: Path) -> None:
+def test_table_4(run: Run, data: Path, tmp_path: Path) -> None:
     methods, out = tmp_path / "methods.toml", tmp_path / "table4"
     methods.write_text(METHODS)
     words = ("--methods", methods, "--data", data, "--out", out, "--results", tmp_path)
-    done = run(data, "table4/table4.py", *words)
-    assert done.returncode == 0, done.stderr
+    done = run("table4/table4.py", *words)
+    assert done.code == 0, done.err
     rows = pd.read_csv(tmp_path / "table4.csv").set_index("method")
     assert list(rows["sequence"]) == ["S01_D2_A"] * 2
     # Both methods begin at the true positions; the images have a quarter of the pixels.
@@ -62,18 +61,18 @@ def test_table_4(data: Path, tmp_path: Path) -> None:
         assert f"{1e3 * rows['mean_error_m'][method]:.1f}" in table
     assert "## FNR" in table
     assert json.loads((tmp_path / "table4.json").read_text())["figure"] == "table4"
-    nothing = run(data, "table4/table4.py", "--data", tmp_path / "none", "--out", out)
+    nothing = run("table4/table4.py", "--data", tmp_path / "none", "--out", out)
     expected = "expected sequences in Simulated_Data or Real_Data, found none"
-    assert (nothing.returncode, nothing.stderr) == (1, f"table4: {tmp_path / 'none'}: {expected}\n")
+    assert (nothing.code, nothing.err) == (1, f"table4: {tmp_path / 'none'}: {expected}\n")
 
 
-def test_table_5_is_made_once(data: Path, tmp_path: Path) -> None:
+def test_table_5_is_made_once(run: Run, data: Path, tmp_path: Path) -> None:
     grid, out = tmp_path / "grid.toml", tmp_path / "table5"
     grid.write_text(GRID)
     words = ("--grid", grid, "--data", data, "--out", out, "--results", tmp_path)
-    done = run(data, "table5/table5.py", *words)
-    assert done.returncode == 0, done.stderr
-    assert "S01_D2_A: 86 to 140 mm" in done.stdout
+    done = run("table5/table5.py", *words)
+    assert done.code == 0, done.err
+    assert "S01_D2_A: 86 to 140 mm" in done.out
     rows = pd.read_csv(tmp_path / "table5.csv")
     assert (len(rows), set(rows["method"])) == (8, {"paper", "psotrack"})
     table = (out / "table5.md").read_text()
@@ -83,14 +82,14 @@ def test_table_5_is_made_once(data: Path, tmp_path: Path) -> None:
     for colour in COLOURS[:2]:
         assert (drawn == colour_rgb(colour)).all(axis=-1).sum() > 20, "of two methods"
     before = small_sweeps.stamps(out)
-    assert run(data, "table5/table5.py", *words).returncode == 0
+    assert run("table5/table5.py", *words).code == 0
     assert small_sweeps.stamps(out) == before
 
 
-def test_from_videos_to_tracks(data: Path, tmp_path: Path) -> None:
+def test_from_videos_to_tracks(run: Run, data: Path, tmp_path: Path) -> None:
     words = ("--sequence", data / "Simulated_Data" / "S01_D2_A", "--repeats", 1, "--results", tmp_path)
-    done = run(data, "benchmark.py", "videos", *words)
-    assert done.returncode == 0, done.stderr
+    done = run("benchmark.py", "videos", *words)
+    assert done.code == 0, done.err
     (row,) = pd.read_csv(tmp_path / "speed.csv").to_dict("records")
     # Six frames at a small size do not show both drones.
     assert (row["drones"] >= 1, row["cameras"], row["video_s"]) == (True, 8, 0.24)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 
@@ -182,34 +179,6 @@ def test_finished_videos_are_kept_and_those_of_other_inputs_are_refused(flight, 
         write(flight)
     assert len(write(flight, OverlayOptions(force=True)).written) == 2
     assert len(write(flight).kept) == 2
-
-
-@pytest.mark.nightly
-def test_a_killed_run_leaves_no_partial_video_and_can_be_continued(run, world, tmp_path):
-    """The run kills itself before the second video gets its name."""
-    program = """
-import os, signal, sys
-
-def kill(event, arguments):
-    if event == "os.rename" and str(arguments[1]).endswith("c1.mp4"):
-        os.kill(os.getpid(), signal.SIGKILL)
-
-sys.addaudithook(kill)
-from psotrack.__main__ import main
-main()
-"""
-    out = tmp_path / "videos"
-    words = ["overlay", world / "tracks.csv", world / "flight", "--out", out, "--jobs", "1"]
-    killed = subprocess.run([sys.executable, "-c", program, *words], check=False)
-    assert killed.returncode == -signal.SIGKILL
-    assert [path.name for path in out.glob("c*.mp4")] == ["c0.mp4"]
-    first = (out / "c0.mp4").stat().st_mtime_ns
-    said = run()
-    assert "2 videos" in said
-    assert "1 were there already" in said
-    assert (out / "c0.mp4").stat().st_mtime_ns == first
-    assert sorted(path.name for path in out.glob("*c*.mp4")) == [f"{name}.mp4" for name in CAMERAS]
-    assert [probe(out / f"{name}.mp4").num_frames for name in CAMERAS] == [NUM_FRAMES] * 3
 
 
 def test_the_next_codec_is_used_where_the_first_one_fails():

@@ -311,17 +311,13 @@ def test_play_step_jump_and_sort_on_the_page_of_a_flight(page, width, dark):
 
 
 @pytest.mark.nightly
-def test_a_view_of_a_notebook(tmp_path):
+def test_a_view_of_a_notebook_and_a_page_without_webgl(page, tmp_path):
     cell = view_3d(on_x_axis([0, 1, 2, 3]))._repr_html_()
     (tmp_path / "cell.html").write_text(f"<!doctype html><title>cell</title>{cell}", encoding="utf-8")
     with open_page(tmp_path / "cell.html") as shown:
         frame = shown.frame_locator("iframe")
         frame.locator(".scene canvas").wait_for()
         assert frame.locator(".scene-clock").inner_text() == "0.00 s"
-
-
-@pytest.mark.nightly
-def test_without_webgl_the_rest_of_the_page_works(page):
     with open_page(page, arguments=("--disable-gpu", "--disable-3d-apis", "--no-sandbox")) as shown:
         shown.wait_for_selector(".scene-none")
         assert "no 3D graphics" in shown.inner_text(".scene-none")

@@ -127,19 +127,9 @@ with progress_bar("silhouettes", 300) as advance:
         advance(1)
 with progress_bar("<b>track", 0) as advance:
     advance(7)
-try:
-    with progress_bar("fails", 4) as advance:
-        advance(1)
-        raise ValueError
-except ValueError:
-    pass
 """
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
     NotebookClient(notebook, kernel_name="python3", timeout=120).execute()
     outputs = notebook.cells[0].outputs
     texts = [output["data"]["text/plain"] for output in outputs]
-    assert [text.rpartition(" in ")[0] or text.rpartition(" after ")[0] for text in texts] == [
-        "silhouettes: 300 of 300",
-        "<b>track: 7",
-        "fails: 1 of 4, stopped",
-    ]
+    assert [text.rpartition(" in ")[0] for text in texts] == ["silhouettes: 300 of 300", "<b>track: 7"]
