@@ -34,7 +34,7 @@ from psotrack.recordings import VideoWriter, probe, read_frames
 
 HEIGHT, WIDTH = 120, 160
 SETTINGS = ForegroundSettings(working_reduction=1, min_blob_px=9)
-NO_DRONES = np.zeros((HEIGHT, WIDTH), np.uint8)
+NO_DRONES, CALM = np.zeros((HEIGHT, WIDTH), np.uint8), np.zeros((HEIGHT, WIDTH), bool)
 
 
 def _smooth(rng: np.random.Generator, height: int, width: int, *, cells: int = 8) -> np.ndarray:
@@ -397,9 +397,14 @@ def test_all_foreground_belongs_to_blobs_that_changed(seed: int, strength: float
     image[y : y + 15, x : x + 20] = np.clip(image[y : y + 15, x : x + 20] + strength, 0, 255).astype(np.uint8)
     difference = largest(cv2.absdiff(image, background))
     changed, strong = (np.where(difference > level, np.uint8(255), np.uint8(0)) for level in (3, 8))
-    found = find_objects(changed, strong, difference, np.zeros((HEIGHT, WIDTH), bool), 9)
+    found = find_objects(changed, strong, difference, CALM, 9)
     assert not (found.mask & ~changed).any()
     assert not (found.with_own_edges(image, background) & ~found.mask).any()
+    # The slopes of a cloud are no contour, however much it changes the image.
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    cloud = (strength * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 30**2))).astype(np.uint8)
+    slopes = find_objects(*(255 * (cloud > level).astype(np.uint8) for level in (3, 8)), cloud, CALM, 9)
+    assert not slopes.mask.any()
 
 
 # --- the first look at a video
