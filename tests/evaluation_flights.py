@@ -1,20 +1,16 @@
 """Flights of a few frames, for the tests of evaluation."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from psotrack.trajectories import UNASSIGNED, Status, Trajectories
+from psotrack.trajectories import Status, Trajectories
 
 #: Frames per second. Frames 0 and 1 are the first second, in which identity is fixed.
 FPS = 2.0
 #: Tolerance for sums of a few float64 numbers of some metres, metres.
 ROUNDING = 1e-12
-
-seeds = st.integers(0, 2**32 - 1)
 
 
 def on_x_axis(*tracks, frame=None, **others) -> Trajectories:
@@ -28,6 +24,12 @@ def on_x_axis(*tracks, frame=None, **others) -> Trajectories:
 
 #: Reference of two drones that stand still, 10 m apart.
 TRUTH = on_x_axis([0] * 5, [10] * 5)
+
+
+def with_covariance(est, covariance_m2):
+    """The flight with one covariance for all positions."""
+    shape = (est.num_frames, est.num_drones, 3, 3)
+    return replace(est, covariance_m2=np.broadcast_to(np.array(covariance_m2, float), shape).copy())
 
 
 def random_flights(
@@ -49,12 +51,6 @@ def random_flights(
     return flights(num_estimates, "est"), replace(
         ref, orientation_wxyz=orientation_wxyz.reshape(num_frames, num_drones, 4)
     )
-
-
-def pairings(num_drones: int, num_estimates: int):
-    """Set of all assignments of estimates to drones; each drone has its own estimate, or none (`UNASSIGNED`)."""
-    choices = [*range(num_estimates), *[UNASSIGNED] * num_drones]
-    return set(itertools.permutations(choices, num_drones))
 
 
 #: Frames of `circling_flights`.

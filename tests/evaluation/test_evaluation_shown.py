@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from clock_worlds import FPS, LATE_S, make_late_videos
-from evaluation_flights import NUM_FRAMES, ROUNDING, on_x_axis
+from evaluation_flights import NUM_FRAMES, ROUNDING, on_x_axis, with_covariance
 from evaluation_flights import circling_flights as flights
 from helpers import make_once
 from matplotlib.colors import to_rgb
@@ -96,11 +96,6 @@ class TestOffsets:
         assert "(world frame)" in tables.as_text(evaluation)
 
 
-def with_covariance(est, variance_m2):
-    shape = (est.num_frames, est.num_drones, 3, 3)
-    return replace(est, covariance_m2=np.broadcast_to(variance_m2 * np.eye(3), shape))
-
-
 class TestTable:
     def test_rows(self):
         evaluation = evaluate(*flights())
@@ -128,7 +123,7 @@ class TestTable:
         est.status[:, 2] = Status.LOST
         orientation_wxyz = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (NUM_FRAMES, 3, 4))
         est, ref = (replace(flight, orientation_wxyz=orientation_wxyz) for flight in (est, ref))
-        text = tables.as_text(evaluate(with_covariance(est, 1e-4), ref))
+        text = tables.as_text(evaluate(with_covariance(est, 1e-4 * np.eye(3)), ref))
         # The error of 20 mm is two standard deviations of 10 mm, so NEES is 4; without the offset, NEES is 0.
         assert "ellipsoid of 90 % holds 100.0% (100.0% centred), mean NEES 4 (" in text
         assert "RPE over 1 s 0.0 mm and 0.00 deg" in text
@@ -138,7 +133,7 @@ class TestTable:
     def test_ten_drones_with_large_errors_fit_into_eighty_columns(self):
         est, ref = flights(10, swap=True, names=tuple(f"[red]d_{number}" for number in range(10)))
         est.position_m[30:, :5] += 3.0
-        lines = tables.as_text(evaluate(with_covariance(est, 1e-8), ref), "S04_D10").splitlines()
+        lines = tables.as_text(evaluate(with_covariance(est, 1e-8 * np.eye(3)), ref), "S04_D10").splitlines()
         assert max(map(len, lines)) <= 80
         # No name is cut off, and no part of a name is interpreted as a style.
         assert [line.split()[0] for line in lines if "d_" in line] == [f"[red]d_{n}" for n in range(10)]
