@@ -46,7 +46,6 @@ draws = 3
 SMALL = {"sequences": ["S01"], "grid": {"swarm.particles": [20, 50]}}
 INPUT = {"cam1": "ab", "cam2": "cd"}
 SAME = "expected cells that differ, found the same cell as with"
-TWICE = "grid.swarm.particles: expected the name in one place, found"
 
 
 def cells_of(**changes):
@@ -95,9 +94,7 @@ def test_a_cell_has_the_settings_of_the_file(cells):
     assert (ours.settings.swarm.spread_m, ours.settings.silhouettes.reduction) == (1.0, 2)
     # A whole number becomes a float where the setting is a float.
     assert isinstance(paper.axes["silhouettes.var_threshold"], float)
-
-
-def test_without_axes_and_methods_there_is_one_cell_per_sequence():
+    # Without axes and methods there is one cell per sequence.
     (cell,) = grid({"sequences": [Path("data/S01")], "first_seed": 5, "runs": 2}).cells()
     assert (cell.sequence, cell.method, dict(cell.axes)) == ("data/S01", "", {})
     assert cell.settings == TrackSettings()
@@ -123,16 +120,15 @@ def test_perturbations_and_frames_can_be_varied():
 BAD = {
     'sequnces = ["S01"]': ("sequnces: expected an allowed name", "did you mean sequences?"),
     "methods.paper.swram = 1": ("methods.paper.swram: expected an allowed name",),
-    "settings.reduction = 4": ("settings.reduction: ", "did you mean silhouettes.reduction?"),
-    "settings.zzz = 4": ("settings.zzz: ", "allowed names are method, detections, "),
     'settings.swarm = "joint"': ("settings.swarm: expected a table with names, found none",),
     "grid.draw = [20]": ("grid.draw: ", "did you mean draws?"),
     # Right names, wrong places.
     "settings.cameras = 4": ("settings.cameras: ", "it belongs in [grid], with a list of values"),
     '"swarm.particles" = 4': ("swarm.particles: ", "it belongs in [settings], or in [grid] with a list of "),
     "grid.seed = [1, 2]": ("grid.seed: ", "every run has a seed of its own: set runs = 10, and first_seed "),
-    "settings.swarm.particles = 20": (f"{TWICE} settings.swarm.particles as well",),
-    "methods.a.swarm.particles = 20": (f"{TWICE} methods.a.swarm.particles as well",),
+    "methods.a.swarm.particles = 20": (
+        "grid.swarm.particles: expected the name in one place, found methods.a.swarm.particles as well",
+    ),
     'settings = {"swarm.spread_m" = 4, swarm.spread_m = 8}': (
         "settings.swarm.spread_m: expected the name once, found the name twice",
     ),
@@ -142,23 +138,20 @@ BAD = {
     "grid.swarm.particles = [20, 1]": (
         "grid.swarm.particles[1]: expected a whole number of at least 2, found 1",
     ),
-    'grid.score.windows = [[1.0], [0.5, "a"]]': ('grid.score.windows[1][1]: expected a number, found "a"',),
     "grid.swarm.particles = 20": ("grid.swarm.particles: expected a list of values, found 20; write [20]",),
     "grid.swarm.particles = []": ("grid.swarm.particles: expected a list of values, found []",),
     "grid.frames = [0]": ("grid.frames[0]: expected a whole number of at least 1, found 0",),
-    "grid.draws = 0": ("grid.draws: expected a whole number of at least 1, found 0",),
     **{
         f"grid.cameras = [{value}]": (
             'grid.cameras[0]: expected "all", a number above 0, or a list of different names, found ',
         )
-        for value in ("0", "true", '["a", "b", "a"]', "[]", '["a", 1]')
+        for value in ("0", "true", '["a", "b", "a"]', '["a", 1]')
     },
     # What does not fit together.
     "grid.silhouettes.reduction = [4, 6]\nmethods.a.silhouettes.working_reduction = 4": (
         "grid.silhouettes.reduction[1]: expected a multiple of working_reduction, 4, found 6",
     ),
     "grid.swarm.spread_m = [0.1, 1, 1.0]": (f"grid.swarm.spread_m[2]: {SAME} grid.swarm.spread_m[1]",),
-    'sequences = ["a", "a"]': (f"sequences[1]: {SAME} sequences[0]",),
     'methods = {a = {}, b = {detections = "yolo"}}': (f"methods.b: {SAME} methods.a",),
     # A perturbation of silhouettes has no effect on detections.
     'settings.method = "projection-lines"\ngrid.flipped = [0.0, 0.03]': (
@@ -179,9 +172,7 @@ def test_an_error_is_one_line_with_the_place_in_the_file(lines, tmp_path):
     assert_refused(bad, f"table5.toml: {words}", *more, unchanged=tmp_path)
 
 
-def test_sequences_must_be_given_and_messages_of_a_file_begin_with_its_path(tmp_path):
-    alone = functools.partial(grid, {"runs": 2})
-    assert_refused(alone, "grid: sequences: expected a value, found none", unchanged=tmp_path)
+def test_messages_of_a_file_begin_with_its_path(tmp_path):
     path = tmp_path / "grid.toml"
     path.write_text(FILE.replace("swarm.kind", "swram.kind"))
     assert_refused(lambda: read_grid(path), f"{path}: methods.paper.swram.kind: ", unchanged=tmp_path)
@@ -190,16 +181,14 @@ def test_sequences_must_be_given_and_messages_of_a_file_begin_with_its_path(tmp_
 # --- keys
 
 
-def test_neither_the_number_of_runs_nor_the_place_of_the_sequence_is_in_the_key():
+def test_what_decides_the_rows_is_in_the_key_alone():
+    """Neither the number of runs nor the place of the sequence is."""
     (few,) = grid({"sequences": ["S01"], "runs": 2, "settings": {"swarm.particles": 20}}).cells()
     elsewhere = {"sequences": ["/data/elsewhere/S01"], "runs": 9, "first_seed": 4}
     many = grid(elsewhere | {"grid": {"swarm.particles": [20, 50]}}).cells()[0]
     assert few != many
     assert cell_key(few, INPUT) == cell_key(many, dict(reversed(INPUT.items())))
     assert re.fullmatch("[0-9a-f]{20}-[0-9a-f]{20}", cell_key(few, INPUT))
-
-
-def test_everything_that_decides_the_rows_is_in_the_key():
     base = {"sequences": ["S01"], "settings": {"swarm.particles": 20}, "grid": {}}
     changes = [
         {},
