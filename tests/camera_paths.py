@@ -152,8 +152,6 @@ def make_paths_and_tracks(folder: Path) -> Path:
     """Write the flight with a swap: `dron1.csv`, `dron2.csv`, `tracks.csv`, and files that do not belong to it."""
     paths, outside, _ = fly_with_a_swap()
     write_trajectories(folder / "tracks.csv", remove_positions(outside, slice(80, 90)))
-    far = replace(outside, position_m=outside.position_m + np.array([0.0, 50.0, 0.0]))
-    write_trajectories(folder / "elsewhere.csv", far)
     write_trajectories(folder / "later.csv", replace(outside, time_s=outside.time_s + 100))
     write_camera_path(folder / "blind.csv", remove_poses(paths["dron1"], slice(0, 100)), "dron3")
     for name, path in paths.items():

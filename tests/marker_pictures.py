@@ -1,6 +1,7 @@
 """Pictures of ArUco markers, with their true corners: on flat and bent sheets, and at any four corners."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -8,9 +9,12 @@ import numpy as np
 from psotrack.foreground.markers import marker_dictionary
 from psotrack.geometry import undistort
 
-BLACK, WHITE, GAMMA = 35.0, 215.0, 2.2
-#: Samples per pixel along each side.
+#: Grey levels of a marker's cells and of a plain wall, and the power of a sheet's grey levels that is light.
+BLACK, WHITE, WALL, GAMMA = 35.0, 215.0, 140.0, 2.2
+#: Samples per pixel of a sheet along each side.
 FINE = 3
+#: Corners of a marker in its own places, clockwise from the top left one.
+OWN_CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 #: Error of a sample's place on a sheet, pixels.
 CONVERGED_PX = 1e-4
 #: Distance of the camera from a sheet, in sides of the marker.
@@ -45,17 +49,22 @@ class Sheet:
 
     @property
     def corners_px(self):
-        return self.pixels(np.array([-0.5, 0.5, 0.5, -0.5]), np.array([-0.5, -0.5, 0.5, 0.5]))
+        return self.pixels(*OWN_CORNERS.T)
 
 
-def _places(sheet, x, y):
-    """Places on the sheet that pixels show: by a homography for a flat sheet, by Newton's method for a bent one."""
+def _places(corners_px, lens, x, y):
+    """Places on a flat marker that pixels show; its corners are undistorted ones where a lens is given."""
+    H = cv2.getPerspectiveTransform(corners_px.astype(np.float32), OWN_CORNERS.astype(np.float32))
+    points = np.stack([x, y], axis=-1)
+    if lens is not None:
+        points = undistort(lens, points) @ lens.K[:2, :2].T + lens.K[:2, 2]
+    u, v, scale = np.moveaxis(points @ H[:, :2].T + H[:, 2], -1, 0)
+    return u / scale, v / scale
+
+
+def _places_on_bent(sheet, x, y):
+    """Places on a bent sheet that pixels show, by Newton's method."""
     off_x, off_y = x - sheet.centre[0], y - sheet.centre[1]
-    if not sheet.bow:
-        to_pixels = np.array([[sheet.side_px * FAR], [sheet.side_px * FAR], [1]]) * sheet.R
-        to_pixels[:, 2] = 0, 0, FAR
-        u, v, scale = (row[0] * off_x + row[1] * off_y + row[2] for row in np.linalg.inv(to_pixels))
-        return u / scale, v / scale
     cos, sin = np.cos(sheet.turn) / sheet.side_px, np.sin(sheet.turn) / sheet.side_px
     u, v = off_x * cos + off_y * sin, off_y * cos - off_x * sin
     small = 1e-4
@@ -71,6 +80,35 @@ def _places(sheet, x, y):
         u = np.clip(u + (left_x * by_v[..., 1] - left_y * by_v[..., 0]) / area, -2, 2)
         v = np.clip(v + (left_y * by_u[..., 0] - left_x * by_u[..., 1]) / area, -2, 2)
     return u, v
+
+
+def _paint(image, marker, dictionary, corners_px, places, *, exponent, fine, inverted=False):  # noqa: PLR0913
+    """Draw a marker with one white cell around it.
+
+    Args:
+        image: grey levels, which are changed.
+        places: a function from pixels x and y to places u and v on the marker.
+        fine: number of samples along each side of a pixel.
+        exponent: the light of a pixel is the mean of its samples, and its grey level is this root of the light.
+    """
+    model = marker_dictionary(dictionary)
+    cells = model.markerSize + 2
+    white = cv2.aruco.generateImageMarker(model, marker, cells) > 0
+    shown = np.pad(white, 1, constant_values=True) ^ inverted
+    # The block of whole pixels that holds the marker and its white cells.
+    margin, size_wh = np.ptp(corners_px, axis=0).max() / 4 + 1, image.shape[::-1]
+    low = np.clip(np.floor(corners_px.min(axis=0) - margin), 0, size_wh).astype(int)
+    high = np.clip(np.ceil(corners_px.max(axis=0) + margin), 0, size_wh).astype(int)
+    axes = [(np.arange(fine * (b - a)) + 0.5) / fine - 0.5 + a for a, b in zip(low, high, strict=True)]
+    u, v = places(*np.meshgrid(*axes))
+    row, column = (np.floor((place + 0.5) * cells).astype(int) + 1 for place in (v, u))
+    on_sheet = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < cells + 2)
+    part = image[low[1] : high[1], low[0] : high[0]]
+    levels = part.repeat(fine, 0).repeat(fine, 1)
+    levels[on_sheet] = np.where(shown[row[on_sheet], column[on_sheet]], WHITE, BLACK)
+    light = (levels / 255) ** exponent
+    light = light.reshape(part.shape[0], fine, part.shape[1], fine).mean(axis=(1, 3))
+    part[:] = 255 * light ** (1 / exponent)
 
 
 def picture(  # noqa: PLR0913
@@ -92,26 +130,12 @@ def picture(  # noqa: PLR0913
         x, y = rng.uniform((0, 0), size_wh).astype(int)
         board_wh = rng.integers(width // 30, width // 6, 2)
         image[y : y + board_wh[1], x : x + board_wh[0]] = rng.uniform(20, 230)
-    model = marker_dictionary(dictionary)
-    cells = model.markerSize + 2
     for sheet in sheets:
-        reach = 1.1 * sheet.side_px
-        low = np.maximum(np.floor(np.array(sheet.centre) - reach), 0).astype(int)
-        high = np.minimum(np.ceil(np.array(sheet.centre) + reach), size_wh).astype(int)
-        axes = [(np.arange(FINE * (b - a)) + 0.5) / FINE - 0.5 + a for a, b in zip(low, high, strict=True)]
-        u, v = _places(sheet, *np.meshgrid(*axes))
-        white = cv2.aruco.generateImageMarker(model, sheet.marker, cells) > 0
-        shown = np.ones((cells + 2, cells + 2), bool)
-        shown[1:-1, 1:-1] = white
-        row, column = (np.floor((place + 0.5) * cells).astype(int) + 1 for place in (v, u))
-        on_sheet = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < cells + 2)
-        bright = np.zeros(u.shape, bool)
-        bright[on_sheet] = shown[row[on_sheet], column[on_sheet]] ^ inverted
-        part = image[low[1] : high[1], low[0] : high[0]]
-        fine = np.where(on_sheet, np.where(bright, WHITE, BLACK), part.repeat(FINE, 0).repeat(FINE, 1))
-        light = (fine / 255) ** GAMMA
-        light = light.reshape(part.shape[0], FINE, part.shape[1], FINE).mean(axis=(1, 3))
-        part[:] = 255 * light ** (1 / GAMMA)
+        corners_px = sheet.corners_px
+        places = partial(_places_on_bent, sheet) if sheet.bow else partial(_places, corners_px, None)
+        _paint(
+            image, sheet.marker, dictionary, corners_px, places, exponent=GAMMA, fine=FINE, inverted=inverted
+        )
     light = (np.clip(image, 0, 255) / 255) ** GAMMA
     light = cv2.GaussianBlur(light, (0, 0), blur_px) if blur_px else light
     if shaded:
@@ -142,52 +166,10 @@ def rows_of_sheets(rng, count, size_wh, side_px, *, ids=50, tilt=0.6, bow=0.0):
     ]
 
 
-#: Grey levels of markers that are drawn at given corners, and of the wall.
-DRAWN_BLACK, DRAWN_WHITE, WALL = 40, 200, 140
-#: Pixels along a cell of a marker's own image.
-CELL_PX = 20
-
-
-def marker_image(marker, dictionary):
-    """Image of a marker with a white zone of one cell, and the corners of the marker's border in it, pixels."""
-    model = marker_dictionary(dictionary)
-    side_px = (model.markerSize + 2) * CELL_PX
-    own = cv2.aruco.generateImageMarker(model, marker, side_px)
-    low, high = CELL_PX - 0.5, CELL_PX + side_px - 0.5
-    return np.pad(own, CELL_PX, constant_values=255), np.array(
-        [[low, low], [high, low], [high, high], [low, high]]
-    )
-
-
 def draw(markers, *, size_wh=(640, 480), dictionary="4x4_1000", lens=None, exponent=2.0, fine=8):
-    """Grey picture of a wall with markers at given corners, pairs of id and (4, 2) pixels, one ray for each sample.
-
-    `fine` is the number of samples along each side of a pixel. The light of a pixel is the mean of its samples, and its
-    grey level is a root of the light. Corners are undistorted ones where a `lens` is given.
-    """
-    drawn = np.full(size_wh[::-1], WALL, np.uint8)
-    for marker, corners in markers:
-        image, own = marker_image(marker, dictionary)
-        towards = cv2.getPerspectiveTransform(corners.astype(np.float32), own.astype(np.float32))
-        # The block of whole pixels that holds the marker and its white zone.
-        margin = np.ptp(corners, axis=0).max() / 4
-        low = np.clip(np.floor(corners.min(axis=0) - margin), 0, size_wh).astype(int)
-        high = np.clip(np.ceil(corners.max(axis=0) + margin), 0, size_wh).astype(int)
-        ends = zip(low, high, strict=True)
-        axes = [np.arange(fine * start, fine * end) / fine + 0.5 / fine - 0.5 for start, end in ends]
-        grid = np.stack(np.meshgrid(*axes), axis=-1)
-        if lens is not None:
-            grid = undistort(lens, grid) @ lens.K[:2, :2].T + lens.K[:2, 2]
-        # Positions of the samples in the marker's image.
-        there = grid @ towards[:, :2].T + towards[:, 2]
-        there = np.round(there[..., :2] / there[..., 2:]).astype(int)
-        inside = ((there >= 0) & (there < image.shape[0])).all(axis=-1)
-        levels = np.where(inside, 0.0, float(WALL))
-        shown = image[there[inside][:, 1], there[inside][:, 0]] / 255
-        levels[inside] = DRAWN_BLACK + (DRAWN_WHITE - DRAWN_BLACK) * shown
-        blocks = high[1] - low[1], fine, high[0] - low[0], fine
-        light = (levels**exponent).reshape(blocks).mean(axis=(1, 3))
-        part = drawn[low[1] : high[1], low[0] : high[0]]
-        touched = inside.reshape(blocks).any(axis=(1, 3))
-        part[touched] = np.round(light ** (1 / exponent))[touched]
-    return drawn
+    """Grey picture of a wall with markers at given corners, pairs of id and (4, 2) pixels, one ray for each sample."""
+    drawn = np.full(size_wh[::-1], WALL)
+    for marker, corners_px in markers:
+        places = partial(_places, corners_px, lens)
+        _paint(drawn, marker, dictionary, corners_px, places, exponent=exponent, fine=fine)
+    return np.round(drawn).astype(np.uint8)

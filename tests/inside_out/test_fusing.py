@@ -40,11 +40,8 @@ def rms(error_m):
     [
         {},
         {"inside_part": 0.0, "outside_part": 0.0},
-        {"inside_part": 1.0},
         {"outside_s": 1.0},
         {"inside_stated": 1 / 3},
-        {"outside_stated": 5.0},
-        {"inside_stated": 0.4, "outside_stated": 0.4},
         {"inside_m": (0.008, 0.008, 0.02)},
         {"inside_stated": 3.0},
     ],
@@ -200,16 +197,11 @@ def test_the_source_with_gross_errors_is_left_out(which) -> None:
     assert error_m[wrong].max() < (0.04 if which == "inside" else 0.015)
 
 
-def exchanged(outside, first):
-    """The tracks, whose identities are exchanged from a frame on."""
-    position_m = outside.position_m.copy()
-    position_m[first:, [0, 1]] = position_m[first:, [1, 0]]
-    return replace(outside, position_m=position_m)
-
-
 def test_identity_swaps_are_resolved() -> None:
-    paths, outside, _ = fly_twice_seen(13, num_drones=2, distance_m=1.5)
-    swapped = exchanged(outside, 70)
+    paths, outside, _ = fly_twice_seen(13, 100, num_drones=2, distance_m=1.5)
+    position_m = outside.position_m.copy()
+    position_m[70:, [0, 1]] = position_m[70:, [1, 0]]
+    swapped = replace(outside, position_m=position_m)
     named = replace(swapped, position_m=swapped.position_m[:, [1, 0]], drones=("b", "a"))
     fused, plain = fuse(paths, named), fuse(paths, outside)
     assert [(one.drone, one.frame, one.before, one.after) for one in fused.identity_swaps] == [
@@ -248,22 +240,22 @@ def test_a_path_without_a_track_is_smoothed_and_a_track_without_a_path_is_kept()
     assert (fused.source[100:] == [0, 2]).all()
 
 
-@pytest.mark.parametrize("value", [np.inf, np.nan, 1e7, "astray"])
-def test_frames_that_coast_or_have_no_information_change_nothing(value) -> None:
-    paths, outside, _ = fly_twice_seen(17, 100)
-    path, rows = paths["dron1"], slice(40, 60)
-    status, covariance = path.status.copy(), path.covariance.copy()
+def test_frames_that_coast_or_have_no_information_change_nothing() -> None:
+    paths, outside, _ = fly_twice_seen(17, 60)
+    path, rows = paths["dron1"], slice(20, 40)
+    status, astray_m = path.status.copy(), path.position_m.copy()
     status[rows] = Status.COASTING
-    if value == "astray":
-        position_m = path.position_m.copy()
-        position_m[rows] += 0.01
-        given = replace(path, status=status, position_m=position_m)
-    else:
+    astray_m[rows] += 0.01
+    coasting = replace(path, status=status)
+    without = [replace(coasting, position_m=astray_m)]
+    for value in (np.inf, np.nan, 1e7):
+        covariance = path.covariance.copy()
         covariance[rows, :3, :3] = value
-        given = replace(path, covariance=covariance)
-    expected, found = fuse(replace(path, status=status), outside), fuse(given, outside)
-    np.testing.assert_array_equal(found.trajectories.position_m, expected.trajectories.position_m)
-    assert (found.source[rows] == 2).all()
+        without.append(replace(path, covariance=covariance))
+    expected = fuse(coasting, outside)
+    for found in (fuse(one, outside) for one in without):
+        np.testing.assert_array_equal(found.trajectories.position_m, expected.trajectories.position_m)
+        assert (found.source[rows] == 2).all()
 
 
 def test_orientations_are_at_most_as_uncertain_as_unknown_ones() -> None:

@@ -63,12 +63,8 @@ def localise(run_psotrack, drawn, tmp_path):
 
     def call(source, *options, markers="corners.csv", lens=("--camera", "lens.toml")):
         out, report = tmp_path / "track.csv", tmp_path / "out.json"
-        room = (
-            "--markers",
-            drawn / markers,
-            lens[0],
-            drawn / lens[1] if ".toml" in str(lens[1]) else lens[1],
-        )
+        own_lens = drawn / lens[1] if ".toml" in str(lens[1]) else lens[1]
+        room = ("--markers", drawn / markers, lens[0], own_lens)
         # A stream, or the number of a camera, is no file.
         source = source if "//" in str(source) or source == "0" else drawn / source
         done = run_psotrack(
@@ -127,18 +123,17 @@ def test_the_filter_and_the_smoother_bridge_frames_without_markers(localise):
     assert off_m(smoothed).max() < 0.01
 
 
-@pytest.mark.parametrize(("frame", "options"), [(0, ["--smooth"]), (FEW_MARKERS_FRAME, ["--min-markers", 1])])
-def test_a_folder_with_one_image_has_its_pose(localise, drawn, tmp_path, frame, options):
+def test_a_folder_with_one_image_of_few_markers_has_its_pose(localise, drawn, tmp_path):
     """Stated errors of the map and of the focal length widen its covariance."""
     (tmp_path / "one").mkdir()
-    image = drawn / "images" / f"frame{frame}.png"
+    image, options = drawn / "images" / f"frame{FEW_MARKERS_FRAME}.png", ("--min-markers", 1, "--smooth")
     (tmp_path / "one" / "frame.png").write_bytes(image.read_bytes())
     path, _, said = localise(tmp_path / "one", "--fps", 25, *options)
     assert "one in 1 of 1 frames" in said
     assert path.status.tolist() == [Status.TRACKED]
     # Fewer markers are allowed, and flagged. Three in a plane at 4 m.
-    assert bool(path.flags[0] & Flag.FEW_MARKERS) == (frame == FEW_MARKERS_FRAME)
-    assert off_m(path, TRUTH_M[[frame]])[0] < 0.05
+    assert path.flags[0] & Flag.FEW_MARKERS
+    assert off_m(path, TRUTH_M[[FEW_MARKERS_FRAME]])[0] < 0.05
     stated = ("--map-error", 3, "--focal-error", 1)
     wide, content, _ = localise(tmp_path / "one", "--fps", 25, *options, *stated)
     assert (content["map_error_m"], content["focal_error"]) == (0.003, 0.01)
@@ -148,9 +143,13 @@ def test_a_folder_with_one_image_has_its_pose(localise, drawn, tmp_path, frame, 
 @pytest.mark.parametrize(
     ("fov", "options", "advice"),
     [
-        ("70,55.4", "--dictionary 5x5_1000", "no frame shows a marker of the map: check --dictionary"),
-        ("70,55.4", "--min-markers 14", "of the map: --min-markers requires 14"),
-        ("20,70", "", "no pose fits the markers: check --markers, and --camera or --fov"),
+        (
+            "70,55.4",
+            "--dictionary 5x5_1000 --frames 3",
+            "no frame shows a marker of the map: check --dictionary",
+        ),
+        ("70,55.4", "--min-markers 14 --frames 3", "of the map: --min-markers requires 14"),
+        ("20,70", "--frames 3", "no pose fits the markers: check --markers, and --camera or --fov"),
         ("70,55.4", "--frames 1", "flight in 1 of 1 frames"),
     ],
 )
@@ -163,9 +162,9 @@ def test_without_any_pose_the_output_says_what_to_check(localise, fov, options, 
 
 def test_a_table_may_have_centres_alone(localise, tmp_path):
     rows = [",".join(map(str, (name, *at.mean(axis=0)))) for name, at in wall_markers().items()]
-    (tmp_path / "centres.csv").write_text("\n".join(["id,x_m,y_m,z_m", *rows]))
-    options = ("--marker-size", 0.3)
-    path, content, said = localise("flight.avi", *options, markers=tmp_path / "centres.csv")
+    centres = tmp_path / "centres.csv"
+    centres.write_text("\n".join(["id,x_m,y_m,z_m", *rows]))
+    path, content, said = localise("flight.avi", "--marker-size", 0.3, markers=centres)
     assert content["map"] == "centres"
     assert "centres alone, a weaker map: corners of" in said
     assert off_m(path)[path.seen].max() < 0.05
@@ -359,7 +358,7 @@ def path_of(frames, corners_m):
 
 def test_markers_may_be_turned_any_way():
     """Found: a marker on a pillar was refused, because all other markers are behind it."""
-    frames, centres_m = fly_past(25)
+    frames, centres_m = fly_past(15)
     assert {21, 30, 40} <= {int(each) for _, _, found in frames for each in found.ids}
     path, wrong = path_of(frames, ROOM)
     assert wrong == ()
@@ -380,34 +379,28 @@ def test_exchanged_markers_of_a_map_are_named(localise, tmp_path):
     assert off_m(path)[SHOWN].max() < 0.02
 
 
-def exchange_two(first, second, frames, centres_m):
-    """Frames that are off by more than 0.1 m, frames without a pose, and the named markers."""
-    path, wrong = path_of(frames, {**ROOM, first: ROOM[second], second: ROOM[first]})
-    found_m = off_m(path, centres_m)
-    return int((found_m > 0.1).sum()), int(np.isnan(found_m).sum()), wrong
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("pair", [(2, 20), (30, 31)])
-def test_two_exchanged_markers_are_named_and_do_no_harm(pair):
-    assert exchange_two(*pair, *fly_past(15)) == (0, 0, pair)
-
-
 @pytest.mark.nightly
 def test_any_two_exchanged_markers():
     """No exception, and at most 1 % of the frames off by more than 0.1 m (measured: none)."""
     frames, centres_m = fly_past(25)
     seen = sorted({int(each) for _, _, found in frames for each in found.ids})
     pairs = list(combinations(seen, 2))[::3]
-    found = [exchange_two(*pair, frames, centres_m) for pair in pairs]
-    for each in (0, 1):
-        assert sum(one[each] for one in found) <= 0.01 * len(frames) * len(pairs)
+    far = lost = named = 0
+    for pair in pairs:
+        first, second = pair
+        path, wrong = path_of(frames, {**ROOM, first: ROOM[second], second: ROOM[first]})
+        found_m = off_m(path, centres_m)
+        far += (found_m > 0.1).sum()
+        lost += np.isnan(found_m).sum()
+        named += wrong == pair
+    assert far <= 0.01 * len(frames) * len(pairs)
+    assert lost <= 0.01 * len(frames) * len(pairs)
     # Two markers of which one is hardly seen may not be told apart from one wrong marker.
-    assert sum(one[2] == pair for one, pair in zip(found, pairs, strict=True)) >= 0.8 * len(pairs)
+    assert named >= 0.8 * len(pairs)
 
 
 def test_a_mirrored_marker_and_a_shuffled_map_end_in_lost_frames():
-    frames, _ = fly_past(12)
+    frames, _ = fly_past(8)
     assert path_of(frames, {**ROOM, 2: ROOM[2][[0, 3, 2, 1]]})[1] == (2,)
     names = list(ROOM)
     shuffled = {name: ROOM[other] for name, other in zip(names, names[7:] + names[:7], strict=True)}

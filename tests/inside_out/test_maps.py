@@ -229,11 +229,17 @@ def test_corners_of_a_c3d(tmp_path, labels):
 
 @pytest.mark.parametrize("videos", [1, 2])
 def test_exact_images_give_the_exact_map(videos):
-    """Two videos have different lenses; one lens has distortion."""
-    built = build_map(sightings(videos=videos), {7: ROOM[7]})
+    """Two videos have different lenses, one with distortion, and show markers of different sides."""
+    several, truth = videos == 2, dict(ROOM)
+    if several:
+        for marker, corners in ROOM.items():
+            middle = corners.mean(axis=0)
+            truth[marker] = middle + (0.5 + 0.05 * marker) * (corners - middle)
+    seen = sightings(videos=videos, corners_m=truth)
+    built = build_map(seen, {7: truth[7]}, estimate_sides=several)
     assert set(built.ids) == set(ROOM)
     assert built.unplaced == ()
-    assert errors_m(built).max() < 1e-6
+    assert errors_m(built, truth).max() < 1e-6
     assert built.outliers.sum() == 0
 
 
@@ -262,15 +268,6 @@ def test_a_single_known_side_makes_the_axes_of_the_marker_those_of_the_world():
         # Both searches end when the relative decrease of the cost is less than 1e-9.
         np.testing.assert_allclose(moved, given_world, atol=1e-5)
         np.testing.assert_allclose(own.sides_m, factor * SIDE_M, rtol=1e-12)
-
-
-def test_different_sides_are_estimated():
-    truth = {
-        marker: corners.mean(axis=0) + (0.5 + 0.05 * marker) * (corners - corners.mean(axis=0))
-        for marker, corners in ROOM.items()
-    }
-    built = build_map(sightings(corners_m=truth), {7: truth[7]}, estimate_sides=True)
-    assert errors_m(built, truth).max() < 1e-6
 
 
 def test_an_inset_of_corners_is_estimated():
@@ -310,22 +307,14 @@ def with_insets(seen, seed):
     return replace(seen, corners_px=seen.corners_px - inset_px[seen.marker, None, None] * outward(seen))
 
 
-@pytest.mark.parametrize(
-    ("inset", "noise_px", "rooms", "least"),
-    [
-        (False, 0.3, 4, 1.2),
-        (True, 0.1, 4, 1.8),
-        pytest.param(False, 0.3, 12, 1.2, marks=pytest.mark.nightly),
-        pytest.param(True, 0.1, 12, 1.4, marks=pytest.mark.nightly),
-    ],
-)
-def test_the_covariance_agrees_with_the_errors(inset, noise_px, rooms, least):
+@pytest.mark.parametrize(("inset", "noise_px", "least"), [(False, 0.3, 1.2), (True, 0.1, 1.8)])
+def test_the_covariance_agrees_with_the_errors(inset, noise_px, least):
     """Found: an average three quarters as large, because the covariance had whole insets.
 
-    The adjustment finds a part of an inset. Measured today with insets: 2.1 for 4 rooms, 1.7 for 12.
+    The adjustment finds a part of an inset. Measured today with insets: 2.1 for 4 rooms.
     """
     normalised, corners_inside = [], []
-    for seed in range(rooms):
+    for seed in range(4):
         seen = sightings(noise_px=noise_px, num_views=50, seed=seed)
         built = build_map(with_insets(seen, seed) if inset else seen, {7: ROOM[7]})
         truth_m = np.array([ROOM[marker].mean(axis=0) for marker in built.ids.tolist()])
@@ -354,7 +343,7 @@ ANY_ROOM = any_room()
 def test_a_map_from_centres(side_m, error_m):
     """Corners are found from the video; the covariances count the errors of the centres."""
     rng = np.random.default_rng(0)
-    frames, centres_m = fly_past(25)
+    frames, centres_m = fly_past(20)
     found = [markers for _, _, markers in frames]
     off = {name: error_m * rng.standard_normal(3) for name in ANY_ROOM}
     given = MarkerCentres({name: corners.mean(axis=0) + off[name] for name, corners in ANY_ROOM.items()})
@@ -392,7 +381,7 @@ def noisy_sightings():
 
 
 def test_correct_maps_have_no_findings(noisy_sightings):
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         measured = {marker: corners + 0.001 * rng.standard_normal((4, 3)) for marker, corners in ROOM.items()}
         checkup = check_map(noisy_sightings, MarkerMap(measured))
@@ -418,7 +407,6 @@ FAULTS = {
         "turned",
         rf"turned by (89|90)\.\d {CLOCKWISE}",
     ),
-    "from the opposite": ({9: np.roll(ROOM[9], 2, axis=0)}, "turned", rf"turned by 1(79|80)\.\d {CLOCKWISE}"),
     "backwards": ({9: ROOM[9][[0, 3, 2, 1]]}, "turned", rf"turned by 1(79|80)\.\d {CLOCKWISE}"),
     "too large": ({9: MIDDLE + 1.2 * (ROOM[9] - MIDDLE)}, "side", "it is (399|400|401) mm wide, not 480 mm"),
 }
@@ -518,24 +506,23 @@ def test_a_sequence_provides_videos_intrinsics_and_map(run_map, drawn, tmp_path)
     out = tmp_path / "corners.csv"
     run_map(folder, "--drone", "dron1", "--known", "17", "--out", out)
     assert max(centres_off_m(out).values()) < 0.02
-    assert "nothing disagrees" in run_map(folder, "--check", folder / "aruco_corners.csv")
+    assert "nothing disagrees" in run_map(folder, "--check", folder / "aruco_corners.csv", "--frames", 6)
 
 
 def test_a_wrong_map_is_reported_and_changes_the_exit_status(run_map, drawn, tmp_path):
-    corners_m = wall_markers()
+    corners_m, report = wall_markers(), tmp_path / "map.json"
     wrong = corners_m | {20: corners_m[20] + [0.1, 0.0, 0.05], 8: corners_m[29], 29: corners_m[8]}
     write_marker_corners(tmp_path / "wrong.csv", wrong)
     write_rig(tmp_path / "large.toml", make_rig({"front": scale_lens(DRAWN_LENS, (1280, 960))}))
-    words = (drawn / "flight.avi", "--camera", tmp_path / "large.toml", "--scale-camera", "--check")
-    content = json.loads(run_map(*words, tmp_path / "wrong.csv", "--json", "-", code=1))
+    words = (drawn / "flight.avi", "--camera", tmp_path / "large.toml", "--scale-camera", "--json", report)
+    said = run_map(*words, "--check", tmp_path / "wrong.csv", "--quiet", code=1)
+    assert "marker 20: it is 0.11 m from where the map has it" in said
+    content = json.loads(report.read_text())
     assert [(one["kind"], one["markers"]) for one in content["findings"]] == [
         ("moved", [i]) for i in (8, 20, 29)
     ]
     assert content["markers"]["20"]["moved_m"] == pytest.approx([-0.1, 0, -0.05], abs=0.015)
     assert "where the map has marker 29" in content["findings"][0]["message"]
-    said = run_map(*words, tmp_path / "wrong.csv", "--quiet", code=1)
-    assert "marker 20: it is 0.11 m from where the map has it" in said
-    assert "nothing disagrees" in run_map(*words, drawn / "corners.csv")
 
 
 def test_a_map_from_motion_capture(run_map, tmp_path):

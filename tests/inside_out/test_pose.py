@@ -83,7 +83,7 @@ LENS_MODELS = [
 
 
 @pytest.mark.parametrize(("dist", "fisheye"), LENS_MODELS)
-@pytest.mark.parametrize("count", [1, 2, 4, 10])
+@pytest.mark.parametrize("count", [1, 4])
 def test_exact_corners_give_the_pose_exactly(dist, fisheye, count):
     view, corners_m = camera_at(dist=dist, fisheye=fisheye), two_walls(count)
     found = estimated(view, image_corners(view, corners_m), corners_m, ANY_NUMBER)
@@ -178,17 +178,11 @@ def random_views(rng, number):
         yield camera_at(centre_m, rng.uniform((2.5, 3, 1.2), (3.5, 3.5, 2.2)))
 
 
-@pytest.mark.parametrize(
-    ("place_m", "stated_m"),
+def test_covariances_agree_with_the_errors():
     # The means of corners with independent errors vary more than those of edges, as places that are off by 0.3 mm.
-    [pytest.param(0.0, 6e-4, id="corners"), pytest.param(0.003, 0.003, id="places")],
-)
-def test_covariances_agree_with_the_errors(place_m, stated_m):
-    rng, squares = np.random.default_rng(2), []
+    rng, squares, stated = np.random.default_rng(2), [], PoseSettings(noise=CornerNoise(1.0, 6e-4))
     for view in random_views(rng, 120):
-        placed_m = two_walls(8) + place_m * rng.normal(size=(8, 1, 3))
-        stated = PoseSettings(noise=CornerNoise(1.0, stated_m))
-        found = estimated(view, image_corners(view, placed_m, rng, 0.2), two_walls(8), stated)
+        found = estimated(view, image_corners(view, two_walls(8), rng, 0.2), two_walls(8), stated)
         squares.append(squared_deviations(found, view))
     # A limit of three standard deviations of a share of 120.
     assert np.mean(squares < chi2.ppf(0.9, 6)) > 0.85 - 3 * np.sqrt(0.85 * 0.15 / 120)
@@ -196,12 +190,10 @@ def test_covariances_agree_with_the_errors(place_m, stated_m):
     assert np.median(squares) > chi2.median(6) / 1.5**2
 
 
-@pytest.mark.parametrize(
-    ("map_error_m", "focal_error"), [(0.002, 0.0), (0.0, 0.005), (0.002, 0.005)], ids=["map", "focal", "both"]
-)
-def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error_m, focal_error):
+def test_covariance_includes_errors_of_the_map_and_of_the_focal_length():
     """Six markers with noise of 0.1 px; each pose has another map and another lens."""
     rng, corners_m = np.random.default_rng(12), two_walls(6)
+    map_error_m, focal_error = 0.002, 0.005
     with_errors = PoseSettings(map_error_m=map_error_m, focal_error=focal_error)
     limit, inside, off_m = chi2.ppf(0.9, 3), {with_errors: [], SETTINGS: []}, {with_errors: [], SETTINGS: []}
     for view in random_views(np.random.default_rng(13), 80):
@@ -217,7 +209,7 @@ def test_covariance_includes_errors_of_the_map_and_of_the_focal_length(map_error
     assert np.mean(inside[with_errors]) > 0.9 - 3 * np.sqrt(0.09 / 80)
     assert np.mean(inside[SETTINGS]) < np.mean(inside[with_errors]) - 0.05
     # Markers on two walls determine the focal length; one pose cannot separate the errors of the map.
-    assert np.median(off_m[with_errors]) < (0.8 if focal_error else 1.05) * np.median(off_m[SETTINGS])
+    assert np.median(off_m[with_errors]) < 0.8 * np.median(off_m[SETTINGS])
 
 
 def test_inset_of_all_corners_does_not_move_the_camera():
@@ -256,9 +248,8 @@ def test_pose_follows_a_transformed_world_and_reordered_markers(axis, shift_m, s
 # Wrong markers.
 
 
-@pytest.mark.parametrize("wrong", [1, 4])
-def test_markers_with_the_id_of_another_are_left_out(wrong):
-    for seed in range(5):
+def test_markers_with_the_id_of_another_are_left_out():
+    for seed, wrong in enumerate((1, 4, 1, 4, 4, 4)):
         rng = np.random.default_rng(seed)
         view, corners_m = camera_at(), two_walls(10)
         corners_px = image_corners(view, corners_m, rng, 0.2)
@@ -269,6 +260,13 @@ def test_markers_with_the_id_of_another_are_left_out(wrong):
         found = estimated(view, corners_px, mapped_m)
         np.testing.assert_array_equal(np.flatnonzero(~found.used), np.sort(swapped))
         assert squared_deviations(found, view) < chi2.ppf(0.9999, 6)
+    # A marker that the map places behind the camera.
+    view, corners_m = camera_at(), two_walls(6)
+    mapped_m = corners_m.copy()
+    mapped_m[3] = marker_at((0.0, -4.0, 1.5), (0, 1, 0))
+    found = estimated(view, image_corners(view, corners_m), mapped_m)
+    np.testing.assert_array_equal(found.used, np.arange(6) != 3)
+    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-9)
 
 
 def test_one_bad_corner_excludes_the_corner_and_two_exclude_the_marker():
@@ -297,16 +295,6 @@ def test_good_markers_are_excluded_as_seldom_as_stated():
         excluded += (~estimated(view, image_corners(view, corners_m, rng, 0.3), corners_m).used).sum()
     # A marker is excluded by the mean of its corners, or by two of its corners, which is much rarer.
     assert excluded <= binom.ppf(0.9999, 600, 2 * FALSE_ALARM)
-
-
-def test_a_marker_that_the_map_places_behind_the_camera_is_left_out():
-    view, corners_m = camera_at(), two_walls(6)
-    corners_px = image_corners(view, corners_m)
-    mapped_m = corners_m.copy()
-    mapped_m[3] = marker_at((0.0, -4.0, 1.5), (0, 1, 0))
-    found = estimated(view, corners_px, mapped_m)
-    np.testing.assert_array_equal(found.used, np.arange(6) != 3)
-    np.testing.assert_allclose(pose_error(found, view), 0, atol=1e-9)
 
 
 def test_too_few_markers_and_markers_that_determine_nothing_give_no_pose():
@@ -415,20 +403,12 @@ WALL = {
 }
 
 
-def independent(std_px=0.15):
-    return lambda rng, corners_px: std_px * rng.normal(size=corners_px.shape)
+#: Standard deviations, px, of errors of each corner for itself, of a marker's corners together, as of a lens that is
+#: not exact, and of all corners of a frame together.
+INDEPENDENT, TOGETHER, SHAKEN = (0.15, 0.0, 0.0), (0.1, 0.3, 0.0), (0.1, 0.0, 0.2)
 
 
-def together(rng, corners_px):
-    """Small independent errors, and larger ones that all corners of a marker share, as of a lens that is not exact."""
-    return 0.1 * rng.normal(size=corners_px.shape) + 0.3 * rng.normal(size=(len(corners_px), 1, 2))
-
-
-def shaken(rng, corners_px):
-    return 0.1 * rng.normal(size=corners_px.shape) + 0.2 * rng.normal(size=(1, 1, 2))
-
-
-def fit_of_covariances(errors, markers=10, noise=None):
+def fit_of_covariances(errors_px, markers=10, noise=None):
     """For poses (6) and positions (3): mean squared error by the covariances, as a share of its expectation, and the
     share of the truths in the 90 % ellipsoid; in 60 frames."""
     rng, frames, truths = np.random.default_rng(0), [], []
@@ -437,7 +417,9 @@ def fit_of_covariances(errors, markers=10, noise=None):
         centre_m = np.array([0.0, -0.6, 1.4]) + rng.uniform(-0.5, 0.5, 3)
         view = posed(LENS, centre_m, np.array([0.0, 3.0, 1.35]) + rng.uniform(-0.1, 0.1, 3))
         pixels = project(view, points_m)[0]
-        found = found_markers(range(markers), pixels + errors(rng, pixels))
+        for std_px, groups in zip(errors_px, ((markers, 4), (markers, 1), (1, 1)), strict=True):
+            pixels = pixels + std_px * rng.normal(size=(*groups, 2))
+        found = found_markers(range(markers), pixels)
         frames.append((number, number / 30, found))
         truths.append(view.T_cam_world)
     stated = LocaliseSettings(pose=PoseSettings(noise=noise), filter=None, shutter=RollingShutter(0.0))
@@ -455,13 +437,13 @@ def fit_of_covariances(errors, markers=10, noise=None):
 
 
 @pytest.mark.parametrize(
-    ("errors", "markers"),
-    [(independent(), 10), (together, 10), (independent(0.05), 4), (independent(0.5), 4)],
+    ("errors_px", "markers"),
+    [(INDEPENDENT, 10), (TOGETHER, 10), ((0.05, 0.0, 0.0), 4), ((0.5, 0.0, 0.0), 4)],
     ids=["independent", "of whole markers", "small, of four markers", "large, of four"],
 )
-def test_covariances_fit_the_errors_of_a_recording(errors, markers):
+def test_covariances_fit_the_errors_of_a_recording(errors_px, markers):
     """Two variances fit all of them; the residuals of four markers alone say little."""
-    for found, inside in fit_of_covariances(errors, markers):
+    for found, inside in fit_of_covariances(errors_px, markers):
         # Measured 0.7 to 1.1, and 0.85 to 0.95; with 60 frames, 0.13 and 0.04 are one standard deviation.
         assert 0.5 < found < 1.4
         assert inside >= 0.78
@@ -469,7 +451,7 @@ def test_covariances_fit_the_errors_of_a_recording(errors, markers):
 
 def test_a_shift_of_all_corners_of_a_frame_may_be_stated():
     """Found: 0.015 px, as in drawn videos, whatever the camera."""
-    assert fit_of_covariances(shaken)[0][1] < 0.5
-    found, inside = fit_of_covariances(shaken, noise=CornerNoise(0.5, 3e-4, shift_px=0.2))[0]
+    assert fit_of_covariances(SHAKEN)[0][1] < 0.5
+    found, inside = fit_of_covariances(SHAKEN, noise=CornerNoise(0.5, 3e-4, shift_px=0.2))[0]
     assert 0.5 < found < 1.3
     assert inside >= 0.8

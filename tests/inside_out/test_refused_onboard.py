@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -21,7 +22,6 @@ from marker_worlds import (
     long_table,
     make_drawn_flight,
     simple_lens,
-    wall_markers,
     wide_table,
 )
 
@@ -51,7 +51,6 @@ from psotrack.inside_out.lens_files import read_lens
 from psotrack.inside_out.mapping import complete_map
 from psotrack.inside_out.mapping.sightings import collect_sightings
 from psotrack.inside_out.pose import CornerNoise, estimate_pose
-from psotrack.recordings.datasets import write_marker_corners
 from psotrack.recordings.mocap import Markers, write_c3d
 
 ROOM = four_walls()
@@ -132,13 +131,9 @@ def opens_images_of_two_sizes(folder, run):
 
 
 def opens_folder_that_is_not_readable(folder, run):
-    def refused(_):
-        raise PermissionError(13, "Permission denied")
-
     def call():
         # Tests may run as root, and root may read every folder.
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(Path, "iterdir", refused)
+        with mock.patch.object(Path, "iterdir", side_effect=PermissionError(13, "Permission denied")):
             open_source(folder)
 
     return call
@@ -166,6 +161,7 @@ CORNERS_OF_3 = tuple(f"Marker3:{corner}" for corner in range(1, 5))
 UNSEEN_M = np.where(np.arange(4)[:, None] == 1, np.nan, np.ones((5, 4, 3)))
 TEN_COLUMNS = "\n".join(";".join(line.split(";")[:10]) for line in WIDE.splitlines())
 NEGATIVE_STD = re.sub("(?m)$", ";-2", WIDE.rstrip()).replace("4[m];-2", "4[m];std[mm]")
+THREE_ROWS = re.sub("\n3,3,.*", "", LONG)
 SAME_CENTRE = "id,x_m,y_m,z_m\n3,1,2,0.5\n4,1,2,0.5\n"
 TRACKS = "frame,time_s,drone,x_m,y_m,z_m\n0,0,a,1,2,3\n"
 CENTRES_TWICE = "id,x_m,y_m,z_m\n3,1,2,0.5\n3,1.5,2,0.5\n"
@@ -200,11 +196,7 @@ BAD = {
     "empty last cell": (with_cells([*CELLS[:-1], ""]), "line 4, column z4[m]", "found nothing"),
     "three corners": (with_cells(CELLS[:10]), "line 4: expected 13 values, found 10; "),
     "no fourth corner": (reads(TEN_COLUMNS), "expected a column x4, found only"),
-    "three rows": (
-        reads(re.sub("\n3,3,.*", "", LONG)),
-        "line 10 to 12, marker 3",
-        "found none of number 3; add",
-    ),
+    "three rows": (reads(THREE_ROWS), "line 10 to 12, marker 3", "found none of number 3; add"),
     "marker twice": (reads(WIDE.replace("\n4;", "\n3;")), "line 5, column id", "once, found 3 again"),
     "corner twice": (reads(LONG.replace("\n3,2,", "\n3,1,")), "line 11", "found corner 1 of marker 3 again"),
     "corner 4 from 0": (reads(LONG.replace("\n3,1,", "\n3,0,")), "line 5, column corner", "0 to 3, or tl"),
@@ -216,14 +208,8 @@ BAD = {
     "nothing": (reads("\n"), "expected a table of marker corners, found an empty file"),
     "other numbers": (reads("1;2;3;4\n5;6;7;8\n"), "line 1: expected a header, or numbers in rows of 13"),
     "negative std": (reads(NEGATIVE_STD), "line 2, column std[mm]: expected a standard deviation of 0"),
-    "not planar": (
-        reads(third(bent(0.05, 1))),
-        "line 4, marker 3",
-        "a flat square",
-        "25 mm off",
-        "side is 40",
-    ),
-    "not square": (reads(third(bent(0.06, 0))), "line 4, marker 3", "a flat square", "corners 4"),
+    "not planar": (reads(third(bent(0.05, 1))), "line 4, marker 3", "a flat square", "25 mm off"),
+    "not square": (reads(third(bent(0.06, 0))), "a flat square", "corners 4", "the side is 4"),
     "crossed": (reads(third(ROOM[3][[0, 1, 3, 2]])), "line 4, marker 3", "one after the other"),
     "same place": (reads(third(ROOM[2] + 0.01)), "line 4, marker 3", "both markers at the place of marker 2"),
     "one in mm": (reads(third(1e3 * ROOM[3])), "line 4, marker 3", "found 400 m; is it in mill", "x1[mm]"),
@@ -238,10 +224,7 @@ BAD = {
     "labels of drones": (reads_c3d(("Dron1:Dron11",), np.ones((5, 1, 3))), "Marker7:1", "found Dron1"),
     # Maps from videos and from centres.
     "no frames": (calls(in_frames), "expected frames that show markers, found none in any frame"),
-    "unseen known": (
-        calls(build_map, in_frames(1, 2), {77: ROOM[7]}),
-        "marker 77 beside others, found only 1",
-    ),
+    "unseen known": (calls(build_map, in_frames(1, 2), {77: ROOM[7]}), "77 beside others, found only 1"),
     "known alone": (calls(build_map, in_frames(7), {7: ROOM[7]}), "in no frame; name another one by --known"),
     "no side": (calls(corners_in_own_frame, 0.0), "side_m: expected a number above 0"),
     "no two of a map": (calls(check_map, in_frames(1, 2), MarkerMap({9: ROOM[1]})), "two markers of the map"),
@@ -279,12 +262,10 @@ BAD = {
     "path twice": (fuses("{dron1} {dron1} {tracks}"), "a second path of dron1"),
     "tracks for a path": (fuses("{tracks} {tracks}"), "a camera's path with orientations"),
     "negative range": (fuses("{dron1} {tracks} --max-offset -1"), "expected a number above 0, found -1"),
-    "blind path": (fuses("{blind} {tracks}"), "blind.csv: expected a pose in at least"),
-    "blind tracks": (fuses("{dron1} {blind}"), "blind.csv, outside tracks: expected a pos"),
-    "elsewhere": (fuses("{dron1} {elsewhere}"), "elsewhere.csv, outside", "within 0.5 m", "one clock"),
     "later": (fuses("{dron1} {later}"), "later.csv: ", "0.00 to 3.96 s of dron1, found 100.00 to 103.96 s; "),
     # Lenses, images, and detection.
     "another shape": (reads_lens((1920, 1080), name="left", scale=True), "640 x 480; ", "the shape differs"),
+    "large images": (reads_lens((1280, 960), name="left"), "lens.toml", "for 1280 x 960", "--scale-camera"),
     "axis off": (reads_lens_without_size, "for 1920 x 1080", "an optical axis at (320, 240)"),
     "several lenses": (reads_lens((640, 480)), "one camera, found left, right; name it by --camera-name"),
     "no such lens": (reads_lens((640, 480), name="up"), "expected a camera up, found left, right"),
@@ -296,9 +277,7 @@ BAD = {
     # The command `onboard localise`.
     "no lens": (localises("", lens=""), "lens: expected --camera FILE or --fov H,V, found neither"),
     "two lenses": (localises("--camera {lens}"), "lens: ", "found both"),
-    "large lens": (localises("", lens="--camera {large}"), "large.toml: ", "for 640 x 480", "--scale-camera"),
     "sides of corners": (localises("--marker-size 0.3"), "a table of centres alone, found corners in"),
-    "one place": (localises("--markers {wrong}"), "line 11, marker 40: ", "at the place of marker 5"),
     "frames": (localises("--frames 99"), "frames: expected 1 to 14, the frames of ", "avi, found 99"),
     "drone": (localises("--drone dron1"), "--drone: expected a folder with videos of drones' own"),
     "number": (localises("", "0"), "0: expected a video, ", "pass --live if it is a camera's number"),
@@ -306,7 +285,6 @@ BAD = {
     "no rate": (localises("", "{images}"), "--fps: expected the rate at which ", "such as --fps 25"),
     "one image": (localises("", "{images}/frame0.png"), "frame0.png: expected a video, or a folder"),
     "no images": (localises("", "{tmp}"), "images, which end in .png", "found neither; to use"),
-    "negative readout": (localises("--readout -0.01"), "--readout: expected 0 to 0.04 s"),
     "readout nan": (localises("--readout nan"), "--readout: expected 0 to"),
     "long readout": (localises("--readout 0.05"), "between two frames at 25 frames per second, found 0.05"),
     # The command `onboard map`.
@@ -319,17 +297,8 @@ BAD = {
     "negative side": (maps("--out {new} --known 17 --side -1"), "--side: expected a number above 0"),
     "video as map": (maps("--check {flight}"), "flight.avi: expected UTF-8 text"),
     "drone of a video": (maps("--drone dron1 --check {corners}"), "expected a sequence's folder as SOURCE"),
-    "dictionary": (
-        maps("--check {corners} --fov 70,55 --dictionary 5x5_50 --frames 3"),
-        "show markers, found none",
-    ),
+    "dictionary": (maps("--check {corners} --fov 70,55 --dictionary 5x5_50 --frames 3"), "found none"),
 }
-
-
-def make_wrong_map_and_lens(folder):
-    """A map with two markers at one place, and a lens for larger images."""
-    write_marker_corners(folder / "wrong.csv", wall_markers() | {5: wall_markers()[40]})
-    write_rig(folder / "large.toml", make_rig({"front": simple_lens(914.0, (1280, 960))}))
 
 
 @pytest.fixture(scope="module")
@@ -337,9 +306,7 @@ def files(tmp_path_factory):
     """The files of a drawn flight, and of paths and tracks."""
     drawn = make_once(tmp_path_factory, "drawn_flight", make_drawn_flight)
     flown = make_once(tmp_path_factory, "paths_and_tracks", make_paths_and_tracks)
-    other = make_once(tmp_path_factory, "wrong_map_and_lens", make_wrong_map_and_lens)
-    paths = [*drawn.iterdir(), *flown.iterdir(), *other.iterdir()]
-    return {path.stem: path for path in paths}
+    return {path.stem: path for path in (*drawn.iterdir(), *flown.iterdir())}
 
 
 @pytest.mark.parametrize(("prepare", "words"), [(one, words) for one, *words in BAD.values()], ids=BAD)

@@ -135,8 +135,8 @@ def test_corners_are_moved_to_where_the_middle_row_sees_them():
         (0, 12),
         # The last of 40 frames was 12 mm off and 26 to 30 of six degrees of freedom, because the motion was learned
         # from poses by a global shutter, whose covariances do not contain the motion.
-        *(pytest.param(seed, 40, marks=pytest.mark.slow) for seed in (3, 1, 7)),
-        *(pytest.param(seed, 120, marks=pytest.mark.nightly) for seed in (1, 2, 3)),
+        pytest.param(3, 40, marks=pytest.mark.slow),
+        *(pytest.param(seed, 120, marks=pytest.mark.nightly) for seed in (1, 2)),
     ],
 )
 def test_poses_of_a_rolling_shutter_are_as_good_as_stated(seed, num_frames):
@@ -161,9 +161,8 @@ def test_poses_of_a_rolling_shutter_are_as_good_as_stated(seed, num_frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
-def test_a_line_time_that_is_left_out_widens_the_covariances_where_the_video_shows_it(seed):
-    hand = Hand(seed)
+def test_a_line_time_that_is_left_out_widens_the_covariances_where_the_video_shows_it():
+    hand = Hand(0)
     found = followed(filmed(hand, 40, LINE_TIME_S), RollingShutter(0.0))
     assert found.shutter.line_time_s == 0
     assert found.shutter.std_s == pytest.approx(LINE_TIME_S, rel=0.03)
@@ -176,7 +175,7 @@ def test_a_line_time_that_is_left_out_widens_the_covariances_where_the_video_sho
 
 def test_a_stream_follows_a_shutter_whose_line_time_is_given():
     hand = Hand(1)
-    path = followed(iter(filmed(hand, 30, LINE_TIME_S)), RollingShutter(LINE_TIME_S)).path
+    path = followed(iter(filmed(hand, 20, LINE_TIME_S)), RollingShutter(LINE_TIME_S)).path
     assert path.seen[3:].all()
     # With the motion that the filter predicts; 10 to 20 mm if the shutter is left out.
     assert np.median(off_m(path, hand)[5:]) < 0.004
@@ -206,7 +205,7 @@ def line_time_of(hand, num_frames, line_time_s=LINE_TIME_S):
     return estimate_line_time(filmed(hand, num_frames, line_time_s), MarkerMap(ROOM), LENS, PoseSettings())
 
 
-@pytest.mark.parametrize("readout_s", [0.0, 0.005, -0.01])
+@pytest.mark.parametrize("readout_s", [0.0, -0.01])
 def test_the_line_time_is_estimated_with_its_uncertainty(readout_s):
     found = line_time_of(Hand(2), 33, readout_s / HEIGHT)
     assert found.is_shown
