@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from dpjait_folders import make_simulated
 from marker_pictures import draw
 from scipy.spatial.transform import Rotation
 
@@ -200,19 +201,15 @@ def make_drawn_flight(folder: Path) -> Path:
 
 
 def write_onboard_sequence(drawn: Path, folder: Path) -> Path:
-    """Write a sequence in the dataset's layout: two drones and a static camera, all with the drawn flight's video."""
-    folder.mkdir()
-    for name in ("dron1_cam_s.avi", "dron2_cam_s.avi", "cam1i_s.avi"):
-        shutil.copy(drawn / "flight.avi", folder / name)
+    """Write a sequence in the dataset's layout, where the videos of two drones' own cameras are the drawn flight's."""
+    make_simulated(folder)
+    for number in (1, 2):
+        shutil.copy(drawn / "flight.avi", folder / f"dron{number}_cam_s.avi")
     shutil.copy(drawn / "corners.csv", folder / "aruco_corners.csv")
     K = DRAWN_LENS.K
     rows = [f"dron{number};{K[0, 0]};{K[1, 1]};319.5;239.5;640;480\n" for number in (1, 2)]
     header = "cam_name;focal_length_x;focal_length_y;cx;cy;width;height\n"
     (folder / "drone_cameras_calibration.csv").write_text("".join([header, *rows]))
-    (folder / "cameras_calibration.csv").write_text(
-        "cam_name;cam_x[m];cam_y[m];cam_z[m];cam_or_x[rad];cam_or_y[rad];cam_or_z[rad];focal_length;cx;cy\n"
-        "cam1i;0;0;5;0;0;0;600;480;360\n"
-    )
     # A picture in the folder does not make it a folder of images.
     cv2.imwrite(str(folder / "plot.png"), np.zeros((20, 30), np.uint8))
     return folder

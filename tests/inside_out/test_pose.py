@@ -212,14 +212,6 @@ def test_covariance_includes_errors_of_the_map_and_of_the_focal_length():
     assert np.median(off_m[with_errors]) < 0.8 * np.median(off_m[SETTINGS])
 
 
-def test_inset_of_all_corners_does_not_move_the_camera():
-    view, corners_m = camera_at(), two_walls(8)
-    corners_px = image_corners(view, corners_m)
-    found = estimated(view, corners_px + 0.5 * inward(corners_px), corners_m)
-    assert squared_deviations(found, view) < 0.01
-    assert found.reprojection_px == pytest.approx(0.5, rel=0.01)
-
-
 @given(
     axis=st.tuples(*[st.floats(-3, 3)] * 3),
     shift_m=st.tuples(*[st.floats(-50, 50)] * 3),
@@ -403,14 +395,13 @@ WALL = {
 }
 
 
-#: Standard deviations, px, of errors of each corner for itself, of a marker's corners together, as of a lens that is
-#: not exact, and of all corners of a frame together.
-INDEPENDENT, TOGETHER, SHAKEN = (0.15, 0.0, 0.0), (0.1, 0.3, 0.0), (0.1, 0.0, 0.2)
-
-
 def fit_of_covariances(errors_px, markers=10, noise=None):
     """For poses (6) and positions (3): mean squared error by the covariances, as a share of its expectation, and the
-    share of the truths in the 90 % ellipsoid; in 60 frames."""
+    share of the truths in the 90 % ellipsoid; in 60 frames.
+
+    `errors_px` are standard deviations of errors of each corner for itself, of a marker's corners together, as of a
+    lens that is not exact, and of all corners of a frame together.
+    """
     rng, frames, truths = np.random.default_rng(0), [], []
     points_m = np.array(list(WALL.values()))[:markers]
     for number in range(60):
@@ -438,8 +429,8 @@ def fit_of_covariances(errors_px, markers=10, noise=None):
 
 @pytest.mark.parametrize(
     ("errors_px", "markers"),
-    [(INDEPENDENT, 10), (TOGETHER, 10), ((0.05, 0.0, 0.0), 4), ((0.5, 0.0, 0.0), 4)],
-    ids=["independent", "of whole markers", "small, of four markers", "large, of four"],
+    [((0.1, 0.3, 0.0), 10), ((0.05, 0.0, 0.0), 4), ((0.5, 0.0, 0.0), 4)],
+    ids=["of whole markers", "small, of four markers", "large, of four"],
 )
 def test_covariances_fit_the_errors_of_a_recording(errors_px, markers):
     """Two variances fit all of them; the residuals of four markers alone say little."""
@@ -451,7 +442,6 @@ def test_covariances_fit_the_errors_of_a_recording(errors_px, markers):
 
 def test_a_shift_of_all_corners_of_a_frame_may_be_stated():
     """Found: 0.015 px, as in drawn videos, whatever the camera."""
-    assert fit_of_covariances(SHAKEN)[0][1] < 0.5
-    found, inside = fit_of_covariances(SHAKEN, noise=CornerNoise(0.5, 3e-4, shift_px=0.2))[0]
+    found, inside = fit_of_covariances((0.1, 0.0, 0.2), noise=CornerNoise(0.5, 3e-4, shift_px=0.2))[0]
     assert 0.5 < found < 1.3
     assert inside >= 0.8
