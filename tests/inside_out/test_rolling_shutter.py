@@ -184,7 +184,7 @@ def test_a_stream_follows_a_shutter_whose_line_time_is_given():
 
 def test_a_still_camera_has_the_poses_of_a_global_shutter():
     """A pose does not depend on the line time where nothing moves, up to the uncertainty of the motion."""
-    detected = filmed(Hand(0, size=0.0), 10, LINE_TIME_S)
+    detected = filmed(Hand(0, size=0.0), 8, LINE_TIME_S)
     plain, rolling = (followed(detected, RollingShutter(one)).path for one in (0.0, LINE_TIME_S))
     assert np.linalg.norm(plain.position_m - rolling.position_m, axis=1)[6:].max() < 1e-3
 
