@@ -109,12 +109,6 @@ class TestMog2:
                 (mask,) = Mog2(fg_settings).foreground(empty, [frame])
                 assert mask.any() == seen
 
-    @pytest.mark.parametrize("shape", [(119, 159), (1, 1), (5, 3)])
-    def test_any_image_size_works_at_half_scale(self, shape: tuple[int, int]) -> None:
-        light, dark = np.full((9, *shape, 3), 105, np.uint8), np.full((1, *shape, 3), 10, np.uint8)
-        (mask,) = Mog2(ForegroundSettings(min_blob_px=0)).foreground(light, dark)
-        np.testing.assert_array_equal(mask, np.full((-(-shape[0] // 2), -(-shape[1] // 2)), 255))
-
 
 @given(pixels=st.lists(st.integers(0, 20 * 30 - 1), max_size=150), min_blob_px=st.integers(0, 12))
 def test_remove_speckle_removes_only_small_blobs(pixels: list[int], min_blob_px: int) -> None:

@@ -461,10 +461,6 @@ BAD = {
         _settings(shadows="drop"),
         "shadows: expected keep, because the background model living does not",
     ),
-    "no model": (
-        _made(lambda recording: recording, settings=SilhouetteSettings(background="liveing")),
-        "liveing",
-    ),
     "no jobs": (_made(lambda recording: recording, jobs=0), "jobs: expected a whole number of at least 1"),
     "small mask": (_made(_ignoring), "small.png: expected 162 x 118 ", " as in cam1.avi, found 10 x 10"),
     "no video": (
