@@ -1,8 +1,7 @@
 """Simulated flights with white jerk, and one joint Gaussian of all states in float64 NumPy, as oracles for `motion`.
 
-The textbook's state is position, velocity and acceleration, (9,), or with a correlated error of the measurements,
-(12,). A measurement observes position plus correlated error. The state of `psotrack.tracking.motion` contains this sum
-instead.
+The textbook's state, (12,), is position, velocity, acceleration and the correlated error of the measurements. A
+measurement observes position plus correlated error. The state of `psotrack.tracking.motion` contains this sum instead.
 """
 
 from dataclasses import dataclass, replace
@@ -15,6 +14,8 @@ from psotrack.tracking.motion import Measurements, MotionParams
 
 DT_S = 1 / 25
 
+#: (3, 12), the measurement matrix.
+H = np.eye(3, 12) + np.eye(3, 12, k=9)
 #: (12, 12), maps the state of `psotrack.tracking.motion` to the textbook's state.
 TO_TEXTBOOK = np.eye(12) - np.eye(12, k=9)
 
@@ -29,38 +30,23 @@ class Model:
     error_share: float = 0.0
     error_time_s: float = 0.4
 
-    @property
-    def H(self):
-        """(3, 9) or (3, 12), the measurement matrix."""
-        return np.eye(3, 12) + np.eye(3, 12, k=9) if self.error_share else np.eye(3, 9)
-
     def start(self, measured_m, covariance_m2):
         """Initial mean and covariance from the first measurement z = p + b + w.
 
         The position p has no prior; the correlated error b has its stationary prior; w is white noise.
         """
         rest = np.diag(np.repeat([self.velocity_std**2, self.acceleration_std**2], 3))
-        spread = block_diag(covariance_m2, rest)
-        mean = np.concatenate([measured_m, np.zeros(len(self.H.T) - 3)])
-        if self.error_share:
-            correlated = self.error_share * covariance_m2
-            spread = block_diag(spread, correlated)
-            # p = z - b - w.
-            spread[:3, 9:] = spread[9:, :3] = -correlated
-        return mean, spread
+        correlated = self.error_share * covariance_m2
+        spread = block_diag(covariance_m2, rest, correlated)
+        # p = z - b - w.
+        spread[:3, 9:] = spread[9:, :3] = -correlated
+        return np.concatenate([measured_m, np.zeros(9)]), spread
 
     def transition(self, dt_s, covariance_m2):
         """F and Q of a time step; `covariance_m2` is the covariance of the previous measurement."""
         F, Q = transition(dt_s, self.density)
-        if self.error_share:
-            left, begun = decay(dt_s, self.error_time_s)
-            F = block_diag(F, left * np.eye(3))
-            Q = block_diag(Q, begun * self.error_share * covariance_m2)
-        return F, Q
-
-    def white(self, covariance_m2):
-        """(..., 3, 3), the part of a measurement's covariance that is independent from frame to frame."""
-        return (1 - self.error_share) * covariance_m2
+        left, begun = decay(dt_s, self.error_time_s)
+        return block_diag(F, left * np.eye(3)), block_diag(Q, begun * self.error_share * covariance_m2)
 
     def params(self, drones):
         """`MotionParams` in float64 with the same values for all drones."""
@@ -91,10 +77,14 @@ def decay(dt_s, time_s):
     return left.item(), begun.item()
 
 
-def textbook(model, time_s, measured_m, covariance_m2, was_measured):
-    """Means and covariances of one drone without recursion: condition a Gaussian of all states on all measurements.
+def joint_gaussian(model, time_s, measured_m, covariance_m2, was_measured):
+    """Mean and covariance of all states of one drone, given its first measurement, and what the others must be.
 
     In the first frame, only the measurement determines the position.
+
+    Returns:
+        (frames · 12,) and (frames · 12, frames · 12), then (measurements · 3, frames · 12), which maps all states to
+        the measurements after the first, and their covariance.
     """
     frames = len(time_s)
     start, P = model.start(measured_m[0], covariance_m2[0])
@@ -112,12 +102,19 @@ def textbook(model, time_s, measured_m, covariance_m2, was_measured):
         prior[k, :, k] = F @ prior[k - 1, :, k - 1] @ F.T + Q
     prior, mean = prior.reshape(size * frames, size * frames), mean.ravel()
     rows = np.flatnonzero(was_measured[1:]) + 1
-    H = np.kron(np.eye(frames)[rows], model.H)
-    R = block_diag(*model.white(covariance_m2[rows]))
-    gain = np.linalg.solve(H @ prior @ H.T + R, H @ prior).T
-    mean = mean + gain @ (measured_m[rows].ravel() - H @ mean)
-    covariance = (prior - gain @ H @ prior).reshape(frames, size, frames, size)
-    return mean.reshape(frames, size), np.stack([covariance[k, :, k] for k in range(frames)])
+    observed = np.kron(np.eye(frames)[rows], H)
+    R = block_diag(*(1 - model.error_share) * covariance_m2[rows])
+    return mean, prior, observed, observed @ prior @ observed.T + R
+
+
+def textbook(model, time_s, measured_m, covariance_m2, was_measured):
+    """Means and covariances of one drone without recursion: condition a Gaussian of all states on all measurements."""
+    mean, prior, observed, S = joint_gaussian(model, time_s, measured_m, covariance_m2, was_measured)
+    gain = np.linalg.solve(S, observed @ prior).T
+    mean = mean + gain @ (measured_m[1:][was_measured[1:]].ravel() - observed @ mean)
+    frames = len(time_s)
+    covariance = (prior - gain @ observed @ prior).reshape(frames, 12, frames, 12)
+    return mean.reshape(frames, 12), np.stack([covariance[k, :, k] for k in range(frames)])
 
 
 @dataclass(frozen=True)
@@ -209,10 +206,11 @@ def halve_errors(flown):
 
 def remove_measurements(flown, unknown):
     """Flight without the measurements where `unknown`; their values become NaN, so that any use of them would show."""
-    measured_m, covariance_m2 = flown.measured_m.copy(), flown.covariance_m2.copy()
-    measured_m[unknown], covariance_m2[unknown] = np.nan, np.nan
     return replace(
-        flown, measured_m=measured_m, covariance_m2=covariance_m2, was_measured=flown.was_measured & ~unknown
+        flown,
+        measured_m=np.where(unknown[..., None], np.nan, flown.measured_m),
+        covariance_m2=np.where(unknown[..., None, None], np.nan, flown.covariance_m2),
+        was_measured=~unknown,
     )
 
 
@@ -221,13 +219,3 @@ def remove_random_measurements(flown, seed, share=0.3):
     unknown = np.random.default_rng(seed).random(flown.was_measured.shape) < share
     unknown[0] = False
     return remove_measurements(flown, unknown)
-
-
-def motion_params(density, drones, velocity_std=1.0, acceleration_std=2.0, **error):
-    """`MotionParams` in float64 with the same values for all drones."""
-    return Model(density, velocity_std, acceleration_std, **error).params(drones)
-
-
-def nees(error, covariance):
-    """Normalised estimation error squared, eᵀ C⁻¹ e, over the last axis."""
-    return (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)

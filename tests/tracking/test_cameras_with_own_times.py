@@ -305,17 +305,21 @@ def test_boxes_are_where_the_drones_are_when_the_cameras_rows_are_exposed():
     position_m = rng.uniform(-1, 1, (3, 3)) + np.array([0, 0, 1.5])
     velocity_m_s = rng.normal(0, 1.5, (3, 3))
     exposures = replace(NOW, is_there=np.array([True, True, True, False, True]))
+
+    @jax.jit
+    def boxes_at(exposures, cameras):
+        extents = make_extents(exposures.seeing(cameras), np.full((3, 3), 0.02))
+        return project_boxes(exposures.moved(extents, position_m, velocity_m_s), position_m)
+
     with jax.enable_x64(True):
-        extents = make_extents(exposures.seeing(RIG.cameras), np.full((3, 3), 0.02))
-        boxes = project_boxes(exposures.moved(extents, position_m, velocity_m_s), position_m)
+        boxes = boxes_at(exposures, RIG.cameras)
     seen = [0, 1, 2, 4]
     shown = np.stack([boxes.x_middle, boxes.y_middle], axis=-1) - 0.5
     # The row is that of the expected position, which differs little from that of the moved one.
     one_step = pixels_at_exposure(position_m, velocity_m_s, steps=1)
     np.testing.assert_allclose(shown[:, seen], one_step[:, seen], atol=0.05)
-    np.testing.assert_allclose(
-        shown[:, seen], pixels_at_exposure(position_m, velocity_m_s)[:, seen], atol=1.0
-    )
+    at_exposure = pixels_at_exposure(position_m, velocity_m_s)
+    np.testing.assert_allclose(shown[:, seen], at_exposure[:, seen], atol=1.0)
     assert not np.asarray(boxes.in_front)[:, 3].any()
     assert np.isfinite(shown).all()
 
@@ -344,38 +348,3 @@ def test_a_rolling_shutter_has_the_time_of_its_middle_row():
     assert not rolling.is_synchronous
     assert rolling.line_time_s.tolist() == [0, 2e-5, 0, 0, 0]
     np.testing.assert_allclose(rolling.offset_s[:20], np.tile([0, 0.0108, 0, 0, 0], (20, 1)), atol=1e-9)
-
-
-def test_silhouettes_at_instants_show_the_frames_of_the_timeline():
-    times = {"a": FrameTimes(4, 10.0), "b": FrameTimes(2, 5.0, 0.12)}
-    arrays = tuple(
-        np.arange(1, each.num_frames + 1, dtype=np.uint8)[:, None, None] * np.ones((1, 2, 3), np.uint8)
-        for each in times.values()
-    )
-    frames = Silhouettes(("a", "b"), {"a": "", "b": ""}, 4, 4, (2, 3), {}, arrays)
-    timeline = make_timeline(times)
-    shown = frames.at_instants(timeline)
-    assert shown.read(0, 4)[:, 0, 0, 0].tolist() == [1, 2, 3, 4]
-    assert shown.read(0, 4)[:, 1, 0, 0].tolist() == (timeline.frame[:4, 1] + 1).tolist()
-    assert shown.part(1, 3).read(0, 2).tolist() == shown.read(1, 3).tolist()
-    synchronous = make_timeline({"a": times["a"], "b": times["a"]})
-    alike = replace(frames, arrays=(arrays[0], arrays[0]))
-    assert alike.at_instants(synchronous) is alike
-    # A frame that a camera does not have counts as none, not as one without foreground.
-    shorter = frames.at_instants(synchronous)
-    assert shorter.exposures is not None
-    assert shorter.exposures.is_there.tolist() == [[True, True]] * 2 + [[True, False]] * 2
-
-
-def test_sightings_at_instants():
-    """Those of synchronous cameras stay as they are; a camera that is not there has none."""
-    shown = sightings_of(alike(10))
-    assert shown.at_instants(make_timeline(alike(10))) is shown
-    times = alike(10) | {RIG.names[3]: FrameTimes(4, FPS, 0.08)}
-    shown = sightings_of(times).at_instants(make_timeline(times))
-    there = np.isfinite(shown.noise_px[:, 3]).all(axis=-1)
-    assert there.tolist() == [False] * 2 + [True] * 4 + [False] * 4
-    assert shown.exposures.is_there[:, 3].tolist() == there.tolist()
-    one = shown[3]
-    assert one.exposures.offset_s.shape == (5,)
-    assert replace(one, exposures=None).noise_px.shape == one.noise_px.shape

@@ -1,4 +1,4 @@
-"""The soft IoU: compared with fractions computed by hand, with a NumPy implementation, and its invariants.
+"""The soft IoU and its vertex: compared with fractions computed by hand, with NumPy, and their invariants.
 
 Results that are computed by hand use cameras so far away that their images are parallel projections.
 """
@@ -10,19 +10,22 @@ import jax
 import numpy as np
 import pytest
 from helpers import draw_coverage, far_camera, float32, make_unnamed_rig, ring_rig
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from windows import best_place, cut_at
 
 from psotrack.foreground.silhouettes import summed_area_table
+from psotrack.geometry import look_at, make_camera
 from psotrack.tracking.swarm import SoftIoU
 from psotrack.tracking.swarm.fitness import (
     PAPER_SCORE,
+    camera_scores,
     drone_fitness,
     filled_share,
     joint_fitness,
     score_inputs,
 )
+from psotrack.tracking.swarm.vertex import SPAN, find_vertex
 
 #: 64 x 48 pixels, 20 pixels per metre: a drone of 1 m x 0.5 m at the origin covers columns 22 to 42, rows 19 to 29.
 FAR = {"image_size_wh": (64, 48), "pixels_per_m": 20.0}
@@ -100,15 +103,16 @@ def test_hard_edges_are_whole_pixels():
 
 def test_whole_cells_of_a_whole_image_are_whole_pixels():
     """A search reads whole cells of its windows; those of a whole image are the silhouette's pixels."""
-    cameras = make_unnamed_rig(far_camera(**FAR)).cameras
-    tables = summed_area_table(silhouette(DRONE))
-    soft, hard = (
-        score_inputs(cameras, SIZE_M, tables, SoftIoU(whole_pixels=hard, min_cameras=1), reduction=1)
-        for hard in (False, True)
-    )
-    soft = replace(soft, patches=replace(soft.patches, whole_cells=True))
-    position_m = np.array([[[x_px * PIXEL_M, 0, 0]] for x_px in np.linspace(-12.3, 12.3, 40)], np.float32)
-    np.testing.assert_allclose(drone_fitness(soft, position_m), drone_fitness(hard, position_m), atol=1e-6)
+
+    def in_whole_cells(inputs, position_m):
+        return drone_fitness(replace(inputs, patches=replace(inputs.patches, whole_cells=True)), position_m)
+
+    rig, image = make_unnamed_rig(far_camera(**FAR)), silhouette(DRONE)
+    position_m = np.array([[[x_px * PIXEL_M, 0, 0]] for x_px in np.linspace(-12.3, 12.3, 40)])
+    soft = evaluate(in_whole_cells, rig, image, position_m, settings=SoftIoU(min_cameras=1))
+    whole = SoftIoU(whole_pixels=True, min_cameras=1)
+    hard = evaluate(drone_fitness, rig, image, position_m, settings=whole)
+    np.testing.assert_allclose(soft, hard, atol=1e-6)
 
 
 def test_fitness_is_undefined_with_too_few_cameras():
@@ -272,3 +276,91 @@ def test_fitness_is_highest_at_the_drone(place_m, shape):
     assert fitness[0] > 0.45
     # Measured: at least 2.8 % lower.
     assert (fitness[1:] < 0.98 * fitness[0]).all()
+
+
+# --- the vertex of the score, compared with least squares in float64 and with silhouettes of known ellipsoids
+
+LENS_RIG = ring_rig(6, image_size_wh=(480, 360), coefficients=5)
+FLAT_M = np.array([[0.5, 0.5, 0.2]])
+PLACE_M = np.array([[0.1, 0.2, 1.2]])
+
+
+def vertex_of(inputs, position_m):
+    return find_vertex(inputs, position_m, inputs.extents.size_m)
+
+
+def shown(truth_m, rig=LENS_RIG):
+    return draw_coverage(rig, truth_m, FLAT_M, reduction=2)
+
+
+def vertex(images, position_m, rig=LENS_RIG):
+    return evaluate(vertex_of, rig, images, position_m, FLAT_M, SOFT)
+
+
+def test_the_vertex_is_that_of_the_least_squares_paraboloid():
+    """Vertex, curvature and dispersion, from NumPy's least squares through the 27 scores of each camera."""
+    truth = np.array([[0.31, -0.22, 1.17]])
+    images, start = shown(truth), truth + np.array([0.012, -0.008, 0.006])
+    grid = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], float)
+    places = start + SPAN * FLAT_M * grid[:, None, :]
+    scores, weights = np.float64(evaluate(camera_scores, LENS_RIG, images, places, FLAT_M, SOFT))
+    share = weights[13, 0] / weights[13, 0].sum()
+    x, y, z = grid.T
+    terms = np.stack([np.ones(27), x, y, z, x * x / 2, y * y / 2, z * z / 2, x * y, x * z, y * z], axis=-1)
+    solved = np.linalg.lstsq(terms, scores[:, 0], rcond=None)[0]
+    slope = (share * solved[1:4]).T
+    xx, yy, zz, xy, xz, yz = share * solved[4:]
+    bent = -np.stack([np.stack(row, -1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], axis=-2)
+    whole = bent.sum(axis=0)
+    to_vertex = np.linalg.solve(whole, slope.sum(axis=0))
+    left = slope - bent @ to_vertex
+    cameras = 1 / np.square(share).sum()
+    phi = np.einsum("ci,ij,cj->", left, np.linalg.inv(whole), left) / 3 * cameras / (cameras - 1.5)
+
+    found = vertex(images, start)
+    span = SPAN * FLAT_M[0]
+    # Scores have float32 errors of 1e-7; vertex and curvature divide score differences by a curvature of about 0.1.
+    np.testing.assert_allclose(found.position_m[0], start[0] + span * to_vertex, atol=2e-6)
+    inverse = np.linalg.inv(whole) * np.outer(span, span)
+    atol_m2 = 1e-5 * np.trace(inverse)
+    np.testing.assert_allclose(found.inverse_curvature_m2[0], inverse, rtol=1e-3, atol=atol_m2)
+    # Residual slopes are small differences of large ones.
+    np.testing.assert_allclose(found.dispersion[0], phi, rtol=0.02)
+
+
+def test_cameras_on_one_side_know_that_the_depth_is_uncertain():
+    """Three cameras within nine degrees. Regression: variances were limited to a ratio of 50."""
+    cameras = []
+    for angle in (-0.08, 0.0, 0.08):
+        R, t_m = look_at((4 * np.cos(angle), 4 * np.sin(angle), 1.2), (0.0, 0.0, 1.2))
+        K = np.array([[450.0, 0, 239.5], [0, 450.0, 179.5], [0, 0, 1]])
+        cameras.append(make_camera(R=R, t_m=t_m, K=K, image_size_wh=(480, 360)))
+    rig, truth = make_unnamed_rig(*cameras), np.array([[0.02, -0.03, 1.21]])
+    variance, axes = np.linalg.eigh(vertex(shown(truth, rig), truth, rig).inverse_curvature_m2[0])
+    # The worst axis is the line of sight; rays alone would give a ratio of 1 / mean of squared sines, 230.
+    assert abs(axes[0, -1]) > 0.95
+    assert variance[-1] > 80 * np.sqrt(variance[0] * variance[1])
+
+
+SHOWN = shown(PLACE_M)
+
+
+def test_the_vertex_stays_within_the_grid_and_one_camera_has_no_dispersion():
+    start = PLACE_M + np.array([0.3, 0.0, 0.0])
+    moved = np.abs(vertex(SHOWN, start).position_m - start)
+    assert (moved <= SPAN * FLAT_M * (1 + 1e-5)).all()
+    assert np.isinf(vertex(SHOWN[:1], PLACE_M, LENS_RIG.select(LENS_RIG.names[:1])).dispersion[0])
+
+
+@settings(max_examples=25)
+@given(st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 6)))
+@example((0.0, 0.0, 1.0))
+def test_the_vertex_is_finite_everywhere(position_m):
+    """Beside the drone, outside of images and behind cameras: finite numbers, and a positive definite matrix."""
+    found = vertex(SHOWN, np.array([position_m]))
+    assert np.isfinite(found.position_m).all()
+    inverse = np.float64(found.inverse_curvature_m2[0])
+    # The inverse of a 3 x 3 matrix in float32: each element has a few roundings of 6e-8 of the largest element.
+    np.testing.assert_allclose(inverse, inverse.T, rtol=0, atol=1e-6 * np.abs(inverse).max())
+    assert np.linalg.eigvalsh((inverse + inverse.T) / 2)[0] > 0
+    assert not np.isnan(found.dispersion).any()

@@ -284,16 +284,9 @@ def boxes_in_camera(view, camera):
     return np.concatenate([centre_px - half_px, centre_px + half_px], axis=-1)
 
 
-def two_drones():
-    """Positions of two drones side by side, the second a little higher than the first.
-
-    In some cameras, the whole narrow drone is in front of or behind the wide drone.
-    """
-    return np.array([[0.0, 0.0, 1.0], [0.2, 0.15, 1.24]])
-
-
 def test_a_drone_in_a_merged_box_gets_its_own_box_if_edges_of_the_merged_box_are_its_own():
-    drones_m = two_drones()
+    """Two drones side by side: in some cameras, the whole narrow drone is in front of or behind the wide drone."""
+    drones_m = np.array([[0.0, 0.0, 1.0], [0.2, 0.15, 1.24]])
     own = corners(drones_m)
     whole = enclosing_box(own)
     seen = split(sightings_of(whole), drones_m, SPANS_M)
@@ -307,6 +300,11 @@ def test_a_drone_in_a_merged_box_gets_its_own_box_if_edges_of_the_merged_box_are
     assert {1, 2} <= set(num_placed)
     off_px = PART_SHARE * np.sqrt(seen.size_px[:, 1:].prod(axis=-1))
     np.testing.assert_allclose(seen.noise_px[:, 1:], np.hypot(3.0, off_px), rtol=1e-12)
+    # A box for each drone does not change, nor does the box of drones of unknown size.
+    for view, span_m in ((sightings_of(*own), SPANS_M), (sightings_of(whole), np.full((2, 2), np.nan))):
+        seen = split(view, drones_m, span_m)
+        np.testing.assert_array_equal(seen.centre_px, view.centre_px)
+        np.testing.assert_array_equal(seen.noise_px, view.noise_px)
 
 
 def test_the_expected_positions_hardly_change_the_boxes():
@@ -319,15 +317,6 @@ def test_the_expected_positions_hardly_change_the_boxes():
     # An error of 5 cm at about 4 m is 1.3 % of 150 px, and half of the size goes into the centre.
     middle_px = (own[:, 0, :2] + own[:, 0, 2:]) / 2
     np.testing.assert_allclose(seen.centre_px[0, 1:], middle_px, atol=1.0)
-
-
-@pytest.mark.parametrize("case", ["a box for each drone", "drones of unknown size"])
-def test_boxes_that_do_not_change(case):
-    own, alone = corners(two_drones()), case == "a box for each drone"
-    view = sightings_of(*own) if alone else sightings_of(enclosing_box(own))
-    seen = split(view, two_drones(), SPANS_M if alone else np.full((2, 2), np.nan))
-    np.testing.assert_array_equal(seen.centre_px, view.centre_px)
-    np.testing.assert_array_equal(seen.noise_px, view.noise_px)
 
 
 def test_a_drone_in_the_middle_of_a_merged_box_is_hidden():

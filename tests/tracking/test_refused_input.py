@@ -53,10 +53,6 @@ BAD = {
     "time that steps back": (measured(smooth, "time_s", 3, 0.01), TIMES),
     "endless time": (measured(estimate_jerk_density, "time_s", 29, np.inf), TIMES),
     "no position": (measured(smooth, "measured_m", (4, 1, 2), np.nan), "row 4, drone 1: " + POSITION),
-    "endless variance": (
-        measured(estimate_jerk_density, "covariance_m2", (4, 1, 2), np.inf),
-        "measurements, row 4, drone 1: " + POSITION,
-    ),
     "negative variance": (
         measured(smooth, "covariance_m2", (5, 0), np.diag([1, 1, -1])),
         "measurements, row 5, drone 0: " + POSITION,

@@ -45,13 +45,18 @@ def cut_at(rig, images, expected_m, size_m, *, reduction=1, reach_m=0.1, occludi
         np.broadcast_to(np.float32(reach_m), count),
         None if occluding is None else np.broadcast_to(occluding, count),
     )
-    of_frame = jax.tree.map(lambda level: level[0], make_pyramid(images[None]))
-    return jax.tree.map(np.asarray, _cut(of_frame, cameras, size_m, expected, reduction))
+    return jax.tree.map(np.asarray, _cut(images, cameras, size_m, expected, reduction))
+
+
+def pyramid_of(images):
+    """The pyramid of one frame, (cameras, height, width)."""
+    return jax.tree.map(lambda level: level[0], make_pyramid(images[None]))
 
 
 @partial(jax.jit, static_argnames="reduction")
-def _cut(pyramid, cameras, size_m, expected, reduction):
-    return cut(pyramid, make_extents(cameras, size_m), expected, reduction=reduction, ring=RING)[0]
+def _cut(images, cameras, size_m, expected, reduction):
+    extents = make_extents(cameras, size_m)
+    return cut(pyramid_of(images), extents, expected, reduction=reduction, ring=RING)[0]
 
 
 def pixels(patches):
