@@ -29,57 +29,45 @@ INTEL, DEC, SGI = 84, 85, 86
 LABELS = ("LASI", "RASI", "SACR")
 
 
-def real(value: float, processor: int) -> bytes:
-    """One real; VAX has the words exchanged and an exponent that is larger by 2 (except for zero)."""
+def reals(values, processor: int) -> bytes:
+    """VAX has the words of a real exchanged and an exponent that is larger by 2 (except for zero)."""
     if processor == DEC:
-        low, high = struct.unpack("<2H", struct.pack("<f", 4 * value))
-        return struct.pack("<2H", high, low)
-    return struct.pack(">f" if processor == SGI else "<f", value)
+        return (4 * np.asarray(values, "<f4")).view("<u2").reshape(-1, 2)[:, ::-1].tobytes()
+    return np.asarray(values, ">f4" if processor == SGI else "<f4").tobytes()
 
 
 def parameters(processor: int, values: dict[str, object]) -> bytes:
-    """Section of parameters: POINT, and what else `values` names as GROUP:NAME; None leaves a parameter out."""
+    """Section of parameters, which `values` names as GROUP:NAME."""
     order = ">" if processor == SGI else "<"
-    groups = {
-        name: number for number, name in enumerate(dict.fromkeys(key.split(":")[0] for key in values), 1)
-    }
-    items = [struct.pack("2b", len(name), -number) + name.encode() + struct.pack(order + "H", 3) + b"\0"
-             for name, number in groups.items()]  # fmt: skip
+    groups = list(dict.fromkeys(key.partition(":")[0] for key in values))
+
+    def item(name: str, number: int, content: bytes) -> bytes:
+        start = struct.pack("2b", len(name), number) + name.encode()
+        return start + struct.pack(order + "H", 3 + len(content)) + content + b"\0"
+
+    items = [item(group, -number, b"") for number, group in enumerate(groups, 1)]
     for key, value in values.items():
-        group, name = key.split(":")
-        if value is None:
-            continue
+        group, _, name = key.partition(":")
         if isinstance(value, tuple) and isinstance(value[0], str):
-            width = max(len(text.encode()) for text in value)
-            data = struct.pack("bBBB", -1, 2, width, len(value))
-            data += b"".join(text.encode().ljust(width) for text in value)
+            width = max(map(len, value))
+            content = struct.pack("bBBB", -1, 2, width, len(value))
+            content += b"".join(text.encode().ljust(width) for text in value)
         elif isinstance(value, float):
-            data = struct.pack("bB", 4, 0) + real(value, processor)
+            content = bytes([4, 0]) + reals([value], processor)
         else:
-            numbers = value if isinstance(value, tuple) else (value,)
-            data = struct.pack("bB", 2, len(numbers) > 1) + (
-                bytes([len(numbers)]) if len(numbers) > 1 else b""
-            )
-            data += b"".join(struct.pack(order + "H", number) for number in numbers)
-        data += b"\0"
-        items.append(struct.pack("2b", len(name), groups[group]) + name.encode()
-                     + struct.pack(order + "H", 2 + len(data)) + data)  # fmt: skip
+            numbers = np.array(value, order + "u2")
+            content = bytes([2, numbers.ndim, *numbers.shape]) + numbers.tobytes()
+        items.append(item(name, 1 + groups.index(group), content))
     section = b"".join(items) + b"\0\0"
     blocks = math.ceil((4 + len(section)) / 512)
     return (bytes([1, 80, blocks, processor]) + section).ljust(512 * blocks, b"\0")
 
 
-def make_c3d(
-    path: Path,
-    points: np.ndarray,
-    *,
-    processor: int = INTEL,
-    scale: float = -0.1,
-    header_frames: int | None = None,
-    analog: int = 0,
-    **changed: object,
-) -> Path:
-    """Write a C3D file of (frames, points, 4); the fourth value is the residual. Keywords change POINT's parameters."""
+def make_c3d(path, points, *, processor=INTEL, scale=-0.1, header_frames=None, analog=0, **changed) -> Path:
+    """Write a C3D file of (frames, points, 4), of which the last value is the residual.
+
+    Keywords change parameters of POINT, or of a group in GROUP__NAME; None leaves one out.
+    """
     order = ">" if processor == SGI else "<"
     num_frames, num_points, _ = points.shape
     values: dict[str, object] = {
@@ -87,24 +75,18 @@ def make_c3d(
         "POINT:DATA_START": 0, "POINT:LABELS": LABELS[:num_points] or ("-",), "POINT:UNITS": ("mm",),
         "ANALOG:USED": analog,
     }  # fmt: skip
-    values |= {
-        name.replace("__", ":") if "__" in name else f"POINT:{name}": each for name, each in changed.items()
-    }
-    section = parameters(processor, values)
+    for name, value in changed.items():
+        values[name.replace("__", ":") if "__" in name else f"POINT:{name}"] = value
+    section = parameters(processor, {key: value for key, value in values.items() if value is not None})
     count = num_frames if header_frames is None else header_frames
     header = bytes([2, 80]) + struct.pack(order + "5H", num_points, analog, 1, count % 2**16, 0)
-    header += real(scale, processor) + struct.pack(order + "2H", 2 + len(section) // 512, min(analog, 1))
-    header += real(50.0, processor)
-    frames = []
-    for frame in points:
-        for point in frame:
-            if scale < 0:
-                frames += [real(value, processor) for value in point]
-            else:
-                words = [*np.round(point[:3] / scale).astype(int), int(point[3])]
-                frames.append(struct.pack(order + "4h", *words))
-        frames += [real(7.0, processor) if scale < 0 else struct.pack(order + "h", 7)] * analog
-    path.write_bytes(header.ljust(512, b"\0") + section + b"".join(frames))
+    header += reals([scale], processor) + struct.pack(order + "2H", 2 + len(section) // 512, min(analog, 1))
+    header += reals([50.0], processor)
+    if scale > 0:
+        points = points / [scale, scale, scale, 1]
+    frames = np.hstack([points.reshape(num_frames, -1), np.full((num_frames, analog), 7.0)])
+    data = reals(frames, processor) if scale < 0 else np.round(frames).astype(order + "i2").tobytes()
+    path.write_bytes(header.ljust(512, b"\0") + section + data)
     return path
 
 
