@@ -1,7 +1,8 @@
-"""Small folders in the layout of the DPJAIT dataset, which are written line by line, without the package's writers."""
+"""Small folders in the layout of the DPJAIT dataset, and files of other layouts, without the package's writers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,11 @@ POSE_HEADER = "id;pos_x[m];pos_y[m];pos_z[m];rot_x[rad];rot_y[rad];rot_z[rad];q_
 SERIALS = ("55260362", "56339527", "60881257", "61920488")
 
 
-def write_video(path: Path, num_frames: int = NUM_FRAMES, size_wh: tuple[int, int] = SIZE_WH) -> None:
+def write_video(
+    path: Path, num_frames: int = NUM_FRAMES, size_wh: tuple[int, int] = SIZE_WH, fps: float = FPS
+) -> None:
     """A black video."""
-    with VideoWriter(path, FPS, size_wh) as writer:
+    with VideoWriter(path, fps, size_wh) as writer:
         for _ in range(num_frames):
             writer.write(np.zeros((size_wh[1], size_wh[0], 3), np.uint8))
 
@@ -68,3 +71,20 @@ def make_real(folder: Path) -> None:
     position_m = np.tile([1.0, 2.0, 1.5], (20, 6, 1)) + 0.01 * t + 0.1 * np.arange(6)[None, :, None]
     labels = tuple(f"Dron{drone}:Dron{drone}{i}" for drone in (4, 7) for i in (1, 2, 3))
     write_c3d(folder / "R99.c3d", Markers(labels, position_m, 100.0))
+
+
+def write_tum(path: Path, time_s: np.ndarray, position_m: np.ndarray) -> None:
+    """A drone's positions (times, 3) in the format of TUM, which is level."""
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time_s), 1))
+    np.savetxt(path, np.column_stack([time_s, position_m, level]), "%.17g")
+
+
+def edit(file: str, old: str, new: str, count: int = 1) -> Callable[[Path], None]:
+    """Function that replaces a text in a file of a folder."""
+
+    def change(folder: Path) -> None:
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new, count))
+
+    return change

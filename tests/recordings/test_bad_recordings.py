@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 from archives_made import OLD
-from dpjait_folders import make_real, make_simulated, write_video
-from helpers import assert_refused, cameras_of, make_once, ring_rig
+from dpjait_folders import edit, write_video
+from helpers import assert_refused, cameras_of, ring_rig
 from worlds import make_tracks
 
 from psotrack.geometry import make_camera, make_rig
@@ -43,32 +43,6 @@ from psotrack.recordings.datasets import (
     write_poses,
 )
 from psotrack.recordings.exchange import Footage, export_tracks, read_tracks
-from psotrack.trajectories import Trajectories, write_trajectories
-
-
-@pytest.fixture
-def folder(tmp_path_factory, tmp_path):
-    """A folder of sound files, which a test may spoil: a sequence of each half, and videos of any rig."""
-
-    def make(folder):
-        make_simulated(folder / "S99_D9")
-        make_real(folder / "R99_D9")
-        any_rig = folder / "any"
-        any_rig.mkdir()
-        for name in ("left", "right"):
-            write_video(any_rig / f"{name}.avi", 6)
-        any_rig.joinpath("left.zip").write_bytes(b"PK")
-        cv2.imwrite(str(any_rig / "ignore.png"), np.zeros((10, 10), np.uint8))
-        time_s = np.arange(5.0)
-        write_trajectories(
-            any_rig / "tracks.csv", Trajectories(np.arange(5), time_s, ("drone",), np.ones((5, 1, 3)))
-        )
-        any_rig.joinpath("drone.tum").write_text("".join(f"{t} 1 1 1 0 0 0 1\n" for t in time_s))
-        any_rig.joinpath("pictures").mkdir()
-        for index in range(12):
-            cv2.imwrite(str(any_rig / "pictures" / f"frame{index}.png"), np.zeros((48, 64), np.uint8))
-
-    return shutil.copytree(make_once(tmp_path_factory, "sound_recordings", make), tmp_path / "in")
 
 
 def nothing(folder):
@@ -81,17 +55,6 @@ def write(file, text):
     def change(folder):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_text(text, encoding="utf-8")
-
-    return change
-
-
-def edit(file, old, new, count=1):
-    """Function that replaces a text in a file of a folder."""
-
-    def change(folder):
-        text = (folder / file).read_text()
-        assert old in text
-        (folder / file).write_text(text.replace(old, new, count))
 
     return change
 
@@ -570,24 +533,24 @@ BAD = [
 
 
 @pytest.mark.parametrize(("change", "call", "words"), [row[1:] for row in BAD], ids=[row[0] for row in BAD])
-def test_it_is_refused(folder, change, call, words, capfd):
-    change(folder)
-    assert_refused(lambda: call(folder), *words, unchanged=folder)
+def test_it_is_refused(sound, change, call, words, capfd):
+    change(sound)
+    assert_refused(lambda: call(sound), *words, unchanged=sound)
     # Libraries write nothing either.
     assert capfd.readouterr().err == ""
 
 
-def test_times_since_1970_are_refused_before_memory_is_used_up(folder):
+def test_times_since_1970_are_refused_before_memory_is_used_up(sound):
     texts = (
         each.replace("K =", f"time_offset_s = 1700000000.{number}\nK =")
         for each, number in ((LEFT, 25), (RIGHT, 5))
     )
-    toml("".join(texts))(folder)
+    toml("".join(texts))(sound)
     words = (
         "frame times: expected at most 10000000 instants from time 0 on, found 4.3e+10: 25 Hz until 1700000000.70 s, ",
         "when camera right ends; ", " subtract 1700000000.25 s, the time of the first frame of camera left",
     )  # fmt: skip
-    assert_refused(lambda: opened()(folder).timeline(), *words, unchanged=folder)
-    toml(LEFT + RIGHT)(folder)
+    assert_refused(lambda: opened()(sound).timeline(), *words, unchanged=sound)
+    toml(LEFT + RIGHT)(sound)
     words = ("1e+09 Hz until 0.20 s, ", "; check the rates and times")
-    assert_refused(lambda: opened()(folder).timeline(1e9), *words, unchanged=folder)
+    assert_refused(lambda: opened()(sound).timeline(1e9), *words, unchanged=sound)

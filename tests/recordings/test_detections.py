@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from dpjait_folders import write_tum
 from helpers import assert_refused, make_once, ring_rig
 from hypothesis import given
 from hypothesis import strategies as st
@@ -107,8 +108,7 @@ def folder(tmp_path_factory):
             text += f'[cameras.{name}]\ndetections = "{name}.csv"\nfps = {fps}\ntime_offset_s = {begins_s}\n'
         (folder / "recording.toml").write_text(text)
         time_s = np.arange(0, LASTS_S, 0.01)
-        rows = (f"{t} {x} {y} {z} 0 0 0 1\n" for t, (x, y, z) in zip(time_s, path_m(time_s), strict=True))
-        (folder / "drone.tum").write_text("".join(rows))
+        write_tum(folder / "drone.tum", time_s, path_m(time_s))
 
     return make_once(tmp_path_factory, "detections_alone", make)
 

@@ -1,22 +1,11 @@
 """The dataset's folders: both halves are read, written files are read back, and what is wrong is said in one line."""
 
 import csv
-import shutil
 
 import cv2
 import numpy as np
 import pytest
-from dpjait_folders import (
-    POSE_HEADER,
-    REAL_HEADER,
-    SERIALS,
-    make_real,
-    make_simulated,
-    pose_lines,
-    write_cameras,
-    write_video,
-)
-from helpers import make_once
+from dpjait_folders import POSE_HEADER, REAL_HEADER, SERIALS, edit, pose_lines, write_cameras, write_video
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -42,45 +31,22 @@ from psotrack.recordings.datasets import (
 from psotrack.recordings.mocap import Markers, write_c3d
 
 
-@pytest.fixture(scope="session")
-def halves(tmp_path_factory):
-    """Folder with a sequence of each half; the names of the folders state other numbers of drones."""
-
-    def make(folder):
-        make_simulated(folder / "S99_D9")
-        make_real(folder / "R99_D9")
-
-    return make_once(tmp_path_factory, "dpjait", make)
+@pytest.fixture
+def simulated(sound):
+    return sound / "S99_D9"
 
 
 @pytest.fixture
-def simulated(halves, tmp_path):
-    """A copy of the simulated sequence, which a test may change."""
-    return shutil.copytree(halves / "S99_D9", tmp_path / "S99_D9")
-
-
-@pytest.fixture
-def real(halves, tmp_path):
-    """A copy of the real sequence, which a test may change."""
-    return shutil.copytree(halves / "R99_D9", tmp_path / "R99_D9")
-
-
-def edit(file, old, new, count=1):
-    """Function that replaces a text in a file of a folder."""
-
-    def change(folder):
-        text = (folder / file).read_text()
-        assert old in text
-        (folder / file).write_text(text.replace(old, new, count))
-
-    return change
+def real(sound):
+    return sound / "R99_D9"
 
 
 # --- both halves
 
 
-def test_the_simulated_half(simulated):
-    recording = read_sequence(simulated)
+def test_the_simulated_half(simulated, monkeypatch):
+    monkeypatch.chdir(simulated)
+    recording = read_sequence(".")
     assert recording.name == "S99_D9"
     assert recording.rig.names == ("cam1i", "cam2i", "cam3i")
     assert {name: video.path.name for name, video in recording.videos.items()} == {
@@ -175,10 +141,10 @@ def test_the_real_half(real):
 
 
 @pytest.mark.parametrize(("half", "metres"), [("S99_D9", 1), ("R99_D9", 1e-3)])
-def test_projection_agrees_with_opencv(halves, half, metres):
+def test_projection_agrees_with_opencv(sound, half, metres):
     """Projection agrees with `cv2.projectPoints` and the values of the file: t is not the camera's centre."""
-    rig = read_sequence(halves / half).rig
-    line = (halves / half / CALIBRATION).read_text().splitlines()[2].split(";")
+    rig = read_sequence(sound / half).rig
+    line = (sound / half / CALIBRATION).read_text().splitlines()[2].split(";")
     t, rvec = np.array(line[1:4], float), np.array(line[4:7], float)
     f, cx, cy = (float(value) for value in line[7:10])
     points_m = np.random.default_rng(0).uniform(-2, 2, (7, 3))
@@ -188,12 +154,6 @@ def test_projection_agrees_with_opencv(halves, half, metres):
     assert depth_m.min() > 0
     # Both compute in double precision with pixels up to a few thousand.
     np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-8)
-
-
-def test_forms_of_the_path_of_a_sequence(halves, monkeypatch):
-    for place, typed in ((halves, "./S99_D9//"), (halves / "S99_D9", ".")):
-        monkeypatch.chdir(place)
-        assert read_sequence(typed).name == "S99_D9"
 
 
 # --- folders that differ

@@ -1,16 +1,16 @@
 """`recording.toml`: every key is read, and every fault of the file is one line that names file, table and key."""
 
-import shutil
 import tomllib
 
 import cv2
 import numpy as np
 import pytest
-from helpers import assert_refused, make_once
+from dpjait_folders import write_tum, write_video
+from helpers import assert_refused
 
 from psotrack.geometry import project
 from psotrack.geometry.rig_files import read_rig, write_calibration, write_rig
-from psotrack.recordings import Detections, VideoWriter, read_frames, write_detections
+from psotrack.recordings import Detections, read_frames, write_detections
 from psotrack.recordings.datasets import find_marker_corners, open_recording, write_poses
 from psotrack.trajectories import Trajectories, write_trajectories
 
@@ -19,22 +19,10 @@ RVEC, TVEC = (1.2, -0.4, 0.3), (0.1, 0.2, 5.0)
 PLACE = f"K = {K}\nrvec = {list(RVEC)}\ntvec = {list(TVEC)}\n"
 
 
-def write_video(path, count, fps=25.0, size_wh=(64, 48)):
-    with VideoWriter(path, fps, size_wh) as writer:
-        for index in range(count):
-            writer.write(np.full((size_wh[1], size_wh[0], 3), 20 * index, np.uint8))
-
-
 @pytest.fixture
-def folder(tmp_path_factory, tmp_path):
-    """A folder for a test's own `recording.toml`, with videos: wide has twice the rate, and another size."""
-
-    def make(folder):
-        write_video(folder / "left.avi", 6)
-        write_video(folder / "right.avi", 6)
-        write_video(folder / "wide.avi", 11, 50.0, (96, 48))
-
-    return shutil.copytree(make_once(tmp_path_factory, "videos_of_two_rates", make), tmp_path / "flight")
+def folder(sound):
+    """A folder with videos, for a test's own `recording.toml`."""
+    return sound / "any"
 
 
 def write(folder, *tables, top=""):
@@ -81,7 +69,7 @@ def test_the_keys_of_a_camera(folder):
         '[markers]\ncorners = "corners.csv"\n',
     )
     recording = open_recording(path)
-    assert recording.name == "flight"
+    assert recording.name == "any"
     assert recording.rig.names == tuple(recording.videos) == ("left", "right")
     left, right = recording.cameras
     assert (left.ignore, right.ignore) == (folder / "ignore.png", None)
@@ -111,7 +99,7 @@ def test_a_folder_a_file_and_a_folder_of_the_dataset_are_recordings(folder):
     rig = open_recording(other).rig
     rig.cameras.K[:, 1, 1], rig.cameras.K[:, 0, 1] = 1160.2, 0.0
     write_calibration(folder / "cameras_calibration.csv", rig)
-    assert open_recording(folder).name == "flight"
+    assert open_recording(folder).name == "any"
     np.testing.assert_array_equal(open_recording(folder).rig.cameras.K, rig.cameras.K)
 
 
@@ -217,11 +205,10 @@ def path_m(time_s):
 def write_reference(file):
     time_s = np.arange(0, 2, 0.01)
     if file.suffix == ".tum":
-        rows = (f"{t} {x} {y} {z} 0 0 0 1\n" for t, (x, y, z) in zip(time_s, path_m(time_s), strict=True))
-        file.write_text("".join(rows))
+        write_tum(file, time_s, path_m(time_s))
     else:
         tracks = Trajectories(np.arange(len(time_s)), time_s, ("drone",), path_m(time_s)[:, None])
-        write_trajectories(file, tracks)
+        write_trajectories(file, tracks, force=True)
 
 
 def truth_of(folder, file, *lines):
